@@ -4,7 +4,7 @@
 
 SESSIONS holds folders with a session.yaml, TRUTH folders of the same names with a truth.yaml:
 `bending_stiffness` [N m^2], `marker_noise` [m] of a coordinate, `repeat_rms_all_m`, how far two
-hangings of a pose differ at the markers, and `effects` that are hidden.
+repeats of a pose differ at the markers, and `effects` that are hidden.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def main() -> int:
     """Print the table; 1 if anything in it is not as it should be."""
     sessions, truths, names = asked(__doc__)
     print(
-        "session | verdict | effect | EI [N m^2] | held out [mm] | two hangings [mm] | noise [mm] "
+        "session | verdict | effect | EI [N m^2] | held out [mm] | two repeats [mm] | noise [mm] "
         "| in 90 % band |"
     )
     good, inside = True, []

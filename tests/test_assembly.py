@@ -157,7 +157,9 @@ def test_the_curve_without_measurement_effects_is_the_cable(element):
     np.testing.assert_allclose(z[..., :2], a.nodes(shapes, given), atol=1e-14)
     np.testing.assert_array_equal(z[:, 0, :2], ENDS[:, :2])
     if a.chain.kind.smooth:
-        stretch = float(lagrangian_of(a.model).held(given.p[0], 0, 0)[1]) / CABLE.length
+        stretch = (
+            float(lagrangian_of(a.model).true_ends_and_length(given.p[0], 0, 0)[1]) / CABLE.length
+        )
         x = shapes.x[..., 0]
         exact = stretch * np.stack([np.cos(x), np.sin(x)], axis=-1)
         np.testing.assert_allclose(z[..., 2:], exact, atol=1e-14)
@@ -169,7 +171,7 @@ def test_the_end_is_held_where_the_multipliers_say(element):
     a, shapes, given = posed(element, ("clamped", "pinned"))
     gap = a.balance(shapes, given)[1].y[:, :2, 0]
     held = [
-        np.array(lagrangian_of(a.model).held(p, ends, own)[0]).ravel()[2:4]
+        np.array(lagrangian_of(a.model).true_ends_and_length(p, ends, own)[0]).ravel()[2:4]
         for p, ends, own in zip(given.p, ENDS, shapes.deviation, strict=True)
     ]
     exact = a.nodes(shapes, given)[:, -1] - held

@@ -20,7 +20,7 @@ from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.options import ElementName
-from dlo_casadi.config.problems import Problem, show
+from dlo_casadi.config.problems import ConfigProblem, show
 from dlo_casadi.config.sections import Boundary
 from dlo_casadi.config.values import (
     STIFFNESS,
@@ -56,21 +56,21 @@ _LISTED = 5
 _DAMAGED, _REMEDY = "damaged parameters", ".\n  Try: the file as a fit has written it."
 
 
-def _wrong_effect(row: Mapping[str, Any]) -> list[Problem]:
+def _wrong_effect(row: Mapping[str, Any]) -> list[ConfigProblem]:
     """Problems of an effect and its options, by their keys."""
     name = row.get("name")
     kind = known_effect(name) if isinstance(name, str) else None
     if kind is None:
         known = ", ".join((*EFFECTS, *NUISANCES))
-        return [Problem((), f"no effect is called {name!r}; known: {known}")]
+        return [ConfigProblem((), f"no effect is called {name!r}; known: {known}")]
     defaults = {item.name: item.default for item in fields(kind)}
     problems = []
     for key, value in row.items():
         if key not in ("name", *defaults):
-            problems.append(Problem((key,), f"{name} knows {', '.join(defaults)}"))
+            problems.append(ConfigProblem((key,), f"{name} knows {', '.join(defaults)}"))
         elif key != "name" and _form(value) != _form(defaults[key]):
             text = f"something like {defaults[key]!r} belongs here, found {show(value)}"
-            problems.append(Problem((key,), text))
+            problems.append(ConfigProblem((key,), text))
     return problems
 
 
@@ -242,26 +242,28 @@ def _effect(row: Mapping[str, Any]) -> Effect:
     return kind(**options)
 
 
-def _unlike(file: ParametersFile, model: CableModel) -> Iterator[Problem]:
+def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
     """Contradictions to the model: names and numbers of parameters, and their bounds."""
     if strange := set(file.parameters) ^ set(model.names):
         wrong = ", ".join(sorted(strange))
-        yield Problem(("parameters",), f"parameters and effects do not belong together: {wrong}")
+        yield ConfigProblem(
+            ("parameters",), f"parameters and effects do not belong together: {wrong}"
+        )
     for q in [] if strange else model.parameters:
         if wrong := _beyond(q, file.parameters[q.name]):
             name = f"parameters.{q.name}.value"
-            yield Problem(("parameters", q.name, "value"), f"{name}: {wrong}")
+            yield ConfigProblem(("parameters", q.name, "value"), f"{name}: {wrong}")
     for key, size, found in (
         ("rest_curvature", model.n_coefficients, file.rest_curvature.coefficients),
         ("state", model.chain.n_rests, file.state.rest_curvature),
     ):
         if len(found) != size:
             text = f"{counted(size, 'number')} belong here, found {len(found)}"
-            yield Problem((key,), f"{key}: {text}")
+            yield ConfigProblem((key,), f"{key}: {text}")
     coefficients = {f"rest_curvature[{k}]" for k in range(model.n_coefficients)}
     for name in set(file.covariance.names) - {*model.names, *coefficients}:
         text = f"covariance.names: nothing is called {show(name)}"
-        yield Problem(("covariance", "names"), text)
+        yield ConfigProblem(("covariance", "names"), text)
 
 
 def _beyond(q: Parameter, row: _Value) -> str:

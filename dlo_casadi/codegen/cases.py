@@ -80,7 +80,7 @@ class Case:
     @property
     def length(self) -> float:
         """True length of the cable [m]."""
-        return float(self.lagrangian.held(self.p, 0, 0)[1])
+        return float(self.lagrangian.true_ends_and_length(self.p, 0, 0)[1])
 
     @property
     def load(self) -> FloatArray:
@@ -98,7 +98,7 @@ class _PlaneCase(Case):
     @property
     def numbers(self) -> list[float]:
         model, chain, gravity = self.model, self.model.chain, self.model.gravity
-        offsets, _ = self.lagrangian.held(self.p, 0, 0)
+        offsets, _ = self.lagrangian.true_ends_and_length(self.p, 0, 0)
         stretch = self.length / model.cable.length
         return [
             self.length,
@@ -181,7 +181,7 @@ class _SpaceCase(Case):
 
         def held(frames: FloatArray) -> FloatArray:
             ends = np.concatenate([np.zeros(6), frames.ravel()])
-            return np.array(self.lagrangian.held(self.p, ends, 0)[0]).ravel()
+            return np.array(self.lagrangian.true_ends_and_length(self.p, ends, 0)[0]).ravel()
 
         found = held(np.tile(self.model.node.identity, 2))
         anywhere = np.random.default_rng(0).normal(size=(2, 4))

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.measuring import Tolerances
+from dlo_casadi.config.measuring import DeclaredTolerances
 from dlo_casadi.config.options import DeclaredEffect
-from dlo_casadi.config.problems import Place, Problem, Source, did_you_mean, kind_of, show
+from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
 from dlo_casadi.config.values import Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
@@ -82,7 +82,7 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
     n_fit = sum(pose.role == "fit" and pose.name not in reasons for pose in poses)
     if n_fit == 0:
         lost = [
-            Problem(("experiment", "poses", i), f"{_called(i, pose)}: {reasons[pose.name]}")
+            ConfigProblem(("experiment", "poses", i), f"{_called(i, pose)}: {reasons[pose.name]}")
             for i, pose in enumerate(poses)
             if pose.role == "fit"
         ]
@@ -136,19 +136,19 @@ def _called(index: int, pose: Pose) -> str:
     return f"pose {index + 1} ({pose.shown_by})"
 
 
-def _contradictions(experiment: Experiment) -> Iterator[Problem]:
+def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
     """Find poses that do not fit the boundary, the kind of measurement, or each other."""
     measurement, held, poses = experiment.measurement, experiment.boundary, experiment.poses
     if experiment.in_space and measurement.kind == "images" and measurement.board is None:
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
-        yield Problem(("experiment", "measurement"), text)
+        yield ConfigProblem(("experiment", "measurement"), text)
     if experiment.in_space and held.start == "pinned" and held.end == "free":
         text = (
             "on a ball joint and with a free end a cable in space may be turned about gravity, "
             "which holds it in no shape of all these. Try: start: clamped, with start_orientation; "
             "or two numbers of gravity, in the plane in which it hangs"
         )
-        yield Problem(("experiment", "boundary"), text)
+        yield ConfigProblem(("experiment", "boundary"), text)
     names = [pose.name for pose in poses]
     for i, pose in enumerate(poses):
         wrong = [*_file_problems(experiment, pose), *_end_problems(experiment, pose)]
@@ -159,10 +159,10 @@ def _contradictions(experiment: Experiment) -> Iterator[Problem]:
             wrong.append(("the first pose continues none; branch: ccw or cw?", "branch"))
         for message, key in wrong:
             at: Place = ("experiment", "poses", i)
-            yield Problem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
+            yield ConfigProblem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
     if not any(pose.role == "fit" for pose in poses):
         text = "no pose has role: fit, there is nothing to fit to"
-        yield Problem(("experiment", "poses"), text)
+        yield ConfigProblem(("experiment", "poses"), text)
 
 
 def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
@@ -187,18 +187,20 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
         yield "several photographs are of a cable in space; gravity: two numbers", "files"
 
 
-def _weightless(config: Config) -> Iterator[Problem]:
+def _weightless(config: Config) -> Iterator[ConfigProblem]:
     """Why a mass that is not declared cannot be found."""
     experiment, at = config.experiment, ("cable", "mass")
     if config.cable.mass is not None:
         return
     if not any(experiment.gravity):
-        yield Problem(at, "mass: null: without gravity nothing depends on it; declare any")
+        yield ConfigProblem(at, "mass: null: without gravity nothing depends on it; declare any")
     elif not any(pose.readings for pose in experiment.poses if pose.role == "fit"):
         text = "mass: null: shapes tell stiffness over weight alone. Try: the mass in kg, or "
-        yield Problem(at, f"{text}end_force of a fit pose, which tells both")
+        yield ConfigProblem(at, f"{text}end_force of a fit pose, which tells both")
     elif any(item.name == UNKNOWN_MASS.name for item in config.model.effects):
-        yield Problem(at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two")
+        yield ConfigProblem(
+            at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two"
+        )
 
 
 def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
@@ -244,7 +246,9 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
         yield f"branch: {pose.branch} is of a cable in a plane", "branch"
 
 
-def _unreachable(poses: Iterable[Pose], cable: Cable, tolerances: Tolerances) -> dict[str, str]:
+def _unreachable(
+    poses: Iterable[Pose], cable: Cable, tolerances: DeclaredTolerances
+) -> dict[str, str]:
     """Find poses whose ends are farther apart than the cable is long, beyond three tolerances."""
     slack = 3.0 * math.hypot(tolerances.length, tolerances.end)
     reasons: dict[str, str] = {}
@@ -326,19 +330,19 @@ def _oddities(config: Config) -> Iterator[str]:
             yield f"{end}_heading is not used, the {end} is pinned: {', '.join(given)}"
 
 
-def _impossible_values(experiment: Experiment, length: float) -> Iterator[Problem]:
+def _impossible_values(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
     """Find noise, tolerances, arc lengths that are impossible for a cable of that length [m]."""
     std = experiment.measurement.std
     if std is not None and std not in (possible := Range(_FINEST_STD, length, "m")):
         text = f"std: {possible.complaint(std)}; without it, it is estimated from the data"
-        yield Problem(("experiment", "measurement", "std"), text)
+        yield ConfigProblem(("experiment", "measurement", "std"), text)
     for i, pose in enumerate(experiment.poses):
         if outside := [s for s in pose.at or () if not 0.0 <= s <= length]:
             text = (
                 f"{_called(i, pose)}: at {outside[0]:g} m is not between 0 and cable.length "
                 f"{length:g} m: arc length from the start, in metres?"
             )
-            yield Problem(("experiment", "poses", i, "at"), text)
+            yield ConfigProblem(("experiment", "poses", i, "at"), text)
     # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
     torsional_stiffness = 1.0 if experiment.in_space else None
     cable = CableData(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
@@ -352,7 +356,7 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Proble
     for key, q in taken_up.items():
         most = min(q.upper - q.nominal, q.nominal - q.lower)
         if wrong := Range(_FINEST_TOLERANCE, most, q.unit).complaint(declared[key]):
-            yield Problem(("experiment", "tolerances", key), f"tolerances.{key}: {wrong}")
+            yield ConfigProblem(("experiment", "tolerances", key), f"tolerances.{key}: {wrong}")
 
 
 # ---- declared effects ----------------------------------------------------------------------------
@@ -383,42 +387,42 @@ def declared_setup(config: Config) -> Setup:
     )
 
 
-def wrong_effects(config: Config) -> list[Problem]:
+def wrong_effects(config: Config) -> list[ConfigProblem]:
     """Find effects, and parameters of theirs, that do not exist or cannot be as declared."""
     setup = declared_setup(config)
-    found: list[Problem] = []
+    found: list[ConfigProblem] = []
     for i, item in enumerate(config.model.effects):
         found += _wrong(item, ("model", "effects", i), setup)
     for i, name in enumerate(config.diagnosis.exclude):
         if name not in EFFECTS:
             text = f"diagnosis.exclude: {_unknown(name)}"
-            found.append(Problem(("diagnosis", "exclude", i), text))
+            found.append(ConfigProblem(("diagnosis", "exclude", i), text))
     return found
 
 
-def _wrong(item: DeclaredEffect, at: Place, setup: Setup) -> Iterator[Problem]:
+def _wrong(item: DeclaredEffect, at: Place, setup: Setup) -> Iterator[ConfigProblem]:
     """Find what is wrong with one declared effect."""
     if item.name not in EFFECTS:
-        yield Problem((*at, "name"), f"model.effects: {_unknown(item.name)}")
+        yield ConfigProblem((*at, "name"), f"model.effects: {_unknown(item.name)}")
         return
     effect, said = EFFECTS[item.name].made_for(setup), f"model.effects: {item.name}"
     known = {q.name: q for q in effect.parameters(setup.cable)}
     values = {name: q.nominal for name, q in known.items()}
     if refusal := effect.refusal(setup, values):
-        yield Problem((*at, "name"), f"{said}: {refusal}")
+        yield ConfigProblem((*at, "name"), f"{said}: {refusal}")
         return
     for name, declared in item.parameters.items():
         key = (*at, "parameters", name)
         if name not in known:
             hint = did_you_mean(name, known)
-            yield Problem(key, f"{said} has no parameter {name!r}{hint}")
+            yield ConfigProblem(key, f"{said} has no parameter {name!r}{hint}")
         elif wrong := Range(*known[name].range, known[name].unit).complaint(declared.value):
-            yield Problem(key, f"{said}.{name}: {wrong}")
+            yield ConfigProblem(key, f"{said}.{name}: {wrong}")
         else:
             values[name] = declared.value
     as_declared = all(values.get(name) == item.parameters[name].value for name in item.parameters)
     if as_declared and (refusal := effect.refusal(setup, values)):
-        yield Problem((*at, "name"), f"{said}: {refusal}")
+        yield ConfigProblem((*at, "name"), f"{said}: {refusal}")
 
 
 def _unknown(name: str) -> str:

@@ -11,20 +11,20 @@ from dlo_casadi.config.values import (
     COORDINATE,
     FORCE,
     MOMENT,
+    ConfigSection,
     NonNegative,
     Number,
     Positive,
     Range,
     Row,
-    Section,
     Vector,
     checked,
     within,
 )
 from dlo_casadi.errors import counted
-from dlo_casadi.model.cable_model import Tolerances as Known
+from dlo_casadi.model.cable_model import Tolerances
 
-_STANDARD = Known()
+_STANDARD = Tolerances()
 # A nanonewton is what atomic force microscopes resolve.
 FORCE_STD, MOMENT_STD = FORCE._replace(least=1.0e-9), MOMENT._replace(least=1.0e-9)
 # A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
@@ -51,7 +51,7 @@ def _unknown_count(distortion: tuple[float, ...]) -> str:
     return f"found {found}; OpenCV knows 4, 5 [k1, k2, p1, p2, k3], 8, 12 or 14"
 
 
-class Camera(Section):
+class DeclaredCamera(ConfigSection):
     """A pinhole camera with lens distortion, in OpenCV's convention."""
 
     matrix: Annotated[tuple[Row, Row, Row], checked(_no_pinhole)]
@@ -81,7 +81,7 @@ def _unknown_dictionary(name: str) -> str:
     return "" if name in _DICTIONARIES else f"OpenCV has no dictionary {name!r}{hint}"
 
 
-class Board(Section):
+class DeclaredBoard(ConfigSection):
     """A plane board with ArUco markers; it defines the frame in which everything is measured."""
 
     dictionary: Annotated[str, checked(_unknown_dictionary)]
@@ -118,7 +118,7 @@ _Pixel = Annotated[Vector, within(PIXELS)]
 _Place = Annotated[Vector, within(COORDINATE)]
 
 
-class Reference(Section):
+class Reference(ConfigSection):
     """Two known points in the photograph: scale, rotation and origin of a similarity transform."""
 
     pixels: Annotated[tuple[_Pixel, _Pixel], checked(_one_point)]
@@ -127,7 +127,7 @@ class Reference(Section):
     """The same two points in the board frame [[x, y], [x, y]] [m]."""
 
 
-class Measurement(Section):
+class Measurement(ConfigSection):
     """How well was measured."""
 
     std: Positive | None = None
@@ -144,10 +144,10 @@ class Images(Measurement):
 
     kind: Literal["images"] = "images"
     """images."""
-    camera: Camera | None = None
+    camera: DeclaredCamera | None = None
     """The camera. Without it, it is found from the session's photographs where it is needed (in
     space, or with a standoff); else the board's plane is mapped by a homography."""
-    board: Board | None = None
+    board: DeclaredBoard | None = None
     """The board with its markers; or give reference."""
     reference: Reference | None = None
     """Two known points; or give board."""
@@ -167,7 +167,7 @@ class Centerlines(Measurement):
     """centerlines."""
 
 
-class Tolerances(Section):
+class DeclaredTolerances(ConfigSection):
     """How well the declared values are known: one standard deviation each."""
 
     length: Positive = _STANDARD.length

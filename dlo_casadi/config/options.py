@@ -5,13 +5,13 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from dlo_casadi.config.values import Elements, Number, RestCoefficients, Section, Switch
+from dlo_casadi.config.values import ConfigSection, Elements, Number, RestCoefficients, Switch
 from dlo_casadi.thresholds import SIGNIFICANCE
 
 ElementName = Literal["quadratic", "arc", "link"]
 
 
-class EffectParameter(Section):
+class EffectParameter(ConfigSection):
     """The declared value of an effect's parameter: an initial guess, or kept when fixed."""
 
     value: Number
@@ -26,7 +26,7 @@ _as_parameter = BeforeValidator(
 )
 
 
-class DeclaredEffect(Section):
+class DeclaredEffect(ConfigSection):
     """An effect that is part of the model from the start."""
 
     name: str
@@ -41,7 +41,7 @@ _as_effect = BeforeValidator(
 )
 
 
-class ModelOptions(Section):
+class ModelOptions(ConfigSection):
     """The declared model."""
 
     n: Elements | None = None
@@ -53,7 +53,7 @@ class ModelOptions(Section):
     """Effects beside bending and weight."""
 
 
-class EstimationOptions(Section):
+class EstimationOptions(ConfigSection):
     """How the parameters are estimated."""
 
     algorithm1: Switch = True
@@ -70,7 +70,7 @@ class EstimationOptions(Section):
     """Number of coefficients of the rest curvature, 0 for a straight one; chosen from the data."""
 
 
-class DiagnosisOptions(Section):
+class DiagnosisOptions(ConfigSection):
     """The search for missing effects."""
 
     enabled: Switch = True

@@ -19,7 +19,7 @@ PLACEHOLDER = "FILL_IN"
 """What stands in a new configuration where only its user knows the value."""
 
 
-class Problem(NamedTuple):
+class ConfigProblem(NamedTuple):
     """Something wrong, and where in the file."""
 
     place: Place
@@ -29,7 +29,7 @@ class Problem(NamedTuple):
 class Contradiction(ValueError):  # noqa: N818  (a ValueError is what pydantic collects)
     """What is wrong inside one section: problems by the key they belong to."""
 
-    def __init__(self, *problems: Problem) -> None:
+    def __init__(self, *problems: ConfigProblem) -> None:
         super().__init__("; ".join(problem.message for problem in problems))
         self.problems = problems
 
@@ -112,7 +112,7 @@ class Source:
             raise self.error(explain(model, error.errors(), self), heading, remedy) from None
 
     def error(
-        self, problems: Iterable[Problem], heading: str = "", remedy: str = ""
+        self, problems: Iterable[ConfigProblem], heading: str = "", remedy: str = ""
     ) -> ConfigError:
         """All problems as one error, in the order of their lines, under what they say together."""
         most = 12
@@ -225,7 +225,7 @@ _MESSAGES: dict[str, str] = {
 
 def explain(
     model: type[BaseModel], errors: Sequence[ErrorDetails], source: Source
-) -> Iterator[Problem]:
+) -> Iterator[ConfigProblem]:
     """Say what pydantic found in a source of that model in the words of the source."""
     sections = _sections(model)
     suggested: set[Place] = set()
@@ -265,9 +265,9 @@ def explain(
             text = f"{label}: kind must be images or centerlines, found {show(context.get('tag'))}"
         elif kind == "value_error":
             wrong = context["error"]
-            for inner in getattr(wrong, "problems", (Problem((), str(wrong)),)):
+            for inner in getattr(wrong, "problems", (ConfigProblem((), str(wrong)),)):
                 at = (*place, *inner.place)
-                yield Problem(at, f"{source.label(at)}: {inner.message}")
+                yield ConfigProblem(at, f"{source.label(at)}: {inner.message}")
             continue
         elif kind in _MESSAGES:
             words = {
@@ -283,4 +283,4 @@ def explain(
                 text += "; for a value that is known exactly write a small one, such as 1.0e-6"
         else:
             text = f"{label}: {error['msg']}"
-        yield Problem(place, text)
+        yield ConfigProblem(place, text)

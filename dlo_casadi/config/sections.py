@@ -13,12 +13,13 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from dlo_casadi.config.document import dump_yaml
-from dlo_casadi.config.measuring import Centerlines, Images, Tolerances
+from dlo_casadi.config.measuring import Centerlines, DeclaredTolerances, Images
 from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
-from dlo_casadi.config.problems import PLACEHOLDER, Contradiction, Problem, show
+from dlo_casadi.config.problems import PLACEHOLDER, ConfigProblem, Contradiction, show
 from dlo_casadi.config.values import (
     STIFFNESS,
     ArcLengths,
+    ConfigSection,
     Force,
     Gravity,
     Moment,
@@ -28,7 +29,6 @@ from dlo_casadi.config.values import (
     Points,
     Positive,
     Quaternion,
-    Section,
     checked,
     implausible_sizes,
     optional,
@@ -43,7 +43,7 @@ from dlo_casadi.rod.ends import REACTIONS
 DENSITY = 2200.0
 
 
-class Cable(Section):
+class Cable(ConfigSection):
     """The cable between its two fixtures."""
 
     name: Name = "cable"
@@ -90,19 +90,19 @@ class Cable(Section):
         declared, young = self.bending_stiffness, self.youngs_modulus
         problems = implausible_sizes(self.length, self.prior_mass, self.diameter)
         if declared is not None and (wrong := STIFFNESS.complaint(declared)):
-            problems.append(Problem(("bending_stiffness",), wrong))
+            problems.append(ConfigProblem(("bending_stiffness",), wrong))
         if (young is None) == (declared is None):
             found, key = ("neither", ()) if young is None else ("both", ("bending_stiffness",))
             text = f"give youngs_modulus [Pa] or bending_stiffness [N m^2], found {found}"
-            problems.append(Problem(key, text))
+            problems.append(ConfigProblem(key, text))
         elif young and (wrong := STIFFNESS.complaint(self.prior_bending_stiffness)):
-            problems.append(Problem(("youngs_modulus",), f"{wrong} for EI = E pi d^4 / 64"))
+            problems.append(ConfigProblem(("youngs_modulus",), f"{wrong} for EI = E pi d^4 / 64"))
         if problems:
             raise Contradiction(*problems)
         return self
 
 
-class Boundary(Section):
+class Boundary(ConfigSection):
     """How the two ends are held."""
 
     start: Literal["pinned", "clamped"]
@@ -135,7 +135,7 @@ _as_boundary = BeforeValidator(_both_ends, json_schema_input_type=Boundary | tup
 _TOLD_APART = re.compile(r"(.*[0-9])[-_. ]?[A-Za-z]+")
 
 
-class Pose(Section):
+class Pose(ConfigSection):
     """One shape: where the ends were held, and the file, the files or the points that show it.
 
     From Python `start` and `end` may stand without their names: `Pose(start, end, points=...)`.
@@ -256,17 +256,19 @@ class Pose(Section):
         if self.at is not None and len(self.at) != len(self.points or ()):
             points = counted(len(self.points or ()), "point")
             text = f"{counted(len(self.at), 'arc length')} for {points}: each point has one"
-            raise Contradiction(Problem(("at",), text))
+            raise Contradiction(ConfigProblem(("at",), text))
         if self.points is not None and len(self.points) == 1:
-            raise Contradiction(Problem(("points",), "one point only; a pose takes two or more"))
+            raise Contradiction(
+                ConfigProblem(("points",), "one point only; a pose takes two or more")
+            )
         for s, after in pairwise(self.at or ()):
             if after <= s:
                 text = f"{after:g} m follows {s:g} m; arc lengths grow from the start to the end"
-                raise Contradiction(Problem(("at",), text))
+                raise Contradiction(ConfigProblem(("at",), text))
         return self
 
 
-class Experiment(Section):
+class Experiment(ConfigSection):
     """What was measured, and under which conditions."""
 
     gravity: Gravity
@@ -277,7 +279,7 @@ class Experiment(Section):
     [start, end]."""
     measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
     """What the files of the poses are: kind: images or kind: centerlines."""
-    tolerances: Annotated[Tolerances, optional(Tolerances)] = Tolerances()
+    tolerances: Annotated[DeclaredTolerances, optional(DeclaredTolerances)] = DeclaredTolerances()
     """How well the declared values are known."""
     poses: tuple[Pose, ...]
     """The poses, in the order in which they were taken."""
@@ -290,7 +292,7 @@ class Experiment(Section):
     @field_validator("poses", mode="before")
     @classmethod
     def _listed(cls, poses: Any) -> Any:
-        if isinstance(poses, Section):
+        if isinstance(poses, ConfigSection):
             raise ValueError("a list belongs here, found one pose")
         return poses
 
@@ -303,7 +305,7 @@ class Experiment(Section):
             "points: [[x, y], ...]"
         )
         if nothing := [k for k, x in enumerate(poses) if not x.paths and x.points is None]:
-            raise Contradiction(*(Problem((k,), text) for k in nothing))
+            raise Contradiction(*(ConfigProblem((k,), text) for k in nothing))
         return tuple(
             pose if pose.name else pose.model_copy(update={"name": f"pose_{k:02d}"})
             for k, pose in enumerate(poses, start=1)
@@ -321,7 +323,7 @@ class SkippedPose(NamedTuple):
     role: Literal["fit", "held_out"]
 
 
-class Config(Section):
+class Config(ConfigSection):
     """A session as it is declared: all that a fit starts from."""
 
     cable: Cable

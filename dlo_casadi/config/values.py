@@ -23,8 +23,8 @@ from pydantic import (
 
 from dlo_casadi.config.problems import (
     Arguments,
+    ConfigProblem,
     Contradiction,
-    Problem,
     explain,
     show,
 )
@@ -83,7 +83,7 @@ MESH = Range(2, 2000, "elements")
 REST_COEFFICIENTS = Range(0, 64, "coefficients")
 
 
-def implausible_sizes(length: float, mass: float, diameter: float) -> list[Problem]:
+def implausible_sizes(length: float, mass: float, diameter: float) -> list[ConfigProblem]:
     """Find sizes [m], [kg] of a cable that no cable has: one by one, then all together."""
 
     def density(diameter: float) -> float:
@@ -124,7 +124,7 @@ def implausible_sizes(length: float, mass: float, diameter: float) -> list[Probl
     elif apparent < _POSSIBLE_DENSITIES.least:
         text = f"{diameter:g} m make {mass:g} kg lighter than air, {apparent:.2g} kg/m^3: units "
         wrong.append(("diameter", f"{text}are SI{in_metres()}, mass in kg?"))
-    return [Problem((key,), text) for key, text in wrong]
+    return [ConfigProblem((key,), text) for key, text in wrong]
 
 
 def implausible_quaternion(values: Sequence[float]) -> str:
@@ -163,7 +163,7 @@ class _Long(int):
         return f"<{counted(int(self), 'item')}>"
 
 
-class Section(BaseModel):
+class ConfigSection(BaseModel):
     """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help.
 
     From Python its keys are arguments; arrays are taken for lists.
@@ -220,20 +220,20 @@ class Section(BaseModel):
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
 
-class OpenSection(Section):
+class OpenSection(ConfigSection):
     """A section in which other keys may stand beside those that are read."""
 
     model_config = ConfigDict(extra="ignore")
 
 
-def optional(section: type[Section]) -> BeforeValidator:
+def optional(section: type[ConfigSection]) -> BeforeValidator:
     """Let a section be empty: `model:` with nothing behind it."""
     return BeforeValidator(
         lambda value: {} if value is None else value, json_schema_input_type=section | None
     )
 
 
-def checked(complaint: Callable[[Any], str | list[Problem]]) -> AfterValidator:
+def checked(complaint: Callable[[Any], str | list[ConfigProblem]]) -> AfterValidator:
     """Refuse a value with what is wrong with it, or with its keys, if anything is."""
 
     def check(value: Any) -> Any:

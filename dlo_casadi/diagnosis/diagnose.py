@@ -145,7 +145,7 @@ def diagnose(
     run_in = executor or InProcess()
     search = Search(fit, center, exclude, significance, max_effects, step, run_in, finest)
     # Where left-out poses are not even reached no effect can be followed: first the force.
-    lost = search.astray and fit.noise.source != "misfit"
+    lost = search.loses_poses and fit.noise.source != "misfit"
     force = estimate_unknown_force(fit, search.executor) if lost else None
     found = search.run(force)
     if found.unexplained and force is not None:
@@ -238,7 +238,7 @@ class Search:
         return self.validation.error if self.validation.complete else 0.0
 
     @property
-    def astray(self) -> bool:
+    def loses_poses(self) -> bool:
         """Whether the declared model cannot follow the poses that are left out."""
         return self.several and not self.validation.complete
 
@@ -249,7 +249,7 @@ class Search:
 
     @property
     def doubt(self) -> float | None:
-        """What a gain has to be held against where a pose or two were taken again and again."""
+        """What a gain is compared with where a pose or two were taken again and again."""
         problem = self.declared.problem
         count = different_poses(problem.history, problem.unknowns.model.cable.length)
         return self.significance if count < min(DIFFERENT, len(problem.used)) else None

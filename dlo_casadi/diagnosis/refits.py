@@ -30,7 +30,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import carried_shapes, descend, refit
 from dlo_casadi.estimation.fit import misfits
 from dlo_casadi.estimation.problem import Priors, Problem, Values
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, hung, relaxed
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed, with_springs_in_place
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -184,7 +184,7 @@ def _beside(near: Fit, candidate: Candidate, values: Mapping[str, float]) -> Fit
     theta = problem.unknowns.pack(near.values_in(model, values), near.coefficients)
     shapes = carried_shapes(problem, near, relaxed=True)
     begun = Values(problem.unknowns.off_bounds(theta), shapes, near.point.projections)
-    return fit_from(problem, hung(problem, begun), SOFTNESS)
+    return fit_from(problem, with_springs_in_place(problem, begun), SOFTNESS)
 
 
 def _anew(near: Fit, candidate: Candidate, places: Mapping[str, float]) -> Fit | None:

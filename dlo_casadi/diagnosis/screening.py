@@ -32,7 +32,7 @@ from dlo_casadi.effects import StateEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.problem import NO_INFORMATION, Linearization, Point, Problem, Values
-from dlo_casadi.estimation.relaxation import Relaxation, hung
+from dlo_casadi.estimation.relaxation import Relaxation, with_springs_in_place
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
@@ -297,7 +297,7 @@ class RelaxedScreen(Screen):
             active = [c for c in self.listed if k < len(c.scans)]
             p = fit.values_in(self.model, _scan(active, k))
             theta = unknowns.pack(p, fit.coefficients)
-            values = hung(problem, Values(theta, shapes, fit.point.projections))
+            values = with_springs_in_place(problem, Values(theta, shapes, fit.point.projections))
             normal = Relaxation(problem, self.softness).normal(values)
             yield AtScan(active, k, normal.hessian, normal.gradient, unknowns.names)
 

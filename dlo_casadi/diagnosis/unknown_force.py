@@ -14,7 +14,7 @@ from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from
-from dlo_casadi.estimation.unknowns import Search, Unknowns
+from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
@@ -63,7 +63,7 @@ class UnknownForce:
 def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> UnknownForce | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
-    The fit without it may have gone far astray, so that it is no place to start from: on a
+    The fit without it may have gone far off, so that it is no place to start from: on a
     coarse mesh places along the cable are searched from the measured shapes, the best refitted
     with the place along with everything else, and the best of those on the base's mesh.
 
@@ -76,7 +76,7 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
     """
     effect = UnknownPull()
     model = base.model.with_effect(effect)
-    coarse = min(Search.of(model).mesh, model.n)
+    coarse = min(SearchSettings.of(model).mesh, model.n)
     search = _Search(base, model.with_mesh(coarse), f"{effect.label}.position")
     length, name = model.cable.length, search.position
     best: Fit | None = None

@@ -170,7 +170,7 @@ class BatchEquilibrium:
         now.x[~converged], now.lam[~converged] = shapes.x[~converged], shapes.lam[~converged]
         return now, converged
 
-    def settled(
+    def solve_or_descend(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any
     ) -> tuple[Shapes, BoolArray]:
         """As `solve`; in space, the energy of lost poses descends to a minimum from their start.

@@ -56,7 +56,7 @@ def _held(
 
     Lengths are relative to the cable's; the chord of a free end and the frame of a pin are None.
     """
-    ends, length = lagrangian_of(model).held(p, pose.ends, 0)
+    ends, length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
     chord = None if model.end == "free" else (end - start) / float(length)

@@ -91,7 +91,7 @@ def search_sizes(model: CableModel) -> list[tuple[int, int]]:
     return [(model.node.coordinates, model.chain.n_nodes), (model.n_border, 1), (1, 1), (1, 1)]
 
 
-class _Search(ca.Callback):
+class _SearchCallback(ca.Callback):
     """(pose, p) -> (x, multipliers, status, 1 or NaN)."""
 
     def __init__(self, model: CableModel, rest: FloatArray, branch: Branch | None) -> None:
@@ -149,12 +149,12 @@ def _solved(
 
 
 @cache
-def search_of(model: CableModel, rest: bytes, branch: Branch | None) -> _Search:
+def search_of(model: CableModel, rest: bytes, branch: Branch | None) -> _SearchCallback:
     """A node for the life of the process: graphs that contain it do not keep it alive."""
-    return _Search(model, np.frombuffer(rest), branch)
+    return _SearchCallback(model, np.frombuffer(rest), branch)
 
 
-def constant(function: ca.Function) -> ca.Function:
+def detached(function: ca.Function) -> ca.Function:
     """The same function without derivatives."""
     given: list[Any] = function.mx_in()
     outs: list[Any] = function.mx_out()
@@ -194,7 +194,7 @@ def chord(model: CableModel, rest: FloatArray) -> ca.Function:
         # Such a cable may roll about its own axis: the first node is kept from it.
         matrix[0, 0] += ca.mmax(ca.fabs(matrix))
     arguments: list[Any] = [x, lam, pose, p]
-    matrix = constant(ca.Function("tangent", arguments, [matrix]))(*arguments)
+    matrix = detached(ca.Function("tangent", arguments, [matrix]))(*arguments)
     total = ca.MX.zeros(z.shape)
     for _ in range(2):
         total -= ca.solve(matrix, force(total, *arguments), "qr")

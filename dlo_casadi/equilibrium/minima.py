@@ -253,20 +253,21 @@ def _balanced(
         return node.difference(shapes.x[0, :-1], shapes.x[0, 1:])[:, 0]
 
     def linearized(shapes: Shapes, moments: FloatArray) -> tuple[Vector, BandMatrix]:
-        """Imbalance and tangent with the joints that are held as further conditions."""
+        """Imbalance and tangent with the active joints as further conditions."""
         _, force, matrix = assembly.balance(shapes, given)
-        arms = np.zeros((1, model.chain.n_nodes, 1, len(held)))
-        arms[0, held, 0, np.arange(len(held))] = -1.0
-        arms[0, held + 1, 0, np.arange(len(held))] = 1.0
-        gap = (bends(shapes)[held] - bound)[None, :, None]
+        arms = np.zeros((1, model.chain.n_nodes, 1, len(active)))
+        arms[0, active, 0, np.arange(len(active))] = -1.0
+        arms[0, active + 1, 0, np.arange(len(active))] = 1.0
+        gap = (bends(shapes)[active] - bound)[None, :, None]
         nodes = force.x + (arms @ moments)[..., None]
         whole = Vector(nodes, np.concatenate([force.y, gap], axis=1))
         return whole, matrix.with_border(arms)
 
     bent = bends(start)
-    held = np.flatnonzero(np.abs(bent) > JOINT_BOUND - AT_BOUND)
+    active = np.flatnonzero(np.abs(bent) > JOINT_BOUND - AT_BOUND)
     while True:
-        bound, moments, now = np.copysign(JOINT_BOUND, bent[held]), bound_multipliers[held], start
+        bound, moments = np.copysign(JOINT_BOUND, bent[active]), bound_multipliers[active]
+        now = start
         for _ in range(NEWTON_STEPS):
             force, matrix = linearized(now, moments)
             step = matrix.factor().solve(Vector(-force.x, -force.y))
@@ -280,7 +281,7 @@ def _balanced(
                 break
         if not np.any(moments * np.sign(bound) < 0):
             break
-        held = held[moments * np.sign(bound) >= 0]
+        active = active[moments * np.sign(bound) >= 0]
     force, matrix = linearized(now, moments)
     residual = float(np.abs(force.y).max(initial=0.0))
     imbalance = float(np.abs(force.x).max())
@@ -288,9 +289,9 @@ def _balanced(
     balanced = imbalance <= BALANCE * float(matrix.scale[0]) < np.inf
     if not (inside and balanced and residual <= END_TOLERANCE):
         return None
-    stable = int(matrix.negative()[0]) == model.n_multipliers + len(held)
+    stable = int(matrix.negative()[0]) == model.n_multipliers + len(active)
     bound_lam = np.zeros((1, len(bent)))
-    bound_lam[0, held] = moments
+    bound_lam[0, active] = moments
     return equilibria_of(
         model,
         now,

@@ -51,7 +51,7 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         return _no_equilibrium(pose, what, "see where these numbers come from.")
     if pose.end is None or model.extensible:
         return None
-    ends, true_length = lagrangian_of(model).held(p, pose.ends, 0)
+    ends, true_length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
     start, end = np.array(ends).ravel()[: 2 * model.node.dimension].reshape(2, -1)
     distance, length = float(np.linalg.norm(end - start)), float(true_length)
     if distance < length:
@@ -131,7 +131,7 @@ def solve_equilibria(
     given = list(starts) if starts is not None else [None] * len(poses)
     errors = {j: out_of_reach(model, p, pose) for j, pose in enumerate(poses)}
     asked = [j for j, error in errors.items() if error is None]
-    search = _Search(model, p, rest)
+    search = _PoseSearch(model, p, rest)
     reached = search.reached([poses[j] for j in asked], [given[j] for j in asked])
     found: dict[int, Equilibrium] = {}
     sided: list[int] = []
@@ -214,7 +214,7 @@ def _chosen(
 
 
 @dataclass(frozen=True)
-class _Search:
+class _PoseSearch:
     """Search for the equilibria of a cable from the first guesses of all poses together."""
 
     model: CableModel
@@ -285,15 +285,15 @@ class _Search:
     def _likely(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
         """The lowest distinct minima of a coarse mesh on the model's mesh, and the pose of each."""
         model, coarse = self.model, self.model.coarse
-        search = _Search(coarse, self.p, coarse_rest(model, coarse, self.rest))
+        search = _PoseSearch(coarse, self.p, coarse_rest(model, coarse, self.rest))
         of, shapes = search._first(poses, [None] * len(poses))
         given, found = search._descend(poses, of, shapes)
         strains = assembly_of(coarse).strain(found.shapes, given)
         twists = _twists(coarse, strains[:, : coarse.chain.n_cells])
-        held = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
+        usable = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
         x, kept = found.shapes.x, []
         for j, pose in enumerate(poses):
-            rows = np.flatnonzero((of == j) & held)
+            rows = np.flatnonzero((of == j) & usable)
             rows = rows[np.argsort(found.energy[rows], kind="stable")]
             mine: list[int] = []
             for k in rows:

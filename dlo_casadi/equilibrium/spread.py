@@ -37,7 +37,7 @@ class Uncertainty:
     scatter : mapping of str to float
         Standard deviation of the fixtures from pose to pose, by the deviation's name.
     rest_scatter : RestScatter
-    hanging : float [m]
+    repeat_std : float [m]
         Standard deviation of a coordinate between repeats of one pose, root mean square along the
         cable; 0 where no pose was repeated.
     """
@@ -46,7 +46,7 @@ class Uncertainty:
     covariance: FloatArray
     scatter: Mapping[str, float]
     rest_scatter: RestScatter
-    hanging: float = 0.0
+    repeat_std: float = 0.0
 
     @property
     def root(self) -> FloatArray:
@@ -113,7 +113,7 @@ def displacements(
     along = equilibria.by_rest(found.shapes, p, rest, by_rest, by_p, by_deviation)
     ((seen, change),) = equilibria.observe(found.shapes, p, rest, along)
     curve, d = seen.curve, seen.curve.d
-    alike = np.broadcast_to(uncertainty.hanging * np.eye(d), (len(s), d, d))
+    alike = np.broadcast_to(uncertainty.repeat_std * np.eye(d), (len(s), d, d))
     return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
 
 

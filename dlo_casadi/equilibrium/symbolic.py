@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.implicit import (
     chord,
-    constant,
+    detached,
     pose_of,
     pose_size,
     search_of,
@@ -31,7 +31,7 @@ STRAIGHT = 1e-8
 FARTHEST = 1e-6
 
 
-class Unknowns(NamedTuple):
+class PoseUnknowns(NamedTuple):
     """Unknowns of the equations of one pose: `x` (coordinates, n_nodes), `multipliers`."""
 
     x: FloatArray
@@ -120,10 +120,10 @@ class CasadiCable:
         if search is None:
             if branch is not None and (self.model.in_space or branch not in SIGNS):
                 raise DloError(f"branch must be 'ccw', 'cw' (in a plane) or None, found {branch!r}")
-            found = constant(search_of(self.model, self.rest.tobytes(), branch))(pose, p)
+            found = detached(search_of(self.model, self.rest.tobytes(), branch))(pose, p)
         else:
             self._check_search(search, with_others=bool(parameters or branch))
-            found = constant(search)(pose)
+            found = detached(search)(pose)
         x, multipliers, status, there = found
         x, multipliers, step = chord(self.model, self.rest)(x, multipliers, pose, p)
         there = ca.if_else(step < FARTHEST, there, np.nan)
@@ -187,7 +187,7 @@ class CasadiCable:
         inputs = {"x": x, "multipliers": multipliers, **inputs}
         return _function("equations", inputs, outputs | _outputs(self.model, symbols))
 
-    def initial(self, pose: ArrayLike, *, branch: Branch | None = None) -> Unknowns:
+    def initial(self, pose: ArrayLike, *, branch: Branch | None = None) -> PoseUnknowns:
         """Unknowns `x`, `multipliers` of `equations` at the stable equilibrium of a pose.
 
         Parameters
@@ -213,7 +213,7 @@ class CasadiCable:
             raise DloError(f"pose: {size} as in dlo_pose of the C header, found {len(numbers)}")
         held = pose_of(self.model, numbers, branch)
         found = solve_equilibrium(self.model, self.p, self.rest, held)
-        return Unknowns(found.x.T, found.multipliers)
+        return PoseUnknowns(found.x.T, found.multipliers)
 
     def _check_search(self, search: ca.Function, *, with_others: bool) -> None:
         if not isinstance(search, ca.Function):

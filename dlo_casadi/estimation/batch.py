@@ -32,7 +32,7 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
 
-# Projections that move less than this share of the noise between solves have settled.
+# Projections that move less than this share of the noise between solves have converged.
 SHIFT_TOLERANCE = 1e-3
 
 

@@ -1,6 +1,6 @@
-"""Fits under one more condition: a parameter held, or the measured equilibria the lowest.
+"""Fits under one more condition: a parameter fixed, or the measured equilibria the lowest.
 
-The profile likelihood of a parameter refits everything else where it is held. And without a branch
+The profile likelihood of a parameter refits everything else where it is fixed. And without a branch
 that it names a pose is in the stable equilibrium of lowest energy; so a model says that predicts
 it. The shapes alone may leave open which one that is: a stiff cable in a single pose fits as well
 with a rest curvature that would bring it to the other side. That a pose was measured in an
@@ -38,7 +38,7 @@ FARTHEST_AIM, MOST_REFITS = 3.0, 12
 # A last aim that moves by this share of itself: what is left of it is of second order.
 SAME_CROSSING = 0.03
 # How far a measured equilibrium is to lie below the predicted one, in standard deviations of their
-# gap, and how closely that is held. Of nine simulated sessions of one pose eight predicted another
+# gap, and how closely that is met. Of nine simulated sessions of one pose eight predicted another
 # equilibrium than was measured: all eight came there in one round; chi-square rose by 2.5 at most.
 BELOW, KEPT = 0.2, 0.03
 ROUNDS = 4
@@ -96,7 +96,7 @@ def profile_intervals(fit: Fit) -> dict[str, Interval]:
 def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     """Profile-likelihood interval of a positive parameter, such as a stiffness [N m^2].
 
-    It is held, everything else refitted; its own prior does not count.
+    It is fixed, everything else refitted; its own prior does not count.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def _crossing(profile: _Profile, limit: float, first: float) -> float | None:
 
 
 def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
-    """Rise of twice the objective where the stiffness is held and everything else refitted.
+    """Rise of twice the objective where the stiffness is fixed and everything else refitted.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Refit:
-    """Everything else refitted where a parameter is held: at the log of its ratio to the fit's."""
+    """Everything else refitted where a parameter is fixed: at the log of its ratio to the fit's."""
 
     place: float
     point: Point
@@ -198,7 +198,7 @@ class _Profile:
         theta = np.delete(self.fit.point.theta, self._k)
         return _Refit(0.0, replace(self.fit.point, theta=theta), 0.0)
 
-    def _held(self, place: float) -> Unknowns:
+    def _fixed_at(self, place: float) -> Unknowns:
         model, found = self.fit.model, self.fit.problem.unknowns
         others = np.array([other != self.name for other in model.names]) & found.free
         p = self.fit.p.copy()
@@ -209,7 +209,7 @@ class _Profile:
         """Hold the parameter at a place, from a neighbour; None without equilibria there."""
         fit, k = self.fit, self._k
         base = 2 * fit.point.objective - fit.problem.unknowns.own_prior(fit.point.theta, k)
-        problem = replace(fit.problem, unknowns=self._held(place))
+        problem = replace(fit.problem, unknowns=self._fixed_at(place))
         for theta in (self._along(place, near), near.point.theta):
             point = problem.balanced(replace(near.point, theta=theta))
             if point is not None:
@@ -221,10 +221,10 @@ class _Profile:
         """Where the other unknowns go with the parameter, to first order about the fit."""
         fit, k = self.fit, self._k
         whole = fit.problem.unknowns
-        p = np.stack([self._held(at).fixed for at in (near.place, place)])
+        p = np.stack([self._fixed_at(at).fixed for at in (near.place, place)])
         before, after = (whole.pack(row, fit.coefficients)[k] for row in p)
         slope = np.delete(fit.covariance[:, k], k) / fit.covariance[k, k]
-        lower, upper = self._held(place).bounds
+        lower, upper = self._fixed_at(place).bounds
         return np.clip(near.point.theta + slope * (after - before), lower, upper)
 
 

@@ -14,7 +14,7 @@ from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from, weighed
-from dlo_casadi.estimation.unknowns import Search, Unknowns
+from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.estimation.variances import (
     SCATTER_FLOOR,
     SMOOTH_MODES,
@@ -97,8 +97,8 @@ def fit_model(
     theta = unknowns.pack(first, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta)
     different = different_poses(measured, model.cable.length)
-    astray = fit.residual_rms > Search.of(model).astray * model.cable.length
-    if different >= DIFFERENT and fit.beyond_noise and astray:
+    doubtful = fit.residual_rms > SearchSettings.of(model).other_minima * model.cable.length
+    if different >= DIFFERENT and fit.beyond_noise and doubtful:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every repeat had a rest curvature of its own.
         scatter = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
@@ -122,16 +122,16 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
     """The minimum near the measured shapes, noise and scatters estimated.
 
     In space the search takes the points for less sure than they are: where an effect is missing,
-    shapes that are held to a fraction of a millimetre allow no way to the minimum.
+    shapes that are kept to a fraction of a millimetre allow no way to the minimum.
     """
-    cable, search = problem.unknowns.model.cable, Search.of(problem.unknowns.model)
+    cable, search = problem.unknowns.model.cable, SearchSettings.of(problem.unknowns.model)
     own = problem.unknowns.without_prior
     problem = loose = weighed(problem, theta)
     doubted = problem.noise.doubted(search.std * cable.length)
     if doubted is not problem.noise:
         loose = weighed(replace(problem, noise=doubted), theta)
     loose, begun = begin(loose, theta, own)
-    fits = [fit_from(loose, begun, held=own)]
+    fits = [fit_from(loose, begun, fixed=own)]
     if own.any():
         fits.append(fit_from(*begin(loose, problem.unknowns.off_bounds(theta))))
     best = min((fit for fit in fits if fit), key=lambda fit: fit.point.objective, default=None)
@@ -149,7 +149,7 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
 
 def misfits(fit: Fit) -> bool:
     """Whether a fit leaves so much that its model lacks something."""
-    return fit.residual_rms > Search.of(fit.model).misfit * fit.model.cable.length
+    return fit.residual_rms > SearchSettings.of(fit.model).misfit * fit.model.cable.length
 
 
 def _fit_to_misfit(near: Fit) -> Fit:

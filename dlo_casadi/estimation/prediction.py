@@ -125,8 +125,8 @@ def predict_poses(
             continue
         last = pose, found.equilibrium.x
         if model.has_state:
-            held = Inputs.of(p, rest, pose.vector[None])
-            rest = assembly_of(model).state_after(found.equilibrium.shapes, held)[0][0]
+            inputs = Inputs.of(p, rest, pose.vector[None])
+            rest = assembly_of(model).state_after(found.equilibrium.shapes, inputs)[0][0]
     return out
 
 

@@ -345,9 +345,9 @@ class Problem:
     def balanced(self, values: Values, **options: Any) -> Point | None:
         """The objective at equilibria of all poses near some values; None if a pose has none there.
 
-        `options`: of `BatchEquilibrium.settled`.
+        `options`: of `BatchEquilibrium.solve_or_descend`.
         """
-        shapes, converged = self.equilibria.settled(*self.state(values), **options)
+        shapes, converged = self.equilibria.solve_or_descend(*self.state(values), **options)
         if not converged.all():
             return None
         point = self.evaluate(Values(values.theta, shapes, values.projections))

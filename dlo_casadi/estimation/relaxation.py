@@ -8,7 +8,7 @@ F_j is the gradient of the Lagrangian of pose j, S its scale: h / EI for the ben
 left over at a node, h / GJ for a twisting one, so that S F is the angle [rad] by which the node
 would turn. The measured shapes fix the nodes, in which the balance is linear in forces, loads and
 1 / EI: no equilibrium has to be known, nor a stiffness. The softness then falls to nothing. Where
-the model lacks something it may be held at a size at which the shapes are still those measured:
+the model lacks something it may be fixed at a size at which the shapes are still those measured:
 what is left over of the balance there is what the model lacks.
 
 References
@@ -164,12 +164,12 @@ class Relaxation:
         slope = unknowns.slopes(values.theta)[bending] / unknowns.p(values.theta)[bending]
         return np.concatenate([np.zeros(self._counts[2]), slope])
 
-    def _reduced(self, values: Values, damping: float, held: BoolArray | None = None) -> _Reduced:
+    def _reduced(self, values: Values, damping: float, fixed: BoolArray | None = None) -> _Reduced:
         """Orthogonal elimination of the poses' own unknowns."""
         problem = self.problem
         equilibria, size = problem.equilibria, problem.unknowns.size
         nodes, border, own, _ = self._counts
-        free = np.ones(size, dtype=bool) if held is None else ~held
+        free = np.ones(size, dtype=bool) if fixed is None else ~fixed
         kept = np.concatenate([np.ones(own, dtype=bool), free])
         state = problem.state(values)
         given = equilibria.given(*state)
@@ -219,12 +219,12 @@ class Relaxation:
 
     # ---- solution ----------------------------------------------------------------------------
 
-    def solve(self, values: Values, held: BoolArray | None = None, steps: int = STEPS) -> Values:
+    def solve(self, values: Values, fixed: BoolArray | None = None, steps: int = STEPS) -> Values:
         """Levenberg-Marquardt from any values.
 
         Parameters
         ----------
-        held : (size,) bool, optional
+        fixed : (size,) bool, optional
             Entries of theta that stay where they are; none by default.
         """
         damping, least = FIRST_DAMPING, self.objective(values)
@@ -232,7 +232,7 @@ class Relaxation:
             found, reached = values, np.inf
             for _ in range(REFUSED):
                 try:
-                    found = self._stepped(values, damping, held)
+                    found = self._stepped(values, damping, fixed)
                     reached = self.objective(found)
                 except np.linalg.LinAlgError:
                     reached = np.inf
@@ -247,13 +247,13 @@ class Relaxation:
                 break
         return values
 
-    def _stepped(self, values: Values, damping: float, held: BoolArray | None) -> Values:
+    def _stepped(self, values: Values, damping: float, fixed: BoolArray | None) -> Values:
         """Values after a damped step within reach."""
         problem = self.problem
         unknowns, equilibria = problem.unknowns, problem.equilibria
         nodes, border, own, _ = self._counts
-        free = np.ones(unknowns.size, dtype=bool) if held is None else ~held
-        reduced = self._reduced(values, damping, held)
+        free = np.ones(unknowns.size, dtype=bool) if fixed is None else ~fixed
+        reduced = self._reduced(values, damping, fixed)
         lower, upper = unknowns.reach(values.theta, LARGEST)
         step = np.zeros(unknowns.size)
         lower, upper = lower - values.theta, upper - values.theta
@@ -291,15 +291,15 @@ def relaxed(
     problem: Problem,
     values: Values,
     softness: Sequence[float] = SOFTNESS,
-    held: BoolArray | None = None,
+    fixed: BoolArray | None = None,
 ) -> Values:
     """Follow the minimum of a relaxed problem from some values through falling softness."""
     for soft in softness:
-        values = Relaxation(problem, soft).solve(values, held)
+        values = Relaxation(problem, soft).solve(values, fixed)
     return values
 
 
-def hung(problem: Problem, values: Values) -> Values:
+def with_springs_in_place(problem: Problem, values: Values) -> Values:
     """Values whose springs, which need not pull yet, are where they hang on the cable."""
     model = problem.unknowns.model
     if not model.n_springs:

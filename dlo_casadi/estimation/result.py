@@ -78,7 +78,7 @@ class Fit:
 
     @property
     def errors_known(self) -> bool:
-        """Whether nothing of what the residuals are held against was estimated from them."""
+        """Whether nothing of what the residuals are compared with was estimated from them."""
         return self.noise.known and self.problem.priors.rest_scatter.std == 0
 
     @property
@@ -246,7 +246,7 @@ class Fit:
         ]
 
     @cached_property
-    def hanging_error(self) -> float:
+    def repeat_error(self) -> float:
         """RMS displacement of points [m] by the rest curvature of each repeat's own."""
         return self._rms_of_points(self._by_rest)
 
@@ -390,5 +390,5 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     history, length = fit.problem.history, fit.model.cable.length
     apart = 0.0
     if different_poses(history, length) < DIFFERENT:
-        apart = repeat_std(history, length, fit.noise.of_points.beside_hangings)
+        apart = repeat_std(history, length, fit.noise.of_points.beside_repeats)
     return Uncertainty(names, covariance, scatter, fit.problem.priors.rest_scatter, apart)

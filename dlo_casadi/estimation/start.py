@@ -15,7 +15,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Problem, Values
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, hung, relaxed
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed, with_springs_in_place
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import END_ROLL
@@ -37,7 +37,7 @@ APART = 2.0
 
 
 def begin(
-    problem: Problem, theta: FloatArray, held: BoolArray | None = None
+    problem: Problem, theta: FloatArray, fixed: BoolArray | None = None
 ) -> tuple[Problem, Values]:
     """Relaxed shapes, forces and unknowns along the measured lines, and the problem weighed there.
 
@@ -48,7 +48,7 @@ def begin(
     ----------
     theta : (size,)
         Where the unknowns start; any stiffness will do.
-    held : (size,) bool, optional
+    fixed : (size,) bool, optional
         Entries of theta that stay where they are; none by default.
     """
     problem = problem if problem.weights else weighed(problem, theta)
@@ -56,14 +56,14 @@ def begin(
         kept = slice(None, None, -(-len(problem.fitted) // POSES_OF_A_SEARCH))
         history = tuple(problem.history[k] for k in problem.fitted[kept])
         few = replace(problem, history=history, weights=problem.whitening[kept])
-        few, values = begin(few, theta, held)
-        theta = relaxed(few, values, SOFTNESS[1:], held).theta
-        return _along_lines(problem, theta, held, ROLLS[:1])
-    return _along_lines(problem, theta, held, ROLLS)
+        few, values = begin(few, theta, fixed)
+        theta = relaxed(few, values, SOFTNESS[1:], fixed).theta
+        return _along_lines(problem, theta, fixed, ROLLS[:1])
+    return _along_lines(problem, theta, fixed, ROLLS)
 
 
 def _along_lines(
-    problem: Problem, theta: FloatArray, held: BoolArray | None, rolls: Sequence[float]
+    problem: Problem, theta: FloatArray, fixed: BoolArray | None, rolls: Sequence[float]
 ) -> tuple[Problem, Values]:
     """As `begin`, from rolls beside that of theta."""
     names, unknowns = problem.unknowns.names, problem.unknowns
@@ -74,11 +74,13 @@ def _along_lines(
         rolled = theta.copy()
         if own is not None:
             rolled[own] += roll / unknowns.scales[own]
-        values = hung(problem, Values(rolled, *measured_shapes(problem, _roll(problem, rolled))))
-        values = relaxation.solve(values, held, FIRST_STEPS)
+        values = with_springs_in_place(
+            problem, Values(rolled, *measured_shapes(problem, _roll(problem, rolled)))
+        )
+        values = relaxation.solve(values, fixed, FIRST_STEPS)
         begun.append((relaxation.objective(values), values))
     likely = sorted(begun, key=lambda start: start[0])[:FOLLOWED]
-    found = [relaxation.solve(values, held) for _, values in likely]
+    found = [relaxation.solve(values, fixed) for _, values in likely]
     return problem, _either_way(problem, min(found, key=relaxation.objective))
 
 
@@ -90,7 +92,7 @@ def _roll(problem: Problem, theta: FloatArray) -> float:
 
 def weighed(problem: Problem, theta: FloatArray) -> Problem:
     """The problem weighed; noise that is not declared at least as large as what shapes leave."""
-    values = hung(problem, Values(theta, *measured_shapes(problem)))
+    values = with_springs_in_place(problem, Values(theta, *measured_shapes(problem)))
     problem = problem.weighed(values)
     if problem.noise.known:
         return problem
@@ -114,9 +116,9 @@ def _either_way(problem: Problem, values: Values) -> Values:
     apart &= np.isin(np.arange(len(apart)), problem.used)
     if not apart.any():
         return values
-    relaxation, held = Relaxation(problem, SOFTNESS[0]), np.ones(len(values.theta), dtype=bool)
+    relaxation, fixed = Relaxation(problem, SOFTNESS[0]), np.ones(len(values.theta), dtype=bool)
     along = measured_shapes(problem, _roll(problem, values.theta), -np.sign(twist) / 2)
-    other = relaxation.solve(hung(problem, Values(values.theta, *along)), held)
+    other = relaxation.solve(with_springs_in_place(problem, Values(values.theta, *along)), fixed)
     return _lower_of_each(relaxation, values, other, apart)
 
 
@@ -145,7 +147,7 @@ def fit_from(
     problem: Problem,
     begun: Values,
     softness: Sequence[float] = SOFTNESS[1:],
-    held: BoolArray | None = None,
+    fixed: BoolArray | None = None,
 ) -> Fit | None:
     """The minimum that relaxed values lead to; None if some pose has no equilibrium there.
 
@@ -157,16 +159,16 @@ def fit_from(
         Near the measured shapes.
     softness : sequence of float [rad]
         Through which the balance becomes strict.
-    held : (size,) bool, optional
+    fixed : (size,) bool, optional
         Entries of theta that stay where they are until the shapes are equilibria.
     """
-    values = relaxed(problem, begun, softness, held)
+    values = relaxed(problem, begun, softness, fixed)
     point = problem.balanced(_anew(problem, begun, values), max_iterations=40)
     return None if point is None else descend(Fit(problem, point), tolerance=1e-2)
 
 
 def _anew(problem: Problem, begun: Values, values: Values) -> Values:
-    """Values with poses that are far off followed anew from their first shapes, theta held."""
+    """Values with poses that are far off followed anew from their first shapes, theta fixed."""
     relaxation = Relaxation(problem, SOFTNESS[-1])
     left = relaxation.objectives(values)[0]
     apart = np.zeros(len(left), dtype=bool)
@@ -174,6 +176,6 @@ def _anew(problem: Problem, begun: Values, values: Values) -> Values:
         apart[j] = left[j] > APART * problem.measured[j].n_residuals
     if not apart.any():
         return values
-    held = np.ones(len(values.theta), dtype=bool)
-    other = relaxed(problem, replace(begun, theta=values.theta), held=held)
+    fixed = np.ones(len(values.theta), dtype=bool)
+    other = relaxed(problem, replace(begun, theta=values.theta), fixed=fixed)
     return _lower_of_each(relaxation, values, other, apart)

@@ -12,7 +12,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, stacked
-from dlo_casadi.estimation.unknowns import Search
+from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -49,7 +49,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     rest = np.zeros(model.chain.n_rests)
     n_points = sum(len(item.traced.points) for item in used)
 
-    stiff, search = model.stiffness_indices, Search.of(model)
+    stiff, search = model.stiffness_indices, SearchSettings.of(model)
 
     def at(log_ei: float) -> FloatArray:
         # Torsion follows bending.

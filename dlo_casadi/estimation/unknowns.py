@@ -61,8 +61,8 @@ class Unknowns:
     @property
     def without_prior(self) -> BoolArray:
         """Entries (size,) of theta that no prior holds: parameters of declared effects."""
-        held = [np.isfinite(q.prior_std) or q.name in STIFFNESSES for q in self._parameters]
-        return ~np.array(held + [True] * self.n_rest, dtype=bool)
+        known = [np.isfinite(q.prior_std) or q.name in STIFFNESSES for q in self._parameters]
+        return ~np.array(known + [True] * self.n_rest, dtype=bool)
 
     @property
     def n_rest(self) -> int:
@@ -223,7 +223,7 @@ class Unknowns:
 
 
 @dataclass(frozen=True)
-class Search:
+class SearchSettings:
     """How the unknowns are searched for, in the plane or in space.
 
     Parameters
@@ -234,37 +234,37 @@ class Search:
         Standard deviation of points in a search, over the length; 0 leaves it as it is.
     misfit : float
         RMS distance over length that a search leaves, from which on the model lacks something.
-    astray : float
-        RMS distance over length from which a search may have gone astray, because every repeat has
-        a rest curvature of its own.
+    other_minima : float
+        RMS distance over length from which a search may have found another minimum,
+        because every repeat has a rest curvature of its own.
     decades : int
         To both sides of the prior, of a search for the stiffness alone.
     predicts : bool
         Whether poses that are lost on the way are predicted anew, from their ends.
-    settled : bool
+    converged_first : bool
         Whether noise is first estimated of minima alone that have converged.
     """
 
     mesh: int
     std: float
     misfit: float
-    astray: float
+    other_minima: float
     decades: int
     predicts: bool
-    settled: bool
+    converged_first: bool
 
     @classmethod
-    def of(cls, model: CableModel) -> Search:
+    def of(cls, model: CableModel) -> SearchSettings:
         """How it is done for a model."""
         return IN_SPACE if model.in_space else IN_PLANE
 
 
-# astray: of 26 sessions in the plane 16 left less; no second search led elsewhere there.
-IN_PLANE = Search(20, 0.0, np.inf, 0.001, 3, predicts=True, settled=False)
+# other_minima: of 26 sessions in the plane 16 left less; no second search led elsewhere there.
+IN_PLANE = SearchSettings(20, 0.0, np.inf, 0.001, 3, predicts=True, converged_first=False)
 # std: of three sessions in which an effect is missing, one (space_flat) found its minimum at the
 # noise, too; at 3 mm two did, and one with a drift in neither. A judgement.
 # misfit: in four sessions in which an effect is missing the searches left 0.0025 to 0.0083, in
 # three with nothing or little missing 0.0008 to 0.0013. Either stiffness of such a fit may be far
 # off (a taper's torsion 0.0005 of 0.005 N m^2): what is missing is looked for from the measured
 # shapes.
-IN_SPACE = Search(10, 0.004, 0.002, np.inf, 1, predicts=False, settled=True)
+IN_SPACE = SearchSettings(10, 0.004, 0.002, np.inf, 1, predicts=False, converged_first=True)

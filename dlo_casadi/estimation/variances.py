@@ -17,7 +17,7 @@ from dlo_casadi.estimation.repeats import (
     with_repeats,
 )
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import Search
+from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.rest_curvature import MODES, RestScatter
 from dlo_casadi.sensing.noise import (
@@ -67,7 +67,7 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
     MacKay, Neural Computation 4 (1992).
     """
     repeats = fit.problem.priors.rest_scatter.std == 0 and not first
-    rough, estimated = first and Search.of(fit.model).settled, not fit.noise.known
+    rough, estimated = first and SearchSettings.of(fit.model).converged_first, not fit.noise.known
     near = descend(fit, tolerance=1e-2)
     fit = near if near.converged or not rough else replace(fit, converged=False)
     for round_ in range(rounds):
@@ -91,7 +91,7 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
         if moved < 0.1 and changed < 0.02 and same:
             break
         if rough and not fit.converged:
-            # What is missing is no noise: to estimate that once more leads farther astray.
+            # What is missing is no noise: to estimate that once more leads farther off.
             break
     return fit
 

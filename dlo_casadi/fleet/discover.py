@@ -18,7 +18,7 @@ _SECTION = re.compile(rb"^(cable|experiment)\s*:", re.MULTILINE)
 
 
 @dataclass(frozen=True, order=True)
-class Session:
+class SessionFile:
     """One configuration of many.
 
     Parameters
@@ -33,7 +33,7 @@ class Session:
     path: Path
 
 
-def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
+def find_sessions(where: str | Path) -> tuple[Path, tuple[SessionFile, ...]]:
     """Find all configurations in a folder and below, or of a pattern.
 
     In a folder a YAML file counts if it has a `cable:` or an `experiment:` and is no result of a
@@ -42,7 +42,7 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
 
     Returns
     -------
-    Path, tuple of Session
+    Path, tuple of SessionFile
         The common folder, and the sessions in the order of their keys.
 
     Raises
@@ -69,7 +69,7 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[Session, ...]]:
             "  Try: a folder, or a pattern in quotes, such as 'cables/*/session.yaml'."
         )
     keys = [well_formed(path.relative_to(base).as_posix()) for path in found]
-    sessions = sorted(map(Session, keys, found))
+    sessions = sorted(map(SessionFile, keys, found))
     return base, tuple(sessions)
 
 
@@ -82,7 +82,7 @@ def _is_session(path: Path) -> bool:
     return bool(_SECTION.search(content)) and not re.search(rb"^schema\s*:", content, re.MULTILINE)
 
 
-def digest_of(session: Session, options: tuple[Any, ...]) -> str:
+def digest_of(session: SessionFile, options: tuple[Any, ...]) -> str:
     """SHA-256 of all that determines a session's results.
 
     The package's version, the options of the run, the configuration's bytes, and the name and

@@ -10,7 +10,7 @@ from pathlib import Path
 from dlo_casadi.config import load_config
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.fleet import parquet_library
-from dlo_casadi.fleet.discover import Session, digest_of
+from dlo_casadi.fleet.discover import SessionFile, digest_of
 from dlo_casadi.fleet.overview import overview_html
 from dlo_casadi.fleet.rows import (
     Row,
@@ -72,7 +72,7 @@ class FleetResult:
 
 
 def fit_fleet(
-    sessions: Sequence[Session],
+    sessions: Sequence[SessionFile],
     output: Path,
     executor: Executor,
     options: Options | None = None,
@@ -90,7 +90,7 @@ def fit_fleet(
 
     Parameters
     ----------
-    sessions : sequence of Session
+    sessions : sequence of SessionFile
     output : Path
         On a file system that all workers see.
     executor : Executor
@@ -155,7 +155,7 @@ def fit_fleet(
 class Job:
     """One session to fit, with all that a worker needs."""
 
-    session: Session
+    session: SessionFile
     digest: str  # of what decides the results
     output: Path  # folder of all results, absolute
     options: Options

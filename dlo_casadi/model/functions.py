@@ -113,10 +113,10 @@ class Functions:
     def _framed(self) -> SegmentInFrame:
         """The segment in space, at this model's own symbols."""
         free, lam = self.model.end == "free", self.terms.lam
-        held = [ca.SX.zeros(3)] * free + [lam[k : k + 3] for k in self._force_rows]
+        multipliers = [ca.SX.zeros(3)] * free + [lam[k : k + 3] for k in self._force_rows]
         _, _, p, rest, place, deviation = self._segment_arguments
         numbers = SegmentNumbers(p, rest, place, deviation, ca.SX(self.terms.shares(p, place)))
-        return self.terms.in_frame(self.terms.x, ca.horzcat(*held), numbers)
+        return self.terms.in_frame(self.terms.x, ca.horzcat(*multipliers), numbers)
 
     @property
     def _force_rows(self) -> list[int]:

@@ -154,14 +154,14 @@ class Lagrangian:
         return ends
 
     @cached_property
-    def held(self) -> ca.Function:
+    def true_ends_and_length(self) -> ca.Function:
         """(p, ends, deviation) -> true ends, length without load [m].
 
         The ends as `EndConditions.vector`, declared and true.
         """
         length = self.model.cable.length * self.stretch
         arguments = [self.p, self.declared_ends, self.deviation]
-        return ca.Function("held", arguments, [self.true_ends.vector, length])
+        return ca.Function("true_ends_and_length", arguments, [self.true_ends.vector, length])
 
     @cached_property
     def stretch(self) -> ca.SX:
@@ -343,19 +343,19 @@ class Lagrangian:
         # The derivative of the Lagrangian by the multipliers holds the end of this curve.
         return _SegmentTerms(lagrangian, kind.advance(true), stretched)
 
-    def in_frame(self, x: ca.SX, held: ca.SX, numbers: SegmentNumbers) -> SegmentInFrame:
+    def in_frame(self, x: ca.SX, multipliers: ca.SX, numbers: SegmentNumbers) -> SegmentInFrame:
         """A segment in space, written in the frame in its middle.
 
         Parameters
         ----------
         x : (8,)
             Frames of both nodes.
-        held : (3, 1 + n_springs) [N]
+        multipliers : (3, 1 + n_springs) [N]
             Force on the end's holder, then the multipliers of the springs.
         numbers : SegmentNumbers
         """
         spread, dead = len(self.kind.rule[0]), len(self.dead_forces)
-        weights = np.zeros((spread + dead + self.model.n_springs, held.shape[1]))
+        weights = np.zeros((spread + dead + self.model.n_springs, multipliers.shape[1]))
         weights[:spread, 0] = -1.0
         weights[spread + dead :, 1:] = -np.eye(self.model.n_springs)
         loads = self.segment_forces(numbers.p, numbers.place, numbers.deviation)
@@ -364,7 +364,7 @@ class Lagrangian:
             local = ca.vertcat(ca.DM(self.node.identity), phi)
             return ca.SX(self.segment_in_frame(local, inner, forces, *numbers))
 
-        total = ca.SX(loads) + held @ ca.DM(weights.T)
+        total = ca.SX(loads) + multipliers @ ca.DM(weights.T)
         return SegmentInFrame(self.kind, energy, x, total, weights)
 
     @cached_property
@@ -422,10 +422,10 @@ class Lagrangian:
     def ends_lagrangian(self) -> ca.SX:
         """Lagrangian of the ends: holders, end conditions, and the work of loads at the start."""
         first, last = self.moved
-        held, gap = self.true_ends, self.node.difference
-        gaps = [] if self.model.end == "free" else [held.start - held.end]
-        gaps += [gap(held.start_frame, first)] if self.model.start == "clamped" else []
-        gaps += [gap(held.end_frame, last)] if self.model.end == "clamped" else []
+        true, gap = self.true_ends, self.node.difference
+        gaps = [] if self.model.end == "free" else [true.start - true.end]
+        gaps += [gap(true.start_frame, first)] if self.model.start == "clamped" else []
+        gaps += [gap(true.end_frame, last)] if self.model.end == "clamped" else []
         total = ca.dot(self.lam[: self.model.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
         for effect, local in self.effects_of(BoundaryEffect):
             total += effect.energy(first, last, local)
@@ -433,8 +433,8 @@ class Lagrangian:
             total -= compliance * self.lam[k] ** 2 / 2
         for k, spring in enumerate(self.springs):
             place, multiplier = self.spring_unknowns(k)
-            total += spring.energy(place) + ca.dot(multiplier, held.start - place)
-        return total - ca.dot(self.total_load, held.start)
+            total += spring.energy(place) + ca.dot(multiplier, true.start - place)
+        return total - ca.dot(self.total_load, true.start)
 
 
 @lru_cache(maxsize=MODELS)

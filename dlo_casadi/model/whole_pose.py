@@ -118,7 +118,7 @@ def tangent(model: CableModel, s: PoseSymbols) -> Any:
 
 
 @dataclass(frozen=True)
-class PoseShape:
+class ShapeExpressions:
     """Expressions of a pose that balances.
 
     `energy` [J], `points` (dimension, n + 1) [m] from start to end, `forces` (dimension, 2) [N] and
@@ -132,13 +132,13 @@ class PoseShape:
     strains: Any
 
 
-def shape(model: CableModel, s: PoseSymbols) -> PoseShape:
+def shape(model: CableModel, s: PoseSymbols) -> ShapeExpressions:
     """True shape and reactions. The energy is the Lagrangian: equal where conditions hold."""
     layout, count, functions = model.chain.layout, model.n + 1, functions_of(model)
     energy, advance, strains = functions.segment_shape(*_segment_arguments(model, s))
     ends, forces, moments = functions.end_shape(*_end_arguments(model, s))
     steps = ca.horzcat(s.pose[: model.node.dimension], advance[:, layout.advancing.tolist()])
-    return PoseShape(
+    return ShapeExpressions(
         energy=ca.sum2(energy) + ends,
         points=steps @ ca.sparsify(ca.DM(np.triu(np.ones((count, count))))),
         forces=forces,

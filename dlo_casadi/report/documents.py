@@ -291,7 +291,7 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
             "fixtures": dict(uncertainty.scatter),
             "rest_curvature_std": uncertainty.rest_scatter.std,
             "rest_curvature_smoothness": uncertainty.rest_scatter.smoothness,
-            "hanging": uncertainty.hanging,
+            "hanging": uncertainty.repeat_std,
         },
     }
     plain: dict[str, Any] = finite(document)

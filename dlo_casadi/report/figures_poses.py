@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.spread import EDGE
 from dlo_casadi.report import canvas
 from dlo_casadi.report.scene import Room, Scene, beside, scene_of, scenes_of, seen
 from dlo_casadi.report.tables import error_rows
-from dlo_casadi.report.words import Compared, compared, label_of, missing
+from dlo_casadi.report.words import ComparedStage, compared, label_of, missing
 from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.show import style
 from dlo_casadi.show.style import band_outline
@@ -96,7 +96,7 @@ def _page(outcome: Outcome, poses: Sequence[PoseInput]) -> Figure:
 
 
 def _legend_of(
-    outcome: Outcome, poses: Sequence[PoseInput], stages: Sequence[Compared]
+    outcome: Outcome, poses: Sequence[PoseInput], stages: Sequence[ComparedStage]
 ) -> list[Line2D | Patch]:
     experiment, readings = outcome.config.experiment, outcome.measurement.readings
     handles: list[Line2D | Patch] = [
@@ -119,7 +119,7 @@ def _legend_of(
 def _draw_pose(
     axes: Axes,
     pose: PoseInput,
-    stages: Sequence[Compared],
+    stages: Sequence[ComparedStage],
     factor: int,
     scene: Scene,
 ) -> None:
@@ -163,7 +163,7 @@ def _draw_pose(
             spine.set(visible=True, color=style.HELD_OUT, linewidth=2)
 
 
-def _magnification(stages: Sequence[Compared], size: float) -> int:
+def _magnification(stages: Sequence[ComparedStage], size: float) -> int:
     """Factor on deviations that makes those of the stage before visible in a figure."""
     shapes = stages[0].stage.shapes.values() if stages else ()
     errors = [shape.rmse for shape in shapes if shape.rmse]

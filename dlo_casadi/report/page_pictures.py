@@ -28,7 +28,7 @@ from dlo_casadi.report.scene import (
     scenes_of,
     seen,
 )
-from dlo_casadi.report.words import Compared, branch_text, compared
+from dlo_casadi.report.words import ComparedStage, branch_text, compared
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput
 from dlo_casadi.session.pose_shape import PoseShape
@@ -161,14 +161,14 @@ def pictures(outcome: Outcome) -> list[Picture]:
 def pose_pictures(
     config: Config,
     poses: Sequence[PoseInput],
-    stages: Sequence[Compared] = (),
+    stages: Sequence[ComparedStage] = (),
     measurement: MeasurementSummary | None = None,
 ) -> list[Picture]:
     """A picture of every pose; of a run that has failed with what was measured until then.
 
     Parameters
     ----------
-    stages : sequence of Compared
+    stages : sequence of ComparedStage
         Whose predictions are drawn.
     """
     scenes, marks = scenes_of(config, poses, [item.stage for item in stages])
@@ -214,12 +214,14 @@ def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
     }
 
 
-def view_pictures(poses: Sequence[PoseInput], stages: Sequence[Compared] = ()) -> list[Picture]:
+def view_pictures(
+    poses: Sequence[PoseInput], stages: Sequence[ComparedStage] = ()
+) -> list[Picture]:
     """A picture of every usable photograph of poses in space, those of a pose side by side.
 
     Parameters
     ----------
-    stages : sequence of Compared
+    stages : sequence of ComparedStage
         Whose predictions are projected into it.
     """
     shown = [(pose, view) for pose in poses for view in pose.views]
@@ -270,7 +272,7 @@ def _picture(
     declared: Pose,
     behind: Background,
     marks: tuple[Sequence[Mark], Sequence[Mark]],
-    stages: Sequence[Compared],
+    stages: Sequence[ComparedStage],
     measurement: MeasurementSummary | None,
 ) -> Picture:
     lines, facts = [], []
@@ -348,7 +350,7 @@ def _readings(measurement: MeasurementSummary, shape: PoseShape) -> list[tuple[s
 
 
 def _view_picture(
-    pose: PoseInput, view: ViewInput, stages: Sequence[Compared], budget: int
+    pose: PoseInput, view: ViewInput, stages: Sequence[ComparedStage], budget: int
 ) -> Picture:
     viewpoint, pixels = view.seen.viewpoint, view.seen.pixels
     photograph, (height, width) = photograph_of(view.image, budget), viewpoint.shape

@@ -58,7 +58,7 @@ def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray
 
 
 @dataclass(frozen=True)
-class Board:
+class Plane:
     """The plane of a cable."""
 
     length: float
@@ -154,7 +154,7 @@ class Room:
         ]
 
 
-Scene = Board | Room
+Scene = Plane | Room
 
 
 def seen(points: FloatArray, view: tuple[str, float, float] = VIEWS[0]) -> FloatArray:
@@ -200,7 +200,7 @@ def scenes_of(
         scenes = _rooms(config, drawn, [x for shape in last.values() for x in shape.forces])
     else:
         pairs = [pair for shape in last.values() for _, *pair in _forces_read(shape)]
-        board = Board(length, _scale(_AT_END * length, [force for pair in pairs for force in pair]))
+        board = Plane(length, _scale(_AT_END * length, [force for pair in pairs for force in pair]))
         scenes = [board] * len(poses)
     return scenes, [
         around(scene, declared[pose.name], pose.points, last.get(pose.name))
@@ -269,7 +269,7 @@ def around(
     """
     read = [] if shape is None else _forces_read(shape)
     line = scene.points(measured if shape is None else shape.curve)
-    if isinstance(scene, Board):
+    if isinstance(scene, Plane):
         pairs = [(k, (("force", model), ("force-read", known))) for k, known, model in read]
         return [], [scene.force(line[k], force, kind) for k, pair in pairs for kind, force in pair]
     under, over = scene.ground(), []
@@ -307,12 +307,12 @@ def scene_of(outcome: Outcome) -> tuple[Scene, list[Mark]]:
         (scene,) = _rooms(config, [[*measured, *held, *ends]], pulls)
     else:
         printed = getattr(config.experiment.measurement, "board", None)
-        scene = Board(config.cable.length, _scale(_PULLING * config.cable.length, pulls))
+        scene = Plane(config.cable.length, _scale(_PULLING * config.cable.length, pulls))
         if printed is not None:
             centers = np.array(list(printed.marker_centers.values()))
             square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) / 2
             outlines = centers[:, None] + printed.marker_size * square
-            scene = Board(scene.length, scene.newton, outlines)
+            scene = Plane(scene.length, scene.newton, outlines)
     lines = [scene.points(points[:: max(1, len(points) // _POINTS)]) for points in measured]
     return scene, scene.ground() + [Mark("taken", line) for line in lines]
 

@@ -117,12 +117,12 @@ def footnotes(outcome: Outcome) -> list[str]:
         bound = unidentified(stiffness)
         known = f"EI {bound}" if bound[0] in "<>" else f"EI: {bound}"
         lines.append(f"{known}, not identifiable from these shapes.")
-        hung = (
+        poses = (
             "poses in which weight and stiffness compete more (ends close together), or hang a "
             "known weight on the cable and declare it under model.effects."
         )
         force = "end_force or start_force of a pose: without gravity shapes tell no stiffness."
-        lines.append(f"Try: {hung if any(gravity) else force}")
+        lines.append(f"Try: {poses if any(gravity) else force}")
     elif stiffness is not None and not outcome.measurement.readings:
         known = "EI is" if twisting is None else "EI and GJ are"
         weight = outcome.fit.mass * math.hypot(*gravity)

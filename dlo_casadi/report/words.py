@@ -56,7 +56,7 @@ def missing(pose: PoseInput) -> str:
 # ---- stages ------------------------------------------------------------------------------------
 
 
-class Compared(NamedTuple):
+class ComparedStage(NamedTuple):
     """A stage that is compared: "before" or "after", and what to call it."""
 
     kind: str
@@ -64,7 +64,7 @@ class Compared(NamedTuple):
     stage: Stage
 
 
-def compared(outcome: Outcome) -> list[Compared]:
+def compared(outcome: Outcome) -> list[ComparedStage]:
     """The last stage with predictions as "after", and as "before" the one that it improves on.
 
     With effects added: the declared model fitted, and the model with the effects. Otherwise: the
@@ -77,7 +77,7 @@ def compared(outcome: Outcome) -> list[Compared]:
     name: StageName = "batch" if after.name == "closed" else "initial"
     before = [stage for stage in with_shapes[:-1] if stage.name == name]
     shown = [("before", stage) for stage in before[:1]] + [("after", after)]
-    return [Compared(kind, label_of(stage, outcome), stage) for kind, stage in shown]
+    return [ComparedStage(kind, label_of(stage, outcome), stage) for kind, stage in shown]
 
 
 def label_of(stage: Stage, outcome: Outcome) -> str:

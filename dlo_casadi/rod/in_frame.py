@@ -207,9 +207,9 @@ class SegmentInFrame:
         blocks = [ca.jacobian(rows, symbols) for symbols in (numbers, flat, inner)]
         direct, by_force, by_inner = self._at(blocks)
         change = direct + by_force @ moved
-        held = 3 + flat.numel()
+        outer = 3 + flat.numel()
         if inner.numel():
-            change = change[:held, :] - by_inner[:held, :] @ self._inverse @ change[held:, :]
+            change = change[:outer, :] - by_inner[:outer, :] @ self._inverse @ change[outer:, :]
         (slope,) = self._at([self._by_frame])
         body = self._body
         by_mu = ca.SX.zeros(3, numbers.numel())
@@ -218,7 +218,7 @@ class SegmentInFrame:
             by_mu += ca.skew(slope[own]) @ moved[3 * j : 3 * j + 3, :]
             by_mu -= ca.skew(body[:, j]) @ change[own, :]
         g_s, g_e = self._to_nodes(by_mu, change[:3, :])
-        by_lam = self._to_world @ self._to_lam.T @ change[3:held, :]
+        by_lam = self._to_world @ self._to_lam.T @ change[3:outer, :]
         return g_s / 2 - g_e, g_s / 2 + g_e, by_lam
 
     def _to_nodes(self, by_mu: ca.SX, by_phi: ca.SX) -> tuple[ca.SX, ca.SX]:

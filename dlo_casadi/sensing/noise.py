@@ -104,7 +104,7 @@ class NoiseModel:
         return self.before if self.before is not None and self.before.known else self
 
     @property
-    def beside_hangings(self) -> float:
+    def beside_repeats(self) -> float:
         """Standard deviation of points [m] beside the scatter of repeats; 0 if that includes it."""
         return 0.0 if self.source == "repeats" else self.std
 

@@ -11,7 +11,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Sensor
-from dlo_casadi.vision import ImageCurve, Viewpoint, compare_pixels, nearest_in_order
+from dlo_casadi.vision import CameraPose, ImageCurve, compare_pixels, nearest_in_order
 
 _TOLERANCE = 1e-5  # of the length: the residual's error is half the curvature times its square
 # Distance from an end of the line within which pixels are left out, in std of the average along the
@@ -61,7 +61,7 @@ class Pixels(Sensor):
 
     Parameters
     ----------
-    viewpoint : Viewpoint
+    viewpoint : CameraPose
         Where the camera stands.
     pixels : (K, 2) [px]
         As photographed, from start to end.
@@ -82,7 +82,7 @@ class Pixels(Sensor):
         Whether the points are of a measured line in space, not guessed.
     """
 
-    viewpoint: Viewpoint
+    viewpoint: CameraPose
     pixels: FloatArray
     diameter: float
     points: FloatArray

@@ -12,7 +12,7 @@ from dlo_casadi.config import Pose
 from dlo_casadi.errors import counted
 from dlo_casadi.session.hypotheses import (
     Hypothesis,
-    Session,
+    ReadSession,
     Suspicion,
     axes_of,
     likeliest,
@@ -116,7 +116,7 @@ class _Shown:
         return f"its {self.key} is {values}, the line {side}s at {along}, {off:.0f} degrees off it"
 
 
-def wrong_directions(session: Session) -> tuple[Suspicion, ...]:
+def wrong_directions(session: ReadSession) -> tuple[Suspicion, ...]:
     """Headings and orientations that the lines contradict: of single poses, or of most of them."""
     found: list[Suspicion] = []
     common: list[_Shown] = []
@@ -160,7 +160,7 @@ def _try(shown: Sequence[_Shown]) -> str:
     return f". Try: {best} then {listed(_MEANT[item.kind][best](item.value), '.4g')}."
 
 
-def _shown(session: Session, side: str) -> Iterator[_Shown]:
+def _shown(session: ReadSession, side: str) -> Iterator[_Shown]:
     """What the lines show at the clamps of one side, where they show it."""
     cable, experiment = session.config.cable, session.config.experiment
     if getattr(experiment.boundary, side) != "clamped":
@@ -233,7 +233,7 @@ def _pieces(points: FloatArray, step: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Compared:
+class ComparedReading:
     """One kind of reading on one side of the cable, of m poses.
 
     Parameters
@@ -261,7 +261,7 @@ class Compared:
         return float(np.sqrt(max(1 - along**2, 0.0)))
 
 
-def misread(readings: Sequence[Compared], *, sized: bool = True) -> tuple[Suspicion, ...]:
+def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple[Suspicion, ...]:
     """What was read otherwise than the configuration says, the likeliest of each reading.
 
     Parameters
@@ -289,7 +289,7 @@ def misread(readings: Sequence[Compared], *, sized: bool = True) -> tuple[Suspic
     return tuple(found)
 
 
-def _otherwise(one: Compared) -> Iterator[Hypothesis[FloatArray]]:
+def _otherwise(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
     """Other ways to read what was measured, the likely ones first."""
     a, (count, size) = one.measured, one.measured.shape
     turned = "with the other sign. Try: what the cable does to the fixture, not the fixture to it."
@@ -319,7 +319,7 @@ def _otherwise(one: Compared) -> Iterator[Hypothesis[FloatArray]]:
         yield Hypothesis(text, a @ turn.T)
 
 
-def _about_elsewhere(one: Compared, forces: FloatArray) -> Iterator[Hypothesis[FloatArray]]:
+def _about_elsewhere(one: ComparedReading, forces: FloatArray) -> Iterator[Hypothesis[FloatArray]]:
     """Moments about a point that is fixed to the clamp: M + (fixture - point) x F, least squares.
 
     The point and the scale are found together: both are linear in what was measured.

@@ -17,7 +17,7 @@ from dlo_casadi.errors import counted
 from dlo_casadi.session.hypotheses import (
     Hypothesis,
     Lines,
-    Session,
+    ReadSession,
     Suspicion,
     T,
     exchanges,
@@ -44,7 +44,7 @@ _NAMED = 0.3
 _FITS_OF_FRAME = 4
 
 
-def wrong_units(session: Session) -> tuple[Suspicion, ...]:
+def wrong_units(session: ReadSession) -> tuple[Suspicion, ...]:
     """Lengths, or distances of the ends, that are off by the factor of a unit."""
     lines, meant = session.lines, []
     ratio, typical = lines.lengths / lines.length, float(np.median(lines.lengths))
@@ -84,7 +84,7 @@ def wrong_units(session: Session) -> tuple[Suspicion, ...]:
     return () if found is None else (Suspicion(found[0].said, True),)
 
 
-def counted_from_the_end(session: Session) -> tuple[Suspicion, ...]:
+def counted_from_the_end(session: ReadSession) -> tuple[Suspicion, ...]:
     """Markers that fit their fixtures once they are counted from the other end."""
     lines = session.lines
     if not lines.known.any():
@@ -122,7 +122,7 @@ def _by_ends(
     return (Suspicion(said, certain),)
 
 
-def wrong_frame(session: Session) -> tuple[Suspicion, ...]:
+def wrong_frame(session: ReadSession) -> tuple[Suspicion, ...]:
     """Ends that fit all fixtures once the points are moved, turned or mirrored as a whole."""
     lines = session.lines
     own = lines.overall(lines.measured)
@@ -215,7 +215,7 @@ def _told(turn: FloatArray, shift: FloatArray) -> str:
     )
 
 
-def out_of_step(session: Session) -> tuple[Suspicion, ...]:
+def out_of_step(session: ReadSession) -> tuple[Suspicion, ...]:
     """Ends that fit the fixtures of other poses: files and end positions in different orders."""
     lines = session.lines
     misfit = lines.misfit(lines.measured[:, None], lines.declared[None, :])
@@ -238,7 +238,7 @@ def out_of_step(session: Session) -> tuple[Suspicion, ...]:
     return (Suspicion(text, True),)
 
 
-def single_poses(session: Session) -> tuple[Suspicion, ...]:
+def single_poses(session: ReadSession) -> tuple[Suspicion, ...]:
     """Poses that are wrong by themselves; of each the first reason.
 
     Points that run to and fro in their order; an end where all others have their start, as if both
@@ -286,7 +286,7 @@ def single_poses(session: Session) -> tuple[Suspicion, ...]:
 # ---- what the points show -----------------------------------------------------------------------
 
 
-def repeated(session: Session) -> tuple[Suspicion, ...]:
+def repeated(session: ReadSession) -> tuple[Suspicion, ...]:
     """Poses with exactly the same points: one file under two names."""
     seen: dict[bytes, str] = {}
     found = []
@@ -301,7 +301,7 @@ def repeated(session: Session) -> tuple[Suspicion, ...]:
     return tuple(found)
 
 
-def stretched(session: Session) -> tuple[Suspicion, ...]:
+def stretched(session: ReadSession) -> tuple[Suspicion, ...]:
     """Markers farther apart than the cable between them."""
     texts, marked = {}, 0
     for item in session.read:

@@ -214,7 +214,7 @@ def minimum_by_ipopt(fit: Fit) -> Minimum:
 
 
 def confirmed(fit: Fit, found: Minimum) -> Fit:
-    """The fit, held against IPOPT's minimum.
+    """The fit, compared with IPOPT's minimum.
 
     Where that is lower by more than what a descent stops at, it is the fit's. Where it is the same,
     the fit has converged; where IPOPT has failed, it has not. In space, and where IPOPT ends

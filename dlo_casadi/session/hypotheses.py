@@ -55,7 +55,7 @@ class Suspicion(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Session:
+class ReadSession:
     """A configuration and the poses of it that were read, each with points."""
 
     config: Config
@@ -283,7 +283,7 @@ def spread(count: int, most: int) -> IntArray:
 # ---- weight -------------------------------------------------------------------------------------
 
 
-def shown_pull(session: Session) -> FloatArray | None:
+def shown_pull(session: ReadSession) -> FloatArray | None:
     """Direction (d,) in which the lines seem to be pulled, without any shape solved.
 
     Between pins a cable hangs from its chord; elsewhere its moments tell, `load_over_stiffness`.

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_casadi import vision
-from dlo_casadi.config import Camera as DeclaredCamera
-from dlo_casadi.config import Config, Images, Pose
+from dlo_casadi.config import Config, DeclaredCamera, Images, Pose
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.io.points import MeasuredPoints, read_points
 from dlo_casadi.sensing.measured_pose import MeasuredPose

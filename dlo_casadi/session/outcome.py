@@ -234,11 +234,11 @@ class Repeatability:
     Parameters
     ----------
     rest_curvature_std : float [1/m]
-        Of the rest curvature that each hanging has of its own; 0 where none was found.
+        Of the rest curvature that each repeat has of its own; 0 where none was found.
     expected_spread : float [m]
-        RMS distance of two hangings of a pose, at the measured points.
+        RMS distance of two repeats of a pose, at the measured points.
     source : "repeats", "poses" or None
-        Whether a pose or two were taken again and again, so that it is how far one hanging is
+        Whether a pose or two were taken again and again, so that it is how far one repeat is
         from the mean of the others, or it is what differs between poses beyond all that they have
         in common; None where it could not be estimated.
     """
@@ -252,7 +252,7 @@ class Repeatability:
         """What a fit has found."""
         rest = fit.problem.priors.rest_scatter.std
         if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
-            return cls(rest, float(np.sqrt(2) * fit.hanging_error), "poses")
+            return cls(rest, float(np.sqrt(2) * fit.repeat_error), "poses")
         spread = repeatability(fit.problem.history, fit.model.cable.length)
         return cls(rest, spread or 0.0, None if spread is None else "repeats")
 
@@ -384,7 +384,7 @@ class Outcome:
         None without held-out points.
         """
         stage, inside = self.stages[-1], []
-        noise = self.fit.noise.of_points.beside_hangings
+        noise = self.fit.noise.of_points.beside_repeats
         for pose in self.poses:
             shape = stage.shapes.get(pose.name)
             if pose.role == "fit" or not len(pose.points) or shape is None or shape.spread is None:

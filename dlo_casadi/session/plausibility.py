@@ -1,4 +1,4 @@
-"""What was read, held against what is declared of it: the list of questions, and those to shapes.
+"""What was read, compared with what is declared of it: the list of questions, and those to shapes.
 
 A question compares the session with hypotheses on what it may have been meant as. Those on units,
 frames and the order of files are in `ends`, those on directions and readings in `clamps`; here are
@@ -20,12 +20,12 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.clamps import Compared, misread, wrong_directions
+from dlo_casadi.session.clamps import ComparedReading, misread, wrong_directions
 from dlo_casadi.session.ends import ENDS, POINTS
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import (
     Hypothesis,
-    Session,
+    ReadSession,
     Suspicion,
     clamp_axes,
     exchanges,
@@ -108,7 +108,7 @@ def without_implausible(
 def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
     """Everything in a session that looks like a mistake, see `QUESTIONS`."""
     read = tuple(item for item in inputs if len(item.points))
-    session = Session(config, read)
+    session = ReadSession(config, read)
     found: tuple[Suspicion, ...] = ()
     if not session.lines.names:
         return found
@@ -118,7 +118,7 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
         if any(item.certain for item in found):
             break
         doubtful = {item.pose for item in found}
-        session = Session(config, tuple(item for item in read if item.name not in doubtful))
+        session = ReadSession(config, tuple(item for item in read if item.name not in doubtful))
     return found
 
 
@@ -193,7 +193,7 @@ class Comparison(NamedTuple):
 
 
 def compare(
-    session: Session, hypotheses: Sequence[Hypothesis[Session]], most: int = _POSES
+    session: ReadSession, hypotheses: Sequence[Hypothesis[ReadSession]], most: int = _POSES
 ) -> Comparison | None:
     """Fit the declared session, and each hypothesis until one explains all; the best one.
 
@@ -212,7 +212,7 @@ def compare(
     return min(tried, key=lambda found: found.other.rms)
 
 
-def coarse_fit(session: Session, most: int = _POSES) -> Coarse:
+def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
     """Quick fit of so many poses at most, evenly picked, whatever their role."""
     measured, length = [], session.config.cable.length
     for k in spread(len(session.read), most):
@@ -231,8 +231,8 @@ def coarse_fit(session: Session, most: int = _POSES) -> Coarse:
     return Coarse(fit, fit.residual_rms, bool(known))
 
 
-def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
-    """Readings held against the forces that the shapes need, by a coarse fit of some poses."""
+def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
+    """Readings compared with the forces that the shapes need, by a coarse fit of some poses."""
     fitted = [item for item in session.read if item.role == "fit" and not item.views]
     fitted = [item for item in fitted if session.declared[item.name].readings]
     shown = [fitted[k] for k in spread(len(fitted), _POSES)]
@@ -253,7 +253,7 @@ def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
         held = getattr(fit.model, side) == "clamped"
         forces = np.array([seen[k].readings[rows[f"{side}_force"]] for k in own])
         compared.append(
-            Compared(
+            ComparedReading(
                 name,
                 np.array([poses[k].readings[name] for k in own]),
                 np.array([seen[k].readings[at] for k in own]),
@@ -267,7 +267,7 @@ def wrong_readings(session: Session) -> tuple[Suspicion, ...]:
 # ---- exchanged ends -----------------------------------------------------------------------------
 
 
-def ends_exchanged(session: Session) -> tuple[Suspicion, ...]:
+def ends_exchanged(session: ReadSession) -> tuple[Suspicion, ...]:
     """Whether lines that leave both clamps backwards fit with start and end exchanged.
 
     Points far apart do not show the directions at the clamps, but the way to them does.
@@ -290,7 +290,7 @@ def ends_exchanged(session: Session) -> tuple[Suspicion, ...]:
     return (Suspicion(text, found.certain),)
 
 
-def _exchanged(session: Session, keys: Sequence[str]) -> Session:
+def _exchanged(session: ReadSession, keys: Sequence[str]) -> ReadSession:
     """The session with start and end exchanged; lines then begin where they ended."""
     pairs = [(f"start{key}", f"end{key}") for key in keys]
     both = [*pairs, *((b, a) for a, b in pairs)]
@@ -302,7 +302,7 @@ def _exchanged(session: Session, keys: Sequence[str]) -> Session:
     return replace(session, read=tuple(read)).with_experiment(poses=poses)
 
 
-def _off(session: Session) -> float:
+def _off(session: ReadSession) -> float:
     """Median angle [rad] of clamps from the way to the points nearest to them."""
     cosines = []
     for item, (side, first, sign) in product(session.read, (("start", 0, 1), ("end", -1, -1))):
@@ -317,7 +317,7 @@ def _off(session: Session) -> float:
 # ---- gravity ------------------------------------------------------------------------------------
 
 
-def hangs_elsewhere(session: Session) -> tuple[Suspicion, ...]:
+def hangs_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
     """Whether the shapes fit only with gravity turned, or the points mirrored.
 
     Where the lines seem to be pulled along gravity nothing is fitted.
@@ -328,7 +328,7 @@ def hangs_elsewhere(session: Session) -> tuple[Suspicion, ...]:
     pull = shown_pull(session)
     if pull is not None and _angle(pull, gravity) < HEADING_OFF:
         return ()
-    found = compare(session, list(_hung_otherwise(session, pull)))
+    found = compare(session, list(_other_gravity(session, pull)))
     if found is None or not (found.better or found.shows_weight):
         return ()
     weightless = ""
@@ -346,7 +346,9 @@ def hangs_elsewhere(session: Session) -> tuple[Suspicion, ...]:
     return (Suspicion(text, found.certain),)
 
 
-def _hung_otherwise(session: Session, pull: FloatArray | None) -> Iterator[Hypothesis[Session]]:
+def _other_gravity(
+    session: ReadSession, pull: FloatArray | None
+) -> Iterator[Hypothesis[ReadSession]]:
     """Gravity along other axes, and points with exchanged or mirrored axes that keep their ends.
 
     Those alone along whose gravity the lines seem to be pulled; all if they show no pull.
@@ -364,7 +366,7 @@ def _hung_otherwise(session: Session, pull: FloatArray | None) -> Iterator[Hypot
             yield Hypothesis(f"gravity ({listed(way + 0.0, 'g')}) m/s^2", meant)
     if experiment.boundary.start == experiment.boundary.end == "pinned":
         return  # between pins it is the same to turn the points, and gravity
-    kept = [_held(session.declared[item.name], length) for item in session.read]
+    kept = [_kept_by_turning(session.declared[item.name], length) for item in session.read]
     for axes in frames:
         if np.allclose(axes, np.eye(len(gravity))):
             continue
@@ -377,7 +379,7 @@ def _hung_otherwise(session: Session, pull: FloatArray | None) -> Iterator[Hypot
             yield Hypothesis(named(axes), replace(session, read=read))
 
 
-def _held(pose: Pose, length: float) -> FloatArray:
+def _kept_by_turning(pose: Pose, length: float) -> FloatArray:
     """What turned points of a pose must keep (n, d): the end from the start, in lengths, clamps."""
     kept: list[FloatArray] = [np.zeros(len(pose.start))]
     if pose.end is not None:
@@ -397,7 +399,7 @@ def _angle(pull: FloatArray | None, way: FloatArray) -> float:
 
 # Each takes a session and tells what it finds. Of alternatives the first that finds anything is the
 # only one. What a group finds certain is the last; poses that it doubts are left out of the next.
-Question = Callable[[Session], tuple[Suspicion, ...]]
+Question = Callable[[ReadSession], tuple[Suspicion, ...]]
 QUESTIONS: tuple[tuple[tuple[Question, ...], ...], ...] = (
     (ENDS,),
     (*((ask,) for ask in POINTS), (wrong_directions,)),

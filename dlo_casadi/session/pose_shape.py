@@ -87,11 +87,11 @@ class PoseShape:
         Forces [N] and moments [N m] on the fixtures that were measured, by their names: measured,
         and as a sensor would show the predicted ones.
     spread : (M,) or (M, 2) or None [m]
-        Standard deviation across the curve of the next hanging, as the residual; None if it was
+        Standard deviation across the curve of the next repeat, as the residual; None if it was
         not computed.
     missed, expected : (K,) or None [m]
         Distance of each measured point from the prediction in the directions in which it is
-        compared, and its RMS that the noise and the next hanging let expect; None if they were not
+        compared, and its RMS that the noise and the next repeat let expect; None if they were not
         computed.
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.

@@ -270,8 +270,8 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
     rest = fit.problem.priors.rest_scatter
     if rest.std > 0:
         lines.append(
-            "the cable does not come back to the same shape: two hangings of a pose differ by "
-            f"{1e3 * np.sqrt(2) * fit.hanging_error:.2g} mm RMS, as if each had a rest curvature "
+            "the cable does not come back to the same shape: two repeats of a pose differ by "
+            f"{1e3 * np.sqrt(2) * fit.repeat_error:.2g} mm RMS, as if each had a rest curvature "
             f"of its own of {rest.std:.2g} 1/m; noise alone gives "
             f"{1e3 * np.sqrt(2) * floor:.2g} mm. A model predicts their mean"
         )

@@ -291,7 +291,7 @@ def close_the_loop(
 
 
 def _confirmed(fit: Fit, confirming: Callable[[], fitting.Minimum], clock: Clock) -> Fit:
-    """A fit held against the minimum that IPOPT has found meanwhile."""
+    """A fit compared with the minimum that IPOPT has found meanwhile."""
     found = confirming()
     clock.add("batch", found.seconds)
     return fitting.confirmed(fit, found)

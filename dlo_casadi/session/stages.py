@@ -90,7 +90,7 @@ def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArra
 class _Model:
     """A model with its parameters; of a fit also how well they are known, to say what to expect.
 
-    `nodes` are those of the fitted poses, `noise` [m] is that of a point beside other hangings.
+    `nodes` are those of the fitted poses, `noise` [m] is that of a point beside other repeats.
     """
 
     model: CableModel
@@ -151,7 +151,7 @@ class _Model:
     def _told(
         self, item: MeasuredPose, known: Prediction, other: MeasuredBranch | None, shape: PoseShape
     ) -> PoseShape:
-        """A predicted pose with all that the uncertainty tells of it and of its next hanging."""
+        """A predicted pose with all that the uncertainty tells of it and of its next repeat."""
         if self.uncertainty is None:
             return shape
         places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
@@ -317,7 +317,7 @@ def fit_stage(
         Qualified names of the parameters that are effects, not nuisances.
     """
     nodes = {fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used}
-    noise = fit.noise.of_points.beside_hangings
+    noise = fit.noise.of_points.beside_repeats
     return _Model(fit.model, fit.p, fit.rest, uncertainty_of(fit), nodes, noise).stage(
         name,
         measured,

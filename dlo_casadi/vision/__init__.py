@@ -4,12 +4,12 @@ from dlo_casadi.vision.board import Board, locate_board, locate_camera
 from dlo_casadi.vision.calibration import Calibration, calibrate_camera
 from dlo_casadi.vision.camera import (
     Camera,
+    CameraPose,
     View,
-    Viewpoint,
     compare_pixels,
     from_reference,
 )
-from dlo_casadi.vision.centerline import Centerline, extract_centerline
+from dlo_casadi.vision.centerline import ExtractedCenterline, extract_centerline
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.image import draw_steps, encoded, read_image
 from dlo_casadi.vision.image_curve import ImageCurve, nearest_in_order, see_cable
@@ -20,12 +20,12 @@ __all__ = [
     "Board",
     "Calibration",
     "Camera",
-    "Centerline",
+    "CameraPose",
+    "ExtractedCenterline",
     "ImageCurve",
     "KnownCable",
     "SpaceLine",
     "View",
-    "Viewpoint",
     "Views",
     "Workings",
     "calibrate_camera",

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from dlo_casadi.errors import VisionError, counted
-from dlo_casadi.vision.camera import Array, Camera, Picture, View, Viewpoint
+from dlo_casadi.vision.camera import Array, Camera, CameraPose, Picture, View
 from dlo_casadi.vision.image import spoilt
 
 MAX_ERROR_PX = 2.0  # largest error of a marker that is where the configuration says
@@ -75,7 +75,7 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
     return View(homography=cable, camera=camera, **seen)
 
 
-def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
+def locate_camera(image: Picture, board: Board, camera: Camera) -> CameraPose:
     """Find the board and return the pose of the camera.
 
     The pose (R, t) minimises the reprojection error of all corners of all visible markers. The
@@ -96,7 +96,7 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> Viewpoint:
     by_shift = camera.project(at)[1]
     J = np.concatenate([np.cross(at[:, None, :], by_shift), by_shift], axis=2).reshape(-1, 6)
     scatter = max(fit.rms**2 * len(at) / (2 * len(at) - 6), _BEST_CORNER_PX**2)
-    return Viewpoint(
+    return CameraPose(
         camera=camera,
         rotation=rotation,
         translation=shift,

@@ -165,7 +165,7 @@ def from_reference(pixels: ArrayLike, points: ArrayLike, shape: tuple[int, ...])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Viewpoint(Photograph):
+class CameraPose(Photograph):
     """Pose of the camera of one photograph.
 
     A point p of the board frame (x right, y up, z out of the board) is at
@@ -206,7 +206,7 @@ class Viewpoint(Photograph):
         """Undistorted rays (K, 2), q_xy / q_z, of pixels (K, 2) [px]."""
         return self.camera.undistort(np.asarray(pixels, float).reshape(-1, 2))
 
-    def moved(self, motion: Array) -> "Viewpoint":
+    def moved(self, motion: Array) -> "CameraPose":
         """Turn the board by the rotation vector w and shift it by d in the camera's frame."""
         turn = Rotation.from_rotvec(motion[:3]).as_matrix()
         shift = turn @ self.translation + motion[3:]
@@ -224,7 +224,7 @@ class Viewpoint(Photograph):
 
 
 def project_outline(
-    viewpoint: Viewpoint, points: ArrayLike, tangents: ArrayLike, diameter: float
+    viewpoint: CameraPose, points: ArrayLike, tangents: ArrayLike, diameter: float
 ) -> tuple[Array, Array, Array]:
     """Project the outline of a round cable.
 
@@ -278,7 +278,11 @@ def project_outline(
 
 
 def compare_pixels(
-    viewpoint: Viewpoint, pixels: ArrayLike, points: ArrayLike, tangents: ArrayLike, diameter: float
+    viewpoint: CameraPose,
+    pixels: ArrayLike,
+    points: ArrayLike,
+    tangents: ArrayLike,
+    diameter: float,
 ) -> tuple[Array, Array]:
     """Pixels measured minus those of a curve, across it.
 

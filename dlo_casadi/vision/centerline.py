@@ -197,7 +197,7 @@ def _std(rough: Array, fine: Array, sound: Flags, view: View) -> Array:
 
 
 @dataclass(frozen=True)
-class Centerline:
+class ExtractedCenterline:
     """The centre-line of a cable, as seen in one photograph."""
 
     points: Array
@@ -218,7 +218,7 @@ class Centerline:
 
 def extract_centerline(
     image: Picture, view: View, cable: KnownCable, workings: Workings | None = None
-) -> Centerline:
+) -> ExtractedCenterline:
     """Isolate the cable, order it from start to end and refine it to sub-pixel.
 
     Parameters
@@ -251,7 +251,7 @@ def extract_centerline(
             f"Try: {name} in metres and in the board frame? Is the cable hidden there?"
         )
     workings.pixels, workings.gaps = view.to_pixels(points), line.gaps
-    return Centerline(
+    return ExtractedCenterline(
         points,
         line.trace.std[line.kept],
         workings.pixels,

@@ -68,7 +68,7 @@ class Workings:
 
 
 @dataclass(frozen=True)
-class Chain:
+class StrandChain:
     """Strands in the order in which the cable runs through them."""
 
     strands: tuple[Array, ...]  # each (K, 2) [m], directed from start to end
@@ -78,7 +78,7 @@ class Chain:
     cost: float  # [m], lower is better; about -length for a cable that is seen without a gap
 
 
-def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> Chain:
+def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> StrandChain:
     """Try the candidate pictures in turn and keep the chain of least cost."""
     diameter, length, scene = expected.diameter, expected.typical, expected.scene
     area_px = length * diameter / plane.pixel**2
@@ -88,7 +88,7 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
             "Try: start, end and length in metres and in the board frame?"
         )
     contrast = local_contrast(plane, diameter / plane.pixel)
-    best: Chain | None = None
+    best: StrandChain | None = None
     longest = 0.0
     for candidate in candidate_maps(contrast, area_px):
         for cut in thresholds(candidate[plane.reachable], area_px):
@@ -154,7 +154,7 @@ def _strands(
     return strands
 
 
-def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> Chain | None:
+def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> StrandChain | None:
     """Find the chain of strands that explains the cable best.
 
     The cost of a chain, in metres,
@@ -204,7 +204,9 @@ def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> Chain | 
     if best is None:
         return None
     cost, path, supported, total = best
-    return Chain(tuple(ways[w] for w in path), tuple(w // 2 for w in path), supported, total, cost)
+    return StrandChain(
+        tuple(ways[w] for w in path), tuple(w // 2 for w in path), supported, total, cost
+    )
 
 
 def _links(ways: list[Array], diameter: float, scene: Scene) -> tuple[Array, Array]:
@@ -246,7 +248,7 @@ def _of_one_colour(strands: list[Strand], chosen: list[Strand]) -> list[Strand]:
     return [strand for strand in strands if np.linalg.norm(strand.colour - ours.colour) < most]
 
 
-def _with_folds(chain: Chain, strands: list[Strand], diameter: float) -> Chain:
+def _with_folds(chain: StrandChain, strands: list[Strand], diameter: float) -> StrandChain:
     """The chain with strands inserted that the cable follows forth and back.
 
     Seen from its side, a bend is a strand with a free end that the cable covers twice. It begins
@@ -281,7 +283,7 @@ def _with_folds(chain: Chain, strands: list[Strand], diameter: float) -> Chain:
 
 
 def _refuse_twins(
-    chain: Chain, workings: Workings, contrast: Contrast, expected: ExpectedLine
+    chain: StrandChain, workings: Workings, contrast: Contrast, expected: ExpectedLine
 ) -> None:
     """Raise if strands away from the chain look like a second cable.
 

@@ -7,7 +7,7 @@ from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, Viewpoint
+from dlo_casadi.vision.camera import Array, CameraPose, Flags, Indices, Picture
 from dlo_casadi.vision.centerline import FINE, measure_line
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.profiles import chord_length, normals
@@ -28,7 +28,7 @@ _POSE_PX = 0.5  # error of an epipolar line from the cameras' poses
 class ImageCurve:
     """The centre-line in one photograph, ordered from start to end."""
 
-    viewpoint: Viewpoint
+    viewpoint: CameraPose
     """Where the camera stands."""
     pixels: Array
     """(K, 2) [px], middle of the cable's outline, as photographed."""
@@ -64,7 +64,7 @@ class ImageCurve:
 
 
 def see_cable(
-    image: Picture, viewpoint: Viewpoint, cable: KnownCable, workings: Workings | None = None
+    image: Picture, viewpoint: CameraPose, cable: KnownCable, workings: Workings | None = None
 ) -> ImageCurve:
     """Find the cable in front of the board, order it from start to end, refine it to sub-pixel.
 
@@ -119,7 +119,7 @@ def see_cable(
     )
 
 
-def _expected_line(cable: KnownCable, viewpoint: Viewpoint, distance: float) -> ExpectedLine:
+def _expected_line(cable: KnownCable, viewpoint: CameraPose, distance: float) -> ExpectedLine:
     """The expected line in the facing plane, with bounds on its length there.
 
     The lower bound is the distance of the fixtures there, or some diameters. The upper bound is the

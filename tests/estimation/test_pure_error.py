@@ -101,13 +101,13 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     assert rms_distance(predictions, measured, held_out=True) < 1.5 * floor
     # The band is as wide as repeats differ, of which a distance in a plane has up to two parts.
     uncertainty = uncertainty_of(fit)
-    assert floor / 2 < uncertainty.hanging < floor
+    assert floor / 2 < uncertainty.repeat_std < floor
     (found,) = (item.equilibrium for item in predictions[left_out : left_out + 1])
     at = np.array([0.4, 0.7])
     known = (fit.model, fit.p, fit.rest, poses[left_out], found, uncertainty)
     curve, moved = displacements(*known, at)
-    assert np.all(spread_across(curve, at, moved) > uncertainty.hanging)
-    assert fit_dict(fit)["scatter"]["hanging"] == uncertainty.hanging
+    assert np.all(spread_across(curve, at, moved) > uncertainty.repeat_std)
+    assert fit_dict(fit)["scatter"]["hanging"] == uncertainty.repeat_std
     # Noise that repeats tell is no declared one.
     assert np.isfinite(fit.variance_degrees("bending_stiffness"))
 

@@ -14,7 +14,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem, Values
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, hung, relaxed
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed, with_springs_in_place
 from dlo_casadi.estimation.start import begin
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
@@ -93,11 +93,11 @@ def test_normal_equations_are_those_of_differences(rolled):
     problem, true = rolled
     start = problem.unknowns.pack(true, np.zeros(MODEL.n_coefficients))
     weighed, values = begin(problem, start)
-    held = np.ones(len(start), dtype=bool)
+    fixed = np.ones(len(start), dtype=bool)
     relaxation = Relaxation(weighed, SOFTNESS[0])
     values = replace(values, theta=values.theta + 0.02)
     for _ in range(5):
-        values = relaxation.solve(values, held, steps=40)
+        values = relaxation.solve(values, fixed, steps=40)
     gradient = relaxation.normal(values).gradient
     step, differences = 1e-4, []
     for k in range(len(start)):
@@ -137,7 +137,7 @@ def test_a_spring_hangs_at_the_place_that_its_effect_says():
     unknowns = Unknowns(model, np.ones(1, dtype=bool), model.nominal)
     problem = Problem(unknowns, measured, NoiseModel(NOISE), Priors.of(Tolerances(), model))
     theta = unknowns.pack(model.nominal, np.zeros(0))
-    values = hung(problem, Values(theta, *measured_shapes(problem)))
+    values = with_springs_in_place(problem, Values(theta, *measured_shapes(problem)))
     place = [model.border_names.index(f"spring_0.place_{axis}") for axis in "xy"]
     for lam, seen in zip(values.shapes.lam, problem.observed(values), strict=True):
         np.testing.assert_allclose(lam[place], seen.curve.at(np.array([0.4]))[0], atol=1e-12)

@@ -25,8 +25,8 @@ def test_twists_are_turned_the_way_that_fits():
     theta = unknowns.pack(p, np.zeros(model.n_coefficients))
     theta[unknowns.names.index(END_ROLL)] = roll / 0.1
     values = Values(theta, *measured_shapes(problem, roll))
-    problem, held = problem.weighed(values), np.ones(len(theta), dtype=bool)
-    begun = _either_way(problem, Relaxation(problem, SOFTNESS[0]).solve(values, held))
+    problem, fixed = problem.weighed(values), np.ones(len(theta), dtype=bool)
+    begun = _either_way(problem, Relaxation(problem, SOFTNESS[0]).solve(values, fixed))
 
     true = model.node.turning(measured_shapes(problem, ROLL)[0].x)
     before, after = (model.node.turning(x.shapes.x) for x in (values, begun))

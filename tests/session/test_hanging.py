@@ -10,7 +10,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session import plausibility
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.hypotheses import Session, load_over_stiffness, shown_pull
+from dlo_casadi.session.hypotheses import ReadSession, load_over_stiffness, shown_pull
 from dlo_casadi.session.measure import read_inputs
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -66,7 +66,7 @@ def test_a_curved_cable_between_ball_joints_is_no_mistake(curved, monkeypatch):
     """Its moments seem to show another load, which they are far from; nothing needs a fit."""
     load = load_over_stiffness([(item.points, item.s) for item in curved[1]])
     assert load[2] > 0.5 * np.linalg.norm(load), "upwards: rest curvature is taken for weight"
-    assert shown_pull(Session(*curved))[2] < 0
+    assert shown_pull(ReadSession(*curved))[2] < 0
     monkeypatch.setattr(plausibility, "fit_model", None)
     assert plausibility.find_suspicions(*curved) == ()
 

@@ -8,7 +8,7 @@ from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session.clamps import wrong_directions
 from dlo_casadi.session.ends import single_poses
-from dlo_casadi.session.hypotheses import Session
+from dlo_casadi.session.hypotheses import ReadSession
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import without_implausible
 
@@ -57,7 +57,7 @@ def test_a_clamp_that_is_a_little_askew_is_no_mistake(turn, askew, tmp_path):
         pose["start_heading"] += askew
         pose["end_heading"] -= askew
 
-    assert wrong_directions(Session(*session(tmp_path, change, turn))) == ()
+    assert wrong_directions(ReadSession(*session(tmp_path, change, turn))) == ()
 
 
 @pytest.mark.parametrize(
@@ -85,11 +85,11 @@ def test_the_heading_of_a_pinned_side_is_not_used(tmp_path):
         pose["start_heading"] += 2.0
 
     config, inputs = session(tmp_path, change)
-    assert wrong_directions(Session(config, inputs))
+    assert wrong_directions(ReadSession(config, inputs))
     boundary = config.experiment.boundary.model_copy(update={"start": "pinned"})
     experiment = config.experiment.model_copy(update={"boundary": boundary})
     assert (
-        wrong_directions(Session(config.model_copy(update={"experiment": experiment}), inputs))
+        wrong_directions(ReadSession(config.model_copy(update={"experiment": experiment}), inputs))
         == ()
     )
 
@@ -115,18 +115,18 @@ def test_a_full_turn_more_than_the_line_has_is_a_mistake(tmp_path):
 @pytest.mark.parametrize("apart", [50, 133, 399])
 def test_points_far_apart_do_not_show_the_direction_of_a_clamp(apart, tmp_path):
     """A third of the cable on, arcs have turned by radians."""
-    assert wrong_directions(Session(*session(tmp_path, turn=13.0, apart=apart))) == ()
-    assert wrong_directions(Session(*session(tmp_path, turn=-6.0, apart=apart))) == ()
+    assert wrong_directions(ReadSession(*session(tmp_path, turn=13.0, apart=apart))) == ()
+    assert wrong_directions(ReadSession(*session(tmp_path, turn=-6.0, apart=apart))) == ()
 
 
 @pytest.mark.parametrize("apart", [5, 100, 133])
 def test_lines_of_few_points_may_end_before_their_fixtures(apart, tmp_path):
     """But no farther than what they leave of the cable."""
-    assert single_poses(Session(*session(tmp_path, apart=apart))) == ()
+    assert single_poses(ReadSession(*session(tmp_path, apart=apart))) == ()
 
     def elsewhere(pose, k):
         if k == 1:
             pose["end"] = [0.0, 0.9 * LENGTH]
 
-    (found,) = single_poses(Session(*session(tmp_path, elsewhere, apart=apart)))
+    (found,) = single_poses(ReadSession(*session(tmp_path, elsewhere, apart=apart)))
     assert found.pose == "arc_1"

@@ -13,7 +13,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.pixels import Pixels, ViewInput, pixel_std, pixels_of
 from dlo_casadi.sensing.sensors import line_or_markers
-from dlo_casadi.vision import Camera, ImageCurve, Viewpoint
+from dlo_casadi.vision import Camera, CameraPose, ImageCurve
 from dlo_casadi.vision.camera import project_outline
 
 LENGTH, DIAMETER = 0.9, 0.008
@@ -27,7 +27,7 @@ def viewpoint(angle):
     """A camera 1.2 m away, turned by an angle about the board's y axis."""
     turn = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
     at = np.array([0.4 - 1.2 * np.sin(angle), 0.0, 1.2 * np.cos(angle)])
-    return Viewpoint(
+    return CameraPose(
         shape=(960, 1280),
         camera=CAMERA,
         rotation=turn,

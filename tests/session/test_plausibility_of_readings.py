@@ -13,7 +13,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.session.clamps import Compared, misread
+from dlo_casadi.session.clamps import ComparedReading, misread
 from dlo_casadi.session.fitting import declared_model, straight
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
@@ -68,8 +68,10 @@ def said_of(read, force: np.ndarray, moment: np.ndarray, mass: float = 0.8) -> l
     noise = np.random.default_rng(1).normal(scale=0.01, size=force.shape)
     found = misread(
         [
-            Compared("end_force", force + noise * np.abs(force).max(), model_force / mass, axes),
-            Compared("end_moment", moment, model_moment / mass, axes, model_force / mass),
+            ComparedReading(
+                "end_force", force + noise * np.abs(force).max(), model_force / mass, axes
+            ),
+            ComparedReading("end_moment", moment, model_moment / mass, axes, model_force / mass),
         ]
     )
     return [item.message for item in found if item.certain]
