@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from dlo_casadi.cable.fitted_cable import Shape as Shape
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
+    from dlo_casadi.config import Clip as Clip
     from dlo_casadi.config import Pose as Pose
     from dlo_casadi.effects import EFFECTS as EFFECTS
     from dlo_casadi.errors import ConfigError as ConfigError
@@ -34,7 +35,7 @@ _PUBLIC = {
     "cable.file": "load",
     "cable.fitted_cable": "FittedCable Shape",
     "codegen": "CompiledSolver",
-    "config": "Cable Pose",
+    "config": "Cable Clip Pose",
     "effects": "EFFECTS",
     "errors": "ConfigError DloError EquilibriumError EstimationError MeasurementError VisionError",
 }

@@ -1,7 +1,7 @@
 """A fitted cable with the uncertainty of its parameters, and its shape in one pose."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
@@ -17,6 +17,7 @@ from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.config import Clip
 from dlo_casadi.config.values import MESH
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -33,6 +34,7 @@ from dlo_casadi.equilibrium.spread import (
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.show.text import html_table, millimetres, vector
@@ -99,6 +101,7 @@ class FittedCable(CasadiCable):
         end_orientation: ArrayLike | None = None,
         turns: float = 0.0,
         branch: Branch | None = None,
+        clips: Sequence[Clip | Mapping[str, Any]] = (),
     ) -> "Shape":
         """Predict the shape of the cable in a pose.
 
@@ -124,6 +127,9 @@ class FittedCable(CasadiCable):
             cable may shed two of them over a loop; that is an error.
         branch : "ccw" or "cw", optional
             In a plane, which way the cable turns from start to end.
+        clips : sequence of Clip or dict
+            What holds the cable between its ends, in the order along it, see `Clip`; none by
+            default, whatever held it in the session.
 
         Raises
         ------
@@ -136,7 +142,13 @@ class FittedCable(CasadiCable):
         asked = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        pose = held_pose(self.model, self.metadata.fixtures, asked)
+        pose = held_pose(self.model, self.metadata.fixtures, asked | {"clips": list(clips)})
+        if pose.clips:
+            model = replace(self.model, clips=tuple(clip.kind for clip in pose.clips))
+            return replace(self, model=model)._solved(pose)
+        return self._solved(pose)
+
+    def _solved(self, pose: HeldPose) -> "Shape":
         try:
             eq = solve_equilibrium(self.model, self.p, self.rest, pose)
         except EquilibriumError as error:
@@ -265,7 +277,8 @@ class Shape:
         tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
         if not self.cable.model.in_space:
             return np.stack([tangents, tangents[:, ::-1] * (-1.0, 1.0)], axis=2)
-        x = Frame.interpolated(self.s, self.cable.model.chain.places, self.equilibrium.x)
+        places = node_places(self.cable.model.chain, self.pose.clips)
+        x = Frame.interpolated(self.s, places, self.equilibrium.x)
         y = Rotation.from_quat(x).apply([0.0, 1.0, 0.0])
         y -= (y * tangents).sum(axis=1, keepdims=True) * tangents
         y /= np.linalg.norm(y, axis=1, keepdims=True)
@@ -293,6 +306,12 @@ class Shape:
     def end_moment(self) -> FloatArray:
         """Moment [N m] of the cable on its end clamp, as `start_moment`."""
         return np.asarray(self.equilibrium.moments[1])
+
+    @property
+    def clips(self) -> dict[str, ClipLoad]:
+        """Arc length, and force and moment of the cable on it, of each clip by its name."""
+        names = (clip.name for clip in self.pose.clips)
+        return dict(zip(names, self.equilibrium.clips, strict=True))
 
     @property
     def energy(self) -> float:
@@ -398,6 +417,7 @@ class Shape:
             "force_on_end": self.end_force.tolist(),
             "moment_on_start": self.start_moment.tolist(),
             "moment_on_end": self.end_moment.tolist(),
+            "clips": clip_rows(pose.clips, self.equilibrium.clips),
             "min_bend_radius": self.min_bend_radius,
             "points": self.points.tolist(),
             "band_90": self.band.tolist(),

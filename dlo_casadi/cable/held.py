@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from dlo_casadi.config import Pose
+from dlo_casadi.config.clips import clip_problems
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
@@ -59,7 +60,11 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
                 f"the {side} of {name} is clamped, and its {kind} differed from pose to pose: "
                 f"give {key}{unit}"
             )
-    pose = Pose(**given).held
+    posed = Pose(**given)
+    length, axes = model.cable.length, model.node.dimension
+    if wrong := [text for text, _ in clip_problems(posed, length, axes)]:
+        raise DloError(f"{name}: {'; '.join(wrong)}")
+    pose = posed.held
     for key, at in (("start", pose.start), ("end", pose.end)):
         if at is not None and len(at) != model.node.dimension:
             raise DloError(f"{key}: {place} belongs here ({gravity}), found {at}")

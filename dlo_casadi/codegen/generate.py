@@ -214,6 +214,11 @@ def generate(
         If the prefix is not a C identifier or an effect cannot be generated.
     """
     check_prefix(prefix)
+    if model.clips:
+        raise DloError(
+            "the C solver holds a cable at its ends alone, and this one has "
+            f"{counted(len(model.clips), 'clip')}.\n  Try: solve(..., clips=...) of Python."
+        )
     p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
     if len(p) != len(model.parameters) or len(rest) != model.chain.n_rests:
         raise DloError(

@@ -4,6 +4,7 @@ The only package that imports yaml and pydantic. All units are SI. Every problem
 reported at once, each with its line.
 """
 
+from dlo_casadi.config.clips import Clip
 from dlo_casadi.config.document import dump_yaml, read_yaml
 from dlo_casadi.config.load import (
     any_photographs,

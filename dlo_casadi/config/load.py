@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
+from dlo_casadi.config.clips import clip_problems, clips_differ, too_short
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.measuring import DeclaredTolerances
 from dlo_casadi.config.options import DeclaredEffect
@@ -72,6 +73,7 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
         *_weightless(config),
         *wrong_effects(config),
         *_impossible_values(config.experiment, config.cable.length),
+        *_wrong_clips(config.experiment, config.cable.length),
     ]:
         raise source.error(problems)
 
@@ -163,6 +165,16 @@ def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
     if not any(pose.role == "fit" for pose in poses):
         text = "no pose has role: fit, there is nothing to fit to"
         yield ConfigProblem(("experiment", "poses"), text)
+
+
+def _wrong_clips(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
+    """Find clips that cannot be so on a cable of that length [m]."""
+    if wrong := clips_differ(experiment.poses):
+        yield ConfigProblem(("experiment", "poses"), wrong)
+    for i, pose in enumerate(experiment.poses):
+        for text, k in clip_problems(pose, length, len(experiment.gravity)):
+            at: Place = ("experiment", "poses", i, "clips", k)
+            yield ConfigProblem(at, f"{_called(i, pose)}: {text}")
 
 
 def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
@@ -262,6 +274,8 @@ def _unreachable(
                 f"end ({', '.join(f'{x:g}' for x in end)}) m is {distance:.4g} m from the start; "
                 f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?{hint}"
             )
+        elif wrong := too_short(pose, cable.length, slack):
+            reasons[pose.name] = wrong
     return reasons
 
 
@@ -384,6 +398,7 @@ def declared_setup(config: Config) -> Setup:
         camera=measurement.kind == "images" and None not in (measurement.board, measurement.camera),
         readings=tuple({name for pose in experiment.poses for name in pose.readings}),
         tolerances=experiment.tolerances.model_dump(),
+        clips=experiment.clips,
     )
 
 

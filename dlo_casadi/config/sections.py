@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from dlo_casadi.config.clips import Clip
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.measuring import Centerlines, DeclaredTolerances, Images
 from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
@@ -36,6 +37,7 @@ from dlo_casadi.config.values import (
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import counted, well_formed
+from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.ends import REACTIONS
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
@@ -184,6 +186,8 @@ class Pose(ConfigSection):
     """Moment [N m] that the cable exerts on its end fixture, about `end`, as start_moment."""
     branch: Literal["ccw", "cw", "previous"] | None = None
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
+    clips: tuple[Clip, ...] = ()
+    """What holds the cable between its ends, in the order along it."""
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -210,7 +214,9 @@ class Pose(ConfigSection):
     def held(self) -> HeldPose:
         """How its ends are held."""
         names = [item.name for item in dataclasses.fields(HeldPose) if hasattr(self, item.name)]
-        return HeldPose(**{name: getattr(self, name) for name in names})
+        held = {name: getattr(self, name) for name in names}
+        clips = tuple(clip.held(k) for k, clip in enumerate(self.clips, start=1))
+        return HeldPose(**{**held, "clips": clips})
 
     @field_validator("file", mode="before")
     @classmethod
@@ -288,6 +294,11 @@ class Experiment(ConfigSection):
     def in_space(self) -> bool:
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
+
+    @property
+    def clips(self) -> tuple[ClipKind, ...]:
+        """Kinds of the clips, the same in all poses."""
+        return tuple(clip.kind for pose in self.poses[:1] for clip in pose.held.clips)
 
     @field_validator("poses", mode="before")
     @classmethod

@@ -35,6 +35,8 @@ class Setup:
         Mean headings at start and end.
     largest_bend : float, optional [1/m]
         Largest |curvature - rest curvature| of all poses.
+    clips : tuple of str
+        Kinds of the clips between the ends.
     """
 
     cable: CableData
@@ -50,3 +52,4 @@ class Setup:
     tolerances: Mapping[str, float] = field(default_factory=dict)
     directions: tuple[float, float] = (0.0, 0.0)
     largest_bend: float | None = None
+    clips: tuple[str, ...] = ()

@@ -16,6 +16,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.minima import TOLERANCE, descend, stepped
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -51,7 +52,8 @@ class BatchEquilibrium:
 
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes of these nodes (m, n_nodes, coordinates), without forces and deviations."""
-        return Shapes.declared(x, np.zeros((self.m, self.model.n_border)))
+        border = [border_of(self.model, *each) for each in zip(self.poses, x, strict=True)]
+        return Shapes.declared(x, np.array(border).reshape((self.m, -1)))
 
     # ---- state -----------------------------------------------------------------------------------
 
@@ -151,10 +153,10 @@ class BatchEquilibrium:
                 step = self._handed_on(here, given, matrix, step) if coupled else step
             except np.linalg.LinAlgError:
                 break
-            size = np.abs(step.x).max(axis=(1, 2, 3))
+            size = self.assembly.size(step)
             if coupled:
                 size[:] = size.max()
-            now.x[active], now.lam[active] = stepped(self.node, here, step, size)
+            now.x[active], now.lam[active] = stepped(self.assembly, here, step, size)
             done = _settled(size, last[active], tolerance, fresh)
             stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
             stale[active] |= size > NEAR

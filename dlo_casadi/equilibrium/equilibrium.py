@@ -9,6 +9,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.pose import SIGNS, Branch
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import ClipLoad
 from dlo_casadi.rod.ends import reaction_rows
 
 # Largest angle between neighbouring headings (Eq. 8; joints only) [rad].
@@ -48,7 +49,7 @@ class Equilibrium:
         Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
         In a plane (2,).
     multipliers : (n_border,)
-        Of the end conditions, then places and multipliers of springs: see `model.border_names`.
+        Of the end conditions, then unknowns of springs and clips: see `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
         Of the joint bounds; zero where a joint bends freely.
     curvature : (axes n_cells,) [1/m]
@@ -65,6 +66,8 @@ class Equilibrium:
     other_side : Equilibrium or None
         The stable equilibrium of the same pose on its other side, see `CableModel.tipped_by`;
         None where there is none, and where the pose names its side.
+    clips : tuple of ClipLoad
+        What the cable does to its clips, in their order.
     """
 
     x: FloatArray
@@ -82,6 +85,7 @@ class Equilibrium:
     status: Status
     iterations: int
     other_side: "Equilibrium | None" = None
+    clips: tuple[ClipLoad, ...] = ()
 
     @property
     def shapes(self) -> Shapes:
@@ -154,6 +158,7 @@ def equilibria_of(
     strains = assembly.strain(shapes, given)
     on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(node)
     points = assembly.nodes(shapes, given)
+    on_clips = assembly.clip_loads(shapes, given)
     if bound_multipliers is None:
         bound_multipliers = np.zeros((len(shapes.x), chain.n_nodes - 1))
     out = []
@@ -181,6 +186,7 @@ def equilibria_of(
                 residual=float(residuals[j]),
                 status=Status.STABLE if stable[j] else Status.UNSTABLE,
                 iterations=int(iterations[j]),
+                clips=on_clips[j],
             )
         )
     return out

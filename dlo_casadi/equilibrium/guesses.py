@@ -40,15 +40,6 @@ _HALF_ANGLE = (
 _FORWARD = np.array([1.0, 0.0, 0.0])
 
 
-def first_nodes(
-    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose
-) -> list[FloatArray]:
-    """First guesses of the nodes (n_nodes, coordinates): `guesses`, or `guessed_frames`."""
-    if model.node is Frame:
-        return guessed_frames(model, p, rest, pose)
-    return [phi[:, None] for phi in guesses(model, p, rest, pose)]
-
-
 def _held(
     model: CableModel, p: FloatArray, pose: HeldPose
 ) -> tuple[FloatArray, FloatArray | None, Clamps]:
@@ -259,7 +250,7 @@ def guessed_frames(
     Turns are counted along the first arc, and to the nearest value along the others.
     """
     u, chord, frames = _held(model, p, pose)
-    clamps = _rotation(frames[0]), _rotation(frames[1])
+    clamps = frame_rotation(frames[0]), frame_rotation(frames[1])
     down = np.array(model.gravity)
     if chord is None:
         bends = model.chain.curvatures(rest) * np.diff(model.chain.cells, axis=1).ravel()
@@ -273,21 +264,22 @@ def guessed_frames(
     aimed = turns = 0.0 if None in clamps else pose.turns
     for quarter in range(4):
         turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
-        carried, roll = _carried(u, _arc_tangents(u, chord, turned), clamps)
-        roll = _nearest(roll, aimed)
+        free, roll = carried(u, arc_tangents(u, chord, turned), clamps)
+        roll = nearest_roll(roll, aimed)
         if turns and not found:
             aimed = roll / (2 * np.pi)
         if not turns and None not in clamps and abs(roll) > np.pi - HALF_TURN:
-            others.append(_rolled(u, carried, clamps, roll - np.copysign(2 * np.pi, roll)))
-        found.append(_rolled(u, carried, clamps, roll))
+            others.append(rolled(u, free, clamps, roll - np.copysign(2 * np.pi, roll)))
+        found.append(rolled(u, free, clamps, roll))
     return found + others
 
 
-def _rotation(frame: Sequence[float] | FloatArray | None) -> Rotation | None:
+def frame_rotation(frame: Sequence[float] | FloatArray | None) -> Rotation | None:
+    """Rotation of a frame; None of none."""
     return None if frame is None else Rotation.from_quat(frame)
 
 
-def _smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
+def smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
     """Smallest rotation of the unit vector a into b."""
     axis = np.cross(a, b)
     cosine = float(a @ b)
@@ -297,7 +289,7 @@ def _smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
     return Rotation.from_quat(np.append(axis, 1 + cosine))
 
 
-def _arc_tangents(u: FloatArray, chord: FloatArray, side: FloatArray) -> FloatArray:
+def arc_tangents(u: FloatArray, chord: FloatArray, side: FloatArray) -> FloatArray:
     """Tangents (k, 3) of the circular arc of length 1 over a chord (3,), bulging to a side (3,)."""
     along = chord / max(float(np.linalg.norm(chord)), 1e-12)
     across = side - (side @ along) * along
@@ -312,49 +304,49 @@ def _hanging_frames(
     """Guesses for a cable with a free end; rest bends (2, k - 1) [rad] about the axes y and z."""
     down = down / max(float(np.linalg.norm(down)), 1e-12)
     if first is None:
-        first = _smallest_turn(_FORWARD, down if np.any(down) else _FORWARD)
+        first = smallest_turn(_FORWARD, down if np.any(down) else _FORWARD)
     rest = [first]
     for bend in bends.T:
         rest.append(rest[-1] * Rotation.from_rotvec([0.0, *bend]))
     shapes = [Rotation.concatenate(rest)]
     if np.any(down):
-        fall = _smallest_turn(first.apply(_FORWARD), down).as_rotvec()
+        fall = smallest_turn(first.apply(_FORWARD), down).as_rotvec()
         shapes.append(Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall) * first)
     shapes.append(Rotation.concatenate([first] * len(u)))
     return [same_sign(shape.as_quat()) for shape in shapes]
 
 
-def _carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotation, float]:
+def carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotation, float]:
     """Frames (k,) without twist along tangents bent into the clamps, and the end clamp's roll.
 
     The roll is the angle [rad] about the cable from the last frame to the clamp, in (-pi, pi].
     """
     bends = [
-        decay[:, None] * _smallest_turn(tangents[end], clamp.apply(_FORWARD)).as_rotvec()
+        decay[:, None] * smallest_turn(tangents[end], clamp.apply(_FORWARD)).as_rotvec()
         for clamp, end, decay in zip(clamps, (0, -1), ((1 - u) ** _DECAY, u**_DECAY), strict=True)
         if clamp is not None
     ]
     axes = tangents
     for bend in bends:
         axes = Rotation.from_rotvec(bend).apply(axes)
-    first = clamps[0] or _smallest_turn(_FORWARD, axes[0])
-    frames = [_smallest_turn(first.apply(_FORWARD), axes[0]) * first]
+    first = clamps[0] or smallest_turn(_FORWARD, axes[0])
+    frames = [smallest_turn(first.apply(_FORWARD), axes[0]) * first]
     for before, after in pairwise(axes):
-        frames.append(_smallest_turn(before, after) * frames[-1])
+        frames.append(smallest_turn(before, after) * frames[-1])
     if clamps[1] is None:
         return Rotation.concatenate(frames), 0.0
     x, _, _, w = (frames[-1].inv() * clamps[1]).as_quat()
     return Rotation.concatenate(frames), float(np.pi - (np.pi - 2 * np.arctan2(x, w)) % (2 * np.pi))
 
 
-def _rolled(u: FloatArray, frames: Rotation, clamps: Turned, roll: float) -> FloatArray:
+def rolled(u: FloatArray, frames: Rotation, clamps: Turned, roll: float) -> FloatArray:
     """Frames (k, 4) with a roll [rad] at the end, linear from a clamp, constant from a pin."""
     share = np.ones_like(u) if clamps[0] is None else u
     about = Rotation.from_rotvec(np.outer(roll * share, _FORWARD))
     return same_sign((frames * about).as_quat())
 
 
-def _nearest(roll: float, aimed: float) -> float:
+def nearest_roll(roll: float, aimed: float) -> float:
     """The roll [rad], up to full turns, that is nearest to `aimed` [turns].
 
     The larger of two that are equally near up to rounding.
@@ -393,9 +385,9 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
     tangents = np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
     clamps = (
-        _rotation(pose.start_orientation if chain.start_clamped else None),
-        _rotation(pose.end_orientation if chain.end_clamped else None),
+        frame_rotation(pose.start_orientation if chain.start_clamped else None),
+        frame_rotation(pose.end_orientation if chain.end_clamped else None),
     )
     u = chain.places / chain.length
-    frames, roll = _carried(u, tangents, clamps)
-    return _rolled(u, frames, clamps, _nearest(roll, 0.0 if None in clamps else pose.turns))
+    frames, roll = carried(u, tangents, clamps)
+    return rolled(u, frames, clamps, nearest_roll(roll, 0.0 if None in clamps else pose.turns))

@@ -32,11 +32,12 @@ from dlo_casadi.equilibrium.equilibrium import (
     equilibria_of,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import clamped_nodes
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
-from dlo_casadi.rod.node import Node
 from dlo_casadi.runtime.executors import interrupts_held
 
 # Longest step of a node [rad].
@@ -91,7 +92,7 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
         What each of them depends on.
     """
     m = len(shapes.x)
-    node, wanted = assembly.node, assembly.model.n_multipliers
+    wanted = assembly.model.n_multipliers
     now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
     balanced, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
     shift, first = np.zeros(m), np.full(m, np.inf)
@@ -108,10 +109,10 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
             matrix = matrix.subset(bounded)
         if not len(active):
             break
-        factor, shift[active] = _convex(matrix, wanted, shift[active])
+        factor, shift[active] = _convex(matrix, wanted, shift[active], assembly.turn_per_slip)
         step = factor.solve(Vector(-force.x, -force.y))
-        size = np.abs(step.x).max(axis=(1, 2, 3))
-        now.x[active], now.lam[active] = stepped(node, here, step, size)
+        size = assembly.size(step)
+        now.x[active], now.lam[active] = stepped(assembly, here, step, size)
         # A shift makes steps small even where forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
@@ -128,11 +129,13 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
     return Minima(now, balanced, converged, energy, iterations)
 
 
-def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFactor, FloatArray]:
+def _convex(
+    matrix: BandMatrix, wanted: int, before: FloatArray, turns: FloatArray
+) -> tuple[BandFactor, FloatArray]:
     """Factors of the matrices, shifted until their inertia is that of a minimum, and the shifts.
 
-    No shift exceeds the one that makes the nodes' part positive definite: if the inertia is wrong
-    even then, the conditions are the cause.
+    `turns` (k,): see `Assembly.turn_per_slip`. No shift exceeds the one that makes the nodes' part
+    positive definite: if the inertia is wrong even then, the conditions are the cause.
     """
     scale, most = matrix.scale, matrix.row_sum
     shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)
@@ -141,7 +144,8 @@ def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFa
     def shifted(index: IntArray) -> BandFactor:
         part = matrix.subset(index)
         diagonal = part.diagonal + shift[index, None, None, None] * unit
-        return replace(part, diagonal=diagonal).factor()
+        corner = part.corner + shift[index, None, None] * np.diag(turns**2)
+        return replace(part, diagonal=diagonal, corner=corner).factor()
 
     everyone = np.arange(len(scale))
     factor = shifted(everyone)
@@ -156,15 +160,19 @@ def _convex(matrix: BandMatrix, wanted: int, before: FloatArray) -> tuple[BandFa
 
 
 def stepped(
-    node: type[Node], shapes: Shapes, step: Vector, size: FloatArray
+    assembly: Assembly, shapes: Shapes, step: Vector, size: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Nodes and border of shapes after a step of one column, cut at LONGEST_STEP.
 
-    `size` (m,) [rad] is the longest step of each shape's nodes.
+    `size` (m,) [rad] is the longest step of each shape, see `Assembly.size`. No eyelet leaves the
+    cable.
     """
     share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
-    x = node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
-    return x, shapes.lam + share[:, None] * step.y[..., 0]
+    x = assembly.node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
+    lam = shapes.lam + share[:, None] * step.y[..., 0]
+    sliding = list(assembly.model.sliding.values())
+    lam[:, sliding] = lam[:, sliding].clip(0.0, assembly.chain.length)
+    return x, lam
 
 
 # ---- by IPOPT ------------------------------------------------------------------------------------
@@ -183,8 +191,8 @@ def ipopt(name: str, problem: dict[str, ca.SX], tolerance: float, iterations: in
 
 
 @lru_cache(maxsize=32)
-def _solver(model: CableModel) -> ca.Function:
-    problem, count = potential(model), model.chain.n_nodes
+def _solver(model: CableModel, clamped: tuple[int, ...]) -> ca.Function:
+    problem, count = potential(model, clamped), model.chain.n_nodes
     x = problem.coordinates
     conditions = ca.vertcat(problem.conditions, x[1:count] - x[: count - 1])
     stated = {"x": x, "p": problem.parameters, "f": problem.energy, "g": conditions}
@@ -221,9 +229,11 @@ def by_ipopt(
     phi : (n_nodes,) [rad]
     """
     count, conditions = model.chain.n_nodes, model.n_multipliers
-    solver = _solver(model)
+    solver = _solver(model, clamped_nodes(model.chain, pose.clips))
     deviation = np.zeros(len(model.deviation_names))
-    x0 = np.concatenate([phi, np.zeros(solver.size1_in("x0") - len(phi))])
+    others = border_of(model, pose, phi[:, None])[~model.are_multipliers]
+    inner = np.zeros(solver.size1_in("x0") - len(phi) - len(others))
+    x0 = np.concatenate([phi, others, inner])
     bounds = np.zeros(conditions + count - 1)
     bounds[conditions:] = JOINT_BOUND
     parameters = np.concatenate([p, rest, pose.vector, deviation])
@@ -231,7 +241,7 @@ def by_ipopt(
     multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))
     border = np.zeros(model.n_border)
     border[model.are_multipliers] = multipliers[:conditions]
-    border[~model.are_multipliers] = coordinates[count : count + 2 * model.n_springs]
+    border[~model.are_multipliers] = coordinates[count:][: np.sum(~model.are_multipliers)]
     start = Shapes(coordinates[None, :count, None], border[None], deviation[None])
     given = Inputs.of(p, rest, pose.vector[None])
     return _balanced(model, start, multipliers[conditions:], given, stats["iter_count"])

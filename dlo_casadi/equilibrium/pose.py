@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.model.clips import Clip
 from dlo_casadi.rod.node import Frame, Heading, Node, quaternion_product
 
 Branch = Literal["ccw", "cw"]
@@ -40,6 +41,8 @@ class HeldPose:
     name : str
     camera_center : (float, float, float), optional [m]
         Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
+    clips : tuple of Clip
+        What holds the cable between its ends, in the order along it.
     """
 
     start: tuple[float, ...]
@@ -52,6 +55,7 @@ class HeldPose:
     branch: PoseBranch | None = None
     name: str = "pose"
     camera_center: tuple[float, float, float] | None = None
+    clips: tuple[Clip, ...] = ()
 
     @property
     def node(self) -> type[Node]:
@@ -114,9 +118,10 @@ class HeldPose:
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `pose`: the ends, then the camera, see `effects.Viewpoint`.
+        """The model's argument `pose`: the ends, the camera, see `effects.Viewpoint`, the clips.
 
         The camera's centre (x, y, z) enters as (x, y, 1) / z: zeros if it is not known.
         """
         x, y, z = self.camera_center or (0.0, 0.0, np.inf)
-        return np.concatenate([self.ends, np.array([x, y, 1.0]) / z])
+        clips = (clip.vector(self.node) for clip in self.clips)
+        return np.concatenate([self.ends, np.array([x, y, 1.0]) / z, *clips])

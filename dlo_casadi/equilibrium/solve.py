@@ -13,12 +13,19 @@ from dlo_casadi.equilibrium.equilibrium import (
     Equilibrium,
     equilibria_of,
 )
-from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
+from dlo_casadi.equilibrium.spans import (
+    border_of,
+    chords,
+    first_guesses,
+    fixed_stretches,
+    holders,
+)
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
-from dlo_casadi.model.cable_model import COARSE_MESH, CableModel
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import clamped_nodes
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame, Heading
 
@@ -49,6 +56,8 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
             f"{pose.end} m, headings {pose.start_heading} and {pose.end_heading} rad"
         )
         return _no_equilibrium(pose, what, "see where these numbers come from.")
+    if wrong := _wrong_clips(model, p, pose):
+        return _no_equilibrium(pose, *wrong)
     if pose.end is None or model.extensible:
         return None
     ends, true_length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
@@ -62,6 +71,35 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         f"from the start, the cable is {length:.4f} m long"
     )
     return _no_equilibrium(pose, what, "end in metres? cable.length?")
+
+
+def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
+    """Why clips leave no equilibrium, and what to try: other kinds, no room on the mesh or cable.
+
+    Eyelets are taken to be anywhere between the clips beside them.
+    """
+    if tuple(clip.kind for clip in pose.clips) != model.clips:
+        own, others = (", ".join(x) or "none" for x in ([c.kind for c in pose.clips], model.clips))
+        return f"no equilibrium: the pose has the clips {own}, the model {others}", "the same."
+    nodes = clamped_nodes(model.chain, pose.clips)
+    if len(set(nodes)) < len(nodes):
+        what = f"clamped clips are nearer to each other than an element, {model.chain.h:.4g} m"
+        return f"no equilibrium: {what}", "a finer mesh (model.n)."
+    held = holders(model, p, pose) if pose.clips and not model.extensible else []
+    names = ["the start", *(clip.name for clip in pose.clips), "the end"]
+    apart, true_length = (
+        chords(held),
+        float(lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1]),
+    )
+    for low, high, declared in fixed_stretches(held):
+        length = declared * true_length / model.cable.length
+        if sum(apart[low:high]) >= length:
+            what = (
+                f"no equilibrium: {names[low]} and {names[high]} are {sum(apart[low:high]):.4f} m "
+                f"apart, with {length:.4f} m of cable between them"
+            )
+            return what, "places and arc lengths in metres, in the order along the cable?"
+    return None
 
 
 def solve_equilibrium(
@@ -227,7 +265,7 @@ class _PoseSearch:
         """Equilibria of each pose, in the order of the first guesses that lead to them."""
         found: list[list[Equilibrium]] = [[] for _ in poses]
         free = [j for j, start in enumerate(starts) if start is None]
-        if free and self.model.in_space and self.model.n > COARSE_MESH:
+        if free and self.model.in_space and self.model.n > self.model.coarse.n:
             of, likely = self._likely([poses[j] for j in free])
             if len(of):
                 found = self._descended(poses, np.array(free)[of], likely)
@@ -243,13 +281,16 @@ class _PoseSearch:
         self, poses: Sequence[HeldPose], starts: Sequence[FloatArray | None]
     ) -> tuple[IntArray, Shapes]:
         """First guesses of all poses, or the given starts, and the pose of each."""
+        model = self.model
         rows = [
-            first_nodes(self.model, self.p, self.rest, pose) if start is None else [start]
+            first_guesses(model, self.p, self.rest, pose)
+            if start is None
+            else [(start, border_of(model, pose, start))]
             for pose, start in zip(poses, starts, strict=True)
         ]
         of = np.repeat(np.arange(len(poses)), [len(guesses) for guesses in rows])
-        x = np.array([guess for guesses in rows for guess in guesses])
-        return of, Shapes.declared(x, np.zeros((len(x), self.model.n_border)))
+        x, border = zip(*(guess for guesses in rows for guess in guesses), strict=True)
+        return of, Shapes.declared(np.array(x), np.array(border))
 
     def _descend(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes

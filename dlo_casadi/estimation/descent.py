@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.guesses import first_nodes
 from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
+from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.problem import (
     NO_INFORMATION,
@@ -209,7 +209,7 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
             continue
         pose = problem.history[index].pose
         if relaxed:
-            x = first_nodes(fit.model, fit.p, fit.rest, pose)[0]
+            x = first_guesses(fit.model, fit.p, fit.rest, pose)[0][0]
             none = np.zeros(fit.model.n_border), np.zeros(len(fit.model.deviation_names))
             rows.append((x, *none))
             continue

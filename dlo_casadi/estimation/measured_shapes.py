@@ -7,7 +7,8 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
-from dlo_casadi.equilibrium.guesses import first_nodes, line_nodes
+from dlo_casadi.equilibrium.guesses import line_nodes
+from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel
@@ -50,7 +51,7 @@ def measured_shapes(
         )
     flat = np.zeros(chain.n_rests)
     predicted = np.array(
-        [first_nodes(model, model.nominal, flat, item.pose)[0] for item in problem.measured]
+        [first_guesses(model, model.nominal, flat, item.pose)[0][0] for item in problem.measured]
     )
     along = predicted.copy()
     for j in used:

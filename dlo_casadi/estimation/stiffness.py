@@ -15,7 +15,7 @@ from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, 
 from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 # Steps per decade of the first search.
@@ -204,4 +204,4 @@ def law_of(model: CableModel, p: FloatArray, bend: FloatArray) -> FloatArray:
 
     Laws that depend on the place count with the middle of the cable.
     """
-    return np.array([float(lagrangian_of(model).section_moment(value, p)) for value in bend])
+    return np.array([float(functions_of(model).section_moment(value, p)) for value in bend])

@@ -7,21 +7,27 @@ the derivatives of both and of the measured curve.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
+from dlo_casadi.model.mapped import Mapped
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame, Heading
 
+# Step of differences by slips of clips, relative to the length.
+_SLIP = 1e-6
+# Turn [rad] that counts as much as a slip of the whole length through an eyelet.
+_TURN = 10.0
 _NODES = {node.coordinates: node for node in (Heading, Frame)}
 
 
@@ -102,36 +108,6 @@ class Tangents:
         return Tangents(x, np.concatenate([self.lam, step.y], axis=-1), p, rest, deviation)
 
 
-class _Mapped:
-    """A CasADi function of a segment (or node), mapped over a pose and called pose by pose.
-
-    It reads and writes NumPy's memory: a conversion to CasADi's matrices takes several times as
-    long as the evaluation.
-    """
-
-    def __init__(self, function: ca.Function, count: int) -> None:
-        self._shapes = [
-            (count, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
-        ]
-        mapped = function.map(count) if count > 1 else function
-        # Any: by CasADi's stubs a buffer does not take NumPy's memory.
-        self._buffer: Any
-        self._buffer, self._run = mapped.buffer()
-
-    def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
-        """Arguments (m, count, rows) -> outputs (m, count, rows, columns)."""
-        given = [np.ascontiguousarray(block, dtype=float) for block in arguments]
-        m = len(given[0])
-        outputs = [np.zeros((m, *shape)) for shape in self._shapes]
-        for j in range(m):
-            for i, block in enumerate(given):
-                self._buffer.set_arg(i, memoryview(block[j]))
-            for i, out in enumerate(outputs):
-                self._buffer.set_res(i, memoryview(out[j]))
-            self._run()
-        return [out.transpose(0, 1, 3, 2) for out in outputs]
-
-
 def _repeated(rows: FloatArray, count: int) -> FloatArray:
     """Rows (m, k) of poses, the same for `count` segments or stations (m, count, k)."""
     return np.broadcast_to(rows[:, None], (len(rows), count, rows.shape[1]))
@@ -155,27 +131,50 @@ class Assembly:
         # Numbers that tell the rest strains inside a segment.
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
-        self._functions: dict[str, _Mapped] = {}
+        self._functions: dict[str, Mapped] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle without compiled functions: another process makes its own."""
         return {**self.__dict__, "_functions": {}}
 
+    @cached_property
+    def turn_per_slip(self) -> FloatArray:
+        """Turn [rad/m] that an eyelet's change of arc length counts as; zero of others (k,)."""
+        turns = np.zeros(self.k)
+        turns[list(self.model.sliding.values())] = _TURN / self.chain.length
+        return turns
+
+    def size(self, step: Vector) -> FloatArray:
+        """Largest turn (m,) [rad] of a step of one column."""
+        nodes = np.abs(step.x).max(axis=(1, 2, 3))
+        slips = np.abs(step.y[..., 0]) * self.turn_per_slip
+        return np.maximum(nodes, slips.max(axis=1, initial=0.0))
+
     # ---- calls ---------------------------------------------------------------------------------
 
-    def _mapped(self, name: str, count: int) -> _Mapped:
+    def _mapped(self, name: str, count: int) -> Mapped:
         if name not in self._functions:
-            self._functions[name] = _Mapped(getattr(functions_of(self.model), name), count)
+            self._functions[name] = Mapped(getattr(functions_of(self.model), name), count)
         return self._functions[name]
 
     def _call_segments(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """A function of a segment for all segments: outputs (m, n_segments, rows, columns)."""
-        count, places = self._segments, self.chain.layout.segments
-        own = self.chain.rest_inside(given.rest[..., None])[..., 0]
+        count, clipped = self._segments, self.clipped(shapes, given)
+        own = clipped.rest(self.chain.rest_inside(given.rest[..., None]))[..., 0]
         alike = (shapes.lam, given.p, shapes.deviation)
         lam, p, deviation = (_repeated(one, count) for one in alike)
-        place = np.broadcast_to(places, (len(shapes.x), *places.shape))
-        return self._mapped(name, count)(self._both(shapes.x), lam, p, own, place, deviation)
+        both = clipped.carried(self._both(shapes.x))
+        return self._mapped(name, count)(both, lam, p, own, clipped.segments(), deviation)
+
+    def clipped(self, shapes: Shapes, given: Inputs) -> Clipped:
+        """Where the clips are on the cable."""
+        kinds = self.model.clips
+        declared = given.poses[:, given.poses.shape[1] - self.model.clip_numbers :]
+        declared = declared.reshape((len(declared), len(kinds), clip_size(self.node)))
+        at = declared[..., -1] + given.p @ functions_of(self.model).slips.T
+        for k, row in self.model.sliding.items():
+            at[:, k] = shapes.lam[:, row]
+        return Clipped.of(self.chain, kinds, declared, at, shapes.x)
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, of (m, n_nodes, k, ...)."""
@@ -217,7 +216,25 @@ class Assembly:
         end_value, end_gradient, end_bend = self._call_ends("at_ends", shapes, given)
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         matrix = self._held(self._band(bend, end_bend), given)
-        return total, self._added(gradient, end_gradient), matrix
+        force = self._added(gradient, end_gradient)
+        clipped, stiffness = self.clipped(shapes, given), self._stiffness(given)
+        clipped.hold(force, shapes.x, stiffness)
+        clipped.hold_matrix(matrix, stiffness)
+        return total, force, matrix
+
+    def _stiffness(self, given: Inputs) -> FloatArray:
+        """Bending stiffness (m,) [N m] of an element."""
+        return given.p[:, self.model.stiffness_indices[0]] / self.chain.h
+
+    def clip_loads(self, shapes: Shapes, given: Inputs) -> list[tuple[ClipLoad, ...]]:
+        """What the cables do to their clips, for each of m poses."""
+        if not self.model.clips:
+            return [()] * len(shapes.x)
+        (gradient,) = self._call_segments("segment_slope", shapes, given)
+        _, end_gradient, _ = self._call_ends("at_ends", shapes, given)
+        by_turns = self._added(gradient, end_gradient).x[..., 0]
+        forces = shapes.lam[:, self.model.pulls[self.model.n_springs :]]
+        return self.clipped(shapes, given).loads(self.model.clips, forces, by_turns)
 
     def _held(self, matrix: BandMatrix, given: Inputs) -> BandMatrix:
         """Add a stiffness against roll of the first node to cables free to roll about their axis.
@@ -236,7 +253,9 @@ class Assembly:
         """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
         (gradient,) = self._call_segments("segment_slope", shapes, given)
         _, end_gradient, _ = self._call_ends("at_ends", shapes, given)
-        return self._added(gradient, end_gradient)
+        force = self._added(gradient, end_gradient)
+        self.clipped(shapes, given).hold(force, shapes.x, self._stiffness(given))
+        return force
 
     def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
         first, last, border = self._parts
@@ -262,16 +281,33 @@ class Assembly:
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         n_p = along.p.shape[1]
         at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
-        return self._added(self.add_by_numbers(0.0, segments, along), at_ends)
+        clipped = self.clipped(shapes, given)
+        total = self._added(self.add_by_numbers(0.0, segments, along, clipped), at_ends)
+        for slip, (more, less) in self.slipped(given, along):
+            change = self.imbalance(shapes, more) - self.imbalance(shapes, less)
+            total = total + Vector(change.x * slip[:, None, None], change.y * slip[:, None])
+        clipped.hold(total, shapes.x, np.zeros(len(shapes.x)))
+        return total
+
+    def slipped(
+        self, given: Inputs, along: Tangents
+    ) -> Iterator[tuple[FloatArray, tuple[Inputs, Inputs]]]:
+        """Inputs whose difference, times factors (m, q), is the change by slips of clips."""
+        step = _SLIP * self.chain.length
+        for k in np.flatnonzero(functions_of(self.model).slips.any(axis=0)):
+            unit = step * np.eye(given.p.shape[1])[k]
+            both = (replace(given, p=given.p + unit), replace(given, p=given.p - unit))
+            if along.p[:, k].any():
+                yield along.p[:, k] / (2 * step), both
 
     def add_by_numbers(
-        self, total: FloatArray | float, blocks: FloatArray, along: Tangents
+        self, total: FloatArray | float, blocks: FloatArray, along: Tangents, clipped: Clipped
     ) -> FloatArray:
         """Add the change along p, rest and deviation to a total, given derivatives of segments."""
         n_p = along.p.shape[1]
         n_r = n_p + self.n_inside
         total = total + blocks[..., :n_p] @ along.p[:, None]
-        total += blocks[..., n_p:n_r] @ self.chain.rest_inside(along.rest)
+        total += blocks[..., n_p:n_r] @ clipped.rest(self.chain.rest_inside(along.rest))
         total += blocks[..., n_r:] @ along.deviation[:, None]
         return np.asarray(total)
 
@@ -288,13 +324,19 @@ class Assembly:
     def nodes(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """True places (m, n + 1, dimension) [m] of the element boundaries."""
         (advance,) = self._call_segments("segment_curve", shapes, given)
-        return self._stations(advance[..., 0], given.poses[:, : self.node.dimension])[0]
+        start, clipped = given.poses[:, : self.node.dimension], self.clipped(shapes, given)
+        places, rates = self._stations(advance[..., 0], start)
+        if not clipped.clamps:
+            return places
+        ahead = rates[..., :1] * tangents(self.node, shapes.x)
+        moved = np.concatenate([places, ahead], axis=2)[..., None]
+        return clipped.evenly(moved)[:, :, : self.node.dimension, 0]
 
     def curve(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Measured places, and dr/ds of smooth elements, (m, n + 1, d or 2 d)."""
         (advance,) = self._call_segments("segment_curve", shapes, given)
         (rows,) = self._call_stations("station", advance[..., 0], shapes, given)
-        return rows[..., 0]
+        return self.clipped(shapes, given).evenly(rows)[..., 0]
 
     def _call_stations(
         self, name: str, advance: FloatArray, shapes: Shapes, given: Inputs
@@ -311,7 +353,8 @@ class Assembly:
         rows, by_station, by_p = self._call_stations(
             "station_slopes", advance[..., 0], shapes, given
         )
-        return CurveSlopes(self, rows[..., 0], by_moving, by_others, by_station, by_p)
+        even = self.clipped(shapes, given).evenly(rows)[..., 0]
+        return CurveSlopes(self, shapes, given, even, by_moving, by_others, by_station, by_p)
 
     def reactions(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `ends.REACTIONS`."""
@@ -379,6 +422,8 @@ class CurveSlopes:
     """Measured curves `z` (m, n + 1, d or 2 d) and their derivatives, segment by segment."""
 
     assembly: Assembly
+    shapes: Shapes
+    given: Inputs
     z: FloatArray
     by_moving: FloatArray
     by_others: FloatArray
@@ -388,12 +433,17 @@ class CurveSlopes:
     def along(self, directions: Tangents) -> FloatArray:
         """Change (m, n + 1, d or 2 d, q) of the measured curves."""
         a, d = self.assembly, directions
+        clipped = a.clipped(self.shapes, self.given)
         by_nodes, by_lam = np.split(self.by_moving, [2 * a.b], axis=-1)
         steps: FloatArray = by_nodes @ a._both(d.x) + by_lam @ d.lam[:, None]
-        steps = a.add_by_numbers(steps, self.by_others, d)
+        steps = a.add_by_numbers(steps, self.by_others, d, clipped)
         start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
         places, rates = a._stations(steps, start)
         shape = (len(steps), a.chain.n + 1, 2 * a.b, steps.shape[3])
         own = d.x[:, a.chain.layout.stations].reshape(shape)
         moved = self.by_station @ np.concatenate([places, rates, own], axis=2)
-        return np.asarray(moved + self.by_p @ d.p[:, None])
+        change = clipped.evenly(moved + self.by_p @ d.p[:, None])
+        for slip, (more, less) in a.slipped(self.given, d):
+            gap = a.curve(self.shapes, more) - a.curve(self.shapes, less)
+            change = change + gap[..., None] * slip[:, None, None]
+        return np.asarray(change)

@@ -11,6 +11,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects import CableData, Effect, Kinematics, Load, SectionLaw, StateEffect
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
+from dlo_casadi.model.clips import CLAMPS, ClipKind, clip_size
 from dlo_casadi.model.rest_curvature import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
 from dlo_casadi.rod.ends import EndConditions, deviation_names
@@ -30,6 +31,8 @@ TORSIONAL_STIFFNESS = "torsional_stiffness"
 STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
 # Number of elements of `CableModel.coarse`.
 COARSE_MESH = 10
+# Least mean number of its elements between two clips.
+COARSE_SPAN = 6
 # Name of the parameter: roll of the end clamp against the declared one [rad], as by a rest twist.
 END_ROLL = "end_roll"
 # Size of the camera's part of `HeldPose.vector`.
@@ -64,6 +67,8 @@ class CableModel:
     priors : dict
         Standard deviations of Gaussian priors on effect parameters by qualified name: these
         effects are nuisances within a declared tolerance, not findings.
+    clips : tuple of ClipKind
+        Kinds of the clips between the ends, in the order along the cable.
 
     Notes
     -----
@@ -79,6 +84,7 @@ class CableModel:
     effects: tuple[Effect, ...] = ()
     n_rest: int = 9
     priors: Mapping[str, float] = field(default_factory=dict, hash=False)
+    clips: tuple[ClipKind, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.gravity) != len(self.cable.axes):
@@ -87,6 +93,8 @@ class CableModel:
                 f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
                 "give both, in a plane neither"
             )
+        if self.clips and not self.chain.kind.smooth:
+            raise DloError(f"clips need a smooth element, found {self.element!r}; try 'quadratic'")
         labels = [effect.label for effect in self.effects]
         for effect in self.effects:
             if labels.count(effect.label) > 1:
@@ -114,7 +122,12 @@ class CableModel:
     @property
     def n_pose(self) -> int:
         """Size of `HeldPose.vector`."""
-        return EndConditions.size(self.node) + VIEWPOINT_SIZE
+        return EndConditions.size(self.node) + VIEWPOINT_SIZE + self.clip_numbers
+
+    @property
+    def clip_numbers(self) -> int:
+        """Size of the clips' part of `HeldPose.vector`."""
+        return len(self.clips) * clip_size(self.node)
 
     @property
     def deviation_names(self) -> tuple[str, ...]:
@@ -222,7 +235,7 @@ class CableModel:
 
         That is so in space between ball joints, with one bending stiffness about all axes.
         """
-        held = "clamped" in (self.start, self.end)
+        held = "clamped" in (self.start, self.end, *self.clips)
         laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
         twists = "twist" in self.node.strains
         return twists and not held and all(law.isotropic for law in laws)
@@ -236,7 +249,7 @@ class CableModel:
     @property
     def coarse(self) -> Self:
         """The same model on a coarse mesh."""
-        return self.with_mesh(COARSE_MESH)
+        return self.with_mesh(max(COARSE_MESH, COARSE_SPAN * (len(self.clips) + 1)))
 
     @cached_property
     def n_conditions(self) -> int:
@@ -255,19 +268,42 @@ class CableModel:
 
     @cached_property
     def border_names(self) -> tuple[str, ...]:
-        """Names of the unknowns beside the nodes: end conditions' multipliers, then springs'.
+        """Names of the unknowns beside the nodes: end conditions' multipliers, springs', clips'.
 
         A spring's place y [m] is an unknown of its own, held on the cable by a multiplier [N]: the
-        Hessian then couples neighbouring nodes only, see `SpringAt`.
+        Hessian then couples neighbouring nodes only, see `SpringAt`. An eyelet's arc length [m] is
+        an unknown, too.
         """
-        own = [f"{what}_{axis}" for what in ("place", "pull") for axis in self.node.axes]
-        springs = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in own]
-        return (*self.condition_names, *springs)
+        places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
+        names = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in (*places, *pulls)]
+        for k, kind in enumerate(self.clips):
+            names += [f"clip_{k}.{name}" for name in pulls]
+            names += [f"clip_{k}.place_s"] * (kind == "eyelet")
+        return (*self.condition_names, *names)
+
+    @cached_property
+    def pulls(self) -> list[list[int]]:
+        """Rows of the border (dimension,) of the force on each spring, then on each clip [N]."""
+        owners = [f"spring_{k}" for k in range(self.n_springs)]
+        owners += [f"clip_{k}" for k in range(len(self.clips))]
+        rows = self.border_names.index
+        return [[rows(f"{one}.pull_{axis}") for axis in self.node.axes] for one in owners]
+
+    @cached_property
+    def sliding(self) -> dict[int, int]:
+        """Index of each eyelet among the clips -> row of its arc length in the border."""
+        eyelets = [k for k, kind in enumerate(self.clips) if kind == "eyelet"]
+        return {k: self.border_names.index(f"clip_{k}.place_s") for k in eyelets}
+
+    @property
+    def clamped_between(self) -> bool:
+        """Whether a clip between the ends holds the direction of the cable."""
+        return any(kind in CLAMPS for kind in self.clips)
 
     @property
     def n_multipliers(self) -> int:
         """Number of multipliers in the border: negative eigenvalues of a minimum's Hessian."""
-        return self.n_conditions + self.node.dimension * self.n_springs
+        return int(self.are_multipliers.sum())
 
     @cached_property
     def are_multipliers(self) -> BoolArray:

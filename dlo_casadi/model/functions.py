@@ -9,10 +9,11 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import MODELS, SegmentNumbers, lagrangian_of
-from dlo_casadi.rod.element import Segment
+from dlo_casadi.rod.element import LAYOUT_SIZE, Cell, Segment
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
 
@@ -33,8 +34,13 @@ class Functions:
         self._segment_arguments = [x, lam, p, rest, place, deviation]
         self._end_arguments = [x, lam, p, self.terms.pose, deviation]
         # Variables of the first and second derivatives, and the numbers by which gradients of
-        # segments are differentiated, too.
-        self._by, self._numbers = ca.vertcat(self.terms.delta, lam), ca.vertcat(p, rest, deviation)
+        # segments are differentiated, too. Arc lengths of eyelets stand in `place`.
+        border = ca.vertsplit(lam) if lam.numel() else []
+        self._sliding = [(row, place[LAYOUT_SIZE + k]) for k, row in model.sliding.items()]
+        for row, s in self._sliding:
+            border[row] = s
+        self._by = ca.vertcat(self.terms.delta, *border)
+        self._numbers = ca.vertcat(p, rest, deviation)
 
     def _here(
         self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
@@ -59,7 +65,10 @@ class Functions:
     def _gradient(self) -> ca.SX:
         """Gradient (2b + k,) of the Lagrangian of a segment."""
         if self.kind.framed:
-            return self._of_forces @ self._about_nodes.gradient
+            gradient = self._of_forces @ self._about_nodes.gradient
+            for row, s in self._sliding:
+                gradient[2 * self.node.increment + row] = ca.gradient(self._about_nodes.value, s)
+            return gradient
         return ca.gradient(self.terms.segment_terms.lagrangian, self._by)
 
     @cached_property
@@ -68,6 +77,10 @@ class Functions:
         if self.kind.framed:
             found, spread = self._about_nodes, self._of_forces
             value, hessian = found.value, spread @ found.hessian @ spread.T
+            for row, s in self._sliding:
+                k = 2 * self.node.increment + row
+                hessian[:, k] = ca.jacobian(self._gradient, s)
+                hessian[k, :] = hessian[:, k].T
         else:
             value = self.terms.segment_terms.lagrangian
             hessian, _ = ca.hessian(value, self._by)
@@ -102,7 +115,7 @@ class Functions:
         segment = self.terms.segment(ratio, inner, inner**2)
         energy = self.terms.segment_energy(segment)
         energy = kind.expanded(segment, energy, self.terms.elastic_energy)
-        energy += self.model.chain.h * axial**2 / 2
+        energy += self.terms.length * axial**2 / 2
         own = ca.reshape(unknowns[self.model.n_inner - kind.n_inner :], inner.shape)
         reached = ca.gradient(self.terms.work_of_multipliers(segment), self.terms.lam)
         outputs = ca.substitute([energy, reached], [inner], [own])
@@ -113,16 +126,15 @@ class Functions:
     def _framed(self) -> SegmentInFrame:
         """The segment in space, at this model's own symbols."""
         free, lam = self.model.end == "free", self.terms.lam
-        multipliers = [ca.SX.zeros(3)] * free + [lam[k : k + 3] for k in self._force_rows]
+        multipliers = [ca.SX.zeros(3)] * free + [lam[rows] for rows in self._force_rows]
         _, _, p, rest, place, deviation = self._segment_arguments
         numbers = SegmentNumbers(p, rest, place, deviation, ca.SX(self.terms.shares(p, place)))
         return self.terms.in_frame(self.terms.x, ca.horzcat(*multipliers), numbers)
 
     @property
-    def _force_rows(self) -> list[int]:
-        """First rows, in the border, of the force on the end's holder and of springs' forces."""
-        springs = [self.model.n_conditions + 6 * k + 3 for k in range(self.model.n_springs)]
-        return springs if self.model.end == "free" else [0, *springs]
+    def _force_rows(self) -> list[list[int]]:
+        """Rows, in the border, of the forces on the end's holder, on springs and on clips."""
+        return [[0, 1, 2]] * (self.model.end != "free") + self.model.pulls
 
     @cached_property
     def _about_nodes(self) -> SegmentDerivatives:
@@ -135,7 +147,7 @@ class Functions:
         """Matrix from both nodes and these forces to both nodes and the border."""
         every = np.eye(6 + self.model.n_border)
         none = [np.zeros((len(every), 3))] * (self.model.end == "free")
-        forces = [every[:, 6 + k : 9 + k] for k in self._force_rows]
+        forces = [every[:, 6 + np.array(rows)] for rows in self._force_rows]
         return ca.sparsify(ca.DM(np.hstack([every[:, :6], *none, *forces])))
 
     @cached_property
@@ -176,6 +188,9 @@ class Functions:
             first, last, by_lam = self._framed.by_numbers(self._numbers)
             turns = self._framed.node_turns
             mixed = self._of_forces @ ca.vertcat(turns[0] @ first, turns[1] @ last, by_lam)
+            for row, _ in self._sliding:
+                k = 2 * self.node.increment + row
+                mixed[k, :] = ca.jacobian(self._gradient[k], self._numbers)
         else:
             mixed = ca.jacobian(self._gradient, self._numbers)
         return self._of_segment("segment_sensitivity", mixed, often=False)
@@ -212,6 +227,8 @@ class Functions:
         if self.kind.framed:
             # The advance is the Lagrangian's derivative by the force on the end's holder.
             by_nodes = (self._of_forces @ self._about_nodes.hessian)[:, 6:9].T
+            for row, s in self._sliding:
+                by_nodes[:, 6 + row] = ca.jacobian(self._about_nodes.by_lam[:3], s)
             advance = [by_nodes, self._framed.by_numbers(self._numbers)[2][:3, :]]
             ratio = [ca.jacobian(self._rates, one) for one in by]
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
@@ -336,6 +353,30 @@ class Functions:
         """(p) -> arc lengths (n_springs,) [m] of the springs on the cable."""
         places = [spring.position for spring in self.terms.springs]
         return ca.Function("spring_places", [self.terms.p], [ca.vertcat(ca.SX(0, 1), *places)])
+
+    @cached_property
+    def arc_lengths(self) -> ca.Function:
+        """(p, pose) -> true arc lengths (n_clips,) [m] of the clips; zero of eyelets."""
+        found = ca.vertcat(ca.SX(0, 1), *(s for _, s in self.terms.true_ends.clips))
+        return ca.Function("arc_lengths", [self.terms.p, self.terms.pose], [found])
+
+    @cached_property
+    def slips(self) -> FloatArray:
+        """Derivatives of `arc_lengths` by parameters (n_clips, n_parameters): numbers."""
+        at = self.arc_lengths(self.terms.p, self.terms.pose)
+        return np.array(ca.evalf(ca.jacobian(at, self.terms.p)))
+
+    @cached_property
+    def section_moment(self) -> ca.Function:
+        """(bend [1/m], p) -> moment [N m] of the section in the middle of the cable.
+
+        M = dW/dk of the energy W per length; in space about the material axis z.
+        """
+        bend, length = ca.SX.sym("bend"), self.model.cable.length
+        cell = Cell(ca.SX(0.499 * length), ca.SX(0.002 * length), 0.002 * length)
+        strain = ca.vertcat(ca.SX.zeros(len(self.node.strains) - 1), bend)
+        energy = self.terms.section.density(strain, cell)
+        return ca.Function("section_moment", [bend, self.terms.p], [ca.gradient(energy, bend)])
 
     @cached_property
     def dead_load(self) -> ca.Function:

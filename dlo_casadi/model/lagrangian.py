@@ -30,7 +30,8 @@ from dlo_casadi.model.cable_model import (
     VIEWPOINT_SIZE,
     CableModel,
 )
-from dlo_casadi.rod.element import Cell, Section, Segment
+from dlo_casadi.model.clips import clip_size
+from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentInFrame
 
@@ -73,13 +74,13 @@ class Lagrangian:
     deviation : (n_deviations,)
         Unknowns of one pose of its own, see `deviation_names`.
     lam : (n_border,)
-        Border: multipliers of the end conditions, then place and multiplier of each spring.
+        Border: multipliers of the end conditions, then unknowns of springs and of clips.
     x, delta : (2 coordinates,), (2 increment,)
         Coordinates of the two nodes of a segment, or of the first and last; their increments.
     rest_strains : (3 strains,) [1/m]
         Rest strains inside a segment, see `Chain.rest_stencils`.
-    place : (5,)
-        A row of `Layout.segments`.
+    place : (5 + n_clips,)
+        A row of `Layout.segments`, then the arc lengths of the clips.
     inner : (n_inner,)
         Internal unknowns of an element, which are eliminated.
     """
@@ -93,7 +94,7 @@ class Lagrangian:
         self.x = ca.SX.sym("x", 2 * self.node.coordinates)
         self.delta = ca.SX.sym("delta", 2 * self.node.increment)
         self.rest_strains = ca.SX.sym("rest", 3 * len(self.node.strains))
-        self.place = ca.SX.sym("place", model.chain.layout.segments.shape[1])
+        self.place = ca.SX.sym("place", LAYOUT_SIZE + len(model.clips))
         self.inner = ca.SX.sym("inner", self.kind.n_inner)
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
@@ -114,13 +115,22 @@ class Lagrangian:
     @property
     def declared_ends(self) -> ca.SX:
         """The ends as declared, see `EndConditions.vector`."""
-        return self.pose[:-VIEWPOINT_SIZE]
+        return self.pose[: EndConditions.size(self.node)]
 
     @property
     def viewpoint(self) -> Viewpoint:
         """Where the camera of a pose stands."""
+        size = EndConditions.size(self.node)
+        x, y, inverse = ca.vertsplit(self.pose[size : size + VIEWPOINT_SIZE])
         start = EndConditions.of(self.declared_ends, self.node).start
-        return Viewpoint(start, self.pose[-3:-1], self.pose[-1])
+        return Viewpoint(start, ca.vertcat(x, y), inverse)
+
+    @property
+    def declared_clips(self) -> tuple[tuple[ca.SX, ca.SX], ...]:
+        """Place and arc length of each clip as declared."""
+        numbers, d = self.pose[self.model.n_pose - self.model.clip_numbers :], self.node.dimension
+        rows = ca.vertsplit(numbers, clip_size(self.node)) if self.model.clips else []
+        return tuple((row[:d], row[-1]) for row in rows)
 
     @property
     def moved(self) -> list[ca.SX]:
@@ -133,19 +143,14 @@ class Lagrangian:
         """Local coordinates of a segment between the moved nodes, see `Element.local`."""
         return self.kind.local(*self.moved)
 
-    def spring_unknowns(self, k: int) -> tuple[ca.SX, ca.SX]:
-        """Place and multiplier of a spring."""
-        d = self.node.dimension
-        own = self.lam[self.model.n_conditions + 2 * d * k :][: 2 * d]
-        return own[:d], own[d:]
-
     @cached_property
     def true_ends(self) -> EndConditions:
         """True ends: as declared, plus the pose's deviation and the boundary effects."""
         d, b = self.node.dimension, self.node.increment
         place, first, last, _ = ca.vertsplit(self.deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
         declared = EndConditions.of(self.declared_ends, self.node)
-        ends = replace(declared, end=declared.end + place).turned(first, last)
+        ends = replace(declared, end=declared.end + place, clips=self.declared_clips)
+        ends = ends.turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
         if END_ROLL in self.model.names:
@@ -215,6 +220,8 @@ class Lagrangian:
         """The segment's symbols; numbers that all segments share are constants."""
         table = self.model.chain.layout.segments
         alike = np.all(table == table[0], axis=0)
+        if self.model.clamped_between:  # their nodes are moved along the cable
+            alike[:4] = False
         place = [ca.SX(table[0, i]) if alike[i] else self.place[i] for i in range(len(alike))]
         return Segment(
             local=self.local if local is None else local,
@@ -247,18 +254,6 @@ class Lagrangian:
         factors = (partial(product, factor) for factor in ("along", "of_bend", "tangent"))
         return Section(bending, known.get(TORSIONAL_STIFFNESS, ca.SX(0)), *factors)
 
-    @cached_property
-    def section_moment(self) -> ca.Function:
-        """(bend [1/m], p) -> moment [N m] of the section in the middle of the cable.
-
-        M = dW/dk of the energy W per length; in space about the material axis z.
-        """
-        bend, length = ca.SX.sym("bend"), self.model.cable.length
-        cell = Cell(ca.SX(0.499 * length), ca.SX(0.002 * length), 0.002 * length)
-        strain = ca.vertcat(ca.SX.zeros(len(self.node.strains) - 1), bend)
-        energy = self.section.density(strain, cell)
-        return ca.Function("section_moment", [bend, self.p], [ca.gradient(energy, bend)])
-
     def segment_energy(self, segment: Segment) -> ca.SX:
         """Elastic energy of one segment minus the work of the loads along it [J]."""
         return self.elastic_energy(segment) - self.work_along(segment, self.forces_on(segment))
@@ -281,30 +276,36 @@ class Lagrangian:
 
     @cached_property
     def share_symbols(self) -> ca.SX:
-        """Shares (0 to 1) of a segment that lie before each point force, then each spring."""
-        return ca.SX.sym("share", len(self.dead_forces) + self.model.n_springs)
+        """Shares (0 to 1) of a segment that lie before each point force, spring, and clip."""
+        return ca.SX.sym("share", len(self.dead_forces) + len(self.model.pulls))
 
     @cached_property
     def shares(self) -> ca.Function:
-        """(p, place) -> the shares of a segment (n_forces + n_springs,)."""
+        """(p, place) -> the shares of a segment (n_forces + n_springs + n_clips,)."""
         start = self.place[0]
         positions = [local.position for local in self.dead_forces]
         positions += [local.position for local in self.springs]
-        found = [ca.fmin(ca.fmax((s - start) / self.model.chain.h, 0), 1) for s in positions]
+        positions += ca.vertsplit(self.place[LAYOUT_SIZE:]) if self.model.clips else []
+        found = [ca.fmin(ca.fmax((s - start) / self.length, 0), 1) for s in positions]
         return ca.Function("shares", [self.p, self.place], [ca.vertcat(ca.SX.zeros(0), *found)])
+
+    @property
+    def length(self) -> ca.SX | float:
+        """Length of a segment [m], of all the same without clamped clips."""
+        return self.place[1] if self.model.clamped_between else self.model.chain.h
 
     def with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Expressions with the shares in place of their symbols."""
         return ca.substitute(expressions, [self.share_symbols], [self.shares(self.p, self.place)])
 
     def work_of_multipliers(self, segment: Segment) -> ca.SX:
-        """Work of the multipliers of places, of the end and of springs, along a segment [J]."""
+        """Work of the multipliers of places, of the end, springs and clips, along a segment [J]."""
         work = ca.SX(0)
         if self.model.end != "free":
             work = ca.dot(self.lam[: self.node.dimension], self.kind.advance(segment))
-        for k in range(self.model.n_springs):
+        for k, rows in enumerate(self.model.pulls):
             share = self.share_symbols[len(self.dead_forces) + k]
-            work += ca.dot(self.spring_unknowns(k)[1], self.kind.advance(segment, share))
+            work += ca.dot(self.lam[rows], self.kind.advance(segment, share))
         return work
 
     @cached_property
@@ -321,7 +322,7 @@ class Lagrangian:
 
         which is exact for dead loads; the internal unknowns are eliminated.
         """
-        kind, h = self.kind, self.model.chain.h
+        kind, h = self.kind, self.length
         ratio, inner = ca.SX.sym("ratio"), self.inner
         segment = self.segment(ratio, inner, inner**2)
         plain = self.segment_energy(segment) + self.work_of_multipliers(segment)
@@ -350,14 +351,14 @@ class Lagrangian:
         ----------
         x : (8,)
             Frames of both nodes.
-        multipliers : (3, 1 + n_springs) [N]
-            Force on the end's holder, then the multipliers of the springs.
+        multipliers : (3, 1 + n_springs + n_clips) [N]
+            Force on the end's holder, then on springs and clips.
         numbers : SegmentNumbers
         """
         spread, dead = len(self.kind.rule[0]), len(self.dead_forces)
-        weights = np.zeros((spread + dead + self.model.n_springs, multipliers.shape[1]))
+        weights = np.zeros((spread + dead + len(self.model.pulls), multipliers.shape[1]))
         weights[:spread, 0] = -1.0
-        weights[spread + dead :, 1:] = -np.eye(self.model.n_springs)
+        weights[spread + dead :, 1:] = -np.eye(len(self.model.pulls))
         loads = self.segment_forces(numbers.p, numbers.place, numbers.deviation)
 
         def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
@@ -371,7 +372,7 @@ class Lagrangian:
     def segment_forces(self) -> ca.Function:
         """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `segment_in_frame`."""
         forces = self.forces_on(self.segment(self.stretch, self.inner, ca.SX(0)))
-        forces += [ca.SX.zeros(self.node.dimension)] * self.model.n_springs
+        forces += [ca.SX.zeros(self.node.dimension)] * len(self.model.pulls)
         arguments = [self.p, self.place, self.deviation]
         return ca.Function("segment_forces", arguments, [ca.horzcat(*forces)])
 
@@ -381,12 +382,12 @@ class Lagrangian:
 
         Its minimum over the internal unknowns is that of `segment_by_share`. Forces are arguments:
         the energy does not change when a segment and the forces on it are rotated together.
-        Multipliers of the end's place and of springs are such forces, too, see `in_frame`.
+        Multipliers of the end's place, springs and clips are such forces, too, see `in_frame`.
         """
-        kind, h, inner = self.kind, self.model.chain.h, self.inner
+        kind, h, inner = self.kind, self.length, self.inner
         ratio, local = ca.SX.sym("ratio"), ca.SX.sym("local", self.local.numel())
         segment = self.segment(ratio, inner, inner**2, local)
-        count = len(self.forces_on(segment)) + self.model.n_springs
+        count = len(self.forces_on(segment)) + len(self.model.pulls)
         forces = ca.SX.sym("force", self.node.dimension, count)
         energy = self.elastic_energy(segment) - self.work_along(segment, ca.horzsplit(forces))
         tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
@@ -431,9 +432,13 @@ class Lagrangian:
             total += effect.energy(first, last, local)
         for k, compliance in self.compliance_of.items():
             total -= compliance * self.lam[k] ** 2 / 2
-        for k, spring in enumerate(self.springs):
-            place, multiplier = self.spring_unknowns(k)
-            total += spring.energy(place) + ca.dot(multiplier, true.start - place)
+        # A spring's place stands before its multiplier.
+        d, springs = self.node.dimension, self.model.pulls[: self.model.n_springs]
+        places = [self.lam[[row - d for row in rows]] for rows in springs]
+        total += sum(k.energy(y) for k, y in zip(self.springs, places, strict=True))
+        places += [place for place, _ in true.clips]
+        for place, rows in zip(places, self.model.pulls, strict=True):
+            total += ca.dot(self.lam[rows], true.start - place)
         return total - ca.dot(self.total_load, true.start)
 
 

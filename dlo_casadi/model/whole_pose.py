@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import clip_size, moved_rest
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
 
@@ -57,16 +58,17 @@ class Potential:
     conditions: ca.SX
 
 
-def potential(model: CableModel) -> Potential:
+def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
 
-    The coordinates are the nodes', the places of springs, the unknowns inside the segments, then
-    those of clamps that give way: a clamp of the compliance c turns by sqrt(c) a and stores a^2/2.
+    The coordinates are the nodes', the places of springs and eyelets, the unknowns inside the
+    segments, then those of clamps that give way: a clamp of the compliance c turns by sqrt(c) a and
+    stores a^2/2. `clamped`: the nodes that the clamped clips hold, see `clips.clamped_nodes`.
     """
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
     energy, gradient, _ = functions.at_ends(*_end_arguments(model, s))
-    own, reached = functions.segment_potential(*_segment_arguments(model, s), inner)
+    own, reached = functions.segment_potential(*_segment_arguments(model, s, clamped), inner)
     energy = sum(ca.horzsplit(own), start=energy)
     conditions = sum(ca.horzsplit(reached), start=gradient[2 * model.node.increment :])
     multipliers = np.flatnonzero(model.are_multipliers).tolist()
@@ -77,6 +79,9 @@ def potential(model: CableModel) -> Potential:
         conditions[lagrangian.compliant] -= ca.sqrt(lagrangian.compliances(s.p)) * given_way
     given, zero = [energy, conditions[multipliers]], ca.SX.zeros(len(multipliers))
     energy, conditions = ca.substitute(given, [s.lam[multipliers]], [zero])
+    for node, frame in zip(clamped, _clip_frames(model, s), strict=True):
+        # Nothing else depends on the own coordinates of a node that a clip holds.
+        energy += ca.sumsqr(s.x[_rows(model, node)] - frame) / 2
     coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
     parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
     return Potential(coordinates, parameters, energy, conditions)
@@ -177,12 +182,44 @@ def _end_arguments(model: CableModel, s: PoseSymbols) -> list[Any]:
     return [both, s.lam, s.p, s.pose, s.deviation]
 
 
-def _segment_arguments(model: CableModel, s: PoseSymbols) -> list[Any]:
+def _rows(model: CableModel, node: int) -> list[int]:
+    """Rows of a node's coordinates."""
+    c = model.node.coordinates
+    return list(range(c * node, c * (node + 1)))
+
+
+def _clip_frames(model: CableModel, s: PoseSymbols) -> list[Any]:
+    """Frames of the clips that hold the cable's direction and roll, from the pose."""
+    size, c = clip_size(model.node), model.node.coordinates
+    ends = [
+        model.n_pose - size * (len(model.clips) - k) + size - 1 for k in range(len(model.clips))
+    ]
+    kinds = zip(ends, model.clips, strict=True)
+    return [s.pose[last - c : last] for last, kind in kinds if kind == "clamped"]
+
+
+def _segment_arguments(
+    model: CableModel, s: PoseSymbols, clamped: tuple[int, ...] = ()
+) -> list[Any]:
     """A column for each segment, or a single column of what all segments share."""
     chain = model.chain
     x = ca.reshape(s.x, model.node.coordinates, chain.n_nodes)
-    after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)
-    both = ca.vertcat(x[:, : chain.n_segments], x[:, after.tolist()])
     inside = chain.rest_inside(np.eye(chain.n_rests)).reshape((-1, chain.n_rests))
     rest = ca.reshape(ca.sparsify(ca.DM(inside)) @ s.rest, -1, chain.n_segments)
-    return [both, s.lam, s.p, rest, ca.DM(chain.layout.segments.T), s.deviation]
+    place: Any = ca.DM(chain.layout.segments.T)
+    if model.clips:
+        at = ca.vertsplit(ca.SX(functions_of(model).arc_lengths(s.p, s.pose)))
+        for k, row in model.sliding.items():
+            at[k] = s.lam[row]
+        places = ca.SX(ca.DM(chain.places))
+        held = [k for k, kind in enumerate(model.clips) if kind == "clamped"]
+        for k, node, frame in zip(held, clamped, _clip_frames(model, s), strict=True):
+            x[:, node], places[node] = frame, at[k]
+        low, width = places[:-1].T, (places[1:] - places[:-1]).T
+        if clamped:
+            place = ca.vertcat(low, width, low, width, ca.DM.ones(1, chain.n_segments))
+            rest = moved_rest(chain, rest, low, width)
+        place = ca.vertcat(place, ca.repmat(ca.vertcat(*at), 1, chain.n_segments))
+    after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)
+    both = ca.vertcat(x[:, : chain.n_segments], x[:, after.tolist()])
+    return [both, s.lam, s.p, rest, place, s.deviation]

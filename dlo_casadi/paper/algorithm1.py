@@ -262,8 +262,8 @@ class InnerProblem:
 
 
 def applies(model: CableModel) -> bool:
-    """Whether the paper's method applies to the cable: in a plane, pinned at both ends."""
-    return model.node is Heading and model.start == model.end == "pinned"
+    """Whether the paper's method applies to the cable: in a plane, pinned at both ends alone."""
+    return model.node is Heading and model.start == model.end == "pinned" and not model.clips
 
 
 def gravity_slopes(phi: FloatArray, weight: FloatArray, h: float) -> FloatArray:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import numpy as np
@@ -222,7 +222,8 @@ def parameters_text(outcome: Outcome) -> str:
 def fitted_cable(outcome: Outcome) -> FittedCable:
     """The fitted cable of a run, as `load` would read it from the run's file."""
     fit, metadata = outcome.fit, metadata_of(parameters_dict(outcome), outcome.config.path)
-    return FittedCable(fit.model, fit.p, final_rest(fit), metadata)
+    # What held it in the session is no part of a cable.
+    return FittedCable(replace(fit.model, clips=()), fit.p, final_rest(fit), metadata)
 
 
 def parameters_dict(outcome: Outcome) -> dict[str, Any]:

@@ -16,6 +16,9 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.rod.node import Node
 
+# Numbers of a segment in `Layout.segments`.
+LAYOUT_SIZE = 5
+
 
 @dataclass(frozen=True)
 class Cell:

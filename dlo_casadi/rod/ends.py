@@ -32,7 +32,8 @@ class EndConditions:
     """Where and how the ends are held: symbols of one pose.
 
     `start`, `end` (dimension,) [m]; `start_frame`, `end_frame` (coordinates,): the clamps as a
-    node would carry them, in a plane their headings [rad]. `node` is what the nodes carry.
+    node would carry them, in a plane their headings [rad]. `node` is what the nodes carry. `clips`:
+    places (dimension,) [m] and arc lengths [m] of the clips between the ends.
     """
 
     start: ca.SX
@@ -40,6 +41,7 @@ class EndConditions:
     start_frame: ca.SX
     end_frame: ca.SX
     node: type[Node]
+    clips: tuple[tuple[ca.SX, ca.SX], ...] = ()
 
     @staticmethod
     def size(node: type[Node]) -> int:

@@ -117,6 +117,7 @@ def declared_model(
         end=experiment.boundary.end,
         gravity=experiment.gravity,
         n_rest=REST_COEFFICIENTS if coefficients is None else coefficients,
+        clips=experiment.clips,
     )
     if END_ROLL in model.names:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
@@ -202,8 +203,8 @@ class Minimum(NamedTuple):
 
 
 def minimum_by_ipopt(fit: Fit) -> Minimum:
-    """Minimum of the batch NLP, from the Gauss-Newton fit's; none is looked for in space."""
-    if fit.model.in_space:
+    """Minimum of the batch NLP, from the Gauss-Newton fit's; none in space or with clips."""
+    if fit.model.in_space or fit.model.clips:
         return Minimum(searched=False)
     began = time.perf_counter()
     try:
@@ -217,8 +218,8 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
     """The fit, compared with IPOPT's minimum.
 
     Where that is lower by more than what a descent stops at, it is the fit's. Where it is the same,
-    the fit has converged; where IPOPT has failed, it has not. In space, and where IPOPT ends
-    higher, the fit stays as it is.
+    the fit has converged; where IPOPT has failed, it has not. In space, with clips, and where IPOPT
+    ends higher, the fit stays as it is.
     """
     point, own = found.point, fit.point.objective
     if not found.searched:

@@ -1,0 +1,121 @@
+"""Clips of a pose: what holds the cable between its ends, and what may be wrong with them."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, Protocol
+
+from dlo_casadi.config.values import ConfigSection, Name, NonNegative, Number, Place, Quaternion
+from dlo_casadi.model.clips import Clip as HeldClip
+
+
+class Clip(ConfigSection):
+    """A clip that holds the cable between its ends."""
+
+    name: Name = ""
+    """What to call the clip; clip_1, clip_2, ... when absent."""
+    kind: Literal["pinned", "clamped", "eyelet"]
+    """pinned (holds the cable at `at`, it may turn), clamped (a saddle: holds its direction and
+    roll, too) or eyelet (the cable slides through without friction)."""
+    at: NonNegative | None = None
+    """Arc length from the start at which it holds the cable [m]; an eyelet has none."""
+    place: Place
+    """Where the cable is held [m]: [x, y], in space [x, y, z]."""
+    heading: Number | None = None
+    """Direction of the cable in a clamped clip in a plane, continuous along the cable [rad]."""
+    orientation: Quaternion | None = None
+    """Frame of a clamped clip in space, a quaternion [qx, qy, qz, qw]; x forward along the
+    cable."""
+    roll: Literal["held", "free"] = "held"
+    """In space: whether a clamped clip holds the roll of the cable about its axis."""
+
+    def held(self, number: int) -> HeldClip:
+        """The same for the statics; `number` names it where it has no name."""
+        return HeldClip(
+            kind="swivel" if self.kind == "clamped" and self.roll == "free" else self.kind,
+            place=self.place,
+            at=self.at,
+            heading=self.heading,
+            orientation=self.orientation,
+            name=self.name or f"clip_{number}",
+        )
+
+
+class _Clipped(Protocol):
+    """A pose with clips."""
+
+    @property
+    def start(self) -> Sequence[float]: ...
+    @property
+    def end(self) -> Sequence[float] | None: ...
+    @property
+    def clips(self) -> Sequence[Clip]: ...
+    @property
+    def held(self) -> Any: ...
+
+
+def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[str, int]]:
+    """What is wrong with the clips of a pose on a cable of that length [m], and which clip.
+
+    `axes`: 2 in a plane, 3 in space.
+    """
+    last = 0.0
+    for k, (clip, held) in enumerate(zip(pose.clips, pose.held.clips, strict=True)):
+        called, space = held.name, axes == 3
+        if len(clip.place) != axes:
+            yield f"{called}: place: {'[x, y, z]' if space else '[x, y]'} belongs here", k
+        wanted, other = ("orientation", "heading") if space else ("heading", "orientation")
+        if clip.kind == "clamped" and getattr(clip, wanted) is None:
+            unit = "[qx, qy, qz, qw]" if space else "[rad], continuous along the cable"
+            yield f"{called}: a clamped clip needs its {wanted} {unit}", k
+        if getattr(clip, other) is not None:
+            yield f"{called}: {other} is of a cable in {'a plane' if space else 'space'}", k
+        if clip.kind != "clamped" and getattr(clip, wanted) is not None:
+            yield f"{called}: {wanted} is of a clamped clip, it is {clip.kind}", k
+        if clip.roll == "free" and not (space and clip.kind == "clamped"):
+            yield f"{called}: roll: free is of a clamped clip in space", k
+        if (clip.at is None) != (clip.kind == "eyelet"):
+            how = "no at: the cable slides through" if clip.at is not None else "at [m]"
+            yield f"{called}: {clip.kind} clips have {how}", k
+        elif clip.at is not None and not 0.0 < clip.at < length:
+            yield f"{called}: at {clip.at:g} m is not between 0 and cable.length {length:g} m", k
+        elif clip.at is not None and clip.at <= last:
+            text = f"at {clip.at:g} m follows {last:g} m: clips stand in the order along the cable"
+            yield f"{called}: {text}", k
+        last = clip.at if clip.at is not None else last
+
+
+def too_short(pose: _Clipped, length: float, slack: float) -> str:
+    """Why a pose cannot be: a span is longer than its cable, by more than a slack [m]; or empty."""
+    names = ["the start", *(clip.name for clip in pose.held.clips), "the end"]
+    places = [pose.start, *(clip.place for clip in pose.clips), pose.end]
+    at = [0.0, *(clip.at for clip in pose.clips), length]
+    low, straight = 0, 0.0
+    for k in range(1, len(places)):
+        here, before = places[k], places[k - 1]
+        if here is None or before is None:
+            return ""
+        straight += math.dist(before, here)
+        s, start = at[k], at[low]
+        if s is None or start is None:
+            continue
+        if straight > s - start + slack:
+            return (
+                f"{names[low]} and {names[k]} are {straight:.4g} m apart"
+                f"{' by way of the eyelets' if k > low + 1 else ''}, with {s - start:.4g} m of "
+                "cable between them. Places and arc lengths in metres?"
+            )
+        low, straight = k, 0.0
+    return ""
+
+
+def clips_differ(poses: Sequence[_Clipped]) -> str:
+    """Why poses are not of one session: their clips are of other kinds or numbers; or empty."""
+    kinds = [[clip.kind for clip in pose.held.clips] for pose in poses]
+    for i, own in enumerate(kinds):
+        if own != kinds[0]:
+            first, other = (", ".join(x) or "none" for x in (kinds[0], own))
+            return (
+                f"pose {i + 1} has the clips {other}, pose 1 {first}: the poses of a session have "
+                "clips of the same kinds in the same order. Try: a session of its own"
+            )
+    return ""

@@ -1,0 +1,305 @@
+"""First guesses of a cable that clips hold between its ends: arcs, span by span.
+
+A span reaches from one holder to the next. In a plane the arc of a span turns either way; in space
+it bulges along gravity or is rotated about its chord by quarter turns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.guesses import (
+    arc_half_angle,
+    arc_headings,
+    arc_into_clamps,
+    arc_tangents,
+    carried,
+    frame_rotation,
+    guessed_frames,
+    guesses,
+    nearest_roll,
+    rolled,
+    smallest_turn,
+)
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import tangents
+from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.node import Frame
+
+# Half angle [rad] of an arc below which its sides are not told apart.
+_TAUT = 0.3
+# Maximum number of combinations of the spans' sides in a plane.
+MOST_SIDES = 16
+# Shares of the slack between two fixed arc lengths that the first of two spans takes.
+_SLACK = (0.5, 0.15, 0.85)
+# Least length of a span beside an eyelet, relative to its chord.
+_LEAST = 1.0 + 1e-3
+
+
+@dataclass(frozen=True)
+class _Holder:
+    """One that holds the cable: an end or a clip. `at` is None of an eyelet, `place` of a tip."""
+
+    at: float | None
+    place: FloatArray | None
+    frame: FloatArray | None = None
+    rolls: bool = False
+
+
+@dataclass(frozen=True)
+class Span:
+    """The cable between two holders; arc lengths [m], `chord` (dimension,) [m] or None at a tip."""
+
+    start: float
+    end: float
+    chord: FloatArray | None
+    frames: tuple[FloatArray | None, FloatArray | None]
+
+    @property
+    def length(self) -> float:
+        """Length along the cable [m]."""
+        return self.end - self.start
+
+    @property
+    def taut(self) -> bool:
+        """Whether the sides of its arc are hardly apart."""
+        size = 0.0 if self.chord is None else float(np.linalg.norm(self.chord))
+        return arc_half_angle(size, self.length) < _TAUT
+
+
+def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
+    """All that holds the cable, from start to end; arc lengths relative to the declared length."""
+    ends, _ = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
+    d, c = model.node.dimension, model.node.coordinates
+    start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
+    found = [_Holder(0.0, start, first if model.start == "clamped" else None)]
+    for clip in pose.clips:
+        rolls = clip.kind == "swivel"
+        found.append(_Holder(clip.at, np.array(clip.place), clip.frame, rolls))
+    own = last if model.end == "clamped" else None
+    found.append(_Holder(model.cable.length, None if model.end == "free" else end, own))
+    return found
+
+
+def chords(held: Sequence[_Holder]) -> list[float]:
+    """Distances [m] from each holder to the next; zero to a free tip."""
+    return [
+        0.0 if a.place is None or b.place is None else float(np.linalg.norm(b.place - a.place))
+        for a, b in pairwise(held)
+    ]
+
+
+def fixed_stretches(held: Sequence[_Holder]) -> list[tuple[int, int, float]]:
+    """Pairs of holders with only eyelets between them, and the declared length [m] in between."""
+    known = [(k, one.at) for k, one in enumerate(held) if one.at is not None]
+    return [(low, high, end - start) for (low, start), (high, end) in pairwise(known)]
+
+
+def _arc_lengths(held: Sequence[_Holder], share: float) -> list[float]:
+    """Arc lengths [m] of all holders; eyelets share the slack evenly, or as _SLACK says."""
+    at, apart = [one.at or 0.0 for one in held], chords(held)
+    for low, high, length in fixed_stretches(held):
+        own = np.array(apart[low:high])
+        slack = max(length - own.sum(), 0.0)
+        weights = own + 1e-3 * length
+        if share != _SLACK[0]:
+            weights = np.full(len(own), (1 - share) / max(len(own) - 1, 1))
+            weights[0] = share
+        parts = own + slack * weights / weights.sum()
+        at[low + 1 : high] = at[low] + np.cumsum(parts)[:-1] * length / parts.sum()
+    return at
+
+
+def spans_of(held: Sequence[_Holder], at: Sequence[float]) -> list[Span]:
+    """The spans between holders at these arc lengths [m]."""
+    found = []
+    for (a, b), (s, e) in zip(pairwise(held), pairwise(at), strict=True):
+        chord = None if a.place is None or b.place is None else b.place - a.place
+        found.append(Span(s, e, chord, (a.frame, b.frame)))
+    return found
+
+
+def first_guesses(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose
+) -> list[tuple[FloatArray, FloatArray]]:
+    """First guesses of a pose: nodes (n_nodes, coordinates), and the border (n_border,).
+
+    Of a cable without clips `guesses` or `guessed_frames`; with clips arcs span by span.
+    """
+    if not pose.clips:
+        none = np.zeros(model.n_border)
+        if model.node is Frame:
+            return [(x, none) for x in guessed_frames(model, p, rest, pose)]
+        return [(phi[:, None], none) for phi in guesses(model, p, rest, pose)]
+    return _span_guesses(model, p, pose)
+
+
+def _span_guesses(
+    model: CableModel, p: FloatArray, pose: HeldPose
+) -> list[tuple[FloatArray, FloatArray]]:
+    held = holders(model, p, pose)
+    rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
+    out: list[tuple[FloatArray, FloatArray]] = []
+    for share in _SLACK if model.sliding else _SLACK[:1]:
+        at = _arc_lengths(held, share)
+        spans, border = spans_of(held, at), np.zeros(model.n_border)
+        for k, row in model.sliding.items():
+            border[row] = at[k + 1]
+        if model.node is Frame:
+            found = _in_space(model, pose, spans, [(at[k], held[k].frame) for k in rolls])
+        else:
+            found = _in_plane(model, pose, spans)
+        out += [(x, border) for x in found]
+    return out
+
+
+def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
+    """First guess of the border (n_border,) of nodes x: eyelets are nearest to their places."""
+    border, places = np.zeros(model.n_border), model.chain.places
+    if not model.sliding:
+        return border
+    ahead = tangents(model.node, x)
+    steps = (ahead[1:] + ahead[:-1]) / 2 * np.diff(places)[:, None]
+    points = np.vstack([np.zeros(steps.shape[1]), steps.cumsum(axis=0)]) + np.array(pose.start)
+    low = 0.0
+    for k, row in model.sliding.items():
+        gaps = np.linalg.norm(points - np.array(pose.clips[k].place), axis=1)
+        gaps[places <= low] = np.inf
+        border[row] = low = float(np.clip(places[gaps.argmin()], places[1], places[-2]))
+    return border
+
+
+def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
+    """Combinations of the sides of spans; of many, those that differ in one span alone."""
+    free = [1 if span.taut else choices for span in spans]
+    if np.prod(free) <= MOST_SIDES:
+        return list(product(*(range(count) for count in free)))
+    alike = [tuple(min(side, count - 1) for count in free) for side in range(choices)]
+    single = [
+        tuple(side if i == k else 0 for i in range(len(spans)))
+        for k, count in enumerate(free)
+        for side in range(1, count)
+    ]
+    return list(dict.fromkeys([*alike, *single]))
+
+
+# ---- in a plane ----------------------------------------------------------------------------------
+
+
+def _in_plane(model: CableModel, pose: HeldPose, spans: Sequence[Span]) -> list[FloatArray]:
+    gravity, out = np.array(model.gravity), []
+    for sides in _sides(spans, 2):
+        parts = [
+            _headings(model, span, (1 - 2 * side) * _sagging(span, gravity))
+            for span, side in zip(spans, sides, strict=True)
+        ]
+        fixed = [any(frame is not None for frame in span.frames) for span in spans]
+        _joined(parts, fixed)
+        at = np.concatenate([s for s, _ in parts])
+        phi = np.interp(model.chain.places, at, np.concatenate([phi for _, phi in parts]))
+        out.append(phi[:, None])
+    return out
+
+
+def _sagging(span: Span, gravity: FloatArray) -> int:
+    """Side of the arc that bulges along gravity: +1 turns counter-clockwise."""
+    if span.chord is None:
+        return 1
+    bulge = np.array([span.chord[1], -span.chord[0]])
+    return 1 if bulge @ gravity >= 0 else -1
+
+
+def _headings(model: CableModel, span: Span, side: int) -> tuple[FloatArray, FloatArray]:
+    """Arc lengths and headings inside a span, its ends a little inside so that kinks stay apart."""
+    u = np.linspace(0.0, 1.0, max(round(span.length / model.chain.h), 4) + 1)
+    inner = span.start + span.length * (1e-9 + (1 - 2e-9) * u)
+    if span.chord is None:
+        down = np.arctan2(model.gravity[1], model.gravity[0]) if any(model.gravity) else 0.0
+        first = down if span.frames[0] is None else float(span.frames[0][0])
+        drop = np.angle(np.exp(1j * (down - first)))
+        return inner, first + drop * (1 - np.exp(-4 * u))
+    chord = span.chord / span.length
+    if span.frames == (None, None):
+        return inner, arc_headings(u, 1.0, chord, side)
+    return inner, arc_into_clamps(u, chord, span.frames, side)[0]
+
+
+def _joined(parts: list[tuple[FloatArray, FloatArray]], fixed: list[bool]) -> None:
+    """Shift spans without a clamp by full turns toward their neighbours."""
+    known = list(fixed) if any(fixed) else [True] + [False] * (len(parts) - 1)
+    for order, own, beside in (
+        (range(1, len(parts)), 0, -1),
+        (range(len(parts) - 2, -1, -1), -1, 0),
+    ):
+        for k in order:
+            other = k - 1 if own == 0 else k + 1
+            if known[other] and not known[k]:
+                s, phi = parts[k]
+                turns = np.round((parts[other][1][beside] - phi[own]) / (2 * np.pi))
+                parts[k], known[k] = (s, phi + 2 * np.pi * turns), True
+
+
+# ---- in space ------------------------------------------------------------------------------------
+
+
+def _in_space(
+    model: CableModel,
+    pose: HeldPose,
+    spans: Sequence[Span],
+    clamps: Sequence[tuple[float, FloatArray | None]],
+) -> list[FloatArray]:
+    """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all that hold the roll, too."""
+    places, length = model.chain.places, model.chain.length
+    out = []
+    for sides in _sides(spans, 4):
+        axes = np.zeros((len(places), 3))
+        for span, quarter in zip(spans, sides, strict=True):
+            inside = (places >= span.start - 1e-9) & (places <= span.end + 1e-9)
+            u = np.clip((places[inside] - span.start) / span.length, 0.0, 1.0)
+            axes[inside] = _axes(model, span, quarter, u)
+        frames = np.zeros((len(places), 4))
+        edges: list[tuple[float, FloatArray | None]] = list(clamps)
+        if not edges or edges[0][0] > 0:
+            edges.insert(0, (0.0, None))
+        if edges[-1][0] < length:
+            edges.append((length, None))
+        for (low, first), (high, last) in pairwise(edges):
+            inside = (places >= low - 1e-9) & (places <= high + 1e-9)
+            u = (places[inside] - low) / (high - low)
+            both = frame_rotation(first), frame_rotation(last)
+            turned, roll = carried(u, axes[inside], both)
+            turns = pose.turns if high == length and None not in both else 0.0
+            frames[inside] = rolled(u, turned, both, nearest_roll(roll, turns))
+        # Neighbours carry quaternions of the same sign.
+        flips = np.where((frames[1:] * frames[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        out.append(frames * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
+    return out
+
+
+def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatArray:
+    """Tangents (k, 3) of the arc of a span, bent into its clamps."""
+    down = np.array(model.gravity)
+    forward = np.eye(3)[0]
+    ends = [None if one is None else Rotation.from_quat(one).apply(forward) for one in span.frames]
+    if span.chord is None:
+        down = down / max(float(np.linalg.norm(down)), 1e-12)
+        first = down if ends[0] is None else ends[0]
+        fall = smallest_turn(first, down if np.any(down) else first).as_rotvec()
+        return Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall).apply(first)
+    along = span.chord / max(float(np.linalg.norm(span.chord)), 1e-12)
+    side = down - (down @ along) * along
+    if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
+        side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
+    axes = arc_tangents(u, span.chord / span.length, turned)
+    arc = arc_tangents(np.array([0.0, 1.0]), span.chord / span.length, turned)
+    for end, own, decay in zip(ends, arc, ((1 - u) ** 5, u**5), strict=True):
+        if end is not None:
+            bend = smallest_turn(own, end).as_rotvec()
+            axes = Rotation.from_rotvec(decay[:, None] * bend).apply(axes)
+    return np.asarray(axes)

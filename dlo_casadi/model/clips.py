@@ -1,0 +1,306 @@
+"""Clips: what holds a cable between its ends.
+
+A clip k at the arc length s_k adds lam_k . (r(s_k) - place_k) to the Lagrangian. On every segment
+r(s_k) advances by the share of it that lies before s_k, as under a point force: arc lengths need
+not be nodes. Of an eyelet s_k is an unknown, too, and dL/ds_k = lam_k . t = 0: no force along the
+cable. A clamped clip bends the cable by a moment: the nearest node is moved to it and carries its
+frame, so that no element has a jump of curvature inside.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.rod.chain import Chain
+from dlo_casadi.rod.node import Heading, Node, quaternion_product
+
+# A swivel is a clamp in space in which the cable may roll about its axis.
+ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
+CLAMPS = ("clamped", "swivel")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip of one pose as declared.
+
+    Parameters
+    ----------
+    kind : ClipKind
+    place : (dimension,) [m]
+    at : float [m] or None
+        Arc length from the start at which it holds the cable; None of an eyelet.
+    heading : float [rad], optional
+        Direction of a clamped clip in a plane, continuous along the cable.
+    orientation : (4,), optional
+        Frame of a clamped clip in space: a unit quaternion (x, y, z, w), x forward.
+    name : str
+    """
+
+    kind: ClipKind
+    place: tuple[float, ...]
+    at: float | None = None
+    heading: float | None = None
+    orientation: tuple[float, ...] | None = None
+    name: str = "clip"
+
+    @property
+    def frame(self) -> FloatArray | None:
+        """Its frame (coordinates,) as a node carries it; None where the cable may turn."""
+        if self.kind not in CLAMPS:
+            return None
+        if self.orientation is None:
+            return np.array([self.heading], dtype=float)
+        found = np.array(self.orientation, dtype=float)
+        return found / max(np.linalg.norm(found), 1e-300)
+
+    def vector(self, node: type[Node]) -> FloatArray:
+        """Place, frame and arc length (`clip_size`,)."""
+        frame = self.frame
+        own = np.array(node.identity) if frame is None else frame
+        return np.concatenate([self.place, own, [self.at or 0.0]])
+
+
+@dataclass(frozen=True)
+class ClipLoad:
+    """What the cable does to a clip.
+
+    Parameters
+    ----------
+    at : float [m]
+        Arc length at which it holds the cable.
+    force : (dimension,) [N]
+    moment : (increment,) [N m]
+        In space about the world's axes; zero where the cable may turn.
+    """
+
+    at: float
+    force: FloatArray
+    moment: FloatArray
+
+
+def clip_rows(clips: Sequence[Clip], loads: Sequence[ClipLoad]) -> list[dict[str, Any]]:
+    """Clips and what the cable does to them, as plain data in SI units."""
+    return [
+        {
+            "name": clip.name,
+            "kind": "clamped" if clip.kind == "swivel" else clip.kind,
+            "at": load.at,
+            "force": load.force.tolist(),
+            "moment": load.moment.tolist(),
+        }
+        for clip, load in zip(clips, loads, strict=True)
+    ]
+
+
+def clip_size(node: type[Node]) -> int:
+    """Size of `Clip.vector`."""
+    return node.dimension + node.coordinates + 1
+
+
+@dataclass(frozen=True)
+class ClampNode:
+    """The nodes of m poses that carry the frame of one clamped clip.
+
+    `index` (m,) of the node, `frame` (m, coordinates), `held` (increment,): which rotations.
+    """
+
+    index: IntArray
+    frame: FloatArray
+    held: BoolArray
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """Where the clips of m poses are on their cables.
+
+    Parameters
+    ----------
+    chain : Chain
+    at : (m, k) [m]
+        Arc lengths of the clips.
+    clamps : tuple of ClampNode
+    places : (m, n + 1) [m]
+        Arc lengths of the nodes, those of clamped clips moved to them.
+    """
+
+    chain: Chain
+    at: FloatArray
+    clamps: tuple[ClampNode, ...]
+    places: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        chain: Chain,
+        kinds: tuple[str, ...],
+        declared: FloatArray,
+        at: FloatArray,
+        x: FloatArray,
+    ) -> "Clipped":
+        """Clips at the arc lengths `at` (m, k) [m] of shapes x (m, n_nodes, coordinates).
+
+        `declared` (m, k, clip_size) determines which node is the nearest, so that it stays the same
+        while an unknown slip changes.
+        """
+        node, rows = chain.kind.node, np.arange(len(x))
+        places, clamps = np.tile(chain.places, (len(x), 1)), []
+        for k, kind in enumerate(kinds):
+            if kind not in CLAMPS:
+                continue
+            index = np.rint(declared[:, k, -1] / chain.h).astype(np.intp).clip(1, chain.n - 1)
+            frame = declared[:, k, node.dimension : -1]
+            held = np.ones(node.increment, dtype=bool)
+            if kind == "swivel":
+                held[0] = False
+                frame = _rolled_with(frame, x[rows, index])
+            places[rows, index] = at[:, k]
+            clamps.append(ClampNode(index, frame, held))
+        return cls(chain, at, tuple(clamps), places)
+
+    def carried(self, both: FloatArray) -> FloatArray:
+        """Nodes (m, n_segments, 2 coordinates) of segments, with the frames of clamped clips."""
+        c, rows = both.shape[2] // 2, np.arange(len(both))
+        for clamp in self.clamps:
+            before, after = clamp.index - 1, clamp.index
+            both[rows, before, c:] = _alike(clamp.frame, both[rows, before, :c])
+            both[rows, after, :c] = _alike(clamp.frame, both[rows, after, c:])
+        return both
+
+    def segments(self) -> FloatArray:
+        """Rows of the layout (m, n_segments, 5 + k), with the arc lengths of the clips."""
+        table = np.tile(self.chain.layout.segments, (len(self.at), 1, 1))
+        if self.clamps:
+            table[..., [0, 2]] = self.places[:, :-1, None]
+            table[..., [1, 3]] = np.diff(self.places)[..., None]
+        at = np.broadcast_to(self.at[:, None], (*table.shape[:2], self.at.shape[1]))
+        return np.concatenate([table, at], axis=2)
+
+    def rest(self, inside: FloatArray) -> FloatArray:
+        """Rest strains inside (m, n_segments, 3 strains, q) of segments between moved nodes.
+
+        m + a x + c (x^2 - 1/12) of an even element, with x = x_0 + w y.
+        """
+        if not self.clamps:
+            return inside
+        low, width = self.places[:, :-1, None], np.diff(self.places)[..., None]
+        even = self.chain.places[:-1, None]
+        own, x, w = np.empty_like(inside), (low + width / 2 - even) / self.chain.h - 0.5, width
+        for k in range(0, inside.shape[2], 3):
+            own[:, :, k], own[:, :, k + 1], own[:, :, k + 2] = _within(
+                inside[:, :, k], inside[:, :, k + 1], inside[:, :, k + 2], x, w / self.chain.h
+            )
+        return own
+
+    def hold(self, force: Vector, x: FloatArray, stiffness: FloatArray) -> None:
+        """Hold the nodes x at clamped clips in their frames: by a stiffness (m,) [N m].
+
+        Nothing else feels it: in place of such a node the cable feels the frame, see `carried`.
+        """
+        rows = np.arange(len(x))[:, None]
+        for clamp in self.clamps:
+            gap = self.chain.kind.node.difference(clamp.frame, x[rows[:, 0], clamp.index])
+            held = (stiffness[:, None] * gap)[:, clamp.held, None]
+            force.x[rows, clamp.index[:, None], clamp.held] = held
+
+    def hold_matrix(self, matrix: BandMatrix, stiffness: FloatArray) -> None:
+        """The derivative of `hold`."""
+        rows = np.arange(len(stiffness))
+        for clamp in self.clamps:
+            i, free = clamp.index, ~clamp.held
+            matrix.diagonal[rows, i] *= np.outer(free, free)
+            matrix.diagonal[rows, i] += stiffness[:, None, None] * np.diag(clamp.held)
+            matrix.upper[rows, i - 1] *= free
+            matrix.upper[rows, i] *= free[:, None]
+            matrix.border[rows, i] *= free[:, None]
+
+    def loads(
+        self, kinds: Sequence[str], forces: FloatArray, by_turns: FloatArray
+    ) -> list[tuple[ClipLoad, ...]]:
+        """Loads on the clips of each pose: forces (m, k, dimension) [N], and moments.
+
+        `by_turns` (m, n_nodes, increment): derivatives of the energy by rotations of the nodes.
+        """
+        node, rows = self.chain.kind.node, np.arange(len(forces))
+        moments = np.zeros((*forces.shape[:2], node.increment))
+        clamped = [k for k, kind in enumerate(kinds) if kind in CLAMPS]
+        for k, clamp in zip(clamped, self.clamps, strict=True):
+            own = -by_turns[rows, clamp.index] * clamp.held
+            moments[:, k] = node.to_world(clamp.frame, own)
+        return [
+            tuple(ClipLoad(float(s), *both) for s, *both in zip(*each, strict=True))
+            for each in zip(self.at, forces, moments, strict=True)
+        ]
+
+    def evenly(self, stations: FloatArray) -> FloatArray:
+        """Places and dr/ds (m, n + 1, 2 d, q) at even arc lengths, from those at moved nodes."""
+        out, rows = stations.copy(), np.arange(len(stations))
+        for clamp in self.clamps:
+            s = self.chain.places[clamp.index]
+            e = clamp.index - (s <= self.places[rows, clamp.index])
+            width = self.places[rows, e + 1] - self.places[rows, e]
+            u = ((s - self.places[rows, e]) / width)[:, None, None]
+            width = width[:, None, None]
+            (r0, t0), (r1, t1) = (np.split(stations[rows, e + j], 2, axis=1) for j in (0, 1))
+            chord, v = r1 - r0, 1 - u
+            place = r0 + u**2 * (3 - 2 * u) * chord + width * u * v * (v * t0 - u * t1)
+            slope = 6 * u * v * chord / width + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1
+            out[rows, clamp.index] = np.concatenate([place, slope], axis=1)
+        return out
+
+
+def _within(mean: Any, a: Any, c: Any, x: Any, w: Any) -> tuple[Any, Any, Any]:
+    """Mean, linear and quadratic variation of m + a y + c (y^2 - 1/12) where y = x + w z."""
+    return mean + a * x + c * (x * x + (w * w - 1) / 12), w * (a + 2 * c * x), c * w * w
+
+
+def moved_rest(chain: Chain, inside: ca.SX, low: ca.SX, width: ca.SX) -> ca.SX:
+    """As `Clipped.rest`: symbols (3 strains, n_segments), segments (1, n_segments) [m]."""
+    x = (low + width / 2 - ca.DM(chain.places[:-1]).T) / chain.h - 0.5
+    rows = ca.vertsplit(inside)
+    own: list[ca.SX] = []
+    for mean, a, c in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
+        own += _within(mean, a, c, x, width / chain.h)
+    return ca.vertcat(*own)
+
+
+def clamped_nodes(chain: Chain, clips: Sequence[Clip]) -> tuple[int, ...]:
+    """Nodes that the clamped clips hold: the nearest ones."""
+    at = np.array([clip.at for clip in clips if clip.kind in CLAMPS], dtype=float)
+    return tuple(np.rint(at / chain.h).astype(int).clip(1, chain.n - 1).tolist())
+
+
+def node_places(chain: Chain, clips: Sequence[Clip]) -> FloatArray:
+    """Arc lengths (n_nodes,) [m] of the nodes, those that clamped clips hold moved to them."""
+    places = chain.places.copy()
+    held = [clip.at for clip in clips if clip.kind in CLAMPS]
+    places[list(clamped_nodes(chain, clips))] = held
+    return places
+
+
+def _alike(frame: FloatArray, beside: FloatArray) -> FloatArray:
+    """Frames (m, coordinates) with the signs of quaternions beside them; headings as they are."""
+    if frame.shape[1] == 1:
+        return frame
+    return frame * np.where((frame * beside).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+
+
+def _rolled_with(frame: FloatArray, x: FloatArray) -> FloatArray:
+    """Frames (m, 4) rolled about their x axes as quaternions x (m, 4) are against them."""
+    a, _, _, w = quaternion_product((*-frame.T[:3], frame.T[3]), x.T)
+    size = np.maximum(np.hypot(a, w), 1e-300)
+    zero = np.zeros_like(a)
+    return np.stack(quaternion_product(frame.T, (a / size, zero, zero, w / size)), axis=1)
+
+
+def tangents(node: type[Node], x: FloatArray) -> FloatArray:
+    """Unit tangents (..., dimension) of nodes (..., coordinates)."""
+    if node is Heading:
+        return np.concatenate([np.cos(x), np.sin(x)], axis=-1)
+    forward: Any = np.eye(3)[0]
+    flat = x.reshape((-1, node.coordinates))
+    return np.asarray(node.to_world(flat, forward)).reshape((*x.shape[:-1], node.dimension))

@@ -1,0 +1,205 @@
+"""Clips and eyelets between the ends, against closed forms, differences of the energy and IPOPT."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+from scipy.special import ellipe, ellipk
+
+from dlo_casadi.codegen import generate
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.minima import by_ipopt
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spans import first_guesses
+from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import Clip
+
+LENGTH, EI = 1.0, 0.02  # m, N m^2
+CABLE = CableData(LENGTH, mass=0.2, diameter=0.01, bending_stiffness=EI)
+LOOM = replace(CABLE, torsional_stiffness=0.015)
+
+
+def solved(clips, to=(0.8, 0.1), n=40, cable=CABLE, **held):
+    directions = {k: held.pop(k) for k in list(held) if "heading" in k or "orientation" in k}
+    kinds = tuple(clip.kind for clip in clips)
+    model = CableModel(cable, n=n, n_rest=0, clips=kinds, **held)
+    start = (0.0,) * len(model.gravity)
+    pose = HeldPose(start, to, clips=tuple(clips), **directions)
+    return model, pose, solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+
+
+def test_a_beam_on_three_supports():
+    """Clapeyron: M0 + 4 M1 + M2 = -w l^2 / 2 of equal spans l, with M2 = -w o^2 / 2."""
+    span, over, stiff = 0.45, 0.1, replace(CABLE, bending_stiffness=200.0)
+    supports = [Clip("eyelet", (span, 0.0)), Clip("eyelet", (2 * span, 0.0))]
+    model, _, eq = solved(supports, None, cable=stiff, end="free")
+    w = 9.81 * CABLE.mass / LENGTH
+    middle = 1.25 * w * span - 0.75 * w * over**2 / span
+    assert eq.stable
+    assert eq.clips[0].force == pytest.approx([0.0, -middle], rel=2e-4, abs=1e-5)
+    assert [load.at for load in eq.clips] == pytest.approx([span, 2 * span], abs=1e-5)
+
+
+def test_an_elastica_pinned_at_mid_span_converges_to_two_half_waves():
+    """Each half is pinned at both ends: F = EI (2 K / l)^2 with the chord l (2 E / K - 1)."""
+    half, chord = LENGTH / 2, 0.4
+    m = brentq(lambda m: 2 * ellipe(m) / ellipk(m) - 1 - chord / half, 1e-6, 0.9)
+    force = EI * (2 * ellipk(m) / half) ** 2
+    errors = []
+    for n in (20, 40):
+        clip = Clip("pinned", (chord, 0.0), 0.5)
+        _, _, eq = solved([clip], (2 * chord, 0.0), n, gravity=(0.0, 0.0))
+        assert np.abs(eq.clips[0].force).max() < 1e-9
+        errors.append(abs(np.linalg.norm(eq.end_force) / force - 1))
+    assert errors[1] < 1e-4 and np.log2(errors[0] / errors[1]) > 1.9
+
+
+def test_equal_tension_on_both_sides_of_an_eyelet():
+    """T + EI k^2 / 2 - w y is the same all along a heavy elastica, and through an eyelet, too."""
+    drops = []
+    for n in (20, 40):
+        _, _, eq = solved([Clip("eyelet", (0.42, 0.12))], (0.7, 0.25), n)
+        first, last = (np.array([np.cos(phi), np.sin(phi)]) for phi in eq.phi[[0, -1]])
+        drops.append(-eq.end_force @ last - eq.start_force @ first)  # T at the end minus the start
+    assert eq.stable
+    error = np.abs(np.array(drops) - 0.2 * 9.81 * 0.25)
+    assert error[1] < 2e-3 and np.log2(error[0] / error[1]) > 1.8
+
+
+def test_a_rod_clamped_in_three_places_is_two_rods():
+    middle, end = (0.4, 0.1), (0.75, -0.05)
+    clip = Clip("clamped", middle, 0.5, heading=0.3)
+    clamps = {"start": "clamped", "end": "clamped"}
+    _, _, whole = solved([clip], end, 20, start_heading=0.5, end_heading=-0.4, **clamps)
+    half = replace(CABLE, length=0.5, mass=0.1)
+    _, _, first = solved([], middle, 10, half, start_heading=0.5, end_heading=0.3, **clamps)
+    rest = tuple(np.subtract(end, middle))
+    _, _, last = solved([], rest, 10, half, start_heading=0.3, end_heading=-0.4, **clamps)
+    raised = -9.81 * 0.1 * -middle[1]  # the second rod starts at the clip
+    assert whole.energy == pytest.approx(first.energy + last.energy + raised, rel=1e-9)
+    (load,) = whole.clips
+    assert load.force == pytest.approx(first.end_force + last.start_force, rel=1e-9)
+    moment = np.ravel(first.moments)[1] + np.ravel(last.moments)[0]
+    assert load.moment == pytest.approx([moment], rel=1e-9)
+
+
+def turned(*vector):
+    return tuple(Rotation.from_rotvec(vector).as_quat())
+
+
+IN_SPACE = (
+    Clip("swivel", (0.3, 0.1, -0.05), 0.36, orientation=turned(0.2, 0.1, 0.4)),
+    Clip("eyelet", (0.6, 0.1, 0.05)),
+)
+
+
+def test_loads_on_clips_are_minus_the_derivatives_of_the_energy():
+    space = {
+        "gravity": (0.0, 0.0, -9.81),
+        "start": "clamped",
+        "end": "clamped",
+        "start_orientation": turned(0, 0.2, 0.1),
+        "end_orientation": turned(0.3, -0.2, 0.1),
+    }
+    model, pose, eq = solved(IN_SPACE, (0.7, 0.2, 0.1), 20, LOOM, **space)
+    rest, step = np.zeros(model.chain.n_rests), 1e-5
+    assert eq.stable and eq.residual < 1e-12
+
+    def slope(k, changed):
+        energies = []
+        for h in (step, -step):
+            clips = [*IN_SPACE[:k], changed(IN_SPACE[k], h), *IN_SPACE[k + 1 :]]
+            there = replace(pose, clips=tuple(clips))
+            energies.append(
+                solve_equilibrium(model, model.nominal, rest, there, x_init=eq.x).energy
+            )
+        return (energies[0] - energies[1]) / (2 * step)
+
+    for k in (0, 1):
+        for axis in np.eye(3):
+            moved = slope(k, lambda c, h, axis=axis: replace(c, place=tuple(c.place + h * axis)))
+            assert axis @ eq.clips[k].force == pytest.approx(-moved, abs=2e-6)
+
+    def twisted(clip, h, axis):
+        turn = Rotation.from_rotvec(h * axis) * Rotation.from_quat(clip.orientation)
+        return replace(clip, orientation=tuple(turn.as_quat()))
+
+    for axis in np.eye(3):
+        by_turn = slope(0, lambda c, h, axis=axis: twisted(c, h, axis))
+        assert axis @ eq.clips[0].moment == pytest.approx(-by_turn, abs=2e-6)
+    along = Rotation.from_quat(IN_SPACE[0].orientation).apply([1.0, 0.0, 0.0])
+    assert eq.clips[0].moment @ along == pytest.approx(0.0, abs=1e-9)  # a swivel holds no twist
+
+
+@pytest.mark.parametrize("second", ["pinned", "eyelet"])
+def test_ipopt_finds_the_same_minimum(second):
+    clips = (
+        Clip("clamped", (0.31, 0.05), 0.36, heading=0.3),
+        Clip(second, (0.57, -0.02), 0.7 if second == "pinned" else None),
+    )
+    model, pose, eq = solved(clips, (0.75, 0.1), 20)
+    rest = np.zeros(model.chain.n_rests)
+    found = [
+        by_ipopt(model, model.nominal, rest, pose, x[:, 0])
+        for x, _ in first_guesses(model, model.nominal, rest, pose)
+    ]
+    energies = [own.energy for own in found if own is not None and own.stable]
+    assert eq.stable and eq.energy == pytest.approx(min(energies), rel=1e-9)
+
+
+def test_the_tangent_is_the_derivative_of_the_balance():
+    model, pose, eq = solved(
+        IN_SPACE, (0.7, 0.2, 0.1), 10, LOOM, gravity=(0.0, 0.0, -9.81), start="clamped",
+        start_orientation=turned(0, 0.2, 0.1),
+    )  # fmt: skip
+    assembly = assembly_of(model)
+    given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), pose.vector[None])
+    dense = assembly.balance(eq.shapes, given)[2].dense()[0]
+    b, step = model.node.increment, 1e-6
+    for column in (3, 3 * 4, 3 * 5 + 1, b * model.chain.n_nodes + 1, len(dense) - 1):
+        rows = []
+        for h in (step, -step):
+            delta = np.zeros(len(dense))
+            delta[column] = h
+            nodes = delta[: b * model.chain.n_nodes].reshape((*eq.x[None].shape[:2], b))
+            x = model.node.moved(eq.x[None], nodes)
+            lam = eq.multipliers[None] + delta[b * model.chain.n_nodes :]
+            moved = replace(eq.shapes, x=x, lam=lam)
+            rows.append(assembly.imbalance(moved, given).rows[0, :, 0])
+        assert dense[:, column] == pytest.approx((rows[0] - rows[1]) / (2 * step), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("clips", "said"),
+    [
+        ([Clip("pinned", (0.5, 0.3), 0.4, name="first")], "first are 0.5831 m apart"),
+        ([Clip("eyelet", (0.5, 0.6))], "the start and the end are 1.3.* 1.0000 m of cable"),
+        (
+            [
+                Clip("clamped", (0.3, 0.1), 0.4, heading=0.0),
+                Clip("clamped", (0.31, 0.1), 0.411, heading=0.0),
+            ],
+            "nearer to each other than an element",
+        ),
+    ],
+)
+def test_clips_that_leave_no_room(clips, said):
+    with pytest.raises(EquilibriumError, match=said):
+        solved(clips)
+
+
+def test_a_pose_with_other_clips_than_the_model():
+    model, pose, _ = solved([Clip("pinned", (0.4, 0.15), 0.47)])
+    with pytest.raises(EquilibriumError, match="the pose has the clips none, the model pinned"):
+        solve_equilibrium(model, model.nominal, np.zeros(40), replace(pose, clips=()))
+
+
+def test_the_c_solver_refuses_clips():
+    model, *_ = solved([Clip("pinned", (0.4, 0.15), 0.47)])
+    with pytest.raises(DloError, match="1 clip"):
+        generate(model, model.nominal, np.zeros(40))
