@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
 
 from dlo_casadi.codegen import generate
+from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import first_guesses
-from dlo_casadi.errors import DloError, EquilibriumError
+from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import Clip
@@ -203,3 +204,46 @@ def test_the_c_solver_refuses_clips():
     model, *_ = solved([Clip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(DloError, match="1 clip"):
         generate(model, model.nominal, np.zeros(40))
+
+
+SESSION = """\
+cable: {name: harness, length: 0.8, mass: 0.05, diameter: 0.005, bending_stiffness: 0.01}
+experiment:
+  gravity: [0, -9.81]
+  boundary: {start: pinned, end: pinned}
+  measurement: {kind: centerlines, std: 3.0e-4}
+  poses:
+    - file: a.csv
+      start: [0, 0]
+      end: [0.6, 0.1]
+      clips:
+        - {name: first, kind: pinned, at: 0.3, place: [0.25, 0.05]}
+        - {kind: eyelet, place: [0.45, 0.0]}
+"""
+
+
+def test_a_session_with_clips(tmp_path):
+    (tmp_path / "a.csv").touch()
+    (tmp_path / "session.yaml").write_text(SESSION)
+    experiment = load_config(tmp_path / "session.yaml").experiment
+    assert experiment.clips == ("pinned", "eyelet")
+    assert [clip.name for clip in experiment.poses[0].held.clips] == ["first", "clip_2"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("at: 0.3", "at: 0.9", "first: at 0.9 m is not between 0 and cable.length 0.8 m"),
+        ("at: 0.3, ", "", "first: pinned clips have at"),
+        ("kind: eyelet", "kind: eyelet, at: 0.5", "clip_2: eyelet clips have no at"),
+        ("kind: eyelet", "kind: pinned, at: 0.2", "at 0.2 m follows 0.3 m: clips stand in the"),
+        ("kind: pinned", "kind: clamped", "first: a clamped clip needs its heading"),
+        ("place: [0.45, 0.0]", "place: [0.45, 0.0, 0]", r"clip_2: place: \[x, y\] belongs here"),
+        ("place: [0.25, 0.05]", "place: [0.3, 0.2]", "first are 0.3606 m apart, with 0.3 m of"),
+    ],
+)
+def test_clips_that_cannot_be_declared_so(tmp_path, old, new, said):
+    (tmp_path / "a.csv").touch()
+    (tmp_path / "session.yaml").write_text(SESSION.replace(old, new))
+    with pytest.raises(ConfigError, match=said):
+        load_config(tmp_path / "session.yaml")

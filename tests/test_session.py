@@ -82,6 +82,15 @@ IN_PLANE = {
                 "start_heading": 0.1,
                 "end_heading": 0.2,
                 "branch": "ccw",
+                "clips": [
+                    {
+                        "name": "first",
+                        "kind": "clamped",
+                        "at": 0.2,
+                        "place": [0.18, 0.01],
+                        "heading": 0.0,
+                    }
+                ],
                 **HELD,
             },
         ],
@@ -110,6 +119,15 @@ IN_SPACE = {
                 "start_orientation": FRAME,
                 "end_orientation": FRAME,
                 "turns": 0.5,
+                "clips": [
+                    {
+                        "kind": "clamped",
+                        "at": 0.2,
+                        "place": [0.18, 0.0, 0.0],
+                        "orientation": FRAME,
+                        "roll": "free",
+                    }
+                ],
             },
         ],
     },

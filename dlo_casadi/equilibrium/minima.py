@@ -144,7 +144,9 @@ def _convex(
     def shifted(index: IntArray) -> BandFactor:
         part = matrix.subset(index)
         diagonal = part.diagonal + shift[index, None, None, None] * unit
-        corner = part.corner + shift[index, None, None] * np.diag(turns**2)
+        corner = part.corner
+        if turns.any():
+            corner = corner + shift[index, None, None] * np.diag(turns**2)
         return replace(part, diagonal=diagonal, corner=corner).factor()
 
     everyone = np.arange(len(scale))
@@ -170,8 +172,8 @@ def stepped(
     share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
     x = assembly.node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
     lam = shapes.lam + share[:, None] * step.y[..., 0]
-    sliding = list(assembly.model.sliding.values())
-    lam[:, sliding] = lam[:, sliding].clip(0.0, assembly.chain.length)
+    for row in assembly.model.sliding.values():
+        lam[:, row] = lam[:, row].clip(0.0, assembly.chain.length)
     return x, lam
 
 

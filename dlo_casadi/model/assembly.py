@@ -140,15 +140,14 @@ class Assembly:
     @cached_property
     def turn_per_slip(self) -> FloatArray:
         """Turn [rad/m] that an eyelet's change of arc length counts as; zero of others (k,)."""
-        turns = np.zeros(self.k)
-        turns[list(self.model.sliding.values())] = _TURN / self.chain.length
-        return turns
+        slide = np.isin(np.arange(self.k), list(self.model.sliding.values()))
+        return slide * (_TURN / self.chain.length)
 
     def size(self, step: Vector) -> FloatArray:
         """Largest turn (m,) [rad] of a step of one column."""
         nodes = np.abs(step.x).max(axis=(1, 2, 3))
-        slips = np.abs(step.y[..., 0]) * self.turn_per_slip
-        return np.maximum(nodes, slips.max(axis=1, initial=0.0))
+        slips = (np.abs(step.y[..., 0]) * self.turn_per_slip).max(axis=1, initial=0.0)
+        return np.maximum(nodes, slips)
 
     # ---- calls ---------------------------------------------------------------------------------
 
@@ -169,6 +168,8 @@ class Assembly:
     def clipped(self, shapes: Shapes, given: Inputs) -> Clipped:
         """Where the clips are on the cable."""
         kinds = self.model.clips
+        if not kinds:
+            return Clipped(self.chain, np.zeros((len(shapes.x), 0)), (), self.chain.places)
         declared = given.poses[:, given.poses.shape[1] - self.model.clip_numbers :]
         declared = declared.reshape((len(declared), len(kinds), clip_size(self.node)))
         at = declared[..., -1] + given.p @ functions_of(self.model).slips.T

@@ -173,7 +173,11 @@ class Clipped:
 
     def segments(self) -> FloatArray:
         """Rows of the layout (m, n_segments, 5 + k), with the arc lengths of the clips."""
-        table = np.tile(self.chain.layout.segments, (len(self.at), 1, 1))
+        even = self.chain.layout.segments
+        table = np.broadcast_to(even, (len(self.at), *even.shape))
+        if not self.at.shape[1]:
+            return table
+        table = table.copy()
         if self.clamps:
             table[..., [0, 2]] = self.places[:, :-1, None]
             table[..., [1, 3]] = np.diff(self.places)[..., None]
