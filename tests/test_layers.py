@@ -35,6 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
 }
 FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
+MAY_IMPORT["recordings"] = {"config", "vision"}
 MAY_IMPORT["session"] = {*FITTING, "cable", "paper", "config", "io", "vision", "runtime"}
 # A report reads results and solves nothing.
 MAY_IMPORT["report"] = {*MAY_IMPORT["session"], "session"} - {"equilibrium", "paper", "sensing"}

@@ -8,12 +8,14 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from keyword import iskeyword
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK, guarded
 
 # Subcommand -> its module, which is imported only when it is called, and what it does.
 COMMANDS = {
     "new": ("new", "write a commented configuration to start from"),
+    "import": ("recordings", "make a session of motion capture, ROS bags or point clouds"),
     "check": ("check", "check a configuration and its photographs in seconds, without fitting"),
     "calibrate": ("check", "find the camera of a session from its own photographs of the board"),
     "fit": ("fit", "fit a cable to its photographs or centre-lines and report what was found"),
@@ -64,7 +66,8 @@ def _run(arguments: list[str]) -> int:
         for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
             os.environ.setdefault(variable, "1")  # the matrices are small: threads would only cost
         module = import_module(f"dlo_casadi.cli.{COMMANDS[arguments[0]][0]}")
-        code: int = getattr(module, arguments[0].replace("-", "_"))(arguments[1:])
+        name = arguments[0].replace("-", "_")
+        code: int = getattr(module, f"{name}_" if iskeyword(name) else name)(arguments[1:])
         return code
     if arguments[:1] in (["-h"], ["--help"]):
         print(_overview())

@@ -1,7 +1,7 @@
 """What helps to write a configuration: a commented one to start from, a schema for editors."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files as folder_of
 from typing import Any, Literal
 
@@ -19,6 +19,11 @@ def template(
     files: Sequence[str] = (),
     kind: Literal["images", "centerlines"] = "images",
     in_space: bool = False,
+    *,
+    cable: Mapping[str, str] = {},
+    poses: Sequence[Mapping[str, str]] = (),
+    end: str = "clamped",
+    remarks: Sequence[str] = (),
 ) -> str:
     """Text of a configuration with placeholders for what only its user knows.
 
@@ -32,6 +37,14 @@ def template(
         What the files are, in a plane; in space centre-lines.
     in_space : bool
         Whether the cable may leave the plane.
+    cable : mapping of str to str
+        What is known of the cable, by its keys.
+    poses : sequence of mapping of str to str
+        In space, for each file: what is known of its pose by its keys, and a `remark`.
+    end : str
+        How the end is held in space.
+    remarks : sequence of str
+        Lines of comment that begin the configuration.
 
     Returns
     -------
@@ -41,7 +54,15 @@ def template(
     text = (folder_of("dlo_casadi.config") / "templates" / "session.yaml.in").read_text("utf-8")
     filled = Template(text, trim_blocks=True, keep_trailing_newline=True)
     quoted = [_quoted(file) for file in files or [PLACEHOLDER]]
-    return filled.render(name=_quoted(name), files=quoted, kind=kind, in_space=in_space)
+    return filled.render(
+        name=_quoted(name),
+        files=list(zip(quoted, poses or [{}] * len(quoted), strict=True)),
+        kind=kind,
+        in_space=in_space,
+        cable=cable,
+        end=end,
+        remarks=remarks,
+    )
 
 
 def _quoted(text: str) -> str:

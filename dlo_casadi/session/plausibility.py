@@ -105,14 +105,19 @@ def without_implausible(
     return tuple(kept), [item.message for item in found if not item.pose]
 
 
-def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
-    """Everything in a session that looks like a mistake, see `QUESTIONS`."""
+def find_suspicions(
+    config: Config, inputs: Sequence[PoseInput], *, fits: bool = True
+) -> tuple[Suspicion, ...]:
+    """Everything in a session that looks like a mistake, see `QUESTIONS`.
+
+    Without `fits` only what takes none, and the direction in which the lines seem to be pulled.
+    """
     read = tuple(item for item in inputs if len(item.points))
     session = ReadSession(config, read)
     found: tuple[Suspicion, ...] = ()
     if not session.lines.names:
         return found
-    for questions in QUESTIONS:
+    for questions in QUESTIONS if fits else (*QUESTIONS[:2], ((pulled_elsewhere,),)):
         for alternatives in questions:
             found += next(filter(None, (ask(session) for ask in alternatives)), ())
         if any(item.certain for item in found):
@@ -344,6 +349,24 @@ def hangs_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
         + ("" if found.certain else " A strap that lifts the cable would look the same.")
     )
     return (Suspicion(text, found.certain),)
+
+
+def pulled_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
+    """Whether the lines seem to be pulled along another axis than gravity, without any fit."""
+    gravity = np.array(session.config.experiment.gravity)
+    pull = shown_pull(session)
+    axes = np.vstack([np.eye(len(gravity)), -np.eye(len(gravity))])
+    if pull is None or not gravity.any():
+        return ()
+    nearest = axes[int(np.argmax(axes @ pull))]
+    if _angle(pull, gravity) < np.pi / 4 or _angle(pull, nearest) > HEADING_OFF:
+        return ()
+    text = (
+        f"the cable seems to be pulled along ({listed(nearest + 0.0, 'g')}), "
+        f"{np.degrees(_angle(pull, gravity)):.0f} degrees off gravity "
+        f"({listed(gravity + 0.0, 'g')}) m/s^2. Try: points, start, end and gravity in one frame."
+    )
+    return (Suspicion(text, False),)
 
 
 def _other_gravity(

@@ -1,0 +1,124 @@
+"""`dlo import`: a session from what a laboratory has recorded."""
+
+import argparse
+import os
+from dataclasses import fields
+from pathlib import Path
+
+from dlo_casadi.cli.options import Page, command, option
+from dlo_casadi.cli.watch import Watch
+from dlo_casadi.config import load_config
+from dlo_casadi.config.template import schema_text
+from dlo_casadi.errors import DloError, MeasurementError, counted
+from dlo_casadi.io.files import FolderDraft, write_file
+from dlo_casadi.io.points import write_points
+from dlo_casadi.recordings import FREE, Imported, Wishes, make_session, read_recording
+from dlo_casadi.session import measure
+from dlo_casadi.session.plausibility import find_suspicions
+
+_NAME = "session.yaml"
+_CABLE = {
+    "length": "m, along the cable between its fixtures; measured in the recording when absent",
+    "mass": "kg, of that length",
+    "diameter": "m",
+    "bending_stiffness": "N m^2, a first guess; from weight and length when absent",
+}
+
+
+def _vector(text: str) -> tuple[float, ...]:
+    return tuple(float(part) for part in text.split(","))
+
+
+@command(
+    option("file", type=Path, nargs="+", metavar="FILE", help="of Motive or Vicon (.csv)"),
+    option("--output", type=Path, required=True, metavar="DIR", help="folder of the session"),
+    option("--start", default="start", metavar="NAME", help="body, or markers O,X,Y, at the start"),
+    option("--end", default="end", metavar="NAME", help=f"the same at the end; or {FREE}"),
+    *(
+        option(
+            f"--{side}-offset",
+            type=_vector,
+            default=(0.0, 0.0, 0.0),
+            metavar="X,Y,Z",
+            help=f"m, where the cable leaves the {side} body, in its axes",
+        )
+        for side in ("start", "end")
+    ),
+    option("--cable", default="", metavar="TEXT", help="part of the names of its markers"),
+    option("--at", type=_vector, default=(), metavar="S,S,...", help="m, arc lengths of markers"),
+    option("--up", choices="xyz", help="axis that points up; as usual in the format when absent"),
+    option("--hold", type=float, default=0.5, metavar="S", help="shortest pose; %(default)s s"),
+    option("--held-out", type=int, default=4, metavar="N", help="one in N; default %(default)s"),
+    *(
+        option(f"--{key.replace('_', '-')}", type=float, help=text, metavar="X")
+        for key, text in _CABLE.items()
+    ),
+    json="print what was written as JSON",
+)
+def import_(chosen: argparse.Namespace) -> None:
+    """Make a session of recordings: find the poses in which cable and grippers are still, align
+    clocks, name markers by arc length, and check the result. Every assumption is a comment, and
+    FILL_IN stands where only you know the value. Nothing is replaced.
+
+    dlo import take.csv --output loom --mass 0.03 --diameter 0.004
+    dlo import markers.csv robot.csv --output loom --start fixed --end flange
+    """
+    if os.path.lexists(chosen.output):
+        raise DloError(f"{chosen.output} exists already, and nothing is replaced")
+    known = {key: getattr(chosen, key) for key in _CABLE}
+    wishes = Wishes(
+        **{item.name: getattr(chosen, item.name) for item in fields(Wishes) if item.name in chosen},
+        known={key: value for key, value in known.items() if value is not None},
+    )
+    with Watch(quiet=chosen.quiet) as watch:
+        watch.step("read", 0, 3)
+        recording = read_recording(chosen.file, chosen.up)
+        watch.step("find poses", 1, 3)
+        session = make_session(chosen.output.name, recording, wishes)
+        with FolderDraft(chosen.output) as draft:
+            _write(session, draft.folder)
+            watch.step("compare with a cable", 2, 3)
+            mistakes = _mistakes(session, draft.folder)
+            if mistakes:
+                raise MeasurementError(
+                    "\n".join(
+                        [
+                            "nothing is written: the recording contradicts itself.",
+                            *mistakes,
+                            "  Try: --up, the axis that points up in the files; --start-offset.",
+                        ]
+                    )
+                )
+            draft.put_in_place()
+        watch.step("", 3, 3)
+    page, target = Page(chosen), chosen.output / _NAME
+    page.data({"file": str(target), "poses": len(session.poses), "remarks": session.remarks})
+    for remark in session.remarks:
+        page.say(remark)
+    left = session.text().count("FILL_IN") - 1  # one is in a comment
+    follow = f"dlo {'check' if left else 'fit'} {target}"
+    filling = f", {counted(left, 'place')} to fill in, each marked FILL_IN" if left else ""
+    page.say(f"{target}: {counted(len(session.poses), 'pose')}{filling}\nthen: {follow}")
+
+
+def _write(session: Imported, folder: Path, cable: dict[str, str] | None = None) -> None:
+    """Write a configuration, its schema and its points into a folder."""
+    for name, (points, s) in session.points.items():
+        write_points(folder / name, points, s)
+    write_file(folder / "schema.json", schema_text())
+    write_file(folder / _NAME, session.text(cable))
+
+
+def _mistakes(session: Imported, folder: Path) -> list[str]:
+    """What `dlo check` finds in a written session, with stand-ins for values to fill in."""
+    text = session.text(session.stand_ins)
+    if "FILL_IN" in text.split("experiment:")[1]:
+        return []  # without fixtures there is nothing to compare with
+    stand_in = folder / "check.yaml"
+    write_file(stand_in, text)
+    try:
+        config = load_config(stand_in)
+        inputs = measure.read_inputs(config, lambda *_: None)
+        return [item.message for item in find_suspicions(config, inputs, fits=False)]
+    finally:
+        stand_in.unlink()

@@ -1,0 +1,17 @@
+"""Recordings of laboratories to sessions: motion capture, ROS bags, point clouds."""
+
+from dlo_casadi.recordings.read import FORMATS, read_recording
+from dlo_casadi.recordings.recording import Cloud, Recording, Stream
+from dlo_casadi.recordings.session import FREE, Imported, Wishes, make_session
+
+__all__ = [
+    "FORMATS",
+    "FREE",
+    "Cloud",
+    "Imported",
+    "Recording",
+    "Stream",
+    "Wishes",
+    "make_session",
+    "read_recording",
+]

@@ -1,0 +1,178 @@
+"""CSV files of motion capture: OptiTrack Motive, and Vicon Nexus and Tracker."""
+
+import csv
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.config.problems import show
+from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.recordings.recording import Kind, Recording, Stream, factor
+
+# Sections of a Vicon file that hold places; others (devices, model outputs) are passed over.
+_SECTIONS: dict[str, Kind] = {"Trajectories": "marker", "Objects": "body", "Segments": "body"}
+_KINDS: dict[str, Kind] = {"Marker": "marker", "Rigid Body": "body"}  # Types of Motive
+_RADIANS = {"deg": np.pi / 180.0, "rad": 1.0}
+_AGAIN = "Try: export it again, whole, as Motive (Tracking Data) or Vicon (ASCII) writes it."
+Rows = list[list[str]]
+
+
+def read_mocap_csv(path: Path, up: str | None) -> Recording:
+    """Read a CSV file of Motive (format 1.2 or later) or of Vicon (Nexus, Tracker).
+
+    Parameters
+    ----------
+    up : "x", "y", "z" or None
+        The axis that points up; by default y in Motive's files and z in Vicon's, their standards.
+
+    Returns
+    -------
+    Recording
+        Markers, and rigid bodies with their rotations; those of Motive have to be quaternions,
+        those of Vicon may be rotation vectors, too. Unlabelled markers are left out.
+
+    Raises
+    ------
+    MeasurementError
+        If the file is neither, damaged, or has other units.
+
+    References
+    ----------
+    OptiTrack, "Data Export: CSV". Vicon Nexus, "ASCII file format"; its rotations of segments
+    with three components are rotation vectors (angle-axis).
+    """
+    try:
+        rows = list(csv.reader(path.read_text("utf-8-sig").splitlines()))
+    except UnicodeDecodeError:
+        raise MeasurementError(f"is not a text file.\n  {_AGAIN}", pose=path.name) from None
+    except (OSError, csv.Error) as error:
+        raise MeasurementError(f"cannot be read: {error}", pose=path.name) from None
+    first = next((row[0].strip() for row in rows if row and row[0].strip()), "")
+    if first == "Format Version":
+        streams, own, program = list(_motive(rows, path)), "y", "Motive"
+    elif first in (*_SECTIONS, "Devices", "Model Outputs", "Joints"):
+        streams, own, program = list(_vicon(rows, path)), "z", "Vicon"
+    else:
+        found = f"it begins with {show(first)}" if first else "it is empty"
+        raise MeasurementError(
+            f"is no CSV file of Motive or Vicon: {found}; Format Version or Trajectories belongs "
+            f"there.\n  {_AGAIN}",
+            pose=path.name,
+        )
+    if not streams:
+        raise MeasurementError(
+            "holds no labelled marker and no rigid body.\n  Try: label them before the export.",
+            pose=path.name,
+        )
+    assumed = () if up else (f"{own} is up, as {program} exports it; or --up",)
+    return Recording(tuple(streams), assumptions=assumed).with_z_up(up or own)
+
+
+def _motive(rows: Rows, path: Path) -> Iterator[Stream]:
+    meta = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
+    heads = [k for k, row in enumerate(rows) if row[:1] == ["Frame"]]
+    named = {row[1]: row for row in rows[: heads[0]] if len(row) > 2} if heads else {}
+    if not heads or not {"Type", "Name"} <= named.keys():
+        raise MeasurementError(
+            f"has no rows Type, Name and Frame above its numbers.\n  {_AGAIN}", pose=path.name
+        )
+    if meta.get("Coordinate Space", "Global") != "Global":
+        raise MeasurementError(
+            f"is in the space {meta['Coordinate Space']!r}.\n  Try: an export with Coordinate "
+            "Space: Global",
+            pose=path.name,
+        )
+    head, quantities = heads[0], rows[heads[0] - 1]
+    table = _table(rows[head + 1 :], len(rows[head]), path, head + 2)
+    said = meta.get("Total Exported Frames", "")
+    if said.isdigit() and int(said) != len(table):
+        raise MeasurementError(
+            f"ends after {len(table)} of {counted(int(said), 'frame')}.\n  {_AGAIN}", pose=path.name
+        )
+    scale = factor(meta.get("Length Units", "m"), path.name)
+    columns: dict[tuple[str, str], dict[str, int]] = {}
+    for c in range(2, len(rows[head])):
+        columns.setdefault((named["Type"][c], named["Name"][c]), {})[
+            f"{quantities[c]} {rows[head][c]}".strip()
+        ] = c
+    for (label, name), at in columns.items():
+        places = [at.get(f"Position {axis}", -1) for axis in "XYZ"]
+        if min(places) < 0 or "Unlabeled" in name:
+            continue
+        values = scale * table[:, places]
+        if label == "Rigid Body":
+            turns = [at.get(f"Rotation {axis}", -1) for axis in "XYZW"]
+            if min(turns) < 0:
+                raise MeasurementError(
+                    f"rotations of {name!r} are not quaternions ({meta.get('Rotation Type', '?')})."
+                    "\n  Try: an export with Rotation Type: Quaternion",
+                    pose=path.name,
+                )
+            values = np.hstack([values, table[:, turns]])
+        if label in _KINDS:
+            yield Stream(name, _KINDS[label], table[:, 1], values, path.name)
+
+
+def _vicon(rows: Rows, path: Path) -> Iterator[Stream]:
+    starts = [k for k, row in enumerate(rows) if row and row[0].strip() in _SECTIONS]
+    for k in starts:
+        kind = _SECTIONS[rows[k][0].strip()]
+        try:
+            (rate, *_), names, axes, units = rows[k + 1 : k + 5]
+            period = 1.0 / float(rate)
+        except (ValueError, ZeroDivisionError):
+            raise MeasurementError(
+                f"line {k + 2}: a rate [Hz], names, axes and units belong below {rows[k][0]!r}.\n"
+                f"  {_AGAIN}",
+                pose=path.name,
+            ) from None
+        body = rows[k + 5 :]
+        stop = next((i for i, row in enumerate(body) if not any(row)), len(body))
+        table = _table(body[:stop], len(axes), path, k + 6)
+        t = table[:, 0] * period
+        heads = [c for c in range(2, len(names)) if names[c].strip()]
+        for c, following in zip(heads, [*heads[1:], len(axes)], strict=True):
+            at = {axes[i].strip(): i for i in range(c, following)}
+            places = [at.get(a, at.get(f"T{a}", -1)) for a in "XYZ"]
+            if min(places) < 0 or names[c].strip().startswith("*"):
+                continue
+            values = factor(units[places[0]], path.name) * table[:, places]
+            if kind == "body":
+                turns = [at[f"R{a}"] for a in "XYZW" if f"R{a}" in at]
+                values = np.hstack([values, _quaternions(table[:, turns], units[turns[0]])])
+            yield Stream(names[c].strip(), kind, t, values, path.name)
+
+
+def _quaternions(turns: FloatArray, unit: str) -> FloatArray:
+    """Quaternions (n, 4) of quaternions, or of rotation vectors (n, 3) in a unit of angle."""
+    if turns.shape[1] == 4:
+        return turns
+    found = np.full((len(turns), 4), np.nan)
+    seen = np.isfinite(turns).all(axis=1)
+    vectors = turns[seen] * _RADIANS.get(unit.strip(), 1.0)
+    found[seen] = Rotation.from_rotvec(vectors).as_quat()
+    return found
+
+
+def _table(rows: Sequence[list[str]], width: int, path: Path, first: int) -> FloatArray:
+    """Numbers (n, width); nan in empty cells."""
+    table = np.full((len(rows), width), np.nan)
+    for k, row in enumerate(rows):
+        if len(row) < width:
+            raise MeasurementError(
+                f"line {first + k} has {len(row)} of {counted(width, 'cell')}: the file is "
+                f"truncated.\n  {_AGAIN}",
+                pose=path.name,
+            )
+        try:
+            table[k] = [float(cell) if cell.strip() else np.nan for cell in row[:width]]
+        except ValueError as error:
+            raise MeasurementError(
+                f"line {first + k}: {error}.\n  {_AGAIN}", pose=path.name
+            ) from None
+    if not len(rows):
+        raise MeasurementError(f"holds no frames.\n  {_AGAIN}", pose=path.name)
+    return table

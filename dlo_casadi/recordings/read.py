@@ -1,0 +1,39 @@
+"""Which reader reads which file."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.recordings.mocap_csv import read_mocap_csv
+from dlo_casadi.recordings.recording import Recording, together
+
+# Ending of a name -> reader of a file and its way up.
+FORMATS: dict[str, Callable[[Path, str | None], Recording]] = {".csv": read_mocap_csv}
+
+
+def read_recording(paths: Sequence[Path], up: str | None = None) -> Recording:
+    """Read the files of one recording.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files of the `FORMATS`; each has a clock of its own.
+    up : "x", "y", "z" or None
+        The axis that points up; as usual in each format when absent.
+
+    Raises
+    ------
+    MeasurementError
+        If one of them cannot be read.
+    """
+    found = []
+    for path in paths:
+        reader = FORMATS.get(path.suffix.lower())
+        if reader is None:
+            raise MeasurementError(
+                f"files of this kind are not read.\n  Try: {', '.join(FORMATS)}", pose=path.name
+            )
+        if not path.exists():
+            raise MeasurementError("there is no such file", pose=str(path))
+        found.append(reader(path, up))
+    return together(found)

@@ -1,0 +1,272 @@
+"""Clocks aligned by motion, stretches in which nothing moves, and their means."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d, label, uniform_filter1d
+from scipy.signal import correlate
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.recordings.recording import Recording, Stream
+
+_LEVER = 0.1  # m, from a body to the points that show its rotation
+_SMOOTH = 0.05  # s, over which speeds are smoothed before clocks are compared
+# Correlation of speeds from which two clocks are aligned. Of a gripper and the markers of its cable
+# it is above 0.9; of two unrelated recordings of ten moves below 0.4 (simulated).
+_ALIKE = 0.6
+_WINDOW = 0.4  # s, in which scatter is compared with the noise
+_QUIET = 0.1  # share of the time that the cable is still, at least
+# Scatter over the noise from which something moves: RMS over all streams, which noise alone
+# changes by a few per cent.
+_MOVES = 2.0
+_FLOOR = 1.0e-5  # m, a noise below the resolution of files
+# Scatter of a still stretch over the noise from frame to frame, at most: filters of the export
+# make it ten times larger, slow motion hundreds.
+_NEVER = 50.0
+_OUTLIER = 5.0  # median absolute deviations from which a frame is left out of a mean
+
+
+@dataclass(frozen=True)
+class Offset:
+    """How much a clock is ahead of another."""
+
+    clock: str
+    other: str
+    seconds: float
+    correlation: float
+    speed: float
+    """[m/s], the greatest of the moving streams."""
+
+    @property
+    def told(self) -> str:
+        """Sentence on it, and on whether it matters."""
+        if abs(self.seconds) > 1e6:  # one counts from 1970
+            return f"{self.clock} and {self.other}: different origins of time, aligned by motion"
+        moved = 1e3 * abs(self.seconds) * self.speed
+        matters = (
+            f"it would move the fastest pose by {moved:.0f} mm, still ones not at all"
+            if moved >= 1.0
+            else "it does not matter at these speeds"
+        )
+        ahead = "ahead of" if self.seconds > 0 else "behind"
+        return (
+            f"{self.clock} is {1e3 * abs(self.seconds):.0f} ms {ahead} {self.other} and was moved "
+            f"there (speeds correlate by {self.correlation:.2f}); {matters}"
+        )
+
+
+@dataclass(frozen=True)
+class Still:
+    """A stretch of time in which nothing moves, and the means in it."""
+
+    begin: float  # [s]
+    end: float  # [s]
+    values: dict[str, FloatArray]
+    """Mean of each stream that was seen, by kind and name: `marker m1`."""
+    scatter: float  # [m], standard deviation of a coordinate of a marker or body
+    drift: float  # [m], largest distance of the means of its two halves
+
+    @property
+    def told(self) -> str:
+        """How still it was, in words."""
+        return (
+            f"still from {self.begin:.2f} to {self.end:.2f} s: scatter {1e3 * self.scatter:.2f} "
+            f"mm, drift {1e3 * self.drift:.2f} mm"
+        )
+
+
+def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
+    """Shift all clocks to that of the first moving stream, by cross-correlation of speeds.
+
+    The offset of two clocks is the lag at which the mean speeds of their markers and bodies
+    correlate best, to a fraction of a frame by a parabola through the maximum. A clock whose
+    streams do not move, as that of a force sensor, keeps its times.
+
+    Raises
+    ------
+    MeasurementError
+        If two recordings do not move alike.
+    """
+    clocks = tuple(dict.fromkeys(s.clock for s in recording.streams if s.kind != "wrench"))
+    if len(clocks) < 2:
+        return recording, ()
+    dt = _period(recording.streams)
+    speeds = [_speed([s for s in recording.streams if s.clock == c], dt) for c in clocks]
+    first, reference = speeds[0]
+    offsets = []
+    for clock, (begin, speed) in zip(clocks[1:], speeds[1:], strict=True):
+        v, w = reference - reference.mean(), speed - speed.mean()
+        found = correlate(w, v, "full", "fft")
+        k = int(np.argmax(found))
+        height = float(found[k] / max(np.linalg.norm(v) * np.linalg.norm(w), 1e-300))
+        if height < _ALIKE:
+            raise MeasurementError(
+                f"the clocks of {clocks[0]} and {clock} cannot be aligned: the speeds in them "
+                f"correlate by {height:.2f} at best.\n  Try: recordings of the same motions, "
+                "from before the first pose until after the last."
+            )
+        a, b, c = found[max(k - 1, 0)], found[k], found[min(k + 1, len(found) - 1)]
+        lag = (k - (len(v) - 1) + 0.5 * (a - c) / min(a - 2 * b + c, -1e-300)) * dt
+        fastest = float(max(reference.max(), speed.max()))
+        offsets.append(Offset(clock, clocks[0], begin - first + float(lag), height, fastest))
+    by_clock = {item.clock: item.seconds for item in offsets}
+    moved = tuple(replace(s, t=s.t - by_clock.get(s.clock, 0.0)) for s in recording.streams)
+    clouds = tuple(replace(c, t=c.t - by_clock.get(c.clock, 0.0)) for c in recording.clouds)
+    return replace(recording, streams=moved, clouds=clouds), tuple(offsets)
+
+
+def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
+    """Stretches of at least `hold` [s] in which no marker and no body moves.
+
+    The noise of each stream is its scatter in the quietest tenth of the time, in windows of
+    0.4 s; the recording is still where the root mean square over all streams of scatter over
+    noise is below 2. A steady drift of 6 noises a second is just seen.
+
+    Raises
+    ------
+    MeasurementError
+        If nothing was seen, or it never stands still.
+    """
+    shown = [stream for stream in recording.streams if stream.kind != "wrench"]
+    tracks = [track for stream in shown for track in _tracks(stream)]
+    tracks = [(t, x) for t, x in tracks if len(t) > 3]
+    if not tracks:
+        raise MeasurementError(
+            "no marker and no body was seen in this recording.\n  Try: are they labelled, and "
+            "were gaps filled with NaN?"
+        )
+    dt = _period(shown)
+    begin, end = min(t[0] for t, _ in tracks), max(t[-1] for t, _ in tracks)
+    grid = np.arange(begin, end + 0.5 * dt, dt)
+    width = max(3, round(_WINDOW / dt))
+    total, count = np.zeros(len(grid)), np.zeros(len(grid))
+    for t, x in tracks:
+        scatter, known = _scatter(t, x, grid, width)
+        noise = max(float(np.quantile(scatter[known], _QUIET)) if known.any() else 0.0, _FLOOR)
+        jitter = _jitter(x)
+        if jitter > 0.1 * _FLOOR and noise > _NEVER * jitter:
+            raise MeasurementError(
+                f"this recording never stands still: even its quietest tenth scatters by "
+                f"{1e3 * noise:.2g} mm in {_WINDOW:g} s, {noise / jitter:.0f} times its noise.\n"
+                "  Try: hold the cable still for two seconds in each pose."
+            )
+        total[known] += (scatter[known] / noise) ** 2
+        count[known] += 1
+    quiet = (count >= 0.5 * len(tracks)) & (total < _MOVES**2 * np.maximum(count, 1))
+    runs, n = label(quiet)
+    found = []
+    for k in range(1, n + 1):
+        inside = grid[runs == k]
+        if inside[-1] - inside[0] >= hold:
+            found.append(_still(recording.streams, float(inside[0]), float(inside[-1])))
+    merged: list[Still] = []
+    for still in found:  # a glitch of a second does not make two poses of one
+        last = merged[-1] if merged else None
+        if last and still.begin - last.end < _WINDOW + hold and _same(last, still):
+            merged[-1] = _still(recording.streams, last.begin, still.end)
+        else:
+            merged.append(still)
+    if not merged:
+        raise MeasurementError(
+            f"no stretch of {hold:g} s or more is still.\n  Try: --hold with less, or hold the "
+            "cable longer in each pose."
+        )
+    return tuple(merged)
+
+
+def _still(streams: Sequence[Stream], begin: float, end: float) -> Still:
+    """Robust means between two times, and how much they scatter and drift."""
+    values, scatters, drifts = {}, [], [0.0]
+    for stream in streams:
+        seen = (stream.t >= begin) & (stream.t <= end) & np.isfinite(stream.values).all(axis=1)
+        if not seen.any():
+            continue
+        x = stream.values[seen]
+        kept = _inliers(x[:, :3])
+        mean = x[kept].mean(axis=0)
+        if stream.kind == "body":
+            mean[3:] = Rotation.from_quat(x[kept, 3:]).mean().as_quat()
+        values[f"{stream.kind} {stream.name}"] = mean
+        if stream.kind != "wrench":
+            scatters.append(x[kept, :3].var(axis=0).mean())
+            halves = np.array_split(x[kept, :3], 2)
+            if len(halves[1]):
+                drifts.append(float(np.linalg.norm(halves[0].mean(0) - halves[1].mean(0))))
+    return Still(begin, end, values, float(np.sqrt(np.mean(scatters))), max(drifts))
+
+
+def _inliers(x: FloatArray) -> BoolArray:
+    """Rows (n, 3) that are no outliers by the median absolute deviation."""
+    away = np.linalg.norm(x - np.median(x, axis=0), axis=1)
+    return np.asarray(away <= _OUTLIER * max(float(np.median(away)), 1e-9))
+
+
+def _same(one: Still, other: Still) -> bool:
+    """Whether two stretches show the same pose, to the noise of a single frame."""
+    away = [
+        float(np.linalg.norm(one.values[key][:3] - other.values[key][:3]))
+        for key in one.values.keys() & other.values.keys()
+        if not key.startswith("wrench")
+    ]
+    return bool(away) and max(away) < 3.0 * max(one.scatter, other.scatter, _FLOOR)
+
+
+def _tracks(stream: Stream) -> list[tuple[FloatArray, FloatArray]]:
+    """Times and places (n, 3) of points that show the motion of a stream, where it is seen."""
+    seen = np.isfinite(stream.values).all(axis=1)
+    t, x = stream.t[seen], stream.values[seen, :3]
+    if stream.kind != "body" or not len(t):
+        return [(t, x)]
+    axes = Rotation.from_quat(stream.values[seen, 3:]).as_matrix()
+    return [(t, x), *((t, x + _LEVER * axes[:, :, k]) for k in (0, 1))]
+
+
+def _period(streams: Sequence[Stream]) -> float:
+    """Shortest median time [s] between frames."""
+    steps = [float(np.median(np.diff(s.t))) for s in streams if len(s.t) > 1]
+    if not steps or min(steps) <= 0.0:
+        raise MeasurementError("times of the recording do not increase.\n  Try: export it again.")
+    return min(steps)
+
+
+def _speed(streams: Sequence[Stream], dt: float) -> tuple[float, FloatArray]:
+    """First time [s], and RMS speed [m/s] every `dt` of all that moves with one clock."""
+    tracks = [track for stream in streams for track in _tracks(stream) if len(track[0]) > 3]
+    if not tracks:
+        raise MeasurementError(
+            f"nothing was seen in {streams[0].clock}: all its values are NaN.\n  Try: label "
+            "markers and bodies, solve, and export again."
+        )
+    begin, end = min(t[0] for t, _ in tracks), max(t[-1] for t, _ in tracks)
+    grid = np.arange(begin, end + 0.5 * dt, dt)
+    squares = np.zeros(len(grid))
+    for t, x in tracks:
+        path = np.column_stack([np.interp(grid, t, column) for column in x.T])
+        path = gaussian_filter1d(path, _SMOOTH / dt, axis=0, mode="nearest")
+        squares += (np.gradient(path, dt, axis=0) ** 2).sum(axis=1)
+    return float(begin), np.sqrt(squares / len(tracks))
+
+
+def _scatter(
+    t: FloatArray, x: FloatArray, grid: FloatArray, width: int
+) -> tuple[FloatArray, BoolArray]:
+    """Standard deviation of a coordinate in windows about each time, and where it is known."""
+    path = np.column_stack([np.interp(grid, t, column) for column in x.T]) - x.mean(axis=0)
+    mean = uniform_filter1d(path, width, axis=0, mode="nearest")
+    square = uniform_filter1d(path**2, width, axis=0, mode="nearest") - mean**2
+    gap = np.diff(grid[:2])[0] * width
+    after = np.searchsorted(t, grid).clip(1, len(t) - 1)
+    known = (grid >= t[0]) & (grid <= t[-1]) & (t[after] - t[after - 1] <= gap)
+    return np.sqrt(np.maximum(square.mean(axis=1), 0.0)), known
+
+
+def _jitter(x: FloatArray) -> float:
+    """Noise [m] of a coordinate from frame to frame, which smooth motion hardly changes.
+
+    The median absolute second difference of white noise is 0.6745 sqrt(6) times its std.
+    """
+    second = x[2:] - 2.0 * x[1:-1] + x[:-2]
+    return float(np.median(np.abs(second))) / (0.6745 * 6.0**0.5)

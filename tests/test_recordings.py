@@ -1,0 +1,113 @@
+"""Recordings rendered from a session whose truth is known come back as that session."""
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from recorded.takes import WRITERS, rendered
+
+from dlo_casadi.cli import main
+from dlo_casadi.config import load_config
+from dlo_casadi.io.points import read_points
+
+SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
+CABLE = ("--mass", "0.03", "--diameter", "0.004")
+
+
+@pytest.fixture(scope="module")
+def take():
+    return rendered(SESSION)
+
+
+@pytest.fixture(scope="module")
+def short_take():
+    return rendered(SESSION, poses=3)
+
+
+def imported(files, output, *options):
+    arguments = ["import", *map(str, files), "--output", str(output), "--quiet", *options]
+    return main(arguments)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_take_comes_back_as_the_session(kind, take, tmp_path):
+    """Ten poses, ends, roles and arc lengths; the other clock's 80 ms are named."""
+    files, options = WRITERS[kind](take, tmp_path)
+    assert imported(files, tmp_path / "loom", *options, *CABLE) == 0
+
+    path = tmp_path / "loom" / "session.yaml"
+    own, true = load_config(path), load_config(SESSION)
+    poses = list(zip(own.experiment.poses, true.experiment.poses, strict=True))
+    for pose, exact in poses:
+        assert pose.role == exact.role
+        assert pose.start == pytest.approx(exact.start, abs=1e-4)  # 0.1 mm of noise in 100 frames
+        assert pose.end == pytest.approx(exact.end, abs=1e-4)
+        turns = Rotation.from_quat([pose.end_orientation, exact.end_orientation])
+        assert (turns[0].inv() * turns[1]).magnitude() < 3e-4  # rad, of 0.5e-3 in a frame
+        seen = [read_points(x.paths[0], x.start, x.end) for x in (pose, exact)]
+        assert seen[0].points == pytest.approx(seen[1].points, abs=1.5e-4)
+        # The session's own points are 0.3 mm off, the means of ten poses 0.1 mm.
+        assert seen[0].s == pytest.approx(seen[1].s, abs=4e-4)
+    assert own.cable.length == pytest.approx(true.cable.length, abs=4e-4)
+    offset = re.search(r"is (\d+) ms ahead of", path.read_text())
+    assert int(offset[1]) == pytest.approx(80, abs=5)  # half a frame
+
+
+def damaged(kind, how, take, folder):
+    """Files of a take that are broken in one way."""
+    if how == "never seen":
+        take = replace(take, markers={name: x * np.nan for name, x in take.markers.items()})
+    if how == "no gripper":
+        take = replace(take, bodies={name: x * np.nan for name, x in take.bodies.items()})
+    files, options = WRITERS[kind](take, folder)
+    content = files[0].read_bytes()
+    if how == "truncated":
+        files[0].write_bytes(content[: len(content) // 2])
+    if how == "empty":
+        files[0].write_bytes(b"")
+    if how == "other axes":
+        options = [*options, "--up", "x"]
+    if how == "other names":
+        options = [*options, "--end", "flange"]
+    return files, options
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize(
+    "how", ["truncated", "empty", "never seen", "no gripper", "other axes", "other names"]
+)
+def test_broken_files_are_told_and_nothing_is_written(kind, how, short_take, tmp_path, capsys):
+    files, options = damaged(kind, how, short_take, tmp_path)
+    before = sorted(tmp_path.iterdir())
+    assert imported(files, tmp_path / "loom", *options, *CABLE) == 2
+    told = capsys.readouterr().err
+    assert "Try: " in told
+    assert "Traceback" not in told
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_values_that_nobody_knows_are_to_be_filled_in(short_take, tmp_path):
+    files, options = WRITERS["motive"](short_take, tmp_path)
+    assert imported(files, tmp_path / "loom", *options) == 0
+    text = (tmp_path / "loom" / "session.yaml").read_text()
+    for key in ("mass", "diameter", "bending_stiffness"):
+        assert f"{key}: FILL_IN" in text
+
+
+def test_a_recording_that_is_never_still(short_take, tmp_path, capsys):
+    wave = np.sin(3.0 * short_take.t)[:, None] * [0.1, 0.0, 0.0]
+    moving = replace(
+        short_take,
+        markers={name: x + wave for name, x in short_take.markers.items()},
+        bodies={name: x + np.pad(wave, ((0, 0), (0, 4))) for name, x in short_take.bodies.items()},
+    )
+    files, options = WRITERS["motive"](moving, tmp_path)
+    assert imported(files, tmp_path / "loom", *options) == 2
+    assert "still" in capsys.readouterr().err
