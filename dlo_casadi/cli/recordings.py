@@ -12,7 +12,7 @@ from dlo_casadi.config.template import schema_text
 from dlo_casadi.errors import DloError, MeasurementError, counted
 from dlo_casadi.io.files import FolderDraft, write_file
 from dlo_casadi.io.points import write_points
-from dlo_casadi.recordings import FREE, Imported, Wishes, make_session, read_recording
+from dlo_casadi.recordings import FORMATS, FREE, Imported, Wishes, make_session, read_recording
 from dlo_casadi.session import measure
 from dlo_casadi.session.plausibility import find_suspicions
 
@@ -30,7 +30,13 @@ def _vector(text: str) -> tuple[float, ...]:
 
 
 @command(
-    option("file", type=Path, nargs="+", metavar="FILE", help="of Motive or Vicon (.csv)"),
+    option(
+        "file",
+        type=Path,
+        nargs="+",
+        metavar="FILE",
+        help=f"recording: {', '.join(filter(None, FORMATS))}, or the folder of a bag",
+    ),
     option("--output", type=Path, required=True, metavar="DIR", help="folder of the session"),
     option("--start", default="start", metavar="NAME", help="body, or markers O,X,Y, at the start"),
     option("--end", default="end", metavar="NAME", help=f"the same at the end; or {FREE}"),
@@ -61,7 +67,8 @@ def import_(chosen: argparse.Namespace) -> None:
     FILL_IN stands where only you know the value. Nothing is replaced.
 
     dlo import take.csv --output loom --mass 0.03 --diameter 0.004
-    dlo import markers.csv robot.csv --output loom --start fixed --end flange
+    dlo import markers.c3d bag/ --output loom --start fixed --end flange
+    dlo import points.c3d --output loom --start left_o,left_x,left_y --end free
     """
     if os.path.lexists(chosen.output):
         raise DloError(f"{chosen.output} exists already, and nothing is replaced")
@@ -90,7 +97,7 @@ def import_(chosen: argparse.Namespace) -> None:
                     )
                 )
             draft.put_in_place()
-        watch.step("", 3, 3)
+        watch.step("compare with a cable", 3, 3)
     page, target = Page(chosen), chosen.output / _NAME
     page.data({"file": str(target), "poses": len(session.poses), "remarks": session.remarks})
     for remark in session.remarks:

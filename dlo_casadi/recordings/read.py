@@ -4,11 +4,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dlo_casadi.errors import MeasurementError
+from dlo_casadi.recordings.bags import read_bag
+from dlo_casadi.recordings.c3d import read_c3d
 from dlo_casadi.recordings.mocap_csv import read_mocap_csv
 from dlo_casadi.recordings.recording import Recording, together
 
 # Ending of a name -> reader of a file and its way up.
-FORMATS: dict[str, Callable[[Path, str | None], Recording]] = {".csv": read_mocap_csv}
+FORMATS: dict[str, Callable[[Path, str | None], Recording]] = {
+    ".csv": read_mocap_csv,
+    ".c3d": read_c3d,
+    ".mcap": read_bag,
+    ".db3": read_bag,
+    ".bag": read_bag,
+    "": read_bag,  # a folder with metadata.yaml
+}
 
 
 def read_recording(paths: Sequence[Path], up: str | None = None) -> Recording:
@@ -28,10 +37,11 @@ def read_recording(paths: Sequence[Path], up: str | None = None) -> Recording:
     """
     found = []
     for path in paths:
-        reader = FORMATS.get(path.suffix.lower())
+        reader = FORMATS.get("" if path.is_dir() else path.suffix.lower())
         if reader is None:
             raise MeasurementError(
-                f"files of this kind are not read.\n  Try: {', '.join(FORMATS)}", pose=path.name
+                f"files of this kind are not read.\n  Try: {', '.join(filter(None, FORMATS))}",
+                pose=path.name,
             )
         if not path.exists():
             raise MeasurementError("there is no such file", pose=str(path))

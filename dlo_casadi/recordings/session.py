@@ -152,6 +152,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             f"markers by arc length ({', '.join(names)}) along that spline; --at if they were "
             "measured with a tape"
         )
+    readings = _readings(recording, stills, wishes, remarks)
     known = {"length": length, **wishes.known}
     if "mass" in known and "bending_stiffness" not in known:
         known["bending_stiffness"] = _guess(known["mass"], known["length"])
@@ -160,7 +161,10 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
         name,
         {f"pose_{k:02d}.csv": _seen(places[:, k - 1], s) for k in range(1, len(stills) + 1)},
         {key: f"{value:.6g}" for key, value in known.items()},
-        tuple(_declared(k, still, start, end, wishes) for k, still in enumerate(stills)),
+        tuple(
+            {**_declared(k, still, start, end, wishes), **readings[k]}
+            for k, still in enumerate(stills)
+        ),
         FREE if wishes.end == FREE else "clamped",
         tuple(remarks),
     )
@@ -294,6 +298,35 @@ def _twist(start: _Gripper, places: FloatArray, end: _Gripper) -> float:
             side = side - (side @ b) / (1.0 + a @ b) * (a + b)
         total += complex(side @ last[:, 1], side @ last[:, 2])
     return float(-np.angle(total))
+
+
+def _readings(
+    recording: Recording, stills: Sequence[Still], wishes: Wishes, remarks: list[str]
+) -> list[dict[str, str]]:
+    """Forces and moments of each pose in the world's axes, by their keys in a configuration."""
+    found: list[dict[str, str]] = [{} for _ in stills]
+    for name, stream in recording.of("wrench").items():
+        named = (stream.frame, name)
+        side = "start" if any(wishes.start in text for text in named) else "end"
+        if wishes.end == FREE and side == "end":
+            continue
+        for still, row in zip(stills, found, strict=True):
+            wrench, body = still.values.get(f"wrench {name}"), f"body {stream.frame}"
+            if wrench is None or (
+                stream.frame in recording.of("body") and body not in still.values
+            ):
+                continue
+            turn = Rotation.identity()
+            if body in still.values:
+                turn = Rotation.from_quat(still.values[body][3:])
+            row[f"{side}_force"] = _row(turn.apply(wrench[:3]))
+            row[f"{side}_moment"] = _row(turn.apply(wrench[3:]))
+        axes = stream.frame if stream.frame in recording.of("body") else "the world"
+        remarks.append(
+            f"{side}_force, {side}_moment: means of {name}, in axes of {axes}; taken as those of "
+            "the cable on its fixture, about its place, with the gripper's weight taken off"
+        )
+    return found
 
 
 # ---- markers ------------------------------------------------------------------------------------

@@ -79,7 +79,7 @@ class Still:
 
 
 def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
-    """Shift all clocks to that of the first moving stream, by cross-correlation of speeds.
+    """Shift all clocks to that of the first marker or body, which then begins at zero.
 
     The offset of two clocks is the lag at which the mean speeds of their markers and bodies
     correlate best, to a fraction of a frame by a parabola through the maximum. A clock whose
@@ -91,7 +91,7 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
         If two recordings do not move alike.
     """
     clocks = tuple(dict.fromkeys(s.clock for s in recording.streams if s.kind != "wrench"))
-    if len(clocks) < 2:
+    if not clocks:
         return recording, ()
     dt = _period(recording.streams)
     speeds = [_speed([s for s in recording.streams if s.clock == c], dt) for c in clocks]
@@ -112,9 +112,9 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
         lag = (k - (len(v) - 1) + 0.5 * (a - c) / min(a - 2 * b + c, -1e-300)) * dt
         fastest = float(max(reference.max(), speed.max()))
         offsets.append(Offset(clock, clocks[0], begin - first + float(lag), height, fastest))
-    by_clock = {item.clock: item.seconds for item in offsets}
-    moved = tuple(replace(s, t=s.t - by_clock.get(s.clock, 0.0)) for s in recording.streams)
-    clouds = tuple(replace(c, t=c.t - by_clock.get(c.clock, 0.0)) for c in recording.clouds)
+    shift = {item.clock: first + item.seconds for item in offsets}
+    moved = tuple(replace(s, t=s.t - shift.get(s.clock, first)) for s in recording.streams)
+    clouds = tuple(replace(c, t=c.t - shift.get(c.clock, first)) for c in recording.clouds)
     return replace(recording, streams=moved, clouds=clouds), tuple(offsets)
 
 

@@ -1,0 +1,61 @@
+"""C3D files, which most motion capture systems write, read by ezc3d."""
+
+from pathlib import Path
+from struct import unpack_from
+
+import numpy as np
+
+from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.recordings.recording import Recording, Stream, factor, library
+
+_AGAIN = "Try: export the file again, whole."
+
+
+def read_c3d(path: Path, up: str | None) -> Recording:
+    """Read the labelled points of a C3D file as markers; a gripper is three of them.
+
+    Parameters
+    ----------
+    up : "x", "y", "z" or None
+        The axis that points up; by default POINT:Y_SCREEN of the file, or z without it.
+
+    Raises
+    ------
+    MeasurementError
+        If the file is damaged, or holds no labelled points.
+
+    References
+    ----------
+    The C3D file format, www.c3d.org: POINT:Y_SCREEN is the axis that points up on a screen.
+    """
+    ezc3d = library("ezc3d")
+    try:
+        content = ezc3d.c3d(str(path))
+    except (OSError, RuntimeError, ValueError) as error:
+        said = str(error).split(":")[0]
+        raise MeasurementError(f"is no C3D file: {said}.\n  {_AGAIN}", pose=path.name) from None
+    group = content["parameters"]["POINT"].items()
+    point = {key: item["value"] for key, item in group if key != "__METADATA__"}
+    places = content["data"]["points"][:3]
+    first, last = unpack_from("<HH", path.read_bytes(), 6)  # ezc3d corrects what it gives
+    declared = last - first + 1 if last < 65535 else 0
+    if places.shape[2] < declared:
+        raise MeasurementError(
+            f"ends after {places.shape[2]} of {counted(declared, 'frame')}.\n  {_AGAIN}",
+            pose=path.name,
+        )
+    labels = [label.strip() for label in point["LABELS"]]
+    named = [k for k, label in enumerate(labels) if label and not label.startswith("*")]
+    if not named or not places.size:
+        raise MeasurementError(
+            "holds no labelled points.\n  Try: label the markers before the export.",
+            pose=path.name,
+        )
+    t = np.arange(places.shape[2]) / float(point["RATE"][0])
+    scale = factor(point["UNITS"][0], path.name)
+    streams = [Stream(labels[k], "marker", t, scale * places[:, k].T, path.name) for k in named]
+    screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
+    own = screen.lstrip("+") if screen.lstrip("+") in ("x", "y", "z") else "z"
+    said = f"POINT:Y_SCREEN of {path.name}" if screen else "C3D files without POINT:Y_SCREEN"
+    assumed = () if up else (f"{own} is up, as {said}; or --up",)
+    return Recording(tuple(streams), assumptions=assumed).with_z_up(up or own)
