@@ -19,6 +19,7 @@ from dlo_casadi.effects import CableData, Setup
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import Clip, ClipKind
 from dlo_casadi.report.canvas import BLACK, BLUE, GREY, WIDTH, line_of, styled
 from dlo_casadi.report.scene import seen
 
@@ -38,6 +39,7 @@ class Shown:
     space: Mapping[str, float] = field(default_factory=dict)
     clamped: bool = False
     history: bool = False  # the third pose is the first one again
+    clipped: bool = False  # a pinned clip holds the middle
 
 
 # End of the pose that leaves a set [m], and the floor's depth below the cable [m].
@@ -74,6 +76,10 @@ SHOWN = {
     "clamp_rotation": Shown({}, {"start_y": 0.4, "start_z": 0.4, "end_y": 0, "end_z": 0}),
     "clamp_compliance": Shown({"start": 6, "end": 0}, {"start": 6, "end": 0}, clamped=True),
     "end_offset": Shown({"dx": 0.06, "dy": -0.04}, {"dx": 0.06, "dy": 0.06, "dz": -0.04}),
+    "clip_offset": Shown(
+        {"dx": 0.04, "dy": 0.03}, {"dx": 0.04, "dy": 0.04, "dz": 0.03}, clipped=True
+    ),
+    "clip_slip": Shown({"ds": 0.04}, {"ds": 0.04}, clipped=True),
     "rest_curvature_drift": Shown({"rate": 0.6}, {"rate": 0.6}, history=True),
     "plastic_set": Shown(
         {"yield_curvature": 3, "share": 0.9}, {"yield_curvature": 3, "share": 0.9}, history=True
@@ -106,18 +112,28 @@ def poses_in_space() -> list[HeldPose]:
     ]
 
 
+def middle_clip(pose: HeldPose) -> Clip:
+    """A clip that holds the middle of the cable somewhat below the middle of its ends."""
+    place = (np.array(pose.start) + np.array(pose.end)) / 2
+    return Clip("pinned", (*place[:-1], place[-1] - 0.1), LENGTH / 2)
+
+
 def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) -> list[FloatArray]:
     """Points of each pose, as measured; without the effect where there are no values."""
     cable = IN_SPACE if spatial else IN_PLANE
     held = "clamped" if spatial or shown.clamped else "pinned"
     gravity = (0.0, 0.0, -9.81) if spatial else (0.0, -9.81)
-    setup = Setup(cable, held, held, gravity, center=(0.4, -0.1), camera=True)
+    kinds: tuple[ClipKind, ...] = ("pinned",) if shown.clipped else ()
+    setup = Setup(cable, held, held, gravity, center=(0.4, -0.1), camera=True, clips=kinds)
     effects = (dlo.EFFECTS[name].made_for(setup),) if values else ()
-    model = CableModel(cable, ELEMENTS, start=held, end=held, gravity=gravity, effects=effects)
+    options = {"start": held, "end": held, "gravity": gravity, "effects": effects, "clips": kinds}
+    model = CableModel(cable, ELEMENTS, **options)
     p = model.nominal
     for key, value in values.items():
         p[model.names.index(f"{name}.{key}")] = value
     poses = poses_in_space() if spatial else poses_in_plane(shown.clamped)
+    if shown.clipped:
+        poses = [replace(pose, clips=(middle_clip(pose),)) for pose in poses]
     if shown.history:
         poses = [poses[0], replace(poses[1], end=TIGHT[: len(cable.axes)]), poses[0]]
     found = predict_poses(model, p, np.zeros(model.chain.n_rests), poses)

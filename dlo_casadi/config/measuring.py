@@ -180,6 +180,10 @@ class DeclaredTolerances(ConfigSection):
     """Of a clamp's orientation in space, about each of its axes [rad]."""
     roll: Positive = _STANDARD.roll
     """Of the roll of a cable in its end clamp, about itself [rad]."""
+    clip: Positive = _STANDARD.clip
+    """Of a coordinate of a clip between the ends [m]."""
+    slip: Positive = _STANDARD.slip
+    """Of the arc length at which a clip holds the cable [m]."""
     scale: Positive = _STANDARD.scale
     """Of the scale of the measurement, relative."""
     camera_rotation: Positive = _STANDARD.camera_rotation

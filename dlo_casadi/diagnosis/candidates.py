@@ -96,10 +96,8 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
         Effects that the user does not want to be tried.
     """
     found = []
-    for name, kind in EFFECTS.items():
-        if name in exclude or not kind.applies(setup):
-            continue
-        effect = kind.made_for(setup)
+    kinds = [x for x in EFFECTS.values() if x.name not in exclude and x.applies(setup)]
+    for effect in (effect for kind in kinds for effect in kind.each_for(setup)):
         prefix = f"{effect.label}."
         frees = tuple(prefix + q.name for q in effect.parameters(model.cable))
         if any(other.label == effect.label for other in model.effects):

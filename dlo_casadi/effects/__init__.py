@@ -9,6 +9,8 @@ from dlo_casadi.effects.camera_frame import CameraFrame as CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle as ClampAngle
 from dlo_casadi.effects.clamps import ClampCompliance as ClampCompliance
 from dlo_casadi.effects.clamps import ClampRotation as ClampRotation
+from dlo_casadi.effects.clips import ClipOffset as ClipOffset
+from dlo_casadi.effects.clips import ClipSlip as ClipSlip
 from dlo_casadi.effects.edge_bias import EdgeBias as EdgeBias
 from dlo_casadi.effects.effect import BoundaryEffect as BoundaryEffect
 from dlo_casadi.effects.effect import Effect as Effect
@@ -64,6 +66,8 @@ EFFECTS: dict[str, type[Effect]] = {
         ClampRotation,
         ClampCompliance,
         EndOffset,
+        ClipOffset,
+        ClipSlip,
         RestCurvatureDrift,
         PlasticSet,
         ImageScale,

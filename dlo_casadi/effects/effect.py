@@ -134,6 +134,11 @@ class Effect:
         """Return the effect with the options that suit a setup."""
         return cls()
 
+    @classmethod
+    def each_for(cls, setup: Setup) -> tuple[Self, ...]:
+        """All that a setup may have beside each other, of different labels."""
+        return (cls.made_for(setup),)
+
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
         """Why it cannot be declared with these values, and what to try; empty if it can."""
         count, where = len(setup.gravity), {2: "a plane", 3: "space"}

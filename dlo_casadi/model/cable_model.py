@@ -354,6 +354,8 @@ class Tolerances:
     camera_translation: float = 1e-3
     force_bias: float = 0.02
     moment_bias: float = 2e-3
+    clip: float = 2e-4
+    slip: float = 5e-4
 
     def deviation(self, node: type[Node]) -> FloatArray:
         """Standard deviations of `deviation_names`; infinite for unknown forces."""

@@ -76,10 +76,10 @@ def nuisances(
     """
     setup = setup_of(model, tolerances=asdict(tolerances), pixel=pixel, readings=readings)
     present = {effect.label for effect in model.effects}
-    for kind in (*EFFECTS.values(), *NUISANCES.values()):
-        if kind.name in present or not kind.applies(setup):
+    kinds = [x for x in (*EFFECTS.values(), *NUISANCES.values()) if x.applies(setup)]
+    for effect in (effect for kind in kinds for effect in kind.each_for(setup)):
+        if effect.label in present:
             continue
-        effect = kind.made_for(setup)
         priors = {f"{effect.label}.{name}": std for name, std in effect.prior(setup).items()}
         model = model.with_effect(effect, priors) if priors else model
     return model

@@ -1,0 +1,102 @@
+"""Clips that are not quite where, or do not hold the cable quite where, they are declared."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
+
+from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vector
+from dlo_casadi.effects.setup import Setup
+
+
+@dataclass(frozen=True)
+class _OfOneClip(BoundaryEffect):
+    """An effect of one clip, the same in all poses; `clip` is its number, 0 of the first."""
+
+    clip: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.label and self.clip:
+            object.__setattr__(self, "label", f"{self.name}_{self.clip + 1}")
+        super().__post_init__()
+
+    @classmethod
+    def numbers(cls, setup: Setup) -> list[int]:
+        """Clips that may have it."""
+        return list(range(len(setup.clips)))
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where there is such a clip."""
+        return super().applies(setup) and bool(cls.numbers(setup))
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """Of the first clip that may have it."""
+        return cls(clip=next(iter(cls.numbers(setup)), 0))
+
+    @classmethod
+    def each_for(cls, setup: Setup) -> tuple[Self, ...]:
+        """One for each clip that may have it."""
+        return tuple(cls(clip=k) for k in cls.numbers(setup))
+
+
+@dataclass(frozen=True)
+class ClipOffset(_OfOneClip):
+    """True minus declared place of one clip, the same in all poses.
+
+        place' = place + (dx, dy (, dz))
+
+    Parameters
+    ----------
+    dx, dy, dz : scalar [m]
+        Vanish at 0; dz in space alone.
+    """
+
+    name = "clip_offset"
+    tolerances: ClassVar = {"dx": "clip", "dy": "clip", "dz": "clip"}
+
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
+        """Declare the offset."""
+        names = (f"d{axis}" for axis in cable.axes)
+        return Parameter.symmetric(names, "m", 0.002 * cable.length, 0.1 * cable.length)
+
+    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
+        """Move the clip."""
+        clips = [
+            (place + vector(params, "d"), at) if k == self.clip else (place, at)
+            for k, (place, at) in enumerate(ends.clips)
+        ]
+        return replace(ends, clips=tuple(clips))
+
+
+@dataclass(frozen=True)
+class ClipSlip(_OfOneClip):
+    """True minus declared arc length at which one clip holds the cable, the same in all poses.
+
+        at' = at + ds
+
+    Parameters
+    ----------
+    ds : scalar [m]
+        Vanishes at 0.
+    """
+
+    name = "clip_slip"
+    tolerances: ClassVar = {"ds": "slip"}
+
+    @classmethod
+    def numbers(cls, setup: Setup) -> list[int]:
+        """All but eyelets, through which the cable slides anyway."""
+        return [k for k, kind in enumerate(setup.clips) if kind != "eyelet"]
+
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
+        """Declare the slip."""
+        return Parameter.symmetric(["ds"], "m", 0.005 * cable.length, 0.1 * cable.length)
+
+    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
+        """Move the place on the cable."""
+        clips = [
+            (place, at + params["ds"]) if k == self.clip else (place, at)
+            for k, (place, at) in enumerate(ends.clips)
+        ]
+        return replace(ends, clips=tuple(clips))
