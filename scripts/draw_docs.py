@@ -5,9 +5,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 
 import dlo_casadi as dlo
+from dlo_casadi.cable.picture import draw_shape
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import Clip
 from dlo_casadi.session.measure import draw_steps
 
 ROOT = Path(__file__).parents[1]
@@ -42,9 +51,37 @@ def draw_examples() -> None:
             shutil.copy(picture, PICTURES)
 
 
+def draw_clips() -> None:
+    """A cable that a pinned clip, a saddle and an eyelet hold between its ends."""
+    clips = (
+        Clip("pinned", (0.2, 0.06), 0.28, name="pinned"),
+        Clip("clamped", (0.42, 0.1), 0.56, heading=-0.5, name="clamped"),
+        Clip("eyelet", (0.62, 0.0), name="eyelet"),
+    )
+    kinds = tuple(clip.kind for clip in clips)
+    model = CableModel(CableData(1.0, 0.06, 0.005, 0.01), n=40, n_rest=0, clips=kinds)
+    pose = HeldPose((0.0, 0.0), (0.8, 0.05), clips=clips)
+    eq = solve_equilibrium(model, model.nominal, np.zeros(40), pose)
+    given = Inputs.of(model.nominal, np.zeros(40), pose.vector[None])
+    curve = NodeCurve.of(1.0, assembly_of(model).curve(eq.shapes, given)[0])
+    held = zip(clips, eq.clips, strict=True)
+    drawing = draw_shape(
+        curve.at(np.linspace(0.0, 1.0, 201)),
+        {"start": eq.start_force, "end": eq.end_force},
+        clips={clip.name: (np.array(clip.place), load.force) for clip, load in held},
+        band=None,
+        other=None,
+        title="three clips between two pins",
+        remark=f"smallest bend radius {1e3 * eq.min_bend_radius:.0f} mm",
+        alarming=False,
+    )
+    drawing.savefig(PICTURES / "clips.png", dpi=80)
+
+
 def main() -> None:
     """Draw all of them."""
     PICTURES.mkdir(exist_ok=True)
+    draw_clips()
     draw_camera_steps()
     draw_examples()
     result = dlo.fit(ROOT / "configs/cable.yaml")

@@ -10,7 +10,8 @@ from scipy.special import ellipe, ellipk
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import CableData, ClipOffset, ClipSlip
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -38,7 +39,7 @@ def test_a_beam_on_three_supports():
     """Clapeyron: M0 + 4 M1 + M2 = -w l^2 / 2 of equal spans l, with M2 = -w o^2 / 2."""
     span, over, stiff = 0.45, 0.1, replace(CABLE, bending_stiffness=200.0)
     supports = [Clip("eyelet", (span, 0.0)), Clip("eyelet", (2 * span, 0.0))]
-    model, _, eq = solved(supports, None, cable=stiff, end="free")
+    _, _, eq = solved(supports, None, cable=stiff, end="free")
     w = 9.81 * CABLE.mass / LENGTH
     middle = 1.25 * w * span - 0.75 * w * over**2 / span
     assert eq.stable
@@ -57,7 +58,8 @@ def test_an_elastica_pinned_at_mid_span_converges_to_two_half_waves():
         _, _, eq = solved([clip], (2 * chord, 0.0), n, gravity=(0.0, 0.0))
         assert np.abs(eq.clips[0].force).max() < 1e-9
         errors.append(abs(np.linalg.norm(eq.end_force) / force - 1))
-    assert errors[1] < 1e-4 and np.log2(errors[0] / errors[1]) > 1.9
+    assert errors[1] < 1e-4
+    assert np.log2(errors[0] / errors[1]) > 1.9
 
 
 def test_equal_tension_on_both_sides_of_an_eyelet():
@@ -69,7 +71,8 @@ def test_equal_tension_on_both_sides_of_an_eyelet():
         drops.append(-eq.end_force @ last - eq.start_force @ first)  # T at the end minus the start
     assert eq.stable
     error = np.abs(np.array(drops) - 0.2 * 9.81 * 0.25)
-    assert error[1] < 2e-3 and np.log2(error[0] / error[1]) > 1.8
+    assert error[1] < 2e-3
+    assert np.log2(error[0] / error[1]) > 1.8
 
 
 def test_a_rod_clamped_in_three_places_is_two_rods():
@@ -109,7 +112,8 @@ def test_loads_on_clips_are_minus_the_derivatives_of_the_energy():
     }
     model, pose, eq = solved(IN_SPACE, (0.7, 0.2, 0.1), 20, LOOM, **space)
     rest, step = np.zeros(model.chain.n_rests), 1e-5
-    assert eq.stable and eq.residual < 1e-12
+    assert eq.stable
+    assert eq.residual < 1e-12
 
     def slope(k, changed):
         energies = []
@@ -150,7 +154,8 @@ def test_ipopt_finds_the_same_minimum(second):
         for x, _ in first_guesses(model, model.nominal, rest, pose)
     ]
     energies = [own.energy for own in found if own is not None and own.stable]
-    assert eq.stable and eq.energy == pytest.approx(min(energies), rel=1e-9)
+    assert eq.stable
+    assert eq.energy == pytest.approx(min(energies), rel=1e-9)
 
 
 def test_the_tangent_is_the_derivative_of_the_balance():
@@ -204,6 +209,38 @@ def test_the_c_solver_refuses_clips():
     model, *_ = solved([Clip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(DloError, match="1 clip"):
         generate(model, model.nominal, np.zeros(40))
+
+
+@pytest.mark.parametrize("kind", ["pinned", "clamped"])
+def test_effects_of_clips_and_their_derivatives(kind):
+    """A moved clip is a clip elsewhere; the first derivatives are those of the moved equilibria."""
+    heading = 0.3 if kind == "clamped" else None
+    clips = (Clip(kind, (0.31, 0.05), 0.37, heading=heading), Clip("eyelet", (0.57, -0.02)))
+    kinds = tuple(clip.kind for clip in clips)
+    effects = (ClipOffset(clip=0), ClipOffset(clip=1), ClipSlip())
+    model = CableModel(CABLE, n=20, n_rest=0, clips=kinds, effects=effects)
+    assert model.names[2:4] == ("clip_offset.dy", "clip_offset_2.dx")
+    pose, rest = HeldPose((0.0, 0.0), (0.75, 0.1), clips=clips), np.zeros(20)
+    p = model.nominal + np.array([0.0, 0.003, -0.002, 0.004, 0.001, 0.002])
+    eq = solve_equilibrium(model, p, rest, pose)
+    moved = (
+        replace(clips[0], place=(0.313, 0.048), at=0.372),
+        replace(clips[1], place=(0.574, -0.019)),
+    )
+    declared = replace(model, effects=())
+    elsewhere = replace(pose, clips=moved)
+    same = solve_equilibrium(declared, model.nominal[:1], rest, elsewhere)
+    assert eq.energy == pytest.approx(same.energy, rel=1e-12)
+    equilibria, step = BatchEquilibrium(model, [pose]), 1e-6
+    along = equilibria.directions(eq.shapes, p, rest, np.eye(6), np.zeros((20, 6)))
+    ((_, change),) = equilibria.observe(eq.shapes, p, rest, along)
+    for k in range(1, 6):
+        ends = []
+        for h in (step, -step):
+            there = solve_equilibrium(model, p + h * np.eye(6)[k], rest, pose, x_init=eq.x)
+            (seen,) = equilibria.seen(there.shapes, p + h * np.eye(6)[k], rest)
+            ends.append(seen.curve.numbers)
+        assert change.curve[..., k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
 
 
 SESSION = """\

@@ -38,6 +38,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import Clip
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
 
@@ -57,11 +58,14 @@ UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad", "ra
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WHERE = (*(("plane", e) for e in ELEMENTS), *(("space", e) for e in ELEMENTS_IN_SPACE))
+CLIPPED = {"clip_offset", "clip_slip"}
+CLIPS = {"plane": Clip("pinned", (0.3, -0.1), 0.37), "space": Clip("pinned", (0.3, 0, 0), 0.37)}
 CASES = [
     (name, where, element)
     for where, element in WHERE
     for name, kind in sorted(EFFECTS.items())
     if {"plane": 2, "space": 3}[where] in kind.dimensions
+    and not (name in CLIPPED and element == "link")  # refused with clips
 ]
 
 
@@ -76,7 +80,8 @@ def plain(name: str, where: str, element: str) -> CableModel:
     """Model without the effect, with the boundaries that it needs."""
     held = "pinned" if where == "plane" and not name.startswith("clamp_") else "clamped"
     cable = CABLE if where == "plane" else IN_SPACE
-    return CableModel(cable, 5, element, held, held, GRAVITY[where])
+    clips = ("pinned",) if name in CLIPPED else ()
+    return CableModel(cable, 5, element, held, held, GRAVITY[where], clips=clips)
 
 
 @cache
@@ -105,6 +110,9 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
 def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[Shapes, Inputs]:
     """One pose, straight and unloaded or without any symmetry."""
     pose = POSE_IN_SPACE if model.in_space else POSE
+    if model.clips:
+        clip = CLIPS["space" if model.in_space else "plane"]
+        pose = np.concatenate([pose, clip.vector(model.node)])
     a, scale = assembly_of(model), 0.0 if headings == "straight" else 1.0
     shapes = any_shapes(a, scale=1.5 * scale)
     given = Inputs.of(p, scale * any_rest(a)[0], pose[None])

@@ -27,6 +27,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import Clip
 
 FLAT = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 CABLE = replace(FLAT, torsional_stiffness=0.03)
@@ -64,6 +65,8 @@ PLANAR = {
     "axial_stretch": {"compliance": 5e-3},
     "length_error": {"length_difference": 0.02},
     "end_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
+    "clip_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
+    "clip_slip": {"ds": 0.01},
     "rest_curvature_drift": {"rate": 0.3},
     "plastic_set": {"yield_curvature": 2.0, "share": 0.3},
 }
@@ -96,17 +99,22 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
     models, ps, rests = [], [], []
     for cable, g in ((FLAT, gravity), (CABLE, (*gravity, 0.0))):
         effect = EFFECTS[name].made_for(Setup(cable, "clamped", "clamped", g))
-        model = CableModel(cable, 10, "arc", "clamped", "clamped", g, (effect,))
+        model = CableModel(cable, 10, "arc", "clamped", "clamped", g, (effect,), clips=("pinned",))
         p = model.nominal.copy()
         for q in effect.parameters(cable):
             p[model.names.index(f"{name}.{q.name}")] = PLANAR[name][q.name]
         models.append(model)
         ps.append(p)
         rests.append(np.repeat([rest] if len(g) == 2 else [0.0, 0.0, rest], model.chain.n_cells))
-    pose = HeldPose((0.0, 0.0), (0.5, -0.1), *headings)
+    clips = [Clip("pinned", place, 0.22) for place in ((0.2, 0.0), (0.2, 0.0, 0.0))]
+    pose = HeldPose((0.0, 0.0), (0.5, -0.1), *headings, clips=(clips[0],))
     first, last = (tuple(Rotation.from_rotvec([0, 0, a]).as_quat()) for a in headings)
     same = HeldPose(
-        (0.0, 0.0, 0.0), (0.5, -0.1, 0.0), start_orientation=first, end_orientation=last
+        (0.0, 0.0, 0.0),
+        (0.5, -0.1, 0.0),
+        start_orientation=first,
+        end_orientation=last,
+        clips=(clips[1],),
     )
     flat = solve_equilibrium(models[0], ps[0], rests[0], pose)
     shapes = [Shapes.declared(flat.x[None], flat.multipliers[None]), in_space(models[1], flat)]
@@ -313,6 +321,7 @@ ONLY = {
     "space": {"bending_anisotropy", "camera_frame", "clamp_rotation"},
 }
 FULL = {"curved": True, "n_poses": 3, "center": (0.0, 0.0), "camera": True, "readings": True}
+FULL["clips"] = ("pinned",)
 
 
 def applied(where):

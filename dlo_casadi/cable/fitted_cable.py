@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
-from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.held import clip_texts, held_pose
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Clip
@@ -143,10 +143,8 @@ class FittedCable(CasadiCable):
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         pose = held_pose(self.model, self.metadata.fixtures, asked | {"clips": list(clips)})
-        if pose.clips:
-            model = replace(self.model, clips=tuple(clip.kind for clip in pose.clips))
-            return replace(self, model=model)._solved(pose)
-        return self._solved(pose)
+        model = replace(self.model, clips=tuple(clip.kind for clip in pose.clips))
+        return (replace(self, model=model) if pose.clips else self)._solved(pose)
 
     def _solved(self, pose: HeldPose) -> "Shape":
         try:
@@ -352,6 +350,7 @@ class Shape:
         return draw_shape(
             self.points,
             forces,
+            clips={k: (self.curve.at(np.array([x.at]))[0], x.force) for k, x in self.clips.items()},
             band=None if self.cable.model.in_space else self.band,
             other=None if other is None else other.points,
             title=f"{self.cable.name}: predicted shape",
@@ -376,6 +375,7 @@ class Shape:
             if getattr(self.cable.model, side) == "clamped":
                 said = vector(moment, ".4g", "N m") if moment.ndim else f"{moment:.4g} N m"
                 rows.append((f"moment of the cable on its {side}", said))
+        rows += clip_texts(pose.clips, self.equilibrium.clips)
         rows.append(("energy", f"{self.energy:.6g} J"))
         rows.append(("smallest bend radius", millimetres(self.min_bend_radius)))
         rows.append(("stable", "yes" if self.stable else "NO: the cable would not stay there"))

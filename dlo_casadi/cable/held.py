@@ -1,6 +1,6 @@
 """How the ends of a fitted cable are held, from what a caller gives and what a session shares."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -9,12 +9,27 @@ from dlo_casadi.config.clips import clip_problems
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import CLAMPS, Clip, ClipLoad
+from dlo_casadi.show.text import vector
 
 # Whether in space -> key of a clamp's direction, unit, the other dimension's key, words, a place.
 _DIRECTIONS = {
     False: ("heading", " [rad]", "orientation", "two numbers of gravity", "[x, y]"),
     True: ("orientation", " [qx, qy, qz, qw]", "heading", "three numbers of gravity", "[x, y, z]"),
 }
+
+
+def clip_texts(clips: Sequence[Clip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:
+    """Clips, and the forces and moments of the cable on them, as text."""
+    rows = []
+    for clip, load in zip(clips, loads, strict=True):
+        at = f"{clip.kind} at {load.at:.4g} m of the cable, {vector(clip.place, 'g', 'm')}"
+        rows.append((clip.name, at))
+        rows.append((f"force of the cable on {clip.name}", vector(load.force, ".4g", "N")))
+        if clip.kind in CLAMPS:
+            said = vector(load.moment, ".4g", "N m")
+            rows.append((f"moment of the cable on {clip.name}", said))
+    return rows
 
 
 def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, Any]) -> HeldPose:

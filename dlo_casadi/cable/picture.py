@@ -18,6 +18,7 @@ def draw_shape(
     points: FloatArray,
     forces: Mapping[str, FloatArray],
     *,
+    clips: Mapping[str, tuple[FloatArray, FloatArray]],
     band: FloatArray | None,
     other: FloatArray | None,
     title: str,
@@ -26,10 +27,14 @@ def draw_shape(
 ) -> Figure:
     """Draw a shape (K, d) [m] with the forces (d,) [N] on its ends "start" and "end".
 
+    `clips` are the places (d,) [m] of clips and the forces on them, by their names.
     `band` (K,) [m] are half widths about a shape in a plane, `other` (K, d) [m] is the shape on
     the other side.
     """
-    largest = max(float(np.linalg.norm(force)) for force in forces.values())
+    ends = {"start": (points[0], "s"), "end": (points[-1], "o")}
+    drawn = [(name, *ends[name], force) for name, force in forces.items()]
+    drawn += [(name, place, "D", force) for name, (place, force) in clips.items()]
+    largest = max(float(np.linalg.norm(force)) for *_, force in drawn)
     extent = float(np.ptp(points, axis=0).max())
     reach = _LONGEST * extent / max(largest, 1e-12)
     with style.styled((7.0, 6.0)) as drawing:
@@ -41,8 +46,7 @@ def draw_shape(
         axes.plot(*points.T, color=style.BLUE, lw=2.5, label="cable")
         if other is not None:
             axes.plot(*other.T, "--", color=style.BLUE, lw=1.5, label="on the other side")
-        for side, force in forces.items():
-            at, marker = (points[0], "s") if side == "start" else (points[-1], "o")
+        for side, at, marker, force in drawn:
             axes.plot(*at[:, None], marker, color=style.BLACK, ms=7, label=side)
             size = float(np.linalg.norm(force))
             if size <= 1e-3 * largest or largest == 0:
@@ -61,7 +65,8 @@ def draw_shape(
         axes.margins(0.12)
         axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
         axes.plot([], [], color=style.VERMILLION, label="force on the fixtures")
-        drawing.legend(loc="outside lower center", ncols=5 if other is None else 3)
+        few = other is None and len(clips) < 2
+        drawing.legend(loc="outside lower center", ncols=5 if few else 3)
         axes.set_title(remark, color=style.VERMILLION if alarming else style.GREY)
         drawing.suptitle(title, fontsize=12)
     return drawing

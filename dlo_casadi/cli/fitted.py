@@ -9,6 +9,7 @@ from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, o
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
+from dlo_casadi.config import read_yaml
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
@@ -59,6 +60,7 @@ HELD = (
     ),
     option("--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"),
     BRANCH,
+    option("--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"),
     option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
     codes="2 is also a pose without an equilibrium",
 )
@@ -77,7 +79,11 @@ def predict(chosen: argparse.Namespace) -> None:
     figure = chosen.figure
     if figure is not None and figure.suffix.lower() not in DRAWN:
         raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
-    shape = load(chosen.parameters).solve(**{name: getattr(chosen, name) for name in HELD})
+    clips = [] if chosen.clips is None else read_yaml(chosen.clips)
+    if not isinstance(clips, list):
+        raise DloError(f"{chosen.clips}: a list of clips belongs here: - {{kind: pinned, ...}}")
+    asked = {name: getattr(chosen, name) for name in HELD}
+    shape = load(chosen.parameters).solve(**asked, clips=clips)
     if figure is not None:
         save_figure(figure, shape.plot())
     # What a reader of the prediction should know of the file it came from.

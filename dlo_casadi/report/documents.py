@@ -143,6 +143,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
             for pose, shape in stage.shapes.items()
             if shape.readings
         },
+        "clips": {pose: shape.clips for pose, shape in stage.shapes.items() if shape.clips},
         **fields_of(stage, "rmse_fit_measured_branch", "rmse_held_out_measured_branch"),
         "other_branch": {
             pose: {

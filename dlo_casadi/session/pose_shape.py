@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -101,6 +102,8 @@ class PoseShape:
         Of a fit pose that is compared on the side where it was measured, not the lower one.
     either_side : EitherSide or None
         Of a held-out pose that tells no side, where there are two; None if it was not computed.
+    clips : tuple of dict
+        What the cable does to its clips, see `clip_rows`.
     """
 
     curve: FloatArray
@@ -119,6 +122,7 @@ class PoseShape:
     missed: FloatArray | None = None
     expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    clips: tuple[Mapping[str, Any], ...] = ()
 
     def inside_band(self, length: float, noise: float) -> BoolArray:
         """Whether each measured point (K,) lies in its 90 % band, noise included."""

@@ -28,6 +28,7 @@ from dlo_casadi.estimation.prediction import (
 from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
+from dlo_casadi.model.clips import clip_rows
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -62,6 +63,7 @@ def pose_shape(
         np.stack([eq.start_force, eq.end_force]),
         _branch_shape(other, item) if item.readable and other is not None else None,
         readings=item.readings_beside(prediction.seen),
+        clips=tuple(clip_rows(item.pose.clips, eq.clips)),
     )
 
 

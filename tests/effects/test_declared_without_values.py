@@ -12,6 +12,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.clips import Clip
 from dlo_casadi.rod.ends import REACTIONS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
@@ -49,6 +50,8 @@ STRONG = {
     "clamp_rotation": {"start_y": 0.5, "start_z": -0.3, "end_y": 0.3, "end_z": 0.4},
     "clamp_compliance": {"start": 3.0, "end": 5.0},
     "end_offset": {"dx": 0.04, "dy": -0.05, "dz": 0.03},
+    "clip_offset": {"dx": 0.03, "dy": -0.02, "dz": 0.02},
+    "clip_slip": {"ds": 0.03},
     "rest_curvature_drift": {"rate": 0.4},
     "plastic_set": {"yield_curvature": 2.0, "share": 0.6},
     "image_scale": {"factor": 1.1},
@@ -98,7 +101,13 @@ def test_a_fit_stays_finite(name, where, has):
     cable = replace(cable, straight=not issubclass(EFFECTS[name], StateEffect))
     setup = Setup(cable, held, held, gravity, center=(0.2, 0.0), camera=True, readings=REACTIONS)
     effect = EFFECTS[name].made_for(setup)
-    plain = CableModel(cable, N, "arc", held, held, gravity, n_rest=3)
+    clips = ("pinned",) if name.startswith("clip_") else ()
+    if clips:
+        middles = [tuple(np.array(pose.end) / 2) for pose in poses]
+        held_at = [Clip("pinned", place, 0.45 * LENGTH) for place in middles]
+        poses = [replace(pose, clips=(x,)) for pose, x in zip(poses, held_at, strict=True)]
+    n = 2 * N if clips else N  # each span needs its own
+    plain = CableModel(cable, n, "arc", held, held, gravity, n_rest=3, clips=clips)
     model = plain.with_effect(effect)
     p = model.nominal.copy()
     if has:
