@@ -85,6 +85,7 @@ def test_every_key_of_the_schema_is_there(outcome):
             "moment_rmse_fit",
             "moment_rmse_held_out",
             "readings",
+            "clips",
             "rmse_fit_measured_branch",
             "rmse_held_out_measured_branch",
             "other_branch",
