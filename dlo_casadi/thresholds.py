@@ -156,3 +156,14 @@ NOTABLE = 3.0
 EITHER = 2.0
 # Distance of rivals [standard deviations] beyond which they are told apart: one in 370 by chance.
 APART = 3.0
+
+# ---- limits ------------------------------------------------------------------------------------
+
+# Probability of a violated limit below which it passes.
+SAFE = 0.01
+# Largest difference of a probability of first order from that of shapes solved anew, two standard
+# errors included, for which it is told.
+FIRST_ORDER = 0.02
+# Relative change of the least bend radius on half the element size below which the mesh resolves
+# it: of second order, what is left is a third of it.
+RESOLVED = 0.01

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.config import Limits
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.show.text import plus_minus
@@ -130,6 +131,8 @@ class Metadata:
     fixtures : dict
         Those of `start` [m] and `start_heading`, `end_heading` [rad], in space `start_orientation`,
         `end_orientation`, that are the same in all poses of the session.
+    limits : Limits
+        Those that the session declared.
     explains : bool or None
         Whether the model explains the shapes it was fitted to; None where that was not judged.
     model_hash : str
@@ -149,6 +152,7 @@ class Metadata:
     uncertainty: Uncertainty
     coefficients: FloatArray
     fixtures: dict[str, Any]
+    limits: Limits
     explains: bool | None
     model_hash: str
     edited: bool

@@ -18,6 +18,7 @@ import numpy as np
 
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata
 from dlo_casadi.cable.fitted_cable import FittedCable
+from dlo_casadi.config import Limits
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.options import ElementName
 from dlo_casadi.config.problems import ConfigProblem, show
@@ -153,6 +154,7 @@ class ParametersFile(OpenSection):
     covariance: Annotated[_Covariance, checked(lambda found: found.complaint)]
     scatter: _Scatter | None = None
     fixtures: dict[str, Any] | None = None
+    limits: Limits = Limits()
     explains: bool | None = None
     model_hash: Name
     config: Name | None = None
@@ -293,6 +295,7 @@ def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
         uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter, scatter.hanging),
         coefficients=np.array(file.rest_curvature.coefficients, dtype=float),
         fixtures=file.fixtures or {},
+        limits=file.limits,
         explains=file.explains,
         model_hash=file.model_hash,
         edited=parameters_hash(document) != file.model_hash,

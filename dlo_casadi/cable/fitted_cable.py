@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.curve import CableCurve
+from dlo_casadi.cable.curve import CableCurve, curves_of
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
 from dlo_casadi.cable.held import clip_texts, held_pose
+from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Clip
 from dlo_casadi.config.values import MESH
-from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -33,7 +33,6 @@ from dlo_casadi.equilibrium.spread import (
 )
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError, counted
-from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.rod.node import Frame, Heading
@@ -206,19 +205,7 @@ class FittedCable(CasadiCable):
         return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
 
     def _shape(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
-        model = plain = self.model
-        effects = tuple(x for x in model.effects if not isinstance(x, MeasurementEffect))
-        if effects != model.effects:  # the true curve is that without the effects of the camera
-            plain = replace(model, effects=effects, priors={})
-        kept = [name in plain.names for name in model.names]
-        curve, seen = (
-            CableCurve.of(
-                self.length,
-                assembly_of(one).curve(eq.shapes, Inputs.of(p, self.rest, pose.vector[None]))[0],
-            )
-            for one, p in ((plain, self.p[kept]), (model, self.p))
-        )
-        return Shape(self, pose, eq, curve, seen)
+        return Shape(self, pose, eq, *curves_of(self.model, self.p, self.rest, pose, eq))
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,6 +325,20 @@ class Shape:
             cable.model, cable.p, cable.rest, self.pose, self.equilibrium, known, s
         )
         return np.asarray(EDGE * np.linalg.norm(spread_across(curve, s, moved), axis=1))
+
+    def check(self, limits: Asked = None, *, tolerances: Asked = None) -> tuple[LimitCheck, ...]:
+        """Whether a new repeat of the pose keeps limits, by default the session's.
+
+        `tolerances` are standard deviations of other fixtures than the session's, by its keys:
+        `end`, `length` [m], `heading`, `rotation`, `roll` [rad].
+
+        Raises
+        ------
+        ConfigError, DloError
+            If there is no limit, or one or a tolerance has no meaning for this cable.
+        """
+        known = self.cable.metadata
+        return check_limits(self.cable, known, self.pose, self.equilibrium, limits, tolerances)
 
     def plot(self) -> Figure:
         """The shape with the forces of the cable on its fixtures; in a plane with its band."""

@@ -1,7 +1,9 @@
 """How the ends of a fitted cable are held, from what a caller gives and what a session shares."""
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
 from dlo_casadi.config import Pose
@@ -86,3 +88,50 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     if pose.turns and not (spatial and model.start == model.end == "clamped"):
         raise DloError(f"{name} has no turns: it is not in space and clamped at both ends")
     return replace(pose, name=model.cable.name or "cable")
+
+
+def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
+    """Arguments of `FittedCable.solve` for each line of a CSV, by the pose's name.
+
+    Columns are end_x_m, end_y_m and, where they differ from pose to pose, start_x_m, start_y_m,
+    start_heading_rad, end_heading_rad; in space also end_z_m, start_z_m, start_qx to start_qw,
+    end_qx to end_qw and turns; and name, the line's number when absent.
+
+    Raises
+    ------
+    DloError
+        If there is no such file, or it has other columns or cells that are no numbers.
+    """
+    axes, sides = model.node.axes, ("start", "end")
+    keys = {side: [f"{side}_{axis}_m" for axis in axes] for side in sides}
+    if model.in_space:
+        keys |= {f"{side}_orientation": [f"{side}_q{x}" for x in "xyzw"] for side in sides}
+        keys["turns"] = ["turns"]
+    else:
+        keys |= {f"{side}_heading": [f"{side}_heading_rad"] for side in sides}
+    known = ["name", *(column for group in keys.values() for column in group)]
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = list(csv.DictReader(stream, skipinitialspace=True))
+    except (OSError, UnicodeError, csv.Error) as error:
+        raise DloError(
+            f"{path}: {error}\n  Try: a CSV with the columns {', '.join(known)}"
+        ) from None
+    if not rows or (strange := [x for x in rows[0] if x not in known]):
+        said = f"unknown columns {strange}" if rows else "no poses"
+        raise DloError(f"{path}: {said}.\n  Try: {', '.join(known)}; the first line names them")
+    out: dict[str, dict[str, Any]] = {}
+    for k, row in enumerate(rows, start=1):
+        given: dict[str, Any] = {}
+        for key, columns in keys.items():
+            if set(columns) & row.keys():
+                try:
+                    numbers = [float(row[column]) for column in columns]
+                except (KeyError, TypeError, ValueError):
+                    cells = ", ".join(f"{x}={row.get(x)!r}" for x in columns)
+                    raise DloError(
+                        f"{path}, pose {k}: numbers belong here, found {cells}"
+                    ) from None
+                given[key] = numbers if len(columns) > 1 else numbers[0]
+        out[row.get("name") or f"pose_{k:02d}"] = given
+    return out

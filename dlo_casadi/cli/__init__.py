@@ -22,6 +22,7 @@ COMMANDS = {
     "fit-many": ("fit", "fit many sessions, on many cores or machines, into one table"),
     "diagnose": ("fit", "fit, and print the search for missing effects in full"),
     "predict": ("fitted", "predict the shape of a fitted cable from where its ends are held"),
+    "limits": ("fitted", "check whether a fitted cable keeps its limits in a list of poses"),
     "shape-table": ("fitted", "predict the shapes of a fitted cable in very many poses"),
     "generate-solver": ("fitted", "write the C solver of a fitted cable for planners to embed"),
     "schema": ("new", "print the JSON schema of a configuration, for editors"),

@@ -1,16 +1,19 @@
-"""`dlo predict`, `dlo shape-table`, `dlo generate-solver`: what a fitted cable is used for."""
+"""`dlo predict`, `dlo limits`, `dlo shape-table`, `dlo generate-solver`: uses of a fitted cable."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from dlo_casadi.cable.file import load
-from dlo_casadi.cable.fitted_cable import FittedCable
+from dlo_casadi.cable.fitted_cable import FittedCable, Shape
+from dlo_casadi.cable.held import listed_poses
+from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
 from dlo_casadi.config import read_yaml
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
 from dlo_casadi.fleet.shape_table import Plan
@@ -25,6 +28,16 @@ MESH = (
         "--element",
         choices=ELEMENTS,
         help="instead of the fit's; arcs are several times faster than quadratic elements",
+    ),
+)
+_LIMITS = "bend_radius [m], force [N], moment [N m], twist [1/m]; as the session declared without"
+LIMITS = (
+    option("--limits", nargs="*", metavar="NAME=VALUE", help=f"check limits: {_LIMITS}"),
+    option(
+        "--tolerances",
+        nargs="+",
+        metavar="NAME=VALUE",
+        help="of other fixtures than the session's: end, length [m], heading, rotation, roll [rad]",
     ),
 )
 # What `dlo predict` hands on.
@@ -61,6 +74,7 @@ HELD = (
     option("--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"),
     BRANCH,
     option("--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"),
+    *LIMITS,
     option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
     codes="2 is also a pose without an equilibrium",
 )
@@ -72,8 +86,9 @@ def predict(chosen: argparse.Namespace) -> None:
     dlo predict results/cable --start 0.1 0 --end 0.3 -0.1 --branch cw --json
     dlo predict results/wire --end -0.12 0 --start-heading 0 --end-heading -6.2832
     dlo predict results/loom --end 0.6 0.1 0.3 --end-orientation 0 0 0 1 --turns 1
+    dlo predict results/cable --end 0.3 -0.1 --limits bend_radius=0.05 force=8 --tolerances end=2e-3
     """
-    from dlo_casadi.report.terminal import prediction_table
+    from dlo_casadi.report.terminal import limits_table, prediction_table
     from dlo_casadi.show.style import save_figure
 
     figure = chosen.figure
@@ -100,11 +115,67 @@ def predict(chosen: argparse.Namespace) -> None:
             "note: the shapes did not determine the bending stiffness; the shape is more certain "
             "than forces and energy"
         )
-    page = Page(chosen)
-    page.data(shape.as_dict())
+    page, found = Page(chosen), shape.as_dict()
+    checks = None if chosen.limits is None else _checked(shape, chosen)
+    if checks is not None:
+        found["limits"] = [check.as_dict() for check in checks]
+    page.data(found)
     page.print(prediction_table(shape, notes))
+    if checks is not None:
+        page.print(limits_table(shape.cable.name, checks))
     if figure is not None:
         page.say(f"Figure: {figure}")
+
+
+def _checked(shape: Shape, chosen: argparse.Namespace) -> tuple[LimitCheck, ...]:
+    """Checks of a shape against the limits of the command, or those of the session."""
+    return shape.check(_named("limits", chosen) or None, tolerances=_named("tolerances", chosen))
+
+
+def _named(key: str, chosen: argparse.Namespace) -> dict[str, float]:
+    """Numbers by their names, of NAME=VALUE."""
+    found = {}
+    for word in getattr(chosen, key) or ():
+        name, _, value = word.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise DloError(
+                f"--{key} {word}: NAME=VALUE belongs here, such as "
+                f"{'end=2e-3' if key == 'tolerances' else 'bend_radius=0.05'}"
+            ) from None
+    return found
+
+
+@command(
+    PARAMETERS,
+    option("poses", type=Path, help="CSV with end_x_m, end_y_m, ...; in space also end_qx, ..."),
+    *LIMITS,
+)
+def limits(chosen: argparse.Namespace) -> None:
+    """Check whether a fitted cable keeps its limits in every pose of a list, and how sure that is.
+
+    dlo limits results/cable poses.csv
+    dlo limits results/cable poses.csv --limits bend_radius=0.05 force=8 --tolerances end=2e-3
+    """
+    from dlo_casadi.report.terminal import limits_table
+
+    cable = load(chosen.parameters)
+    checks: list[LimitCheck] = []
+    lost: dict[str, str] = {}
+    for name, ends in listed_poses(cable.model, chosen.poses).items():
+        try:
+            shape = cable.solve(**ends)
+        except EquilibriumError as error:
+            lost[name] = error.message.partition("\n")[0]
+            continue
+        named = replace(shape, pose=replace(shape.pose, name=name))
+        checks += _checked(named, chosen)
+    page = Page(chosen)
+    page.data({"limits": [check.as_dict() for check in checks], "without_shape": lost})
+    page.print(limits_table(cable.name, checks))
+    for name, problem in lost.items():
+        page.warn(f"{name}: {problem}")
 
 
 @command(

@@ -14,6 +14,6 @@ from dlo_casadi.config.load import (
     load_config,
     wrong_effects,
 )
-from dlo_casadi.config.measuring import Centerlines, DeclaredCamera, Images
-from dlo_casadi.config.options import DeclaredEffect, EstimationOptions
+from dlo_casadi.config.measuring import Centerlines, DeclaredCamera, DeclaredTolerances, Images
+from dlo_casadi.config.options import DeclaredEffect, EstimationOptions, Limits
 from dlo_casadi.config.sections import Cable, Config, Pose, SkippedPose

@@ -1,11 +1,24 @@
-"""How the fit goes about it: the declared model, the estimate, the diagnosis."""
+"""How the fit goes about it: the declared model, the estimate, the diagnosis; and limits."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
-from dlo_casadi.config.values import ConfigSection, Elements, Number, RestCoefficients, Switch
+from dlo_casadi.config.problems import ConfigProblem
+from dlo_casadi.config.values import (
+    FORCE,
+    LENGTH,
+    MOMENT,
+    ConfigSection,
+    Elements,
+    Number,
+    Positive,
+    Range,
+    RestCoefficients,
+    Switch,
+    within,
+)
 from dlo_casadi.thresholds import SIGNIFICANCE
 
 ElementName = Literal["quadratic", "arc", "link"]
@@ -81,3 +94,56 @@ class DiagnosisOptions(ConfigSection):
     """Largest p-value with which an effect is added."""
     max_effects: Annotated[int, Field(strict=True, ge=0)] = 4
     """Largest number of effects that are added."""
+
+
+# Largest bend radius and clearance that are asked of a cable, in lengths of it: three turn the
+# whole cable by 20 degrees at most; in millimetres a limit is hundreds.
+_LARGEST = 3.0
+# A full turn in a tenth of a millimetre.
+_TWIST = Range(0.0, 1.0e5, "1/m")
+
+
+class Limits(ConfigSection):
+    """What the cable must keep."""
+
+    bend_radius: Annotated[Positive, within(LENGTH._replace(least=1.0e-4))] | None = None
+    """Least radius of curvature [m]."""
+    force: Annotated[Positive, within(FORCE)] | None = None
+    """Greatest force of the cable on each of its fixtures [N]."""
+    moment: Annotated[Positive, within(MOMENT)] | None = None
+    """Greatest moment of the cable on each clamp [N m]."""
+    twist: Annotated[Positive, within(_TWIST)] | None = None
+    """Greatest twist in space, the angle about the axis per length [1/m]."""
+    clearance: Annotated[Positive, within(LENGTH._replace(least=1.0e-6))] | None = None
+    """Least distance of the cable's surface from obstacles [m]; none can be declared yet."""
+
+    @property
+    def given(self) -> dict[str, float]:
+        """The limits that there are, by their names."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: value for name, value in values.items() if value is not None}
+
+    def problems(
+        self, held: Sequence[str], in_space: bool, length: float
+    ) -> Iterator[ConfigProblem]:
+        """Find limits that have no meaning for a cable.
+
+        `held` are the kinds of its ends and clips, `length` [m] is the cable's.
+        """
+        for name in ("bend_radius", "clearance"):
+            value = self.given.get(name, 0.0)
+            if value > _LARGEST * length:
+                text = f"limits.{name}: {value:g} m for a cable of {length:g} m: units are SI"
+                meant = value / 1e3
+                hint = f", did you mean {meant:g}?" if meant < length else ""
+                yield ConfigProblem((name,), f"{text}{hint}")
+        if self.clearance is not None:
+            text = "limits.clearance: there is nothing to be clear of, a session has no obstacles"
+            hint = "leave it out; the compiled solver's clearance(shape, obstacles) measures it"
+            yield ConfigProblem(("clearance",), f"{text}. Try: {hint}")
+        if self.twist is not None and not in_space:
+            text = "limits.twist: a cable in a plane (two numbers of gravity) does not twist"
+            yield ConfigProblem(("twist",), f"{text}. Try: leave it out")
+        if self.moment is not None and not {"clamped", "swivel"} & {*held}:
+            text = f"limits.moment: no end is clamped ({', '.join(held)}), none takes a moment"
+            yield ConfigProblem(("moment",), f"{text}. Try: leave it out")

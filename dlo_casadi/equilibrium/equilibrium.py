@@ -117,18 +117,29 @@ class Equilibrium:
         return self.status is Status.STABLE
 
 
+def places_along(cells: FloatArray) -> FloatArray:
+    """Arc lengths (n_cells + 2,) [m] of `curvatures_along`: start, cells' middles, end."""
+    return np.concatenate([cells[:1, 0], cells.mean(axis=1), cells[-1:, 1]])
+
+
+def curvatures_along(curvature: FloatArray, cells: FloatArray) -> FloatArray:
+    """Sizes (..., n_cells + 2) [1/m] of curvatures (..., axes n_cells) that are means over cells.
+
+    They are continued linearly to both ends, see `Equilibrium.min_bend_radius`.
+    """
+    widths = np.diff(cells, axis=1).ravel()
+    inner = curvature.reshape((*curvature.shape[:-1], -1, len(cells)))
+    known = inner[..., 0, :] if inner.shape[-2] == 1 else np.linalg.norm(inner, axis=-2)
+    ends = []
+    for outer, beside in ((0, 1), (-1, -2)) if len(cells) > 1 else ((0, 0), (-1, -1)):
+        share = widths[outer] / (widths[outer] + widths[beside])
+        ends.append(known[..., [outer]] + share * (known[..., [outer]] - known[..., [beside]]))
+    return np.abs(np.concatenate([ends[0], known, ends[1]], axis=-1))
+
+
 def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
     """Smallest radius [m] of curvatures that are means over cells (n, 2), see `Equilibrium`."""
-    widths = np.diff(cells, axis=1).ravel()
-    if len(curvature) > len(cells):
-        curvature = np.linalg.norm(curvature.reshape((-1, len(cells))), axis=0)
-    largest = float(np.abs(curvature).max())
-    for inner in (1, -2) if len(curvature) > 1 else ():
-        outer = 0 if inner == 1 else -1
-        share = widths[outer] / (widths[outer] + widths[inner])
-        at_end = curvature[outer] + share * (curvature[outer] - curvature[inner])
-        largest = max(largest, abs(float(at_end)))
-    return 1 / max(largest, 1e-300)
+    return 1 / max(float(curvatures_along(curvature, cells).max()), 1e-300)
 
 
 def equilibria_of(

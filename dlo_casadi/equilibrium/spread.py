@@ -1,19 +1,22 @@
 """Uncertainty of a prediction: the spread of a new repeat of a pose, and its side."""
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from scipy.special import ndtri
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import ways_of
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.rest_curvature import MODES, RestScatter, modes_of
 from dlo_casadi.thresholds import EITHER
 
@@ -40,6 +43,9 @@ class Uncertainty:
     repeat_std : float [m]
         Standard deviation of a coordinate between repeats of one pose, root mean square along the
         cable; 0 where no pose was repeated.
+    added : mapping of str to float
+        Standard deviations of parameters beyond the covariance, by name: where the cable is
+        installed again, its length and roll between the fixtures are new.
     """
 
     names: tuple[str, ...]
@@ -47,6 +53,7 @@ class Uncertainty:
     scatter: Mapping[str, float]
     rest_scatter: RestScatter
     repeat_std: float = 0.0
+    added: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def root(self) -> FloatArray:
@@ -72,7 +79,7 @@ class Uncertainty:
 
         Changes of the parameters (n_parameters, q), the rest strains (n_rests, q) and the model's
         deviations (n_deviations, q) without unknown forces: by the fitted unknowns, the fixtures,
-        and modes of the rest curvature that each repeat has of its own.
+        modes of the rest curvature that each repeat has of its own, and what is `added`.
         """
         by_p, by_rest = (by @ self.root for by in self.unknowns_in(model))
         modes = modes_in(model)
@@ -84,7 +91,57 @@ class Uncertainty:
         by_deviation = np.zeros((len(model.deviation_names), count))
         by_deviation[used, n + np.arange(m)] = np.where(np.isfinite(scatter), scatter, 0.0)
         by_rest = np.hstack([np.pad(by_rest, [(0, 0), (0, m)]), modes])
-        return np.pad(by_p, [(0, 0), (0, count - n)]), by_rest, by_deviation
+        by_p = np.pad(by_p, [(0, 0), (0, count - n)])
+        new = np.zeros((len(by_p), len(self.added)))
+        new[[model.names.index(name) for name in self.added], range(len(self.added))] = [
+            *self.added.values()
+        ]
+        none = [(0, 0), (0, len(self.added))]
+        return np.hstack([by_p, new]), np.pad(by_rest, none), np.pad(by_deviation, none)
+
+    def causes_in(self, model: CableModel) -> tuple[str, ...]:
+        """Cause of each of `ways_in`.
+
+        "parameters" of the fit, the "end" fixture's place, directions of clamps such as
+        "end_heading" and "end_rotation", the "repeat", or the name of an added parameter.
+        """
+        fixtures = (cause_of(model, name) for name in model.deviations)
+        repeat = ["repeat"] * modes_in(model).shape[1]
+        return (*["parameters"] * len(self.names), *fixtures, *repeat, *self.added)
+
+    def installed(self, model: CableModel, tolerances: Mapping[str, float]) -> Self:
+        """The same cable between other fixtures, of these standard deviations by `tolerances_of`.
+
+        Deviations of the ends replace the scatter of the session's fixtures; those of parameters
+        are added to what is known of them. Names that the model does not have are left out.
+        """
+        scatter, added = dict(self.scatter), dict(self.added)
+        for name, std in tolerances.items():
+            for varied in tolerances_of(model).get(name, ()):
+                (scatter if varied in model.deviations else added)[varied] = std
+        return replace(self, scatter=scatter, added=added)
+
+
+def cause_of(model: CableModel, deviation: str) -> str:
+    """What deviates: the name of a deviation without the axis along or about which it does."""
+    return re.sub(f"_({'|'.join(model.node.axes)})$", "", deviation)
+
+
+def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
+    """Deviations or parameters of a model that a tolerance is about, by the tolerance's name."""
+    places = {f"end_{axis}" for axis in model.node.axes}
+    turns = "rotation" if model.in_space else "heading"
+    named = [("end" if name in places else turns, name) for name in model.deviations]
+    of_ends = {tolerance for tolerance, _ in named}
+    for effect in model.effects:
+        if not isinstance(effect, MeasurementEffect):
+            named += [
+                (tolerance, f"{effect.label}.{name}")
+                for name, tolerance in effect.tolerances.items()
+                if tolerance not in of_ends and f"{effect.label}.{name}" in model.names
+            ]
+    named += [("roll", END_ROLL)] * (END_ROLL in model.names)
+    return {key: tuple(x for name, x in named if name == key) for key, _ in named}
 
 
 def modes_in(model: CableModel) -> FloatArray:

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dlo_casadi.cable.fitted_cable import Shape
+from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config
 from dlo_casadi.errors import counted
 from dlo_casadi.report import tables, words
@@ -159,6 +160,22 @@ def prediction_table(shape: Shape, notes: Iterable[str] = ()) -> RenderableType:
     for s, point in zip(shape.s[::10], shape.points[::10], strict=True):
         points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in point))
     return Group(table, points, *(Text(note) for note in notes))
+
+
+def limits_table(name: str, checks: Sequence[LimitCheck]) -> Table:
+    """A row for each limit of each pose, and what decides."""
+    numbers = ("value", "limit", "violated")
+    table = _table(f"{name}: limits", ["pose", "quantity"], numbers)
+    for column in ("counted by", "tightest at", "verdict", "most of the variance"):
+        table.add_column(column)
+    colors = {"pass": "green", "risk": "yellow", "fail": "red"}
+    for x in checks:
+        verdict = Text(x.verdict, colors[x.verdict])
+        value = x.text(x.value, x.std)
+        table.add_row(
+            x.pose, x.label, value, x.bound, x.chance, x.method, x.where, verdict, x.decided_by
+        )
+    return table
 
 
 # ---- a check -----------------------------------------------------------------------------------

@@ -1,0 +1,274 @@
+"""Checks of a shape against limits: value, probability, where it is tight, and what decides."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimate import Metadata
+from dlo_casadi.config import DeclaredTolerances, Limits
+from dlo_casadi.config.values import ConfigSection
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.limits import (
+    Exceedance,
+    Varied,
+    places_of,
+    resolved,
+    sizes_of,
+)
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.spread import Uncertainty, cause_of, tolerances_of
+from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.errors import DloError, counted
+from dlo_casadi.model.assembly import Inputs
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.show.text import millimetres
+from dlo_casadi.thresholds import SAFE
+
+Kind = TypeVar("Kind", bound=ConfigSection)
+Verdict = Literal["pass", "risk", "fail"]
+# Smallest probability that is told as a number.
+SHOWN = 1e-3
+UNITS = {"bend_radius": "m", "force": "N", "moment": "N m", "twist": "1/m"}
+
+
+@dataclass(frozen=True, eq=False)
+class LimitCheck:
+    """One quantity of one pose beside its limit.
+
+    Parameters
+    ----------
+    pose, quantity : str
+    limit, value, std : float
+        In the quantity's unit: the limit; the value of the predicted shape where it is tightest,
+        and its standard deviation to first order.
+    probability, error : float
+        That a new repeat of the pose violates the limit, by the parameters' covariance, the
+        fixtures and the cable's own scatter; and the standard error of a counted one.
+    at : float [m]
+        Arc length from the start where the shape is tightest.
+    holder : str
+        The fixture there, of a force or a moment; else empty.
+    draws, lost : int
+        Shapes that were solved to count the probability, 0 where first order suffices; and those of
+        them where the cable snaps to another shape, which count as violations.
+    shares : mapping of str to float
+        Parts of the variance by their causes, the largest first.
+    decided_by : str
+        The largest cause in words, with its size.
+    s, used : (K,)
+        Arc lengths [m], and the share of the limit that is used there: 1 at the limit.
+    """
+
+    pose: str
+    quantity: str
+    limit: float
+    value: float
+    std: float
+    probability: float
+    error: float
+    at: float
+    holder: str
+    draws: int
+    lost: int
+    shares: Mapping[str, float]
+    decided_by: str
+    s: FloatArray
+    used: FloatArray
+
+    @property
+    def verdict(self) -> Verdict:
+        """Fail where the value itself violates the limit, pass below a probability of 1 %."""
+        if self.used.max() > 1:
+            return "fail"
+        return "pass" if self.probability < SAFE else "risk"
+
+    @property
+    def method(self) -> str:
+        """How the probability was found."""
+        return counted(self.draws, "draw") if self.draws else "first order"
+
+    @property
+    def where(self) -> str:
+        """The fixture, or the arc length."""
+        return self.holder or f"s = {self.at:.3f} m"
+
+    def text(self, *values: float) -> str:
+        """A value of the quantity with its unit; or also its standard deviation."""
+        unit = UNITS[self.quantity]
+        unit, size = ("mm", 1e3) if unit == "m" else (unit, 1.0)
+        forms = zip(values, (".4g", ".2g"), strict=False)
+        return f"{' ± '.join(format(size * x, form) for x, form in forms)} {unit}"
+
+    @property
+    def chance(self) -> str:
+        """The probability as text."""
+        if not SHOWN < self.probability < 1 - SHOWN:
+            return "< 0.1 %" if self.probability < 0.5 else "> 99.9 %"
+        return f"{100 * self.probability:.{1 if self.probability < 0.1 else 0}f} %"
+
+    @property
+    def label(self) -> str:
+        """What is limited, in words."""
+        return self.quantity.replace("_", " ")
+
+    @property
+    def bound(self) -> str:
+        """The limit as text, with its side."""
+        return f"{'≥' if self.quantity == 'bend_radius' else '≤'} {self.text(self.limit)}"
+
+    def __str__(self) -> str:
+        return (
+            f"{self.verdict}: {self.label} {self.text(self.value, self.std)} at {self.where} "
+            f"({self.bound}), violated with {self.chance} ({self.method}); "
+            f"most of the variance: {self.decided_by}"
+        )
+
+    __repr__ = __str__
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain data, in SI units."""
+        names = ("pose", "quantity", "limit", "value", "std", "probability", "at", "verdict")
+        more = ("error", "holder", "method", "draws", "lost", "decided_by")
+        return {name: getattr(self, name) for name in (*names, *more)} | {
+            "shares": dict(self.shares)
+        }
+
+
+# What a caller may give for a section of a session: itself, its keys and values, or nothing.
+Asked = ConfigSection | Mapping[str, Any] | None
+# Largest tolerance of a place or of the length, in lengths of the cable.
+_LOOSE = 0.1
+_TRY = "{'bend_radius': 0.05, 'force': 8.0}, of the commands --limits bend_radius=0.05 force=8"
+
+
+def check_limits(
+    cable: CasadiCable,
+    known: Metadata,
+    pose: HeldPose,
+    found: Equilibrium,
+    limits: Asked = None,
+    tolerances: Asked = None,
+) -> tuple[LimitCheck, ...]:
+    """Checks of a fitted cable's shape, see `Shape.check`."""
+    asked = _given(Limits, limits, _TRY) or known.limits
+    if not asked.given:
+        raise DloError(f"no limit is given, and the session declared none.\n  Try: {_TRY}")
+    beside = _given(DeclaredTolerances, tolerances, "tolerances={'end': 2e-3} [m]")
+    stds = {} if beside is None else beside.model_dump(exclude_unset=True)
+    possible = tolerances_of(cable.model)
+    if strange := [name for name in stds if name not in possible]:
+        text = f"tolerances.{strange[0]}: the shape of this cable does not depend on it"
+        raise DloError(f"{text}.\n  Try: {', '.join(possible)}")
+    length = cable.model.cable.length
+    if large := [x for x in ("end", "length") if stds.get(x, 0.0) > _LOOSE * length]:
+        text = f"tolerances.{large[0]}: {stds[large[0]]:g} m for a cable of {length:g} m"
+        raise DloError(f"{text}.\n  Try: metres, such as {stds[large[0]] / 1e3:g}")
+    held = (cable.model.start, cable.model.end, *cable.model.clips)
+    if wrong := [*asked.problems(held, cable.model.in_space, length)]:
+        raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
+    uncertainty = known.uncertainty.installed(cable.model, stds)
+    return limit_checks(cable, known.coefficients, pose, found, uncertainty, asked)
+
+
+def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
+    """A section from what a caller gives."""
+    if given is None or isinstance(given, kind):
+        return given
+    if not isinstance(given, Mapping):
+        raise DloError(f"a mapping belongs here, found {given!r}\n  Try: {example}")
+    return kind(**given)
+
+
+def limit_checks(
+    cable: CasadiCable,
+    coefficients: FloatArray,
+    pose: HeldPose,
+    found: Equilibrium,
+    uncertainty: Uncertainty,
+    limits: Limits,
+) -> tuple[LimitCheck, ...]:
+    """Checks of one predicted shape, one for each limit, in their order.
+
+    A bend is measured on a mesh that resolves it, see `resolved`; draws are solved on one of
+    elements twice as long. Where a state has changed the rest curvature, it is known on the fit's
+    elements alone, and these are used.
+
+    Parameters
+    ----------
+    coefficients : (n_coefficients,) [1/m]
+        Of the rest curvature.
+    limits : Limits
+        With a meaning for this cable, see `Limits.problems`.
+    """
+    model, p, rest = cable.model, cable.p, cable.rest
+    names = {x: "curvature" if x == "bend_radius" else x for x in limits.given}
+    bounds = {names[x]: 1 / y if x == "bend_radius" else y for x, y in limits.given.items()}
+    meshes = [(model, found)]
+    if "curvature" in bounds and not model.has_state:
+        meshes = resolved(model, p, coefficients, pose, found)
+
+    def rest_on(mesh: CableModel) -> FloatArray:
+        return rest if mesh is model else mesh.rest_basis @ coefficients
+
+    def sizes(mesh: CableModel, shape: Equilibrium, name: str) -> FloatArray:
+        given = Inputs.of(p, rest_on(mesh), pose.vector[None])
+        return sizes_of(mesh, shape.shapes, given, name)[0]
+
+    drawn, near = meshes[-2:][0]
+    along = ("curvature", "twist")
+    true = {name: (meshes[-1] if name in along else meshes[0]) for name in bounds}
+    found_sizes = {name: sizes(*mesh, name) for name, mesh in true.items()}
+    # What a size is on the mesh of the draws, over what it is.
+    ratio = {x: sizes(drawn, near, x).max() / y.max() for x, y in found_sizes.items()}
+    varied = Varied(drawn, p, rest_on(drawn), pose, near, uncertainty)
+    likely = varied.exceedances({name: ratio[name] * bound for name, bound in bounds.items()})
+    out = []
+    for quantity, limit in limits.given.items():
+        name = names[quantity]
+        chance, here = likely[name], found_sizes[name]
+        places, holders = places_of(true[name][0], pose, true[name][1], name)
+        tight = int(here.argmax())
+        value, std = float(here[tight]), chance.std / ratio[name]
+        if quantity == "bend_radius":
+            value, std = 1 / value, std / value**2
+        out.append(
+            LimitCheck(
+                pose=pose.name,
+                quantity=quantity,
+                limit=limit,
+                value=value,
+                std=float(std),
+                probability=chance.probability,
+                error=chance.error,
+                at=float(places[tight]),
+                holder=holders[tight],
+                draws=chance.draws,
+                lost=chance.lost,
+                shares=chance.shares,
+                decided_by=_said(model, uncertainty, chance),
+                s=places,
+                used=here / bounds[name],
+            )
+        )
+    return tuple(out)
+
+
+def _said(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:
+    """The largest cause of an uncertain value in words: "2 mm at the end (81 %)"."""
+    cause, share = next(iter(chance.shares.items()))
+    if not chance.std > 0:
+        return "nothing is uncertain"
+    own = [name for name in model.deviations if cause_of(model, name) == cause]
+    size = max((known.scatter.get(name, 0.0) for name in own), default=known.added.get(cause, 0.0))
+    tolerance = next((x for x, y in tolerances_of(model).items() if {cause, *own} & {*y}), "")
+    said = {
+        "end": f"{millimetres(size)} at the end",
+        "length": f"{millimetres(size)} of length",
+        "clip": f"{millimetres(size)} at a clip",
+        "slip": f"{millimetres(size)} along a clip",
+        "roll": f"{size:.2g} rad of roll",
+        "heading": f"{size:.2g} rad of the {cause.partition('_')[0]}'s heading",
+        "rotation": f"{size:.2g} rad of the {cause.partition('_')[0]}'s orientation",
+    }.get(tolerance, "the cable's own scatter" if cause == "repeat" else "the fitted parameters")
+    return f"{said} ({100 * share:.0f} %)"

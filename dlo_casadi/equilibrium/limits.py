@@ -1,0 +1,305 @@
+"""What a cable must not exceed, and how likely a new repeat of a pose exceeds it.
+
+Of a curvature [1/m] the limit is one over the least bend radius. A probability is of first order
+where shapes that are solved anew agree with it; elsewhere it is counted among such shapes.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtr
+
+from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.equilibrium import Equilibrium, curvatures_along, places_along
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import CLAMPS, node_places
+from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
+
+# Draws that are solved to see if first order suffices, and where it does not; draws of the
+# linearised shapes, which cost next to nothing; and shapes that are solved at a time.
+PAIRED, DRAWN, LINEAR, CHUNK = 300, 2000, 4000, 500
+# Probabilities of first order between which solved draws decide if a limit is kept.
+IN_DOUBT = SAFE / 10, SAFE + FIRST_ORDER
+# Largest step [rad] of a node at which a draw counts as solved: draws are counted, not measured.
+_TOLERANCE = 1e-6
+# Step of finite differences along a derivative of the shape, in standard deviations.
+_STEP = 1e-3
+# Largest number of elements on which a bend is resolved.
+FINEST = 640
+
+
+class Fixture(NamedTuple):
+    """What holds the cable: its name, its arc length [m], and whether it takes a moment."""
+
+    name: str
+    at: float
+    clamped: bool
+
+
+def fixtures_of(model: CableModel, pose: HeldPose, found: Equilibrium) -> list[Fixture]:
+    """All that holds a cable in a pose: the ends that are held, then the clips."""
+    ends = (("start", 0.0, model.start), ("end", model.cable.length, model.end))
+    held = [Fixture(name, at, kind == "clamped") for name, at, kind in ends if kind != "free"]
+    clips = zip(pose.clips, found.clips, strict=True)
+    return [*held, *(Fixture(x.name, load.at, x.kind in CLAMPS) for x, load in clips)]
+
+
+def places_of(
+    model: CableModel, pose: HeldPose, found: Equilibrium, quantity: str
+) -> tuple[FloatArray, list[str]]:
+    """Arc lengths (K,) [m] at which a quantity has values, and the names of its fixtures there."""
+    if quantity in ("force", "moment"):
+        held = fixtures_of(model, pose, found)
+        own = [item for item in held if quantity == "force" or item.clamped]
+        return np.array([item.at for item in own]), [item.name for item in own]
+    moved = node_places(model.chain, pose.clips)  # to clamped clips
+    cells = np.interp(model.chain.cells, model.chain.places, moved)
+    places = places_along(cells) if quantity == "curvature" else cells.mean(axis=1)
+    return places, [""] * len(places)
+
+
+def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) -> FloatArray:
+    """Sizes (m, K) at `places_of`: curvature, twist [1/m]; force [N], moment [N m] on fixtures."""
+    assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
+    if quantity in ("curvature", "twist"):
+        strain = assembly.strain(shapes, given)
+        if quantity == "twist":
+            return np.abs(strain[:, : chain.n_cells])  # the first strain in space
+        bends = chain.curvatures(strain)
+        return curvatures_along(bends.reshape((len(bends), -1)), chain.cells)
+    found, loads = assembly.reactions(shapes, given), assembly.clip_loads(shapes, given)
+    known = ("pinned", "eyelet", *CLAMPS) if quantity == "force" else CLAMPS
+    ends = (("start", model.start), ("end", model.end))
+    each = [found[:, rows[f"{side}_{quantity}"]] for side, kind in ends if kind in known]
+    each += [
+        np.array([getattr(load[k], quantity) for load in loads])
+        for k, kind in enumerate(model.clips)
+        if kind in known
+    ]
+    return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
+
+
+@dataclass(frozen=True)
+class Exceedance:
+    """How likely a quantity exceeds its bound.
+
+    Parameters
+    ----------
+    std : float
+        Standard deviation of the greatest size, to first order.
+    probability, error : float
+        That a size exceeds its bound, and the standard error of that; 0 to first order.
+    draws : int
+        Shapes of which the probability is the share; 0 where it is of first order.
+    lost : int
+        Those of them at which the cable has no stable shape near the predicted one: it snaps.
+        They count as exceeding.
+    shares : mapping of str to float
+        Parts of the variance by their causes, see `Uncertainty.causes_in`; the largest first.
+    """
+
+    std: float
+    probability: float
+    error: float
+    draws: int
+    lost: int
+    shares: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Varied:
+    """A cable in a pose, and all in which a new repeat of it may differ.
+
+    Parameters
+    ----------
+    model, p, rest, pose, found
+        As of `spread.displacements`.
+    uncertainty : Uncertainty
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    pose: HeldPose
+    found: Equilibrium
+    uncertainty: Uncertainty
+
+    def exceedances(self, bounds: Mapping[str, float]) -> dict[str, Exceedance]:
+        """How near and how likely each quantity of `sizes_of` exceeds its bound.
+
+        The sizes g_k(z) depend on standard normal z: on the fitted unknowns, the fixtures, the rest
+        curvature of a repeat. To first order g(z) = g + J z at all places together, so that one of
+        several equal bends may become the sharpest:
+
+            P = E[Phi(t_low) + Phi(-t_high)]    (line sampling)
+
+        over z across the direction of the likeliest place; on its line, g stays within the bound
+        between t_low and t_high. Draws that are solved anew tell whether that suffices: where they
+        give a probability that differs by more than `thresholds.FIRST_ORDER`, two standard errors
+        included, or where the verdict hangs on it, the probability is their share, of more draws.
+
+        References
+        ----------
+        Koutsourelakis, Pradlwarter, Schueller, Probab. Eng. Mech. 19 (2004): line sampling.
+        """
+        names = tuple(bounds)
+        causes = self.uncertainty.causes_in(self.model)
+        sizes, slopes = self._linear(names)
+        z = np.random.default_rng(0).standard_normal((LINEAR, len(causes)))
+        solved, lost = self._solved(z[:PAIRED], names)
+        likely = {x: _crossing(sizes[x], slopes[x], bounds[x], z) for x in names}
+        anew = {x: _beyond(solved[x], bounds[x]) | lost for x in names}
+        enough = {
+            x: not IN_DOUBT[0] < likely[x] < IN_DOUBT[1]
+            and _agree(anew[x], _beyond(sizes[x] + z[:PAIRED] @ slopes[x].T, bounds[x]))
+            for x in names
+        }
+        if not all(enough.values()):
+            more, also = self._solved(z[PAIRED:DRAWN], names)
+            lost = np.concatenate([lost, also])
+            beyond = {x: _beyond(more[x], bounds[x]) | also for x in names}
+            anew = {x: np.concatenate([anew[x], beyond[x]]) for x in names}
+        out = {}
+        for name in names:
+            chance, error, draws = likely[name], 0.0, 0
+            if not enough[name]:
+                chance, draws = float(anew[name].mean()), len(lost)
+                error = float(np.sqrt(chance * (1 - chance) / draws))
+            parts = slopes[name][sizes[name].argmax()] ** 2
+            total = float(parts.sum())
+            shares = {
+                cause: float(parts[[x == cause for x in causes]].sum()) / max(total, 1e-300)
+                for cause in dict.fromkeys(causes)
+            }
+            out[name] = Exceedance(
+                float(np.sqrt(total)),
+                chance,
+                error,
+                draws,
+                int(lost.sum()) if draws else 0,
+                dict(sorted(shares.items(), key=lambda item: -item[1])),
+            )
+        return out
+
+    @cached_property
+    def _ways(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return self.uncertainty.ways_in(self.model)
+
+    @cached_property
+    def _along(self) -> Tangents:
+        """Derivatives of the shape by the ways in which a repeat may differ."""
+        by_p, by_rest, by_deviation = self._ways
+        return BatchEquilibrium(self.model, [self.pose]).by_rest(
+            self.found.shapes, self.p, self.rest, by_rest, by_p, by_deviation
+        )
+
+    def _linear(
+        self, names: tuple[str, ...]
+    ) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+        """Sizes (K,) and their derivatives (K, q) by the ways in which a repeat may differ."""
+        count = len(self.uncertainty.causes_in(self.model))
+        z = _STEP * np.vstack([np.eye(count), -np.eye(count), np.zeros((1, count))])
+        near, given = self._near(z), self._given(z)
+        found = {name: sizes_of(self.model, near, given, name) for name in names}
+        slopes = {name: x[:count] - x[count : 2 * count] for name, x in found.items()}
+        sizes = {name: x[-1] for name, x in found.items()}
+        return sizes, {name: np.asarray(x.T / (2 * _STEP)) for name, x in slopes.items()}
+
+    def _given(self, z: FloatArray) -> Inputs:
+        """Inputs of repeats z (m, q); stiffnesses are log-normal, all values within bounds."""
+        by_p, by_rest, _ = self._ways
+        known, steps = self.model.parameters, z @ by_p.T
+        log = np.array([q.log for q in known])
+        p = self.p + np.where(log, 0.0, steps)
+        p[:, log] = self.p[log] * np.exp(steps[:, log] / self.p[log])
+        p = np.clip(p, [q.lower for q in known], [q.upper for q in known])
+        poses = np.broadcast_to(self.pose.vector, (len(z), self.model.n_pose))
+        return Inputs.of(p, self.rest + z @ by_rest.T, poses)
+
+    def _near(self, z: FloatArray) -> Shapes:
+        """Shapes of repeats z (m, q) to first order."""
+        shapes, along = self.found.shapes, self._along
+        start = np.repeat(shapes.x, len(z), axis=0)
+        x = self.model.node.moved(start, np.einsum("nbq,mq->mnb", along.x[0], z))
+        return Shapes(x, shapes.lam + z @ along.lam[0].T, z @ along.deviation[0].T)
+
+    def _solved(
+        self, z: FloatArray, names: tuple[str, ...]
+    ) -> tuple[dict[str, FloatArray], BoolArray]:
+        """Sizes (m, K) of repeats z (m, q), solved anew, and which of them (m,) are lost."""
+        near, given = self._near(z), self._given(z)
+        parts: dict[str, list[FloatArray]] = {name: [] for name in names}
+        lost = []
+        for begin in range(0, len(z), CHUNK):
+            some = slice(begin, begin + CHUNK)
+            own, start = given.subset(some), near.subset(some)
+            batch = BatchEquilibrium(self.model, [self.pose] * len(start.x))
+            shapes, converged = batch.solve_or_descend(start, own.p, own.rest, tolerance=_TOLERANCE)
+            lost.append(~(converged & batch.stable(shapes, own.p, own.rest)))
+            for name in names:
+                parts[name].append(sizes_of(self.model, shapes, own, name))
+        return {name: np.concatenate(x) for name, x in parts.items()}, np.concatenate(lost)
+
+
+def _crossing(sizes: FloatArray, slopes: FloatArray, bound: float, z: FloatArray) -> float:
+    """Probability that one of the sizes (K,) + slopes (K, q) z exceeds the bound, see `Varied`."""
+    std = np.linalg.norm(slopes, axis=1)
+    k = int(((bound - sizes) / np.maximum(std, 1e-300)).argmin())
+    if not std[k] > 0:
+        return float((sizes > bound).any())
+    direction = slopes[k] / std[k]
+    across = z - np.outer(z @ direction, direction)
+    spare, rate = bound - sizes - across @ slopes.T, slopes @ direction
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reached = spare / rate
+    high = np.where(rate > 0, reached, np.inf).min(axis=1)
+    low = np.where(rate < 0, reached, -np.inf).max(axis=1)
+    nowhere = (low >= high) | ((rate == 0) & (spare < 0)).any(axis=1)
+    return float(np.where(nowhere, 1.0, ndtr(low) + ndtr(-high)).mean())
+
+
+def _beyond(sizes: FloatArray, bound: float) -> BoolArray:
+    """Whether a size of each draw (m,), at any of its places, exceeds its bound."""
+    return np.asarray((sizes > bound).any(axis=1))
+
+
+def _agree(anew: BoolArray, linear: BoolArray) -> bool:
+    """Whether draws solved anew give the first-order probability, within two standard errors."""
+    apart = anew.astype(float) - linear
+    error = float(np.sqrt((apart**2).mean() / len(apart)))
+    return bool(abs(apart.mean()) + 2 * error <= FIRST_ORDER)
+
+
+def resolved(
+    model: CableModel, p: FloatArray, coefficients: FloatArray, pose: HeldPose, found: Equilibrium
+) -> list[tuple[CableModel, Equilibrium]]:
+    """The same shape on finer meshes, the last of which resolves its sharpest bend.
+
+    Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`.
+    The radius of the segments, and also the curve's, are too large on a coarse mesh: beside a clamp
+    of a soft cable by tens of percent.
+
+    Parameters
+    ----------
+    coefficients : (n_coefficients,) [1/m]
+        Of the rest curvature.
+    """
+    meshes, settled = [(model, found)], False
+    while not settled and 2 * model.n <= FINEST:
+        finer = model.with_mesh(2 * model.n)
+        start = model.node.interpolated(finer.chain.places, model.chain.places, found.x)
+        rest = finer.rest_basis @ coefficients
+        better = solve_equilibrium(finer, p, rest, pose, x_init=start)
+        settled = abs(better.min_bend_radius / found.min_bend_radius - 1) < RESOLVED
+        model, found = finer, better
+        meshes.append((model, found))
+    return meshes

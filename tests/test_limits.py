@@ -1,0 +1,230 @@
+"""Limits of a shape: value, probability, where it is tight, and messages for bad input."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from dlo_casadi.cable.limits import LimitCheck, limit_checks
+from dlo_casadi.cli import main
+from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.config import Limits, dump_yaml, load_config
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.limits import _crossing
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.errors import ConfigError, DloError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.report.documents import fit_dict, shared_fixtures
+from dlo_casadi.session.fitting import declared_model
+from dlo_casadi.session.measure import measured_poses, read_inputs
+
+KNOWN = Uncertainty((), np.zeros((0, 0)), {}, RestScatter())
+DOWN, UP = -np.pi / 2, np.pi / 2
+
+
+def check(model, pose, uncertainty, **limits) -> dict[str, LimitCheck]:
+    rest = np.zeros(model.chain.n_rests)
+    found = solve_equilibrium(model, model.nominal, rest, pose)
+    cable = CasadiCable(model, model.nominal, rest)
+    none = np.zeros(model.n_coefficients)
+    checks = limit_checks(cable, none, pose, found, uncertainty, Limits(**limits))
+    return {item.quantity: item for item in checks}
+
+
+def draws(*shape):
+    return np.random.default_rng(0).standard_normal((20000, *shape))
+
+
+@pytest.mark.parametrize(
+    ("slopes", "bound", "exact"),
+    [
+        ([[0.6, 0.8]], 1.5, norm.sf(1.5)),
+        ([[0.6, 0.8]], 6.0, norm.sf(6.0)),  # 1e-9: no draw is there
+        ([[1.0, 0.0], [0.0, 1.0]], 1.5, 1 - norm.cdf(1.5) ** 2),  # two independent bends
+        ([[1.0, 0.0], [0.99999999, 0.0]], 1.5, norm.sf(1.5)),  # the same one twice
+        ([[1.0, 0.0], [-1.0, 0.0]], 1.5, 2 * norm.sf(1.5)),
+        ([[0.0, 0.0]], 1.5, 0.0),
+        ([[0.0, 0.0]], -1.5, 1.0),
+    ],
+)
+def test_several_places_exceed_together_as_closed_forms_say(slopes, bound, exact):
+    """Within three standard errors of 20,000 draws across the likeliest direction: 1 %."""
+    slopes = np.array(slopes)
+    found = _crossing(np.zeros(len(slopes)), slopes, bound, draws(2))
+    assert found == pytest.approx(exact, rel=0.01)
+
+
+def test_a_stiff_cantilever_bends_as_its_stiffness_lets_it():
+    """At the clamp k = w L^2 / 2 EI, and EI is log-normal: P(k > c) has a closed form.
+
+    Its tip sinks by 0.6 % of its length. The mesh changes the radius by less than 1 % on half the
+    elements, so that a third of it, 0.3 %, is left.
+    """
+    model = CableModel(CableData(0.5, 0.1, 0.01, 5.0), 10, start="clamped", end="free", n_rest=0)
+    std = 0.1 * 5.0
+    known = Uncertainty(("bending_stiffness",), np.array([[std**2]]), {}, RestScatter())
+    straight = 0.1 * 9.81 * 0.5 / 2 / 5.0  # 1/m
+    for sigma in (-1.0, 0.5):
+        limit = 1 / (straight * np.exp(0.1 * sigma))
+        pose = HeldPose((0.0, 0.0), start_heading=0.0)
+        item = check(model, pose, known, bend_radius=limit)["bend_radius"]
+        assert item.value == pytest.approx(1 / straight, rel=4e-3)
+        assert item.std == pytest.approx(0.1 / straight, rel=6e-3)
+        assert item.probability == pytest.approx(norm.sf(sigma), abs=0.02)
+        assert item.at == 0.0
+        assert item.shares["parameters"] == pytest.approx(1.0)
+        assert item.verdict == ("fail" if sigma < 0 else "risk")
+
+
+def test_a_sharp_bend_beside_a_clamp_is_resolved():
+    """On 20 elements the radius is 24 % too large, that of the segments beside a clamp, too."""
+    cable = CableData(0.5, 0.015, 0.003, 2e-5)
+    pose = HeldPose((0.0, 0.0), (0.25, 0.1), start_heading=DOWN, end_heading=UP)
+
+    def model(n):
+        return CableModel(cable, n, start="clamped", end="clamped", n_rest=0)
+
+    fine = solve_equilibrium(model(960), model(960).nominal, np.zeros(960), pose)
+    coarse = solve_equilibrium(model(20), model(20).nominal, np.zeros(20), pose)
+    item = check(model(20), pose, KNOWN, bend_radius=0.05)["bend_radius"]
+    assert coarse.min_bend_radius > 1.2 * fine.min_bend_radius
+    assert item.value == pytest.approx(fine.min_bend_radius, rel=0.005)
+    assert (item.verdict, item.std, item.decided_by) == ("pass", 0.0, "nothing is uncertain")
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_probability_is_the_share_of_shapes_that_the_compiled_solver_finds():
+    """2,000 ends, 3 mm off in both directions: three standard errors are 3 %, first order 2 %."""
+    model = CableModel(CableData(0.5, 0.05, 0.006, 1e-2), 20, n_rest=0)
+    known = Uncertainty((), np.zeros((0, 0)), {"end_x": 3e-3, "end_y": 3e-3}, RestScatter())
+    pose = HeldPose((0.0, 0.0), (0.32, 0.05))
+    rest = np.zeros(model.chain.n_rests)
+    shape = solve_equilibrium(model, model.nominal, rest, pose)
+    radius, force = 0.994 * shape.min_bend_radius, 1.01 * np.linalg.norm(shape.start_force)
+    items = check(model, pose, known, bend_radius=radius, force=force)
+    ends = np.array(pose.end) + 3e-3 * draws(2)[:2000]
+    poses = np.hstack([np.zeros((2000, 2)), ends, np.zeros((2000, 2))])
+    shapes, status = CompiledSolver(model, model.nominal, rest).solve_many(poses)
+    assert not status.any()
+    # The compiled solver's mesh makes the radius larger by a constant factor.
+    finer = items["bend_radius"].value / shape.min_bend_radius
+    pull = np.linalg.norm([shapes["start_force"], shapes["end_force"]], axis=2).max(axis=0)
+    bends = finer * shapes["min_bend_radius"]
+    counted = {"bend_radius": (bends < radius).mean(), "force": (pull > force).mean()}
+    for name, item in items.items():
+        assert 0.05 < item.probability < 0.6
+        assert item.probability == pytest.approx(counted[name], abs=0.04), item
+        assert item.decided_by == "3 mm at the end (100 %)"
+        assert item.holder == ("" if name == "bend_radius" else "start")
+
+
+# ---- what a user writes -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A folder of results of a quick fit, and a list of poses."""
+    folder = tmp_path_factory.mktemp("fitted")
+    config = load_config("tests/data/bench/short_clean/session.yaml")
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    declared = declared_model(config)
+    fit = fit_model(declared.model.with_mesh(10), measured[:3], declared.tolerances, 3e-4)
+    document = fit_dict(fit) | {"fixtures": shared_fixtures(config), "model_hash": "test"}
+    (folder / "parameters.yaml").write_text(dump_yaml(document))
+    (folder / "declared.yaml").write_text(dump_yaml(document | {"limits": {"force": 30.0}}))
+    (folder / "poses.csv").write_text(
+        "name,end_x_m,end_y_m\nnear, 0.3, -0.1\nfar, 0.9, 0.3\nhigh, 0.25, 0.2\n"
+    )
+    return folder
+
+
+def test_a_list_of_poses_is_checked_and_lost_ones_are_named(fitted, capsys):
+    poses = str(fitted / "poses.csv")
+    assert main(["limits", str(fitted / "declared.yaml"), poses, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [(x["pose"], x["quantity"]) for x in found["limits"]] == [
+        ("near", "force"),
+        ("high", "force"),
+    ]
+    assert found["limits"][0]["limit"] == 30.0
+    assert "far" in found["without_shape"]
+    keys = {"pose", "quantity", "limit", "value", "std", "probability", "at", "verdict"}
+    assert keys < found["limits"][0].keys()
+
+
+def test_other_fixtures_make_a_shape_less_certain(fitted, capsys):
+    end = ["predict", str(fitted), "--end", "0.3", "-0.1", "--json", "--limits", "bend_radius=0.1"]
+    stds = []
+    for more in ([], ["--tolerances", "end=5e-3"]):
+        assert main([*end, *more]) == 0
+        (row,) = json.loads(capsys.readouterr().out)["limits"]
+        stds.append(row["std"])
+    assert stds[1] > 1.5 * stds[0]
+    assert row["decided_by"].startswith("5 mm at the end")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--limits", "bend_radius=-0.1"], "larger than 0"),
+        (["--limits", "bend_radius=50"], "did you mean 0.05?"),
+        (["--limits", "bend=0.1"], "known here: bend_radius"),
+        (["--limits", "force=nan"], "finite number"),
+        (["--limits", "force=eight"], "NAME=VALUE"),
+        (["--limits", "moment=0.1"], "no end is clamped"),
+        (["--limits", "twist=3"], "does not twist"),
+        (["--limits", "clearance=0.01"], "no obstacles"),
+        (["--limits"], "no limit is given"),
+        (["--limits", "force=9", "--tolerances", "end=2"], "such as 0.002"),
+        (["--limits", "force=9", "--tolerances", "heading=0.1"], "Try: end, length"),
+    ],
+)
+def test_what_cannot_be_checked_says_what_to_try(fitted, capsys, words, said):
+    assert main(["limits", str(fitted), str(fitted / "poses.csv"), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no poses"),
+        ("x,y\n1,2\n", "unknown columns"),
+        ("end_x_m\n0.3\n", "numbers belong here"),
+        ("end_x_m,end_y_m\n0.3,high\n", "pose 1: numbers"),
+    ],
+)
+def test_a_list_that_cannot_be_read_is_named(fitted, tmp_path, capsys, text, said):
+    (tmp_path / "list.csv").write_text(text)
+    words = ["limits", str(fitted), str(tmp_path / "list.csv"), "--limits", "force=9"]
+    assert main(words) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_clip_is_a_fixture_like_the_ends(fitted):
+    """An eyelet far below the chord is pulled harder than either end: it takes the weight."""
+    from dlo_casadi import load
+
+    clip = {"name": "eye", "kind": "eyelet", "place": [0.2, -0.1]}
+    shape = load(fitted).solve((0.4, -0.05), clips=[clip])
+    (item,) = shape.check({"force": 1.0})
+    force = np.linalg.norm(shape.clips["eye"].force)
+    assert (item.holder, item.verdict) == ("eye", "fail")
+    assert (item.value, item.at) == pytest.approx((force, shape.clips["eye"].at))
+
+
+def test_from_python_limits_are_a_mapping(fitted):
+    from dlo_casadi import load
+
+    shape = load(fitted).solve((0.3, -0.1))
+    with pytest.raises(DloError, match="a mapping belongs here"):
+        shape.check(0.05)
+    with pytest.raises(ConfigError, match="bend"):
+        shape.check({"bend": 0.05})
+    assert [str(x).partition(":")[0] for x in shape.check({"force": 1e3})] == ["pass"]
