@@ -12,7 +12,15 @@ from dlo_casadi.config.template import schema_text
 from dlo_casadi.errors import DloError, MeasurementError, counted
 from dlo_casadi.io.files import FolderDraft, write_file
 from dlo_casadi.io.points import write_points
-from dlo_casadi.recordings import FORMATS, FREE, Imported, Wishes, make_session, read_recording
+from dlo_casadi.recordings import (
+    FORMATS,
+    FREE,
+    Imported,
+    View,
+    Wishes,
+    make_session,
+    read_recording,
+)
 from dlo_casadi.session import measure
 from dlo_casadi.session.plausibility import find_suspicions
 
@@ -53,6 +61,10 @@ def _vector(text: str) -> tuple[float, ...]:
     option("--cable", default="", metavar="TEXT", help="part of the names of its markers"),
     option("--at", type=_vector, default=(), metavar="S,S,...", help="m, arc lengths of markers"),
     option("--up", choices="xyz", help="axis that points up; as usual in the format when absent"),
+    option("--camera", type=_vector, default=(), metavar="X,Y,Z", help="m, that saw the clouds"),
+    option("--color", type=_vector, default=(), metavar="R,G,B", help="of the cable in clouds"),
+    option("--box", type=_vector, default=(), metavar="X,Y,Z,X,Y,Z", help="m, corners about it"),
+    option("--units", choices=("m", "mm"), default="m", help="of clouds; default %(default)s"),
     option("--hold", type=float, default=0.5, metavar="S", help="shortest pose; %(default)s s"),
     option("--held-out", type=int, default=4, metavar="N", help="one in N; default %(default)s"),
     *(
@@ -68,6 +80,7 @@ def import_(chosen: argparse.Namespace) -> None:
 
     dlo import take.csv --output loom --mass 0.03 --diameter 0.004
     dlo import markers.c3d bag/ --output loom --start fixed --end flange
+    dlo import cloud_*.ply robot.csv --output loom --color 230,110,20 --length 0.9 --diameter 0.007
     dlo import points.c3d --output loom --start left_o,left_x,left_y --end free
     """
     if os.path.lexists(chosen.output):
@@ -77,9 +90,10 @@ def import_(chosen: argparse.Namespace) -> None:
         **{item.name: getattr(chosen, item.name) for item in fields(Wishes) if item.name in chosen},
         known={key: value for key, value in known.items() if value is not None},
     )
+    view = View(**{item.name: getattr(chosen, item.name) for item in fields(View)})
     with Watch(quiet=chosen.quiet) as watch:
         watch.step("read", 0, 3)
-        recording = read_recording(chosen.file, chosen.up)
+        recording = read_recording(chosen.file, chosen.up, view)
         watch.step("find poses", 1, 3)
         session = make_session(chosen.output.name, recording, wishes)
         with FolderDraft(chosen.output) as draft:

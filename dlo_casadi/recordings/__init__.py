@@ -1,5 +1,6 @@
 """Recordings of laboratories to sessions: motion capture, ROS bags, point clouds."""
 
+from dlo_casadi.recordings.clouds import View
 from dlo_casadi.recordings.read import FORMATS, read_recording
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.session import FREE, Imported, Wishes, make_session
@@ -11,6 +12,7 @@ __all__ = [
     "Imported",
     "Recording",
     "Stream",
+    "View",
     "Wishes",
     "make_session",
     "read_recording",

@@ -23,17 +23,12 @@ Rows = list[tuple[float, list[float]]]  # times [s] and values
 Links = dict[str, tuple[str, Rows]]  # frame -> its parent in TF, and its poses there
 
 
-def read_bag(path: Path, up: str | None) -> Recording:
+def read_bag(path: Path) -> Recording:
     """Read a bag: markers, poses and TF of grippers, wrenches, and clouds of points.
 
     Times are those of the messages' headers. Markers and clouds share one clock, grippers and force
     sensors another. A body is called as its topic or, in TF, as its frame, and given in the root of
     its tree; clouds are turned there, too, where TF tells where the camera stands.
-
-    Parameters
-    ----------
-    up : "x", "y", "z" or None
-        The axis that points up; z by default, as in REP 103.
 
     Raises
     ------
@@ -96,8 +91,7 @@ def read_bag(path: Path, up: str | None) -> Recording:
             f"holds {held}.\n  Try: record one or more of {_WANTED}.", pose=path.name
         )
     seen = tuple(_cloud(item, links, f"{path.name} (markers)") for item in clouds)
-    assumed = () if up else ("z is up, as ROS has it (REP 103); or --up",)
-    return Recording(tuple(streams), seen, assumed).with_z_up(up or "z")
+    return Recording(tuple(streams), seen, up_by="as ROS has it (REP 103)")
 
 
 def _time(message: Any) -> float:

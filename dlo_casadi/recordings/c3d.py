@@ -11,13 +11,10 @@ from dlo_casadi.recordings.recording import Recording, Stream, factor, library
 _AGAIN = "Try: export the file again, whole."
 
 
-def read_c3d(path: Path, up: str | None) -> Recording:
+def read_c3d(path: Path) -> Recording:
     """Read the labelled points of a C3D file as markers; a gripper is three of them.
 
-    Parameters
-    ----------
-    up : "x", "y", "z" or None
-        The axis that points up; by default POINT:Y_SCREEN of the file, or z without it.
+    POINT:Y_SCREEN tells the way up; without it that is z.
 
     Raises
     ------
@@ -56,6 +53,5 @@ def read_c3d(path: Path, up: str | None) -> Recording:
     streams = [Stream(labels[k], "marker", t, scale * places[:, k].T, path.name) for k in named]
     screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
     own = screen.lstrip("+") if screen.lstrip("+") in ("x", "y", "z") else "z"
-    said = f"POINT:Y_SCREEN of {path.name}" if screen else "C3D files without POINT:Y_SCREEN"
-    assumed = () if up else (f"{own} is up, as {said}; or --up",)
-    return Recording(tuple(streams), assumptions=assumed).with_z_up(up or own)
+    said = "as POINT:Y_SCREEN tells" if screen else "in most C3D files; POINT:Y_SCREEN is absent"
+    return Recording(tuple(streams), up=own, up_by=said)

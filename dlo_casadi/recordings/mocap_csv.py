@@ -20,19 +20,15 @@ _AGAIN = "Try: export it again, whole, as Motive (Tracking Data) or Vicon (ASCII
 Rows = list[list[str]]
 
 
-def read_mocap_csv(path: Path, up: str | None) -> Recording:
+def read_mocap_csv(path: Path) -> Recording:
     """Read a CSV file of Motive (format 1.2 or later) or of Vicon (Nexus, Tracker).
-
-    Parameters
-    ----------
-    up : "x", "y", "z" or None
-        The axis that points up; by default y in Motive's files and z in Vicon's, their standards.
 
     Returns
     -------
     Recording
         Markers, and rigid bodies with their rotations; those of Motive have to be quaternions,
-        those of Vicon may be rotation vectors, too. Unlabelled markers are left out.
+        those of Vicon may be rotation vectors, too. Unlabelled markers are left out. The standards
+        for the way up are y in Motive, z in Vicon.
 
     Raises
     ------
@@ -67,8 +63,7 @@ def read_mocap_csv(path: Path, up: str | None) -> Recording:
             "holds no labelled marker and no rigid body.\n  Try: label them before the export.",
             pose=path.name,
         )
-    assumed = () if up else (f"{own} is up, as {program} exports it; or --up",)
-    return Recording(tuple(streams), assumptions=assumed).with_z_up(up or own)
+    return Recording(tuple(streams), up=own, up_by=f"as {program} exports it")
 
 
 def _motive(rows: Rows, path: Path) -> Iterator[Stream]:

@@ -1,26 +1,33 @@
 """Which reader reads which file."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings.bags import read_bag
 from dlo_casadi.recordings.c3d import read_c3d
+from dlo_casadi.recordings.clouds import View, read_cloud
 from dlo_casadi.recordings.mocap_csv import read_mocap_csv
 from dlo_casadi.recordings.recording import Recording, together
 
-# Ending of a name -> reader of a file and its way up.
-FORMATS: dict[str, Callable[[Path, str | None], Recording]] = {
+WHOLE = View()  # all points of clouds in metres
+
+# Ending of a name -> reader of a file.
+FORMATS: dict[str, Callable[[Path], Recording]] = {
     ".csv": read_mocap_csv,
     ".c3d": read_c3d,
     ".mcap": read_bag,
     ".db3": read_bag,
     ".bag": read_bag,
+    ".ply": read_cloud,
+    ".pcd": read_cloud,
+    ".npy": read_cloud,
     "": read_bag,  # a folder with metadata.yaml
 }
 
 
-def read_recording(paths: Sequence[Path], up: str | None = None) -> Recording:
+def read_recording(paths: Sequence[Path], up: str | None = None, view: View = WHOLE) -> Recording:
     """Read the files of one recording.
 
     Parameters
@@ -29,6 +36,8 @@ def read_recording(paths: Sequence[Path], up: str | None = None) -> Recording:
         Files of the `FORMATS`; each has a clock of its own.
     up : "x", "y", "z" or None
         The axis that points up; as usual in each format when absent.
+    view : View
+        How clouds were seen, in the axes of their files.
 
     Raises
     ------
@@ -45,5 +54,7 @@ def read_recording(paths: Sequence[Path], up: str | None = None) -> Recording:
             )
         if not path.exists():
             raise MeasurementError("there is no such file", pose=str(path))
-        found.append(reader(path, up))
+        read = reader(path)
+        clouds = tuple(view.of(cloud) for cloud in read.clouds)
+        found.append(replace(read, clouds=clouds).with_z_up(up))
     return together(found)

@@ -64,14 +64,19 @@ class Recording:
     streams: tuple[Stream, ...] = ()
     clouds: tuple[Cloud, ...] = ()
     assumptions: tuple[str, ...] = ()
+    up: str = "z"
+    """The axis, x, y or z, that points up."""
+    up_by: str = ""
+    """Why it is taken for the one."""
 
     def of(self, kind: Kind) -> dict[str, Stream]:
         """Streams of a kind by their names."""
         return {stream.name: stream for stream in self.streams if stream.kind == kind}
 
-    def with_z_up(self, up: str) -> "Recording":
-        """The same in axes of which z is up; `up` is the axis, x, y or z, that points up now."""
-        turn = _UP[up]
+    def with_z_up(self, up: str | None) -> "Recording":
+        """The same in axes of which z is up, from axes of which `up` is, or as it was read."""
+        turn = _UP[up or self.up]
+        assumed = () if up else (f"{self.up} is up, {self.up_by}; or --up",)
 
         def turned(stream: Stream) -> Stream:
             values = stream.values.copy()
@@ -86,7 +91,16 @@ class Recording:
                 values = np.hstack([values[:, :3] @ turn.T, values[:, 3:] @ turn.T])
             return replace(stream, values=values)
 
-        return replace(self, streams=tuple(map(turned, self.streams)))
+        clouds = tuple(
+            replace(
+                cloud,
+                points=cloud.points @ turn.T,
+                camera=None if cloud.camera is None else turn @ cloud.camera,
+            )
+            for cloud in self.clouds
+        )
+        streams = tuple(map(turned, self.streams))
+        return Recording(streams, clouds, (*self.assumptions, *assumed))
 
 
 def together(recordings: Sequence[Recording]) -> Recording:
@@ -110,7 +124,7 @@ def together(recordings: Sequence[Recording]) -> Recording:
         if kind != "wrench" and far > _LARGEST:
             raise MeasurementError(
                 f"{kind} {name!r} is {far:.4g} m from the origin: are its coordinates in "
-                "metres?\n  Try: --units mm, or an export that names its units."
+                "metres?\n  Try: an export that names its units."
             )
     return Recording(
         tuple(streams),

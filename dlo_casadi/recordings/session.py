@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from textwrap import wrap
 from typing import Any
 
@@ -11,18 +10,21 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.recordings.grippers import Gripper, along_cable, find_gripper
 from dlo_casadi.recordings.recording import Recording
 from dlo_casadi.recordings.stills import Still, align_clocks, find_stills
 
 FREE = "free"
 _COLUMNS = 98  # of a comment
 _SAMPLES = 50  # points of a spline between two markers, for its length: exact to 1e-5
-_STRAY = 0.7  # direction cosine of a gripper's axis and the cable from which they may be the same
 _LONGER = 0.03  # relative difference of a declared and a measured length: a mistake
 _DENSITY = 2200.0  # kg/m^3, of a cable whose mass is not known, for `Imported.stand_ins`
+
+Points = tuple[FloatArray, FloatArray | None]  # (K, 3) [m], and arc lengths (K,) [m] of markers
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,8 @@ class Imported:
     """Files of a session that are not written yet."""
 
     name: str
-    points: dict[str, tuple[FloatArray, FloatArray | None]]
-    """Points (K, 3) [m] and arc lengths (K,) [m] of each CSV file."""
+    points: dict[str, Points]
+    """Of each CSV file."""
     cable: dict[str, str]
     """What is known of the cable, as text."""
     poses: tuple[dict[str, str], ...]
@@ -88,18 +90,6 @@ class Imported:
         return {**{key: f"{value:.4g}" for key, value in found.items()}, **self.cable}
 
 
-@dataclass(frozen=True)
-class _Gripper:
-    """A fixture in all poses: places (P, 3) [m], and frames (P, 3, 3) with x along the cable."""
-
-    places: FloatArray
-    frames: FloatArray
-
-    def turned(self, axes: FloatArray) -> "_Gripper":
-        """With other axes, given as columns in its own."""
-        return _Gripper(self.places, self.frames @ axes)
-
-
 def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     """Make a session of a recording: align clocks, find poses, name markers, turn grippers.
 
@@ -115,43 +105,34 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     """
     recording, offsets = align_clocks(recording)
     stills = find_stills(recording, wishes.hold)
-    start = _gripper(wishes.start, wishes.start_offset, "start", stills, recording)
+    start = find_gripper(wishes.start, wishes.start_offset, "start", stills, recording)
     end = None
     if wishes.end != FREE:
-        end = _gripper(wishes.end, wishes.end_offset, "end", stills, recording)
-    markers = _cable_markers(recording, stills, wishes)
+        end = find_gripper(wishes.end, wishes.end_offset, "end", stills, recording)
     remarks = [*recording.assumptions, *(offset.told for offset in offsets)]
     if start is None or (end is None and wishes.end != FREE):
         remarks.append(
             "no body holds the cable in this recording: fill in places and orientations, or "
             "--start, --end with three markers each; an end that nothing holds is free"
         )
-    order = _in_order(markers, None if start is None else start.places)
-    names, places = [list(markers)[k] for k in order], np.array([*markers.values()])[order]
-    start, end = _along_cable(start, end, places, remarks)
-    s, length = _arc_lengths(start, places, end)
-    fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
-    declared = wishes.known.get("length")
-    remarks.append(f"length: {length:.4f} m along a spline {fixtures}, mean of all poses")
-    if declared is not None and abs(length / declared - 1.0) > _LONGER:
-        raise MeasurementError(
-            f"the cable is {length:.4f} m long {fixtures} (a spline through the markers), but "
-            f"--length is {declared:g} m.\n  Try: --length between the fixtures; --units; "
-            "--start-offset and --end-offset where the cable does not leave a body at its origin."
-        )
-    if wishes.at:
-        s = np.array(wishes.at)
-        if len(s) != len(names):
-            raise MeasurementError(
-                f"--at gives {counted(len(s), 'arc length')} of {counted(len(names), 'marker')} "
-                f"({', '.join(names)})"
-            )
-        remarks.append(f"markers: {', '.join(names)}, at the arc lengths of --at")
+    if recording.clouds:
+        lines, told = _cloud_lines(recording, stills, start, end, wishes, remarks)
+        start, end = along_cable(start, end, lines, remarks)
+        points: list[Points] = [(np.round(line, 6), None) for line in lines]
+        length = wishes.known["length"]
     else:
-        remarks.append(
-            f"markers by arc length ({', '.join(names)}) along that spline; --at if they were "
-            "measured with a tape"
-        )
+        told = [still.told for still in stills]
+        markers = _cable_markers(recording, stills, wishes)
+        order = _in_order(markers, None if start is None else start.places)
+        names, places = [list(markers)[k] for k in order], np.array([*markers.values()])[order]
+        seen = np.isfinite(places).all(axis=2)
+        lines = [places[here, k] for k, here in enumerate(seen.T)]
+        start, end = along_cable(start, end, lines, remarks)
+        s, length = _along(start, places, end, names, wishes, remarks)
+        points = [
+            (np.round(line, 6), np.round(s[here], 6))
+            for line, here in zip(lines, seen.T, strict=True)
+        ]
     readings = _readings(recording, stills, wishes, remarks)
     known = {"length": length, **wishes.known}
     if "mass" in known and "bending_stiffness" not in known:
@@ -159,11 +140,11 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
         remarks.append("bending_stiffness: a guess from weight and length")
     return Imported(
         name,
-        {f"pose_{k:02d}.csv": _seen(places[:, k - 1], s) for k in range(1, len(stills) + 1)},
+        {f"pose_{k:02d}.csv": shown for k, shown in enumerate(points, start=1)},
         {key: f"{value:.6g}" for key, value in known.items()},
         tuple(
-            {**_declared(k, still, start, end, wishes), **readings[k]}
-            for k, still in enumerate(stills)
+            {"remark": told[k], **_declared(k, start, end, wishes), **readings[k]}
+            for k in range(len(stills))
         ),
         FREE if wishes.end == FREE else "clamped",
         tuple(remarks),
@@ -175,12 +156,10 @@ def _guess(mass: float, length: float) -> float:
     return mass * 9.81 * length**2 / 30.0
 
 
-def _declared(
-    k: int, still: Still, start: _Gripper | None, end: _Gripper | None, wishes: Wishes
-) -> dict[str, str]:
+def _declared(k: int, start: Gripper | None, end: Gripper | None, wishes: Wishes) -> dict[str, str]:
     """What a configuration says of pose `k`."""
-    found = {"remark": still.told}
-    found["role"] = "held_out" if wishes.held_out and not (k + 1) % wishes.held_out else "fit"
+    left_out = wishes.held_out and not (k + 1) % wishes.held_out
+    found = {"role": "held_out" if left_out else "fit"}
     for side, gripper in (("start", start), ("end", end)):
         if gripper is not None:
             turn = Rotation.from_matrix(gripper.frames[k]).as_quat(canonical=True)
@@ -193,111 +172,7 @@ def _row(values: FloatArray) -> str:
     return f"[{', '.join(f'{x:.6f}' for x in values + 0.0)}]"
 
 
-def _seen(places: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Markers that were seen in a pose, rounded to a micrometre."""
-    seen = np.isfinite(places).all(axis=1)
-    return np.round(places[seen], 6), np.round(s[seen], 6)
-
-
-# ---- grippers -----------------------------------------------------------------------------------
-
-
-def _gripper(
-    name: str, offset: Sequence[float], side: str, stills: Sequence[Still], recording: Recording
-) -> _Gripper | None:
-    """The body, or the three markers, that hold an end; None where the recording has no body."""
-    if name.count(",") == 2:
-        o, x, y = (_means(stills, f"marker {part.strip()}", recording) for part in name.split(","))
-        first = (x - o) / np.linalg.norm(x - o, axis=1, keepdims=True)
-        third = np.cross(first, y - o)
-        third /= np.linalg.norm(third, axis=1, keepdims=True)
-        frames = np.stack([first, np.cross(third, first), third], axis=2)
-        return _Gripper(o + frames @ np.array(offset), frames)
-    bodies = recording.of("body")
-    if not bodies and name == side:
-        return None
-    if name not in bodies:
-        raise MeasurementError(
-            f"no body is called {name!r}, which holds the {side} of the cable; found: "
-            f"{', '.join(bodies) or 'none'}.\n  Try: --{side} NAME of one of them, or --{side} "
-            "O,X,Y of three markers on it: its place, along its x axis, on the side of y."
-        )
-    values = _means(stills, f"body {name}", recording)
-    frames = Rotation.from_quat(values[:, 3:]).as_matrix()
-    return _Gripper(values[:, :3] + frames @ np.array(offset), frames)
-
-
-def _means(stills: Sequence[Still], key: str, recording: Recording) -> FloatArray:
-    """Means (P, k) of a stream in all poses."""
-    kind, name = key.split(" ", 1)
-    if not any(key in still.values for still in stills):
-        known = ", ".join(stream.name for stream in recording.streams if stream.kind == kind)
-        raise MeasurementError(f"no {kind} {name!r} was seen in any pose; found: {known}")
-    for k, still in enumerate(stills, start=1):
-        if key not in still.values:
-            raise MeasurementError(
-                f"{key} is not seen in pose {k} ({still.begin:.2f} to {still.end:.2f} s).\n"
-                "  Try: fill its gaps, or cut the recording there."
-            )
-    return np.array([still.values[key] for still in stills])
-
-
-def _along_cable(
-    start: _Gripper | None, end: _Gripper | None, places: FloatArray, remarks: list[str]
-) -> tuple[_Gripper | None, _Gripper | None]:
-    """Grippers with x along the cable from start to end, and the least roll between them.
-
-    Of the six axes of a body the one that points most along the way to the nearest marker; of the
-    four ways to roll the end about it the one with the smallest twist of the cable over all poses.
-    What is left of it is a nuisance of the fit, `end_roll`.
-    """
-    if start is not None:
-        start = _aimed(start, places[0] - start.places, "start", remarks)
-    if end is not None:
-        end = _aimed(end, end.places - places[-1], "end", remarks)
-    if start is not None and end is not None:
-        rolls = [Rotation.from_rotvec([k * np.pi / 2, 0, 0]).as_matrix() for k in range(4)]
-        twists = [_twist(start, places, end.turned(roll)) for roll in rolls]
-        end = end.turned(rolls[int(np.argmin(np.abs(twists)))])
-    return start, end
-
-
-def _aimed(gripper: _Gripper, ways: FloatArray, side: str, remarks: list[str]) -> _Gripper:
-    """The gripper with that of its axes as x that points most along the ways (P, 3)."""
-    ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)
-    cosines = np.nanmean(np.einsum("pij,pi->pj", gripper.frames, ways), axis=0)
-    k = int(np.argmax(np.abs(cosines)))
-    sign = float(np.sign(cosines[k]))
-    angle = np.degrees(np.arccos(min(1.0, abs(cosines[k]))))
-    if abs(cosines[k]) < _STRAY:
-        raise MeasurementError(
-            f"no axis of the body at the {side} is directed along the cable: the nearest is "
-            f"{'-' if sign < 0 else ''}{'xyz'[k]}, {angle:.0f} degrees off the way to the nearest "
-            f"marker.\n  Try: a body whose x axis is the cable's direction in the clamp; --up; "
-            "cable and grippers in one frame."
-        )
-    remarks.append(
-        f"{side} gripper: its {'-' if sign < 0 else ''}{'xyz'[k]} axis is taken along the cable "
-        f"({angle:.0f} degrees off the way to the nearest marker)"
-    )
-    axes = np.zeros((3, 3))
-    axes[k, 0], axes[(k + 1) % 3, 1], axes[(k + 2) % 3, 2] = sign, sign, 1.0
-    return gripper.turned(axes)
-
-
-def _twist(start: _Gripper, places: FloatArray, end: _Gripper) -> float:
-    """Mean angle [rad] from the start frame, moved along the cable without twist, to the end's."""
-    total = 0j
-    for k, (first, last) in enumerate(zip(start.frames, end.frames, strict=True)):
-        line = places[:, k][np.isfinite(places[:, k]).all(axis=1)]
-        line = np.vstack([start.places[k], line, end.places[k]])
-        steps = np.diff(line, axis=0)
-        ways = [first[:, 0], *(steps / np.linalg.norm(steps, axis=1)[:, None]), last[:, 0]]
-        side = first[:, 1]
-        for a, b in pairwise(ways):
-            side = side - (side @ b) / (1.0 + a @ b) * (a + b)
-        total += complex(side @ last[:, 1], side @ last[:, 2])
-    return float(-np.angle(total))
+# ---- forces -------------------------------------------------------------------------------------
 
 
 def _readings(
@@ -327,6 +202,56 @@ def _readings(
             "the cable on its fixture, about its place, with the gripper's weight taken off"
         )
     return found
+
+
+# ---- clouds -------------------------------------------------------------------------------------
+
+
+def _cloud_lines(
+    recording: Recording,
+    stills: Sequence[Still],
+    start: Gripper | None,
+    end: Gripper | None,
+    wishes: Wishes,
+    remarks: list[str],
+) -> tuple[list[FloatArray], list[str]]:
+    """Line of the cable (K, 3) [m] in each pose, from all its clouds, and what to say of it."""
+    clouds = recording.clouds
+    missing = [key for key in ("length", "diameter") if key not in wishes.known]
+    if missing or start is None:
+        raise MeasurementError(
+            "a cable is found in a cloud by its size and its fixtures.\n  Try: "
+            f"{', '.join(f'--{key}' for key in missing) or 'a recording of the grippers beside it'}"
+        )
+    timed = np.isfinite(clouds[0].t)
+    if not timed and len(clouds) != len(stills):
+        raise MeasurementError(
+            f"{counted(len(clouds), 'cloud')} without a time for {counted(len(stills), 'pose')} of "
+            "the grippers.\n  Try: one file for each pose, in their order; --hold"
+        )
+    if timed and clouds[0].clock not in {stream.clock for stream in recording.streams}:
+        remarks.append("clouds: their times are taken as those of the grippers")
+    lines: list[FloatArray] = []
+    told = []
+    for k, still in enumerate(stills):
+        shown = [c for c in clouds if still.begin <= c.t <= still.end] if timed else [clouds[k]]
+        if not shown:
+            raise MeasurementError(
+                f"no cloud was seen in pose {k + 1} ({still.begin:.2f} to {still.end:.2f} s).\n"
+                "  Try: hold it longer; clouds and grippers with clocks that agree."
+            )
+        cable = vision.KnownCable(
+            start.places[k],
+            None if end is None else end.places[k],
+            wishes.known["diameter"],
+            wishes.known["length"],
+        )
+        found = vision.line_in_cloud(np.vstack([c.points for c in shown]), cable, shown[0].camera)
+        lines.append(found.points)
+        told.append("; ".join([still.told, *found.messages]))
+    if shown[0].camera is not None:
+        remarks.append("clouds: points moved from the surface to the axis, along the line of sight")
+    return lines, told
 
 
 # ---- markers ------------------------------------------------------------------------------------
@@ -381,8 +306,42 @@ def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> l
     return [int(k) for k in order]
 
 
+def _along(
+    start: Gripper | None,
+    places: FloatArray,
+    end: Gripper | None,
+    names: Sequence[str],
+    wishes: Wishes,
+    remarks: list[str],
+) -> tuple[FloatArray, float]:
+    """Arc lengths (M,) [m] of the markers and of the cable, measured or as wished."""
+    s, length = _arc_lengths(start, places, end)
+    fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
+    declared = wishes.known.get("length")
+    if declared is not None and abs(length / declared - 1.0) > _LONGER:
+        raise MeasurementError(
+            f"the cable is {length:.4f} m long {fixtures} (a spline through the markers), but "
+            f"--length is {declared:g} m.\n  Try: --length between the fixtures; "
+            "--start-offset and --end-offset where the cable does not leave a body at its origin."
+        )
+    remarks.append(f"length: {length:.4f} m along a spline {fixtures}, mean of all poses")
+    if not wishes.at:
+        remarks.append(
+            f"markers by arc length ({', '.join(names)}) along that spline; --at if they were "
+            "measured with a tape"
+        )
+        return s, length
+    if len(wishes.at) != len(names):
+        raise MeasurementError(
+            f"--at gives {counted(len(wishes.at), 'arc length')} of "
+            f"{counted(len(names), 'marker')} ({', '.join(names)})"
+        )
+    remarks.append(f"markers: {', '.join(names)}, at the arc lengths of --at")
+    return np.array(wishes.at), length
+
+
 def _arc_lengths(
-    start: _Gripper | None, places: FloatArray, end: _Gripper | None
+    start: Gripper | None, places: FloatArray, end: Gripper | None
 ) -> tuple[FloatArray, float]:
     """Arc lengths (M,) [m] of markers from the start, and the cable's length [m].
 

@@ -135,8 +135,8 @@ def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
     tracks = [(t, x) for t, x in tracks if len(t) > 3]
     if not tracks:
         raise MeasurementError(
-            "no marker and no body was seen in this recording.\n  Try: are they labelled, and "
-            "were gaps filled with NaN?"
+            "no marker and no body was seen in this recording.\n  Try: label them; clouds take a "
+            "recording of the grippers beside them."
         )
     dt = _period(shown)
     begin, end = min(t[0] for t, _ in tracks), max(t[-1] for t, _ in tracks)

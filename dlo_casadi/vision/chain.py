@@ -38,7 +38,7 @@ _ALIKE = 0.5  # largest difference in colour of a cable's strands, over that fro
 class Strand:
     """An unbranched line in metres, with its width and colour."""
 
-    points: Array  # (K, 2) [m]
+    points: Array  # (K, d) [m]
     width: float  # relative to the cable's
     level: float  # how much it stands out from its surroundings
     colour: Array  # (3,) [grey levels]
@@ -71,7 +71,7 @@ class Workings:
 class StrandChain:
     """Strands in the order in which the cable runs through them."""
 
-    strands: tuple[Array, ...]  # each (K, 2) [m], directed from start to end
+    strands: tuple[Array, ...]  # each (K, d) [m], directed from start to end
     used: tuple[int, ...]  # their places in the list that was searched
     supported: float  # [m], length that was seen
     total: float  # [m], length with straight gaps
@@ -212,28 +212,32 @@ def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> StrandCh
 def _links(ways: list[Array], diameter: float, scene: Scene) -> tuple[Array, Array]:
     """Gap [m] and cost [m] of going from the last point of way i to the first of way j."""
 
-    def heading(line: Array) -> float:
-        """Direction [rad] at the first point of a line, over its first two diameters."""
+    def direction(line: Array) -> Array:
+        """Direction (d,) at the first point of a line, over its first two diameters."""
         far = int(np.argmax(np.linalg.norm(line - line[0], axis=1) > 2 * diameter))
         far = far or len(line) - 1
-        step = line[far] - line[min(1, far - 1)]
-        return float(np.arctan2(step[1], step[0]))
+        return np.asarray(line[far] - line[min(1, far - 1)])
 
-    def wrap(angle: Array) -> Array:
-        return (angle + np.pi) % (2 * np.pi) - np.pi
+    def angle(a: Array, b: Array) -> Array:
+        """Angle [rad] of unit vectors (..., d), in any dimension."""
+        a, b = np.broadcast_arrays(a, b)
+        return 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+
+    def unit(a: Array) -> Array:
+        return a / np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-300)
 
     across = np.array([way[0] for way in ways])[None] - np.array([way[-1] for way in ways])[:, None]
     gap = np.linalg.norm(across, axis=2)
-    heading_out = np.array([heading(way[::-1]) for way in ways])[:, None] + np.pi
-    heading_in = np.array([heading(way) for way in ways])[None, :]
-    heading_across = np.arctan2(across[..., 1], across[..., 0])
-    turn = wrap(heading_in - heading_out)
-    before, after = wrap(heading_across - heading_out), wrap(heading_in - heading_across)
+    out = unit(np.array([-direction(way[::-1]) for way in ways]))[:, None]
+    into = unit(np.array([direction(way) for way in ways]))[None]
+    over = unit(across)
+    turn, before, after = angle(out, into), angle(out, over), angle(over, into)
+    mirrored = 2 * (out * over).sum(axis=2, keepdims=True) * over - out  # the way in, on a circle
     short = gap < scene.short * diameter
-    uneven = np.where(short, 0.0, before - after)
+    uneven = np.where(short, 0.0, angle(mirrored, into))
     cost = gap + diameter * (4 * uneven**2 + scene.turn * turn**2)
-    cost[np.abs(turn) > np.where(short, scene.sharpest[1], scene.sharpest[0])] = np.inf
-    cost[~short & ((np.abs(before) > 1.4) | (np.abs(after) > 1.4))] = np.inf
+    cost[turn > np.where(short, scene.sharpest[1], scene.sharpest[0])] = np.inf
+    cost[~short & ((before > 1.4) | (after > 1.4))] = np.inf
     return gap, cost
 
 

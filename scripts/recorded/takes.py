@@ -6,6 +6,7 @@ out. Every frame has white noise of its own. The grippers are recorded with a cl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.config import load_config
+from dlo_casadi.config import Pose, load_config
 from dlo_casadi.io.points import read_points
 
 HOLD, MOVE, OFFSET = 1.6, 1.0, 0.08  # s
@@ -32,6 +33,8 @@ class Take:
     bodies: dict[str, FloatArray]  # (n, 7)
     offset: float = OFFSET  # [s], of the grippers' clock
     force: tuple[float, ...] = ()  # [N], in the end's axes; in bags
+    clouds: tuple[tuple[float, FloatArray, FloatArray], ...] = ()  # t, points, colours; in bags
+    camera: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m], that saw them
 
     @property
     def rate(self) -> float:
@@ -61,10 +64,14 @@ def _product(p: FloatArray, q: FloatArray) -> FloatArray:
 
 def rendered(session: Path, seed: int = 0, poses: int | None = None, rate: float = 100.0) -> Take:
     """A take of a session in space with markers, z up. Names of markers are in no order."""
+    held = load_config(session).experiment.poses[:poses]
+    points = [read_points(pose.paths[0], pose.start, pose.end).points for pose in held]
+    return led(held, np.array(points), seed, rate)
+
+
+def led(poses: Sequence[Pose], points: FloatArray, seed: int = 0, rate: float = 100.0) -> Take:
+    """A take that stops in each pose; points (P, K, 3) [m] of K markers in all of them."""
     random = np.random.default_rng(seed)
-    config = load_config(session)
-    poses = config.experiment.poses[:poses]
-    points = np.array([read_points(x.paths[0], x.start, x.end).points for x in poses])
     period = HOLD + MOVE
     t = np.arange(0.0, len(poses) * period - MOVE + 0.5, 1.0 / rate)
     phase = np.clip((t - HOLD) / period, 0, len(poses) - 1)
@@ -105,13 +112,18 @@ def write_motive(take: Take, folder: Path) -> Written:
             ("Marker", f"cable:{name}", "Position", a, 1e3 * x[:, k]) for k, a in enumerate("XYZ")
         ]
     cable.write_text(_motive(take.t, take.rate, columns))
-    columns = []
-    for name, x in up.bodies.items():
+    write_grippers(up, grippers)
+    return [cable, grippers], []
+
+
+def write_grippers(take: Take, path: Path) -> None:
+    """A file of Motive with the grippers alone, in the axes of the take."""
+    columns: list[tuple[str, str, str, str, FloatArray]] = []
+    for name, x in take.bodies.items():
         columns += [("Rigid Body", name, "Rotation", a, x[:, 3 + k]) for k, a in enumerate("XYZW")]
         columns += [("Rigid Body", name, "Position", a, 1e3 * x[:, k]) for k, a in enumerate("XYZ")]
         columns.append(("Rigid Body", name, "Mean Marker Error", "", 0.1 + 0.0 * take.t))
-    grippers.write_text(_motive(take.t + take.offset, take.rate, columns))
-    return [cable, grippers], []
+    path.write_text(_motive(take.t + take.offset, take.rate, columns))
 
 
 def _motive(
@@ -267,6 +279,12 @@ def _bag(take: Take, path: Path, plugin: str) -> Path:
 
         base = transform(EPOCH, "world", "base", np.hstack([FLANGE, still]))
         put(fixed, EPOCH, msg["TFMessage"]([base]))
+        seen = topic("/depth/points", "sensor_msgs/msg/PointCloud2")
+        eye = transform(EPOCH, "world", "camera", np.hstack([take.camera, still]))
+        put(fixed, EPOCH, msg["TFMessage"]([eye]))
+        for t, points, colors in take.clouds:
+            stamp = header(EPOCH + t, "camera")
+            put(seen, EPOCH + t, _cloud(msg, stamp, points - take.camera, colors))
         for k, t in enumerate(EPOCH + take.t):
             late = t + take.offset
             array = [
@@ -281,6 +299,18 @@ def _bag(take: Take, path: Path, plugin: str) -> Path:
                 wrench = msg["Wrench"](msg["Vector3"](*take.force), msg["Vector3"](0.0, 0.0, 0.0))
                 put(force, t, msg["WrenchStamped"](header(late, "flange"), wrench))
     return path
+
+
+def _cloud(msg: dict[str, type], header: object, points: FloatArray, colors: FloatArray) -> object:
+    """A PointCloud2 with PCL's packed colours."""
+    table = np.zeros(len(points), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+    for k, axis in enumerate("xyz"):
+        table[axis] = points[:, k]
+    table["rgb"] = colors.astype(np.uint32) @ np.array([65536, 256, 1], np.uint32)
+    fields = [msg["PointField"](name, 4 * k, 7, 1) for k, name in enumerate(("x", "y", "z"))]
+    fields.append(msg["PointField"]("rgb", 12, 6, 1))
+    data, n = np.frombuffer(table.tobytes(), np.uint8), len(table)
+    return msg["PointCloud2"](header, 1, n, fields, False, 16, 16 * n, data, True)
 
 
 def _marker(msg: dict[str, type], header: object, name: str, pose: object) -> object:

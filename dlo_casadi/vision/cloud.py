@@ -1,0 +1,179 @@
+"""The line of a cable in a cloud of points that a depth camera has seen of its surface."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.errors import VisionError, counted
+from dlo_casadi.vision.camera import Array, Flags
+from dlo_casadi.vision.chain import Strand, order_strands
+from dlo_casadi.vision.profiles import chord_length, fit_curve, length_of
+from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
+
+_ALIKE = 40.0  # distance in CIE Lab within which a colour is that of the cable
+_REACH = 2.0  # diameters: distance of points that are neighbours, and from the line
+_LONELY = 0.2  # of the usual number of neighbours: a point with fewer is none of the cable
+_SHORTEST = 2.0  # diameters: shorter strands are left out
+_KNOT, _SMOOTH = 5.0, 2.0  # diameters, of the spline
+_ROUNDS = 4  # of assigning points to the spline and fitting it again; it settles in three
+SPACING = 0.01  # m, distance between points of the line
+_FEWEST = 5  # points of the cloud that make one of the line
+_LEAST = 0.25  # smallest share of the length that must be seen
+_TOLD = 0.05  # of the length: a hidden part that is mentioned
+
+
+@dataclass(frozen=True)
+class CloudLine:
+    """A line in space from a cloud of points."""
+
+    points: Array
+    """(K, 3) [m], ordered from start to end; hidden stretches are left out."""
+    std: Array
+    """(K,) [m], standard deviation of a coordinate of each point."""
+    messages: tuple[str, ...]
+    """What a user should know."""
+
+
+def of_color(colors: FloatArray, wanted: Sequence[float]) -> Flags:
+    """Which colours (K, 3), red, green, blue from 0 to 255, are like the wanted one."""
+
+    def lab(rgb: FloatArray) -> Array:
+        row = np.asarray(rgb, np.float32).reshape(1, -1, 3) / 255.0
+        return np.asarray(cv2.cvtColor(row, cv2.COLOR_RGB2LAB)[0])
+
+    away = np.linalg.norm(lab(colors) - lab(np.array([wanted])), axis=1)
+    return np.asarray(away < _ALIKE)
+
+
+def line_in_cloud(points: FloatArray, cable: KnownCable, camera: FloatArray | None) -> CloudLine:
+    """Find the line of a cable in a cloud of its surface.
+
+    Neighbouring points make strands, which are ordered as those in a photograph are; a spline
+    through them is fitted to all points nearby. A camera sees the near half of the surface alone:
+    a point at the distance u from the middle, across the line of sight, lies sqrt(r^2 - u^2) before
+    the axis, r being the cable's radius, and is moved back by that much. The points of the line are
+    means over a centimetre each.
+
+    Parameters
+    ----------
+    points : (K, 3) [m]
+        Of the cable; a few others do no harm.
+    cable : KnownCable
+        Its fixtures, (3,) [m] each, and its size.
+    camera : (3,) [m] or None
+        Where the camera stands. Without it the line lies pi r / 4 before the axis.
+
+    Raises
+    ------
+    VisionError
+        If too little of a cable is found.
+    """
+    diameter = cable.diameter
+    surface = np.asarray(points[np.isfinite(points).all(axis=1)], float)
+    expected = ExpectedLine(cable.fixtures, diameter, cable.length, cable.length, BEFORE_BOARD)
+    chain = order_strands(_strands(surface, diameter), expected)
+    if chain is None or chain.supported < _LEAST * cable.length:
+        seen = 0.0 if chain is None else chain.supported
+        raise VisionError(
+            f"no cable found in {counted(len(surface), 'point')}: strands of {seen:.3f} m of {cable.length:g} "
+            "m at best. Try: --color or --box, so that the cable alone is left; length and "
+            "diameter in metres; clouds and grippers in one frame."
+        )
+    line = np.vstack(chain.strands)
+    t = chord_length(line)
+    kept = np.concatenate([[True], np.diff(t) > 0])
+    curve = fit_curve(t[kept], line[kept], np.ones(int(kept.sum())), _KNOT * diameter, diameter)
+    for _ in range(_ROUNDS):
+        curve, at, near = _refitted(curve, surface, diameter, camera)
+    found, std = _means(curve, at, near)
+    steps = np.linalg.norm(np.diff(found, axis=0), axis=1)
+    seen = float(steps[steps < 2.5 * SPACING].sum())
+    messages = []
+    if seen < (1.0 - _TOLD) * cable.length:
+        hidden = 100 * (1.0 - seen / cable.length)
+        messages.append(f"{hidden:.0f} % of the cable are hidden or cannot be told")
+    if camera is None:
+        before = 1e3 * np.pi * diameter / 8
+        messages.append(f"the line is {before:.1f} mm before the axis (no place of the camera)")
+    return CloudLine(found, std, tuple(messages))
+
+
+def _strands(points: Array, diameter: float) -> list[Strand]:
+    """Lines through the connected parts of a cloud, lonely points left out."""
+    reach = _REACH * diameter
+    if len(points) < _FEWEST:
+        return []
+    tree = cKDTree(points)
+    count = tree.query_ball_point(points, reach, return_length=True)
+    points = points[count > _LONELY * np.median(count)]
+    # One point in each cube of half a diameter, moved to the mean of its neighbours.
+    cubes = np.floor(points / (0.5 * diameter)).astype(int)
+    first = np.unique(cubes, axis=0, return_index=True)[1]
+    tree = cKDTree(points)
+    nodes = np.array(
+        [points[near].mean(axis=0) for near in tree.query_ball_point(points[first], reach)]
+    )
+    graph = cKDTree(nodes).sparse_distance_matrix(cKDTree(nodes), reach).tocsr()
+    n, part = connected_components(graph, directed=False)
+    strands = []
+    for k in range(n):
+        inside = np.flatnonzero(part == k)
+        if len(inside) < _FEWEST:
+            continue
+        own: Any = graph[inside][:, inside]
+        tip = np.argmax(dijkstra(own, indices=np.array([0]))[0])
+        away = dijkstra(own, indices=np.array([tip]))[0]
+        bins = np.floor(away / diameter).astype(int)
+        line = np.array([nodes[inside[bins == b]].mean(axis=0) for b in np.unique(bins)])
+        if length_of(line) > _SHORTEST * diameter:
+            strands.append(Strand(line, 1.0, 1.0, np.zeros(3), np.zeros(3)))
+    return strands
+
+
+def _refitted(
+    curve: BSpline, points: Array, diameter: float, camera: FloatArray | None
+) -> tuple[BSpline, Array, Array]:
+    """The spline fitted to all points near it, their places on it, and the points on the axis."""
+    lower, upper = curve.t[curve.k], curve.t[-curve.k - 1]
+    margin = diameter if upper - lower > 4 * diameter else 0.0
+    fine = np.linspace(
+        lower - margin, upper + margin, max(3, round(8 * (upper - lower) / diameter))
+    )
+    away, nearest = map(np.asarray, cKDTree(curve(fine)).query(points))
+    near = np.asarray(away < _REACH * diameter)
+    near &= (nearest > 0) & (nearest < len(fine) - 1)  # those beyond the ends are not beside it
+    points, t = points[near], fine[nearest[near]]
+    tangent = curve(t, 1)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    t = t + ((points - curve(t)) * tangent).sum(axis=1)
+    if camera is not None:
+        sight = points - camera
+        sight -= (sight * tangent).sum(axis=1, keepdims=True) * tangent
+        sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-12)
+        across = ((points - curve(t)) * np.cross(tangent, sight)).sum(axis=1)
+        points = points + np.sqrt(np.maximum(0.25 * diameter**2 - across**2, 0.0))[:, None] * sight
+    order = np.argsort(t)
+    t, points = t[order], points[order]
+    return fit_curve(t, points, np.ones(len(t)), _KNOT * diameter, _SMOOTH * diameter), t, points
+
+
+def _means(curve: BSpline, t: Array, points: Array) -> tuple[Array, Array]:
+    """Points (K, 3) of the curve, each moved by the mean of the cloud beside it, and their std."""
+    bins = np.floor((t - t[0]) / SPACING).astype(int)
+    found, std = [], []
+    for b in np.unique(bins):
+        inside = bins == b
+        if inside.sum() < _FEWEST:
+            continue
+        residual = points[inside] - curve(t[inside])
+        at = t[inside].mean()
+        found.append(curve(at) + residual.mean(axis=0))
+        std.append(np.sqrt(residual.var(axis=0).mean() / inside.sum()))
+    return np.array(found), np.array(std)

@@ -1,0 +1,143 @@
+"""Depth clouds, rendered from shapes that are known, come back as the lines of the cable."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from recorded.clouds import CABLE, HIDDEN, WALL, depth_cloud, write_pcd, write_ply
+from recorded.takes import HOLD, MOVE, led, write_grippers, write_mcap
+
+from dlo_casadi.cli import main
+from dlo_casadi.config import load_config
+from dlo_casadi.io.points import read_points
+from dlo_casadi.vision import KnownCable, line_in_cloud, of_color
+
+DATA = Path(__file__).parent / "data"
+PLACE, UP = np.array([0.25, -0.1, 1.3]), np.array([0.0, 1.0, 0.0])
+CONFIG = load_config(DATA / "space" / "space_photos" / "session.yaml")
+POSES = CONFIG.experiment.poses[:2]
+KNOWN = ("--length", "0.9", "--diameter", "0.007", "--mass", "0.09")
+SEEN = ("--camera", ",".join(map(str, PLACE)), "--color", ",".join(map(str, CABLE)), "--up", "y")
+SHAPES = np.load(DATA / "space_truth" / "space_photos" / "truth_shapes.npz")
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    random = np.random.default_rng(0)
+    radius = 0.5 * CONFIG.cable.diameter
+    seen = [depth_cloud(SHAPES[x.name], radius, PLACE, UP, random) for x in POSES]
+    few = [(colors != WALL).any(axis=1) | (np.arange(len(colors)) % 99 == 0) for _, colors in seen]
+    return [(points[kept], colors[kept]) for (points, colors), kept in zip(seen, few, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def take():
+    return led(POSES, np.zeros((len(POSES), 0, 3)), rate=50.0)
+
+
+def errors(points, name):
+    """Vectors [m] from the nearest points of the true line."""
+    fine = CubicSpline(np.linspace(0, 1, 101), SHAPES[name])(np.linspace(0, 1, 9001))
+    return points - fine[cKDTree(fine).query(points)[1]]
+
+
+def test_the_line_is_on_the_axis_and_leaves_out_what_is_hidden(clouds):
+    """2 mm of noise, 30 % hidden; without the camera the visible half is pi r / 4 before it."""
+    (points, colors), pose = clouds[0], POSES[0]
+    seen = points[of_color(colors, CABLE)]
+    cable = KnownCable(pose.start, pose.end, CONFIG.cable.diameter, CONFIG.cable.length)
+    sight = (PLACE - SHAPES[pose.name].mean(axis=0)) / 1.2
+
+    line = line_in_cloud(seen, cable, PLACE)
+    off = errors(line.points, pose.name)
+    assert np.sqrt((off**2).sum(axis=1).mean()) < 0.5e-3
+    assert abs((off @ sight).mean()) < 0.15e-3
+    assert len(line.points) * 0.01 == pytest.approx((1 - HIDDEN) * CONFIG.cable.length, abs=0.04)
+    assert "hidden" in line.messages[0]
+
+    bare = line_in_cloud(seen, cable, None)
+    before = np.pi / 8 * CONFIG.cable.diameter
+    assert (errors(bare.points, pose.name) @ sight).mean() == pytest.approx(before, rel=0.2)
+    assert "before the axis" in bare.messages[-1]
+
+
+def write(kind, clouds, take, folder):
+    """Files of a recording with clouds, and the options that they take."""
+    if kind == "mcap":
+        times = [0.5 * HOLD + k * (HOLD + MOVE) for k in range(len(clouds))]
+        seen = tuple((t, *cloud) for t, cloud in zip(times, clouds, strict=True))
+        bag = replace(take, clouds=seen, camera=tuple(PLACE), offset=0.0)
+        files, _ = write_mcap(bag, folder)
+        return files, ["--color", ",".join(map(str, CABLE)), "--up", "y", "--end", "flange"]
+    write_grippers(take, folder / "grippers.csv")
+    for k, (points, colors) in enumerate(clouds):
+        cable = of_color(colors, CABLE)
+        if kind == "ply":
+            write_ply(folder / f"{k}.ply", points, colors)
+        elif kind == "pcd":
+            write_pcd(folder / f"{k}.pcd", points[cable], colors[cable], PLACE)
+        else:
+            np.save(folder / f"{k}.npy", 1e3 * points[cable])
+    files = [*sorted(folder.glob(f"*.{kind}")), folder / "grippers.csv"]
+    options = {"ply": SEEN, "pcd": SEEN[2:], "npy": (*SEEN[:2], *SEEN[4:], "--units", "mm")}
+    return files, list(options[kind])
+
+
+def imported(files, output, options):
+    known = ["--output", str(output), "--quiet", *KNOWN]
+    return main(["import", *map(str, files), *options, *known])
+
+
+@pytest.mark.parametrize("kind", ["ply", "pcd", "npy", "mcap"])
+def test_clouds_come_back_as_lines(kind, clouds, take, tmp_path):
+    files, options = write(kind, clouds, take, tmp_path)
+    assert imported(files, tmp_path / "loom", options) == 0
+    poses = load_config(tmp_path / "loom" / "session.yaml").experiment.poses
+    for pose, true in zip(poses, POSES, strict=True):
+        line = read_points(pose.paths[0], pose.start, pose.end).points
+        y_up = line[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        assert np.sqrt((errors(y_up, true.name) ** 2).sum(axis=1).mean()) < 0.5e-3
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ("truncated", "ends after"),
+        ("empty", "has no header"),
+        ("nan", "finite"),
+        ("another colour", "--color"),
+        ("one too few", "1 cloud without a time for 2 poses"),
+        ("another frame", "clouds and grippers in one frame"),
+        ("no grippers", "grippers"),
+    ],
+)
+def test_broken_clouds_are_told_and_nothing_is_written(how, said, clouds, take, tmp_path, capsys):
+    files, options = write("ply", clouds, take, tmp_path)
+    if how == "truncated":
+        files[0].write_bytes(files[0].read_bytes()[:100_000])
+    if how == "empty":
+        files[0].write_bytes(b"")
+    if how == "nan":
+        write_ply(files[0], np.nan * clouds[0][0], clouds[0][1])
+    if how == "another colour":
+        options[3] = "0,255,0"
+    if how == "one too few":
+        files = files[1:]
+    if how == "another frame":
+        write_ply(files[0], clouds[0][0] + [5.0, 0.0, 0.0], clouds[0][1])
+    if how == "no grippers":
+        files = files[:2]
+    before = sorted(tmp_path.iterdir())
+    assert imported(files, tmp_path / "loom", options) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert "Try: " in told
+    assert "Traceback" not in told
+    assert sorted(tmp_path.iterdir()) == before
