@@ -118,7 +118,7 @@ def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[S
     given = Inputs.of(p, scale * any_rest(a)[0], pose[None])
     # Springs rest at the origin: their unknowns are those of no other model.
     lam = scale * shapes.lam * (np.arange(a.k) < model.n_conditions)
-    return Shapes.declared(shapes.x, lam), given
+    return Shapes.declared(shapes.x, lam, len(model.clips)), given
 
 
 def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[str, np.ndarray]:
@@ -255,7 +255,7 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, where, element):
     )
     lam = shapes.lam.copy()  # multipliers of clamps are about the frames' own axes
     lam[:, :d] = lam[:, :d] @ turn.T
-    there = Shapes.declared(turned_nodes(shapes.x), lam)
+    there = Shapes.declared(turned_nodes(shapes.x), lam, len(model.clips))
     moved = replace(given, poses=pose[None])
     a, b = assembly_of(model), assembly_of(turned)
     fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too

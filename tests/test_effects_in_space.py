@@ -83,7 +83,8 @@ def in_space(model, flat):
     half, named = flat.x[:, 0] / 2, dict(zip(flat_names(model), flat.multipliers, strict=True))
     zero = np.zeros_like(half)
     x = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
-    return Shapes.declared(x[None], np.array([[named.get(k, 0.0) for k in model.border_names]]))
+    lam = np.array([[named.get(k, 0.0) for k in model.border_names]])
+    return Shapes.declared(x[None], lam, len(model.clips))
 
 
 def flat_names(model):
@@ -117,7 +118,7 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
         clips=(clips[1],),
     )
     flat = solve_equilibrium(models[0], ps[0], rests[0], pose)
-    shapes = [Shapes.declared(flat.x[None], flat.multipliers[None]), in_space(models[1], flat)]
+    shapes = [flat.shapes, in_space(models[1], flat)]
     given = [
         Inputs.of(*of) for of in zip(ps, rests, (pose.vector[None], same.vector[None]), strict=True)
     ]

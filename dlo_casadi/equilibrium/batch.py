@@ -53,7 +53,7 @@ class BatchEquilibrium:
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes of these nodes (m, n_nodes, coordinates), without forces and deviations."""
         border = [border_of(self.model, *each) for each in zip(self.poses, x, strict=True)]
-        return Shapes.declared(x, np.array(border).reshape((self.m, -1)))
+        return Shapes.declared(x, np.array(border).reshape((self.m, -1)), len(self.model.clips))
 
     # ---- state -----------------------------------------------------------------------------------
 

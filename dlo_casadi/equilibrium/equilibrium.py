@@ -90,7 +90,7 @@ class Equilibrium:
     @property
     def shapes(self) -> Shapes:
         """As stacked unknowns of one pose, its ends where they are declared."""
-        return Shapes.declared(self.x[None], self.multipliers[None])
+        return Shapes.declared(self.x[None], self.multipliers[None], len(self.clips))
 
     @property
     def phi(self) -> FloatArray:

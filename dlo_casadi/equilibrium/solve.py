@@ -290,7 +290,7 @@ class _PoseSearch:
         ]
         of = np.repeat(np.arange(len(poses)), [len(guesses) for guesses in rows])
         x, border = zip(*(guess for guesses in rows for guess in guesses), strict=True)
-        return of, Shapes.declared(np.array(x), np.array(border))
+        return of, Shapes.declared(np.array(x), np.array(border), len(model.clips))
 
     def _descend(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes
@@ -346,7 +346,7 @@ class _PoseSearch:
                 mine += [int(k) for k in there[:1] if k not in mine]
             kept += mine
         nodes = model.node.interpolated(model.chain.places, coarse.chain.places, x[kept])
-        return of[kept], Shapes.declared(nodes, found.shapes.lam[kept])
+        return of[kept], Shapes.declared(nodes, found.shapes.lam[kept], len(model.clips))
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import settle
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES, CableModel
 from dlo_casadi.thresholds import BIC_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
 
@@ -286,7 +286,7 @@ def _slope(
     steps = [np.concatenate([_STEP * ways.T, -_STEP * ways.T]) for ways in along]
     p, rest = (base + step for base, step in zip(given, steps, strict=True))
     m, q = len(p), len(p) // 2
-    shapes = Shapes.declared(np.repeat(eq.x[None], m, 0), np.repeat(eq.multipliers[None], m, 0))
+    shapes = eq.shapes.subset(np.zeros(m, dtype=np.intp))
     inputs = Inputs(p, rest, np.repeat(pose.vector[None], m, 0))
     total = assembly_of(model).balance(shapes, inputs)[0]
     return np.asarray((total[:q] - total[q:]) / (2 * _STEP))

@@ -209,9 +209,8 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
             continue
         pose = problem.history[index].pose
         if relaxed:
-            x = first_guesses(fit.model, fit.p, fit.rest, pose)[0][0]
-            none = np.zeros(fit.model.n_border), np.zeros(len(fit.model.deviation_names))
-            rows.append((x, *none))
+            guess = first_guesses(fit.model, fit.p, fit.rest, pose)[0]
+            rows.append((*guess, np.zeros(len(fit.model.deviation_names))))
             continue
         try:
             if pose.branch == "previous" and rows:

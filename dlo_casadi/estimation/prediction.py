@@ -153,7 +153,7 @@ def _seen(
 def stacked(equilibria: Sequence[Equilibrium]) -> Shapes:
     """Shapes of some equilibria, held as declared."""
     x, lam = zip(*((eq.x, eq.multipliers) for eq in equilibria), strict=True)
-    return Shapes.declared(np.array(x), np.array(lam))
+    return Shapes.declared(np.array(x), np.array(lam), len(equilibria[0].clips))
 
 
 def predicted_shapes(problem: Problem, values: Values) -> Shapes:
@@ -180,7 +180,7 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     for j, (one, way) in enumerate(zip(known, told, strict=True)):
         if one is not None and way is None:
             x[j], lam[j] = one.equilibrium.x, one.equilibrium.multipliers
-    return Shapes.declared(x, lam)
+    return Shapes.declared(x, lam, len(model.clips))
 
 
 def _tells_no_side(model: CableModel, pose: HeldPose) -> bool:

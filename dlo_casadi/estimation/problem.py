@@ -160,7 +160,7 @@ class Priors:
     @classmethod
     def of(cls, tolerances: Tolerances, model: CableModel) -> Priors:
         """Priors of a model's poses that differ as much as the tolerances allow."""
-        return cls(tolerances, tolerances.deviation(model.node))
+        return cls(tolerances, tolerances.deviation(model))
 
 
 @dataclass(frozen=True, eq=False)

@@ -307,10 +307,11 @@ def scatter_of(fit: Fit) -> FloatArray:
     determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
     scatter = problem.priors.scatter.copy()
     node = problem.unknowns.model.node
-    limits = problem.priors.tolerances.deviation(node)
-    # The coordinates of an end share one scatter, and so do the turns of both clamps.
+    limits = problem.priors.tolerances.deviation(problem.unknowns.model)
+    # The coordinates of an end share one scatter, and so do the turns of both clamps, and those of
+    # all clips.
     d, b = node.dimension, node.increment
-    for group in (range(d), range(d, d + 2 * b)):
+    for group in (range(d), range(d, d + 2 * b), range(2 * (d + b), len(scatter))):
         members = [k for k, column in enumerate(columns) if column in group]
         if members:
             known = max(determined[members].sum(), 0.0)

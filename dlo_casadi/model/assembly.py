@@ -50,9 +50,9 @@ class Shapes:
     deviation: FloatArray
 
     @classmethod
-    def declared(cls, x: FloatArray, lam: FloatArray) -> Shapes:
-        """Shapes without deviations from the declared ends."""
-        return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]])))))
+    def declared(cls, x: FloatArray, lam: FloatArray, clips: int = 0) -> Shapes:
+        """Shapes without deviations from the declared ends and that number of clips."""
+        return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]], clips)))))
 
     def subset(self, index: Any) -> Shapes:
         """Shapes of some of the poses."""

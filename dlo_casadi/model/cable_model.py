@@ -132,7 +132,7 @@ class CableModel:
     @property
     def deviation_names(self) -> tuple[str, ...]:
         """Names of the unknowns that each pose has of its own."""
-        return deviation_names(self.node)
+        return deviation_names(self.node, len(self.clips))
 
     @cached_property
     def rest(self) -> RestCurvature:
@@ -337,7 +337,8 @@ class CableModel:
     def deviations(self) -> tuple[str, ...]:
         """Which deviations of a pose can matter for these boundaries."""
         own = [name for effect in self.effects for name in effect.per_pose(self.cable)]
-        return (*self._held("end"), *own)
+        clips = self.deviation_names[len(deviation_names(self.node)) :]
+        return (*self._held("end"), *own, *clips)
 
 
 @dataclass(frozen=True)
@@ -357,9 +358,11 @@ class Tolerances:
     clip: float = 2e-4
     slip: float = 5e-4
 
-    def deviation(self, node: type[Node]) -> FloatArray:
-        """Standard deviations of `deviation_names`; infinite for unknown forces."""
+    def deviation(self, model: CableModel) -> FloatArray:
+        """Standard deviations of a model's `deviation_names`; infinite for unknown forces."""
+        node = model.node
         turn = self.heading if node.increment == 1 else self.rotation
-        sizes = (self.end, turn, np.inf)
-        counts = (node.dimension, 2 * node.increment, node.dimension)
+        sizes = (self.end, turn, np.inf, self.clip)
+        d = node.dimension
+        counts = (d, 2 * node.increment, d, d * len(model.clips))
         return np.repeat(sizes, counts)

@@ -147,9 +147,13 @@ class Lagrangian:
     def true_ends(self) -> EndConditions:
         """True ends: as declared, plus the pose's deviation and the boundary effects."""
         d, b = self.node.dimension, self.node.increment
-        place, first, last, _ = ca.vertsplit(self.deviation, [0, d, d + b, d + 2 * b, 2 * (d + b)])
+        edges = [0, d, d + b, d + 2 * b, 2 * (d + b), self.deviation.numel()]
+        place, first, last, _, moved = ca.vertsplit(self.deviation, edges)
         declared = EndConditions.of(self.declared_ends, self.node)
-        ends = replace(declared, end=declared.end + place, clips=self.declared_clips)
+        clips = [
+            (x + moved[d * k : d * (k + 1)], s) for k, (x, s) in enumerate(self.declared_clips)
+        ]
+        ends = replace(declared, end=declared.end + place, clips=tuple(clips))
         ends = ends.turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)

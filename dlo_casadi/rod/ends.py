@@ -17,13 +17,15 @@ def reaction_rows(node: type[Node]) -> dict[str, slice]:
     return {name: slice(*both) for name, both in zip(REACTIONS, edges, strict=True)}
 
 
-def deviation_names(node: type[Node]) -> tuple[str, ...]:
+def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
     """Names of the unknowns that each pose has of its own, in the order of `deviation`.
 
-    How the ends deviate from what is declared [m, rad], and a force of unknown cause [N].
+    How the ends deviate from what is declared [m, rad], a force of unknown cause [N], and how a
+    number of clips deviates [m].
     """
     axes, turns = node.axes, node.turns
-    parts = (("end", axes), ("start", turns), ("end", turns), ("unknown_force", axes))
+    parts = [("end", axes), ("start", turns), ("end", turns), ("unknown_force", axes)]
+    parts += [(f"clip_{k}", axes) for k in range(clips)]
     return tuple(f"{what}_{name}" for what, names in parts for name in names)
 
 

@@ -328,4 +328,6 @@ def _scatter(fit: Fit) -> str:
         f"start_{turn}": f"{scatter[f'start_{turn}']:.2g} rad at the start clamp",
         f"end_{turn}": f"{scatter[f'end_{turn}']:.2g} rad at the end clamp",
     }
+    if fit.model.clips:
+        parts[f"clip_0_{place}"] = f"{1e3 * scatter[f'clip_0_{place}']:.2g} mm at the clips"
     return ", ".join(parts[axis] for axis in fit.model.deviations if axis in parts)
