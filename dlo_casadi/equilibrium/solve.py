@@ -283,7 +283,7 @@ class _PoseSearch:
         """First guesses of all poses, or the given starts, and the pose of each."""
         model = self.model
         rows = [
-            first_guesses(model, self.p, self.rest, pose)
+            list(first_guesses(model, self.p, self.rest, pose))
             if start is None
             else [(start, border_of(model, pose, start))]
             for pose, start in zip(poses, starts, strict=True)

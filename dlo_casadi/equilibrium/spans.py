@@ -4,7 +4,7 @@ A span reaches from one holder to the next. In a plane the arc of a span turns e
 it bulges along gravity or is rotated about its chord by quarter turns.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 
@@ -126,25 +126,25 @@ def spans_of(held: Sequence[_Holder], at: Sequence[float]) -> list[Span]:
 
 def first_guesses(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose
-) -> list[tuple[FloatArray, FloatArray]]:
-    """First guesses of a pose: nodes (n_nodes, coordinates), and the border (n_border,).
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """First guesses of a pose, one by one: nodes (n_nodes, coordinates), and border (n_border,).
 
     Of a cable without clips `guesses` or `guessed_frames`; with clips arcs span by span.
     """
-    if not pose.clips:
-        none = np.zeros(model.n_border)
-        if model.node is Frame:
-            return [(x, none) for x in guessed_frames(model, p, rest, pose)]
-        return [(phi[:, None], none) for phi in guesses(model, p, rest, pose)]
-    return _span_guesses(model, p, pose)
+    none = np.zeros(model.n_border)
+    if pose.clips:
+        yield from _span_guesses(model, p, pose)
+    elif model.node is Frame:
+        yield from ((x, none) for x in guessed_frames(model, p, rest, pose))
+    else:
+        yield from ((phi[:, None], none) for phi in guesses(model, p, rest, pose))
 
 
 def _span_guesses(
     model: CableModel, p: FloatArray, pose: HeldPose
-) -> list[tuple[FloatArray, FloatArray]]:
+) -> Iterator[tuple[FloatArray, FloatArray]]:
     held = holders(model, p, pose)
     rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
-    out: list[tuple[FloatArray, FloatArray]] = []
     for share in _SLACK if model.sliding else _SLACK[:1]:
         at = _arc_lengths(held, share)
         spans, border = spans_of(held, at), np.zeros(model.n_border)
@@ -153,9 +153,9 @@ def _span_guesses(
         if model.node is Frame:
             found = _in_space(model, pose, spans, [(at[k], held[k].frame) for k in rolls])
         else:
-            found = _in_plane(model, pose, spans)
-        out += [(x, border) for x in found]
-    return out
+            found = _in_plane(model, spans)
+        for x in found:
+            yield x, border
 
 
 def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
@@ -191,8 +191,9 @@ def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
 # ---- in a plane ----------------------------------------------------------------------------------
 
 
-def _in_plane(model: CableModel, pose: HeldPose, spans: Sequence[Span]) -> list[FloatArray]:
-    gravity, out = np.array(model.gravity), []
+def _in_plane(model: CableModel, spans: Sequence[Span]) -> Iterator[FloatArray]:
+    """Headings (n_nodes, 1) [rad]."""
+    gravity = np.array(model.gravity)
     for sides in _sides(spans, 2):
         parts = [
             _headings(model, span, (1 - 2 * side) * _sagging(span, gravity))
@@ -202,8 +203,7 @@ def _in_plane(model: CableModel, pose: HeldPose, spans: Sequence[Span]) -> list[
         _joined(parts, fixed)
         at = np.concatenate([s for s, _ in parts])
         phi = np.interp(model.chain.places, at, np.concatenate([phi for _, phi in parts]))
-        out.append(phi[:, None])
-    return out
+        yield phi[:, None]
 
 
 def _sagging(span: Span, gravity: FloatArray) -> int:
@@ -252,10 +252,9 @@ def _in_space(
     pose: HeldPose,
     spans: Sequence[Span],
     clamps: Sequence[tuple[float, FloatArray | None]],
-) -> list[FloatArray]:
+) -> Iterator[FloatArray]:
     """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all that hold the roll, too."""
     places, length = model.chain.places, model.chain.length
-    out = []
     for sides in _sides(spans, 4):
         axes = np.zeros((len(places), 3))
         for span, quarter in zip(spans, sides, strict=True):
@@ -277,8 +276,7 @@ def _in_space(
             frames[inside] = rolled(u, turned, both, nearest_roll(roll, turns))
         # Neighbours carry quaternions of the same sign.
         flips = np.where((frames[1:] * frames[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-        out.append(frames * np.concatenate([[1.0], np.cumprod(flips)])[:, None])
-    return out
+        yield frames * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
 
 def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatArray:

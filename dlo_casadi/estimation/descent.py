@@ -209,7 +209,7 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
             continue
         pose = problem.history[index].pose
         if relaxed:
-            guess = first_guesses(fit.model, fit.p, fit.rest, pose)[0]
+            guess = next(first_guesses(fit.model, fit.p, fit.rest, pose))
             rows.append((*guess, np.zeros(len(fit.model.deviation_names))))
             continue
         try:

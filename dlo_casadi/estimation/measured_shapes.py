@@ -51,7 +51,7 @@ def measured_shapes(
         )
     flat = np.zeros(chain.n_rests)
     predicted = np.array(
-        [first_guesses(model, model.nominal, flat, item.pose)[0][0] for item in problem.measured]
+        [next(first_guesses(model, model.nominal, flat, item.pose))[0] for item in problem.measured]
     )
     along = predicted.copy()
     for j in used:

@@ -150,11 +150,9 @@ class Lagrangian:
         edges = [0, d, d + b, d + 2 * b, 2 * (d + b), self.deviation.numel()]
         place, first, last, _, moved = ca.vertsplit(self.deviation, edges)
         declared = EndConditions.of(self.declared_ends, self.node)
-        clips = [
-            (x + moved[d * k : d * (k + 1)], s) for k, (x, s) in enumerate(self.declared_clips)
-        ]
-        ends = replace(declared, end=declared.end + place, clips=tuple(clips))
-        ends = ends.turned(first, last)
+        steps = ca.vertsplit(moved, d) if self.model.clips else []
+        clips = [(x + step, s) for (x, s), step in zip(self.declared_clips, steps, strict=True)]
+        ends = replace(declared, end=declared.end + place, clips=tuple(clips)).turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
         if END_ROLL in self.model.names:
@@ -436,9 +434,8 @@ class Lagrangian:
             total += effect.energy(first, last, local)
         for k, compliance in self.compliance_of.items():
             total -= compliance * self.lam[k] ** 2 / 2
-        # A spring's place stands before its multiplier.
         d, springs = self.node.dimension, self.model.pulls[: self.model.n_springs]
-        places = [self.lam[[row - d for row in rows]] for rows in springs]
+        places = [self.lam[[row - d for row in rows]] for rows in springs]  # before their pulls
         total += sum(k.energy(y) for k, y in zip(self.springs, places, strict=True))
         places += [place for place, _ in true.clips]
         for place, rows in zip(places, self.model.pulls, strict=True):
