@@ -21,7 +21,7 @@ def test_shifts_end_where_the_nodes_part_is_definite():
     least = -np.linalg.eigvalsh(nodes.dense())[:, 0]
     shift = np.zeros(4)
     for _ in range(60):
-        _, shift = _convex(matrix, 1, shift)
+        _, shift = _convex(matrix, 1, shift, np.zeros(0))
     assert np.all(shift >= least)
     assert np.all(shift <= matrix.row_sum)
     # 18 rows of 9 numbers of order one.
