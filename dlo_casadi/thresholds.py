@@ -46,6 +46,10 @@ CLEARLY_WORSE = 2.0
 # 1995), whatever its cross-validated error.
 BIC_APART = 10.0
 
+# Difference of -2 log likelihood below which two random effects cannot be told apart: a likelihood
+# ratio of 20. Moments of both pins and smooth rest curvatures differed by 2 to 9 in three sessions.
+SCATTER_APART = 6.0
+
 # Fewest different poses from which effects are judged by their change from pose to pose: fewer may
 # differ by chance, as repeats of one pose do. With 3, a missing force of 0.4 N passed for scatter
 # in five poses; 6 is a judgement above that case, its power in others is not measured.

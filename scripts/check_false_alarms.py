@@ -1,7 +1,7 @@
 """False alarms of the diagnosis on simulated sessions, and what it names of hidden effects.
 
     python scripts/check_false_alarms.py [--sets 300] [--seed 0] [--jobs N] [--output FILE]
-                                         [--scatter | [--space] [--hidden]]
+                                         [--scatter | [--space] [--hidden | --random SOURCE]]
 
 Each set takes the cable and the poses of a bench session, a new smooth rest curvature and
 stiffness, fixtures, length and scale drawn from their tolerances, and noise that is partly
@@ -14,7 +14,9 @@ markers with 1.5 to 2.5 mm of noise, and every hanging has a smooth random rest 
 own, of 0.1 to 0.3 1/m.
 
 With --space they are random cables between two grippers in space, with --hidden cables in the plane
-of which one or two effects are not declared, with both the same in space: see hidden_sets.py. Of
+of which one or two effects are not declared, with both the same in space: see hidden_sets.py. With
+--random SOURCE the poses differ in a rest curvature, moments of pins, ... of their own instead, and
+it is counted how often that is named. Of
 hidden effects those count that the data show: that make the declared model less likely by e^15 when
 both are fitted from the truth. How often each is named, alone or among what cannot be told from it,
 is counted, and how often a wrong one is.
@@ -35,7 +37,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from hidden_sets import LINE, Simulated, simulated
+from hidden_sets import LINE, RANDOM_SIZES, Simulated, simulated
 from simulated import random_session
 
 import dlo_casadi as dlo
@@ -43,14 +45,14 @@ from dlo_casadi.config import declared_setup, load_config
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spread import modes_in, tipping
+from dlo_casadi.equilibrium.spread import tipping
 from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.descent import descend, refit
 from dlo_casadi.estimation.fit import SEARCH_MESH, fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.files import write_file
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.rest_curvature import SMOOTHNESS, RestScatter
+from dlo_casadi.model.pose_scatter import SMOOTHNESS, PoseScatter, modes_in
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
@@ -85,14 +87,14 @@ def hanging(config, generator):
     p = model.nominal.copy()
     p[0] = stiffness
     places = model.chain.cells.mean(axis=1) / length
-    scatter = RestScatter(generator.uniform(0.1, 0.3), generator.choice(SMOOTHNESS))
+    scatter = PoseScatter(generator.uniform(0.1, 0.3), generator.choice(SMOOTHNESS))
     modes, mean = modes_in(model), generator.normal(0.0, 0.8, 2)
     noise, offset = generator.uniform(1.5e-3, 2.5e-3), generator.normal(0.0, known["heading"])
     s = np.linspace(0.0, length, generator.integers(3, 6))[1:]
     headings = generator.permutation(np.linspace(-3.1, 0.3, generator.integers(20, 27)))
     measured = []
     for k, heading in enumerate(headings):
-        each = modes @ (scatter.sizes * generator.standard_normal(modes.shape[1]))
+        each = modes @ (scatter.sizes(modes.shape[1]) * generator.standard_normal(modes.shape[1]))
         rest = mean[0] + mean[1] * (places - 0.5) + each
         held = HeldPose((0.0, 0.0), start_heading=float(heading), name=f"pose_{k:02d}")
         turned = replace(held, start_heading=float(heading + offset))
@@ -139,13 +141,14 @@ def main() -> None:
     kinds.add_argument("--scatter", action="store_true", help="of cables that do not repeat")
     kinds.add_argument("--space", action="store_true", help="of cables in space")
     parser.add_argument("--hidden", action="store_true", help="one or two effects hidden in each")
+    parser.add_argument("--random", default="", choices=RANDOM_SIZES, help="of each pose's own")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
     rows: dict[int, dict] = {}
     seconds = []
     with open_executor(args.jobs, args.scheduler) as executor:
-        if args.space or args.hidden:
+        if args.space or args.hidden or args.random:
             count_random(args, executor)
             return
         work = partial(run_one, seed=args.seed, scatter=args.scatter)
@@ -174,7 +177,8 @@ def main() -> None:
 def count_random(args: argparse.Namespace, executor: Executor) -> None:
     """Random sessions with nothing hidden, or with one or two effects."""
     rows: dict[int, dict] = {}
-    work = partial(run_random, seed=args.seed, space=args.space, hide=args.hidden)
+    options = {"space": args.space, "hide": args.hidden, "random": args.random}
+    work = partial(run_random, seed=args.seed, **options)
     for done in map_as_completed(executor, work, range(args.sets)):
         row = rows[done.index] = done.value
         if row["missed"] or row["wrong"] or not all(row["inside"].values()) or row["worse"]:
@@ -195,6 +199,9 @@ def summary(rows: list[dict]) -> str:
     said = [f"{len(rows)} sets"]
     if shown:
         said.append(f"{named} of {shown} effects that the data show named or tied")
+    if any("random" in row for row in rows):
+        own = sum("random" in row and not row["missed"] for row in rows)
+        said.append(f"what differs from pose to pose named or tied in {own}")
     said.append(f"{wrong} sets with a wrong effect")
     said.append(f"{sum(row['worse'] for row in rows)} with a batch fit worse than a simpler one")
     for name in ("bending_stiffness", "torsional_stiffness"):
@@ -207,11 +214,11 @@ def summary(rows: list[dict]) -> str:
     return ", ".join(said)
 
 
-def run_random(index: int, seed: int, space: bool, hide: bool) -> dict:
+def run_random(index: int, seed: int, space: bool, hide: bool, random: str = "") -> dict:
     """Simulate and fit one random session, and say what was found of its truth."""
     generator = generator_of(seed, index)
     count = 1 + index % 2 if hide else 0
-    found = simulated(generator, 3 if space else 2, count)
+    found = simulated(generator, 3 if space else 2, count, random)
     begin = time.process_time()
     row = {"hidden": found.hidden, "refused": "", "wrong": [], "inside": {}, "worse": False}
     try:
@@ -221,13 +228,19 @@ def run_random(index: int, seed: int, space: bool, hide: bool) -> dict:
         result = None
     row["cpu_seconds"] = time.process_time() - begin
     row["shown"] = shown_by(found)
-    row["missed"] = row["shown"]
+    row["missed"] = []
     if result is None:
+        row["missed"] = [*row["shown"], *([random] if random else [])]
         return row
+    own = result.fit.problem.priors.pose_scatter
+    if random:
+        row["random"] = [one.source for one in (own, *own.rivals) if one.std]
+        row["std_over_true"] = own.std / found.values[f"random.{random}"]
+        row["missed"] = [] if random in row["random"] else [random]
     named = [{item.name, *item.indistinguishable_from} for item in result.effects]
     row["verdict"] = result.verdict
     row["named"] = [sorted(names) for names in named]
-    row["missed"] = [name for name in row["shown"] if not any(name in names for names in named)]
+    row["missed"] += [name for name in row["shown"] if not any(name in names for names in named)]
     row["wrong"] = [sorted(names) for names in named if not names & set(found.hidden)]
     last, errors = result.stages[-1], {}
     for name in ("bending_stiffness", "torsional_stiffness"):

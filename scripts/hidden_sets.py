@@ -18,6 +18,7 @@ from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.noise import NoiseModel
 
 Draw = Callable[..., float]
@@ -33,6 +34,16 @@ MARKERS = (12, 3e-4)
 # Noise of readings [N], [N m].
 FORCE_STD, MOMENT_STD = 0.01, 0.001
 ELEMENTS = {2: 40, 3: 24}
+# Sizes of what differs from pose to pose, by EI [N m^2] and length [m]: each moves the cable by
+# several times the noise.
+RANDOM_SIZES = {
+    "rest_curvature": lambda stiffness, length: 0.15 / length,
+    "pin_moment": lambda stiffness, length: 0.3 * stiffness / length,
+    "clamp_angle": lambda stiffness, length: 0.05,
+    "clamp_rotation": lambda stiffness, length: 0.05,
+    "end_offset": lambda stiffness, length: 0.008 * length,
+    "length_error": lambda stiffness, length: 0.008 * length,
+}
 
 
 def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Generator) -> Values:
@@ -116,15 +127,22 @@ class Simulated:
     values: Mapping[str, float]
 
 
-def simulated(generator: np.random.Generator, dimension: int, count: int) -> Simulated:
-    """A random session with `count` hidden effects, in the plane (2) or in space (3)."""
+def simulated(
+    generator: np.random.Generator, dimension: int, count: int, random: str = ""
+) -> Simulated:
+    """A random session with `count` hidden effects, in the plane (2) or in space (3).
+
+    `random`: what differs from pose to pose, see `PoseScatter`; nothing by default.
+    """
     while True:
-        found = _tried(generator, dimension, count)
+        found = _tried(generator, dimension, count, random)
         if found is not None:
             return found
 
 
-def _tried(generator: np.random.Generator, dimension: int, count: int) -> Simulated | None:
+def _tried(
+    generator: np.random.Generator, dimension: int, count: int, random: str
+) -> Simulated | None:
     """As `simulated`; None where the poses have no stable equilibria."""
     length, mass = generator.uniform(0.5, 1.0), generator.uniform(0.03, 0.12)
     weight = 9.81 * mass
@@ -135,6 +153,7 @@ def _tried(generator: np.random.Generator, dimension: int, count: int) -> Simula
     if dimension == 3:
         cable = CableData(length, mass, 0.006, bending * off, torsional_stiffness=torsion * off)
     held = "clamped" if dimension == 3 or generator.random() < 0.5 else "pinned"
+    held = {"pin_moment": "pinned", "clamp_angle": "clamped"}.get(random, held)
     chosen = [name for name in HIDDEN[dimension] if held == "clamped" or "clamp" not in name]
     hidden = tuple(str(x) for x in generator.choice(chosen, count, replace=False))
     gravity = (0.0, -9.81) if dimension == 2 else (0.0, 0.0, -9.81)
@@ -149,7 +168,23 @@ def _tried(generator: np.random.Generator, dimension: int, count: int) -> Simula
         p[k] = values.get(name, p[k])
     ends = [_ends(generator, dimension, length, held, k) for k in range(POSES)]
     true = [_moved(generator, pose) for pose in ends]
-    shapes = predict_poses(model, p, _rest(generator, model), true)
+    rest = _rest(generator, model)
+    if random:
+        size = RANDOM_SIZES[random](bending, length) * generator.uniform(0.5, 1.5)
+        scatter = PoseScatter(size, source=random)
+        by_p, by_rest = scatter.ways(model)
+        draws = scatter.sizes(by_p.shape[1])[:, None] * generator.standard_normal(
+            (by_p.shape[1], POSES)
+        )
+        each = scatter.values(p, model)[:, None] + by_p @ draws, rest[:, None] + by_rest @ draws
+        larger = scatter.within(model)
+        shapes = [
+            predict_poses(larger, *(part[:, k] for part in each), [pose])[0]
+            for k, pose in enumerate(true)
+        ]
+        values[f"random.{random}"] = size
+    else:
+        shapes = predict_poses(model, p, rest, true)
     if any(shape is None or not shape.equilibrium.stable for shape in shapes):
         return None
     marked, read = generator.random() < 0.5, "mass_error" in hidden

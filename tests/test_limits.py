@@ -20,12 +20,12 @@ from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.report.documents import fit_dict, shared_fixtures
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
 
-KNOWN = Uncertainty((), np.zeros((0, 0)), {}, RestScatter())
+KNOWN = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter())
 DOWN, UP = -np.pi / 2, np.pi / 2
 
 
@@ -69,7 +69,7 @@ def test_a_stiff_cantilever_bends_as_its_stiffness_lets_it():
     """
     model = CableModel(CableData(0.5, 0.1, 0.01, 5.0), 10, start="clamped", end="free", n_rest=0)
     std = 0.1 * 5.0
-    known = Uncertainty(("bending_stiffness",), np.array([[std**2]]), {}, RestScatter())
+    known = Uncertainty(("bending_stiffness",), np.array([[std**2]]), {}, PoseScatter())
     straight = 0.1 * 9.81 * 0.5 / 2 / 5.0  # 1/m
     for sigma in (-1.0, 0.5):
         limit = 1 / (straight * np.exp(0.1 * sigma))
@@ -103,7 +103,7 @@ def test_a_sharp_bend_beside_a_clamp_is_resolved():
 def test_probability_is_the_share_of_shapes_that_the_compiled_solver_finds():
     """2,000 ends, 3 mm off in both directions: three standard errors are 3 %, first order 2 %."""
     model = CableModel(CableData(0.5, 0.05, 0.006, 1e-2), 20, n_rest=0)
-    known = Uncertainty((), np.zeros((0, 0)), {"end_x": 3e-3, "end_y": 3e-3}, RestScatter())
+    known = Uncertainty((), np.zeros((0, 0)), {"end_x": 3e-3, "end_y": 3e-3}, PoseScatter())
     pose = HeldPose((0.0, 0.0), (0.32, 0.05))
     rest = np.zeros(model.chain.n_rests)
     shape = solve_equilibrium(model, model.nominal, rest, pose)

@@ -28,6 +28,7 @@ from dlo_casadi.config.values import (
     Elements,
     Gravity,
     Name,
+    NonNegative,
     Number,
     OpenSection,
     Positive,
@@ -37,12 +38,12 @@ from dlo_casadi.config.values import (
     stacked,
     within,
 )
-from dlo_casadi.effects import EFFECTS, NUISANCES, CableData, Effect, known_effect
+from dlo_casadi.effects import EFFECTS, NUISANCES, RANDOM, CableData, Effect, known_effect
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import ConfigError, DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter
 from dlo_casadi.rod.node import Frame
 
 FILE = "parameters.yaml"
@@ -129,10 +130,21 @@ class _Covariance(OpenSection):
         return "" if square else f"{counted(size, 'row')} of as many values belong here"
 
 
+class _Own(OpenSection):
+    source: str = REST_CURVATURE
+    std: NonNegative = 0.0
+
+    @property
+    def complaint(self) -> str:
+        known = (REST_CURVATURE, *RANDOM)
+        return "" if self.source in known else f"source is one of {', '.join(known)}"
+
+
 class _Scatter(OpenSection):
     fixtures: dict[str, float | None] | None = None
-    rest_curvature_std: float = RestScatter().std
-    rest_curvature_smoothness: float = RestScatter().smoothness
+    rest_curvature_std: float = PoseScatter().std
+    rest_curvature_smoothness: float = PoseScatter().smoothness
+    from_pose_to_pose: Annotated[_Own, checked(lambda found: found.complaint)] = _Own()
     hanging: float = 0.0
 
 
@@ -287,12 +299,14 @@ def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
     covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
     scatter = file.scatter or _Scatter()
     fixtures = {name: std or 0.0 for name, std in (scatter.fixtures or {}).items()}
-    rest_scatter = RestScatter(scatter.rest_curvature_std, scatter.rest_curvature_smoothness)
+    own, smoothness = scatter.from_pose_to_pose, scatter.rest_curvature_smoothness
+    size = own.std or scatter.rest_curvature_std
+    pose_scatter = PoseScatter(size, smoothness, source=own.source)
     return Metadata(
         path=source,
         params={name: row.estimate for name, row in file.parameters.items()},
         covariance=Covariance(names, covariance),
-        uncertainty=Uncertainty(names, covariance, fixtures, rest_scatter, scatter.hanging),
+        uncertainty=Uncertainty(names, covariance, fixtures, pose_scatter, scatter.hanging),
         coefficients=np.array(file.rest_curvature.coefficients, dtype=float),
         fixtures=file.fixtures or {},
         limits=file.limits,

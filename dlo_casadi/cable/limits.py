@@ -221,7 +221,9 @@ def limit_checks(
     found_sizes = {name: sizes(*mesh, name) for name, mesh in true.items()}
     # What a size is on the mesh of the draws, over what it is.
     ratio = {x: sizes(drawn, near, x).max() / y.max() for x, y in found_sizes.items()}
-    varied = Varied(drawn, p, rest_on(drawn), pose, near, uncertainty)
+    own = uncertainty.pose_scatter
+    with_own = own.within(drawn), own.values(p, drawn)
+    varied = Varied(*with_own, rest_on(drawn), pose, near, uncertainty)
     likely = varied.exceedances({name: ratio[name] * bound for name, bound in bounds.items()})
     out = []
     for quantity, limit in limits.given.items():

@@ -88,15 +88,15 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     modes included; where something is, the noise is too large and the significance too low.
     """
     try:
-        noise, rest_scatter = errors_of(
+        noise, pose_scatter = errors_of(
             closed,
             modes=0,
             estimated=not closed.noise.known,
-            repeats=closed.problem.priors.rest_scatter.std == 0,
+            repeats=closed.problem.priors.pose_scatter.std == 0,
         )
     except EstimationError:  # with the effect hardly a point is left over: nothing is shown
         return 1.0
-    priors = replace(open_.problem.priors, rest_scatter=rest_scatter)
+    priors = replace(open_.problem.priors, pose_scatter=pose_scatter)
     larger = closed.reweighed(noise, priors)
     smaller = replace(larger.problem, unknowns=open_.problem.unknowns)
     without = descend(Fit(smaller, smaller.evaluate(open_.point)))

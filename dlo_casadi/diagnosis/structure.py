@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.variances import rest_scatter_of
+from dlo_casadi.estimation.variances import pose_scatter_of
 from dlo_casadi.sensing.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.thresholds import (
     ALIKE,
@@ -79,7 +79,7 @@ class Structure:
 
 def noise_degrees(fit: Fit) -> float:
     """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
-    return max(LEAST_NOISE_DEGREES, min(fit.noise.slow_dof, fit.problem.priors.rest_scatter.dof))
+    return max(LEAST_NOISE_DEGREES, min(fit.noise.slow_dof, fit.problem.priors.pose_scatter.dof))
 
 
 def screening_degrees(fit: Fit) -> float:
@@ -89,7 +89,7 @@ def screening_degrees(fit: Fit) -> float:
     of cable told it, which is too much: what is found so has to pass a second test, under the
     noise that is left once it is in the model.
     """
-    rest_dof = fit.problem.priors.rest_scatter.dof
+    rest_dof = fit.problem.priors.pose_scatter.dof
     if fit.noise.known:
         return noise_degrees(fit)
     if fit.noise.share == 0:
@@ -137,7 +137,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         _rank_score(energies, spans),
         _position_score(fit, noise_dof),
         dict(zip(names, energies.tolist(), strict=True)),
-        rest_scatter_of(fit, fit.noise).p_systematic if problem.priors.rest_scatter.std else None,
+        pose_scatter_of(fit, fit.noise).p_systematic if problem.priors.pose_scatter.std else None,
     )
 
 

@@ -27,6 +27,7 @@ from dlo_casadi.effects.effect import StateEffect as StateEffect
 from dlo_casadi.effects.effect import Viewpoint as Viewpoint
 from dlo_casadi.effects.end_offset import EndOffset as EndOffset
 from dlo_casadi.effects.end_spring import EndSpring as EndSpring
+from dlo_casadi.effects.end_spring import PinMoment as PinMoment
 from dlo_casadi.effects.end_spring import StartSpring as StartSpring
 from dlo_casadi.effects.image_distortion import ImageDistortion as ImageDistortion
 from dlo_casadi.effects.image_scale import ImageScale as ImageScale
@@ -79,6 +80,10 @@ EFFECTS: dict[str, type[Effect]] = {
 
 # The effect that estimates a mass that is not declared.
 UNKNOWN_MASS: type[Effect] = MassError
+
+# Effects that may differ at random from pose to pose.
+_KINDS: list[type[Effect]] = [PinMoment, *EFFECTS.values()]
+RANDOM = {kind.name: kind for kind in _KINDS if kind.at_random}
 
 # Effects of every measurement that are estimated with the others, never declared or diagnosed.
 NUISANCES: dict[str, type[Effect]] = {kind.name: kind for kind in (EdgeBias, SensorBias)}

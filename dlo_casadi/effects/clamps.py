@@ -57,6 +57,8 @@ class ClampEffect(BoundaryEffect):
 class ClampTurn(ClampEffect):
     """True minus declared direction of the clamps."""
 
+    at_random = "clamps turned by an angle of its own"
+
     # Parameters of one clamp, behind the name of its end.
     errors: ClassVar[tuple[str, ...]]
 

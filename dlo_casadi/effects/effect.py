@@ -100,6 +100,9 @@ class Effect:
     tolerances: ClassVar[Mapping[str, str]] = {}
     # Parameter -> name and unit of its inverse, for those that are better known by it.
     inverses: ClassVar[Mapping[str, tuple[str, str]]] = {}
+    # What each pose has of its own where the parameters differ from pose to pose; empty if they are
+    # never tried so.
+    at_random: ClassVar[str] = ""
     # Whether it is listed in tables of parameters while it is a nuisance.
     shown: ClassVar[bool] = True
     # Whether the effect applies in the plane (2), in space (3).

@@ -20,6 +20,7 @@ class EndOffset(BoundaryEffect):
     """
 
     name = "end_offset"
+    at_random = "an end displaced by a vector of its own"
     tolerances: ClassVar = {"dx": "end", "dy": "end", "dz": "end"}
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:

@@ -1,6 +1,7 @@
-"""A pin that holds the cable's direction."""
+"""Pins that hold the cable's direction, by a spring or by friction."""
 
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, Self
 
 import casadi as ca
 
@@ -69,3 +70,43 @@ class EndSpring(_PinSpring):
 
     name = "end_spring"
     side = "end"
+
+
+@dataclass(frozen=True)
+class PinMoment(BoundaryEffect):
+    """Moments of the pins on the cable, as friction leaves them.
+
+        V = -start phi(0) - end phi(L)                                [J]
+
+    They differ from pose to pose: nobody declares them.
+
+    Parameters
+    ----------
+    start, end : scalar [N m]
+        Counter-clockwise; vanish at 0. Only those of pinned ends.
+    """
+
+    sides: tuple[str, ...] = ("start", "end")
+    name = "pin_moment"
+    at_random = "moments of its own at the pins, as friction leaves them,"
+    dimensions = (2,)
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where an end is a pin."""
+        return super().applies(setup) and "pinned" in (setup.start, setup.end)
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """With the moments at those ends that are pins."""
+        ends = {"start": setup.start, "end": setup.end}
+        return cls(sides=tuple(side for side, held in ends.items() if held == "pinned"))
+
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
+        """Declare the moments."""
+        return Parameter.symmetric(self.sides, "N m", 0.1 * cable.bending_stiffness / cable.length)
+
+    def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
+        """Energy of the moments [J]."""
+        headings = {"start": first, "end": last}
+        return -sum((params[side] * headings[side] for side in self.sides), ca.SX(0))

@@ -20,6 +20,7 @@ class LengthError(Kinematics):
     """
 
     name = "length_error"
+    at_random = "a length of its own, by a standard deviation"
     tolerances: ClassVar = {"length_difference": "length"}
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:

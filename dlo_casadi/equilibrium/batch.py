@@ -175,13 +175,13 @@ class BatchEquilibrium:
     def solve_or_descend(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any
     ) -> tuple[Shapes, BoolArray]:
-        """As `solve`; in space, the energy of lost poses descends to a minimum from their start.
+        """As `solve`; the energy of lost poses descends to a minimum from their start.
 
         Newton's method alone loses one pose of ten wherever frames have far to rotate.
         """
         now, converged = self.solve(shapes, p, rest, **options)
         lost = np.flatnonzero(~converged)
-        if not len(lost) or not self.model.in_space or self.model.has_state:
+        if not len(lost) or self.model.has_state:
             return now, converged
         given = self.given(shapes, p, rest).subset(lost)
         found = descend(self.assembly, shapes.subset(lost), given, DOWNHILL)

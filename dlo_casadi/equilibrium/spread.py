@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import ways_of
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
-from dlo_casadi.model.rest_curvature import MODES, RestScatter, modes_of
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.thresholds import EITHER
 
 # Share of new repeats inside the band, and half its width in standard deviations.
@@ -39,7 +39,7 @@ class Uncertainty:
         Of these, in SI units.
     scatter : mapping of str to float
         Standard deviation of the fixtures from pose to pose, by the deviation's name.
-    rest_scatter : RestScatter
+    pose_scatter : PoseScatter
     repeat_std : float [m]
         Standard deviation of a coordinate between repeats of one pose, root mean square along the
         cable; 0 where no pose was repeated.
@@ -51,7 +51,7 @@ class Uncertainty:
     names: tuple[str, ...]
     covariance: FloatArray
     scatter: Mapping[str, float]
-    rest_scatter: RestScatter
+    pose_scatter: PoseScatter
     repeat_std: float = 0.0
     added: Mapping[str, float] = field(default_factory=dict)
 
@@ -75,23 +75,24 @@ class Uncertainty:
         return by_p, by_rest
 
     def ways_in(self, model: CableModel) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Independent directions in which a new repeat of a pose may differ, each of one std.
+        """Independent directions in which a new repeat of a pose may differ, one std each.
 
-        Changes of the parameters (n_parameters, q), the rest strains (n_rests, q) and the model's
-        deviations (n_deviations, q) without unknown forces: by the fitted unknowns, the fixtures,
-        modes of the rest curvature that each repeat has of its own, and what is `added`.
+        Changes of the parameters (n_parameters, q) of `pose_scatter.within(model)`, the rest
+        strains (n_rests, q) and the deviations (n_deviations, q) without unknown forces: by the
+        fitted unknowns, the fixtures, what each repeat has of its own, and what is `added`.
         """
         by_p, by_rest = (by @ self.root for by in self.unknowns_in(model))
-        modes = modes_in(model)
-        modes = modes * np.tile(self.rest_scatter.sizes, modes.shape[1] // MODES)
+        scattered, modes = self.pose_scatter.ways(model)
+        sizes = self.pose_scatter.sizes(modes.shape[1])
         n, m = by_p.shape[1], len(model.deviations)
-        count = n + m + modes.shape[1]
+        count = n + m + len(sizes)
         scatter = np.array([self.scatter.get(name, 0.0) for name in model.deviations])
         used = [model.deviation_names.index(name) for name in model.deviations]
         by_deviation = np.zeros((len(model.deviation_names), count))
         by_deviation[used, n + np.arange(m)] = np.where(np.isfinite(scatter), scatter, 0.0)
-        by_rest = np.hstack([np.pad(by_rest, [(0, 0), (0, m)]), modes])
-        by_p = np.pad(by_p, [(0, 0), (0, count - n)])
+        by_rest = np.hstack([np.pad(by_rest, [(0, 0), (0, m)]), modes * sizes])
+        more = len(scattered) - len(by_p)
+        by_p = np.hstack([np.pad(by_p, [(0, more), (0, m)]), scattered * sizes])
         new = np.zeros((len(by_p), len(self.added)))
         new[[model.names.index(name) for name in self.added], range(len(self.added))] = [
             *self.added.values()
@@ -106,7 +107,7 @@ class Uncertainty:
         "end_heading" and "end_rotation", the "repeat", or the name of an added parameter.
         """
         fixtures = (cause_of(model, name) for name in model.deviations)
-        repeat = ["repeat"] * modes_in(model).shape[1]
+        repeat = ["repeat"] * self.pose_scatter.ways(model)[0].shape[1]
         return (*["parameters"] * len(self.names), *fixtures, *repeat, *self.added)
 
     def installed(self, model: CableModel, tolerances: Mapping[str, float]) -> Self:
@@ -144,12 +145,6 @@ def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
     return {key: tuple(x for name, x in named if name == key) for key, _ in named}
 
 
-def modes_in(model: CableModel) -> FloatArray:
-    """Modes (n_rests, axes MODES) of the rest curvature of a single repeat, in a model's cells."""
-    axes = np.eye(len(model.node.strains))[:, -len(model.node.curvatures) :]
-    return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
-
-
 def displacements(
     model: CableModel,
     p: FloatArray,
@@ -162,11 +157,12 @@ def displacements(
     """Curve of a pose, and displacements (K, d, q) [m] of its places s [m] in a new repeat.
 
     They are independent, of one standard deviation each. Derivatives of the equilibrium carry the
-    covariance of the fitted parameters, the fixtures' scatter and the rest curvature of a single
-    repeat to the shape; the measured difference of repeats is added, the same all along.
+    covariance of the fitted parameters, the fixtures' scatter and what a single repeat has of its
+    own to the shape; the measured difference of repeats is added, the same all along.
     """
-    equilibria = BatchEquilibrium(model, [pose])
     by_p, by_rest, by_deviation = uncertainty.ways_in(model)
+    scatter = uncertainty.pose_scatter
+    p, equilibria = scatter.values(p, model), BatchEquilibrium(scatter.within(model), [pose])
     along = equilibria.by_rest(found.shapes, p, rest, by_rest, by_p, by_deviation)
     ((seen, change),) = equilibria.observe(found.shapes, p, rest, along)
     curve, d = seen.curve, seen.curve.d
@@ -233,7 +229,8 @@ def tipping_of(
     First order in all that makes a prediction uncertain: the derivative of an equilibrium's energy
     by any input is that of the Lagrangian at fixed nodes and multipliers.
     """
-    each = uncertainty.ways_in(model)
+    each, scatter = uncertainty.ways_in(model), uncertainty.pose_scatter
+    p, larger = scatter.values(p, model), scatter.within(model)
     count = each[0].shape[1]
     p_steps, rest_steps, deviations = (_SHARE * np.hstack([by, -by]).T for by in each)
     given = Inputs.of(p + p_steps, rest + rest_steps, np.tile(pose.vector, (2 * count, 1)))
@@ -241,7 +238,7 @@ def tipping_of(
     for found in (eq, other):
         x = np.broadcast_to(found.x, (2 * count, *found.x.shape))
         lam = np.broadcast_to(found.multipliers, (2 * count, len(found.multipliers)))
-        value = assembly_of(model).balance(Shapes(x, lam, deviations), given)[0]
+        value = assembly_of(larger).balance(Shapes(x, lam, deviations), given)[0]
         slopes.append((value[:count] - value[count:]) / (2 * _SHARE))
     std = float(np.linalg.norm(slopes[1] - slopes[0]))
     return Tipping(tipping(model, eq, other), std / _lever(model, eq, other))

@@ -20,10 +20,11 @@ from dlo_casadi.estimation.variances import (
     SMOOTH_MODES,
     errors_of,
     first_reading_noise,
+    pose_scatter_of,
     refine,
 )
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
@@ -38,6 +39,9 @@ FIRST_STD = 3e-4
 STUCK = 2.0
 # Turns per length, several times what heavy cables were measured to have, 0.1 to 0.3 1/m.
 FIRST_REST_TURNS = 0.05
+# Largest chi-square per degree of freedom at which a scatter from pose to pose explains a misfit:
+# turns of 0.06 rad, taken to first order, left 1.25.
+EXPLAINED = 1.5
 FINEST_MESH = 160
 # The search for missing effects, a hundred refits, runs on at most so many elements.
 SEARCH_MESH = 80
@@ -97,13 +101,15 @@ def fit_model(
     theta = unknowns.pack(first, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta)
     different = different_poses(measured, model.cable.length)
+    if different >= DIFFERENT and fit.noise.source == "misfit":
+        return _at_random(fit) or fit
     doubtful = fit.residual_rms > SearchSettings.of(model).other_minima * model.cable.length
     if different >= DIFFERENT and fit.beyond_noise and doubtful:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
         # left: search once more as if every repeat had a rest curvature of its own.
-        scatter = RestScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
+        scatter = PoseScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
         noise = fit.noise if std is not None and fit.noise.source == "estimated" else noise
-        loose = replace(problem, noise=noise, priors=replace(priors, rest_scatter=scatter))
+        loose = replace(problem, noise=noise, priors=replace(priors, pose_scatter=scatter))
         near = fit_from(*begin(loose, theta))
         try:
             others = [refine(near, first=True)] if near and _scatters(near) else []
@@ -111,6 +117,19 @@ def fit_model(
             return fit
         return max([fit, *others], key=lambda found: found.log_evidence)
     return fit
+
+
+def _at_random(fit: Fit) -> Fit | None:
+    """The fit to a misfit, if that is explained by what differs from pose to pose; else None."""
+    known = fit.noise.before or fit.noise
+    found = pose_scatter_of(fit.reweighed(known), known).scatter
+    if not found.std:
+        return None
+    with suppress(EstimationError):
+        priors = replace(fit.problem.priors, pose_scatter=found)
+        near = refine(fit.reweighed(known, priors), first=True)
+        return near if near.chi2_per_dof < EXPLAINED else None
+    return None
 
 
 def _scatters(fit: Fit) -> bool:

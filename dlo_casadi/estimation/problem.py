@@ -25,12 +25,11 @@ from scipy.linalg import solve_triangular
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
-from dlo_casadi.equilibrium.spread import modes_in
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.model.rest_curvature import MODES, RestScatter
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
@@ -39,7 +38,7 @@ from dlo_casadi.sensing.noise import NoiseModel
 NO_INFORMATION = 1e-6
 # Roughness of the rest curvature until it has been estimated.
 FIRST_ROUGHNESS = 0.3
-NO_REST_SCATTER = RestScatter()
+NO_SCATTER = PoseScatter()
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ class Priors:
         Standard deviations of a pose's own deviations.
     roughness_std : float
         Prior of the rest curvature, see `Unknowns.prior`.
-    rest_scatter : RestScatter
+    pose_scatter : PoseScatter
         Rest curvature of each repeat's own. None by default: cables come back to the same shape,
         unless the data tell otherwise.
     told : tuple of (row (size,), value)
@@ -154,7 +153,7 @@ class Priors:
     tolerances: Tolerances
     scatter: FloatArray
     roughness_std: float = FIRST_ROUGHNESS
-    rest_scatter: RestScatter = NO_REST_SCATTER
+    pose_scatter: PoseScatter = NO_SCATTER
     told: tuple[tuple[FloatArray, float], ...] = ()
 
     @classmethod
@@ -277,7 +276,7 @@ class Problem:
             self.measured[j].whitening(self.noise, s)
             for j, s in zip(self.used, values.projections, strict=True)
         ]
-        for k, way in enumerate(self.rest_errors(values)):
+        for k, way in enumerate(self.own_errors(values)):
             if not way.size:
                 continue
             seen = weights[k] @ way
@@ -285,18 +284,23 @@ class Problem:
             weights[k] = solve_triangular(factor, weights[k], lower=True)
         return replace(self, weights=tuple(weights))
 
-    def moved_by_rest(self, values: Values) -> list[FloatArray]:
-        """Change (R_j, axes MODES) of the fitted residuals by rest curvatures of the poses' own."""
-        along = self.equilibria.by_rest(*self.state(values), modes_in(self.unknowns.model))
-        return [change for _, change in self.residuals(values, along)]
+    def moved_by(self, values: Values, scatter: PoseScatter) -> list[FloatArray]:
+        """Change (R_j, q) of the fitted residuals by a unit of what each pose has of its own."""
+        shapes, p, rest = self.state(values)
+        model = self.unknowns.model
+        larger = BatchEquilibrium(scatter.within(model), self.equilibria.poses)
+        p, (by_p, by_rest) = scatter.values(p, model), scatter.ways(model)
+        along = larger.by_rest(shapes, p, rest, by_rest, by_p)
+        seen = larger.observe(shapes, p, rest, along)
+        places = zip(self.used, values.projections, strict=True)
+        return [self.measured[j].linearized(seen[j][0], s, seen[j][1])[1] for j, s in places]
 
-    def rest_errors(self, values: Values) -> list[FloatArray]:
-        """The same (R_j, axes MODES) by one standard deviation of each mode; (R_j, 0) for none."""
-        rest = self.priors.rest_scatter
-        if rest.std == 0:
+    def own_errors(self, values: Values) -> list[FloatArray]:
+        """The same by one standard deviation of each; (R_j, 0) where the cable repeats."""
+        scatter = self.priors.pose_scatter
+        if scatter.std == 0:
             return [np.zeros((self.measured[j].n_residuals, 0)) for j in self.used]
-        moved = self.moved_by_rest(values)
-        return [way * np.tile(rest.sizes, way.shape[1] // MODES) for way in moved]
+        return [way * scatter.sizes(way.shape[1]) for way in self.moved_by(values, scatter)]
 
     # ---- evaluation --------------------------------------------------------------------------
 

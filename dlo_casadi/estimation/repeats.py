@@ -1,13 +1,14 @@
 """Poses taken more than once, and cables that do not come back to the same shape.
 
 What differs between repeats of a pose no model can explain: it is pure error. Where many poses
-differ, every repeat has a rest curvature of its own instead,
+differ, every repeat has something of its own instead. Most often a rest curvature,
 
     kappa_j(s) = kappa_0(s) + std sum_k sqrt(v_k) c_jk f_k(s),    c_jk ~ N(0, 1)
     f_0 = 1, f_k = sqrt(2) cos(k pi s / L),    v_k ~ exp(-(k pi l / L)^2 / 2),    sum_k v_k = 1
 
-which friction between strands and set leave. To first order it moves the residuals of pose j by
-std E_j c_j, so that their covariance is that of the noise plus std^2 E_j E_j^T.
+which friction between strands and set leave; or moments of pins, turns of clamps, places of the
+end, lengths: the likeliest. To first order it moves the residuals of pose j by std E_j c_j, so that
+their covariance is that of the noise plus std^2 E_j E_j^T.
 
 A model that lacks something leaves residuals, too, but alike in poses that are alike. So a second
 part, correlated over the poses' shapes, takes what is systematic while the size of the random one
@@ -33,7 +34,7 @@ from scipy.special import chdtrc, chdtri
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.rest_curvature import MODES, SMOOTHNESS, RestScatter
+from dlo_casadi.model.pose_scatter import REST_CURVATURE, SMOOTHNESS, PoseScatter
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
@@ -114,7 +115,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
     if different_poses(measured, length) >= DIFFERENT:
-        return noise  # what differs between repeats has its own place there, see `rest_scatter`
+        return noise  # what differs between repeats has its own place there, see `pose_scatter`
     spread = repeatability(measured, length)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise
@@ -188,8 +189,8 @@ class ScatterSample:
     Parameters
     ----------
     e : (R,)
-    rest : (R, axes MODES)
-        By a rest curvature of 1 / m in each mode, about each axis of the section.
+    random : (R, q)
+        By a unit of what differs from pose to pose, see `PoseScatter.ways`.
     own : (R, a)
         By what else is the pose's own, one standard deviation each.
     shared : (R, b)
@@ -197,7 +198,7 @@ class ScatterSample:
     """
 
     e: FloatArray
-    rest: FloatArray
+    random: FloatArray
     own: FloatArray
     shared: FloatArray
 
@@ -230,10 +231,18 @@ class RestLikelihood:
     samples : sequence of ScatterSample
     distances : (m, m) [m]
         Between the poses' shapes, root mean square.
+    source : str
+        What differs from pose to pose, see `PoseScatter`.
     """
 
-    def __init__(self, samples: Sequence[ScatterSample], distances: FloatArray) -> None:
-        self.m, self.modes = len(samples), samples[0].rest.shape[1]
+    def __init__(
+        self,
+        samples: Sequence[ScatterSample],
+        distances: FloatArray,
+        source: str = REST_CURVATURE,
+    ) -> None:
+        self.source = source
+        self.m, self.modes = len(samples), samples[0].random.shape[1]
         self.count = sum(len(sample.e) for sample in samples)
         shared = np.concatenate([sample.shared for sample in samples])
         left, values, _ = np.linalg.svd(
@@ -244,7 +253,7 @@ class RestLikelihood:
         self.free = self.count - left.shape[1]
         fixed = [np.column_stack([x, s.e]) for x, s in zip(blocks, samples, strict=True)]
         self.fixed = np.array([x.T @ x for x in fixed]).sum(axis=0)
-        random = [np.column_stack([s.rest, s.own]) for s in samples]
+        random = [np.column_stack([s.random, s.own]) for s in samples]
         self.random = np.array([z.T @ z for z in random])
         self.cross = np.array([z.T @ x for z, x in zip(random, fixed, strict=True)])
         self.distances = distances
@@ -261,7 +270,7 @@ class RestLikelihood:
         """
         m, q, r = self.m, self.random.shape[1], self.modes
         root = np.full(q, 1 / noise)
-        root[:r] *= np.tile(RestScatter(std, smoothness).sizes, r // MODES)
+        root[:r] *= PoseScatter(std, smoothness, source=self.source).sizes(r)
         inside = self.random * root[:, None] * root
         cross = self.cross * root[None, :, None]
         if systematic > 0 and m > 1:
@@ -360,19 +369,22 @@ class ScatterEstimate:
 
     Parameters
     ----------
-    rest : RestScatter
+    scatter : PoseScatter
     noise : float
         Factor on the standard deviation of the noise.
     p_systematic : float
         Probability of as much that is alike in poses that are alike, if all is random.
+    deviance : float
+        -2 log restricted likelihood, up to a constant.
     """
 
-    rest: RestScatter
+    scatter: PoseScatter
     noise: float
     p_systematic: float
+    deviance: float
 
 
-def estimate_rest_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -> ScatterEstimate:
+def estimate_pose_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -> ScatterEstimate:
     """Sizes of maximal restricted likelihood: only what differs between poses alike is random.
 
     Parameters
@@ -386,8 +398,9 @@ def estimate_rest_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -
     ----------
     Chung et al., Psychometrika 78 (2013).
     """
-    weight = float(sparse)
-    alone = {s: likelihood.best(s, None, weight=weight) for s in SMOOTHNESS}
+    weight, source = float(sparse), likelihood.source
+    trials = SMOOTHNESS if source == REST_CURVATURE else SMOOTHNESS[:1]
+    alone = {s: likelihood.best(s, None, weight=weight) for s in trials}
     smoothness = min(alone, key=lambda s: alone[s].deviance)
     chosen, range_, guess = alone[smoothness], None, alone[smoothness].std
     ranges = [r * likelihood.apart for r in RANGES] if likelihood.m > 2 else []
@@ -401,6 +414,9 @@ def estimate_rest_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -
         chosen, range_ = both[joint], joint
     without = likelihood.best(smoothness, range_, std=False, guess=guess)
     if not sparse and without.deviance - chosen.deviance < TELLING:
-        return ScatterEstimate(RestScatter(), without.noise, p_systematic)
+        return ScatterEstimate(PoseScatter(), without.noise, p_systematic, without.deviance)
     dof = likelihood.degrees(chosen, smoothness, range_)
-    return ScatterEstimate(RestScatter(chosen.std, smoothness, dof), chosen.noise, p_systematic)
+    found = PoseScatter(chosen.std, smoothness, dof, source)
+    sizes = (chosen.noise, chosen.std, chosen.systematic)
+    deviance = likelihood.deviance(*sizes, smoothness, range_ or 1.0)[0]
+    return ScatterEstimate(found, chosen.noise, p_systematic, deviance)

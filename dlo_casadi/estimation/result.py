@@ -74,12 +74,12 @@ class Fit:
     def beyond_noise(self) -> bool:
         """Whether more is left than noise: chi-square by two standard deviations, or a scatter."""
         excess = 2 * np.sqrt(2 / self.degrees_of_freedom)
-        return self.problem.priors.rest_scatter.std > 0 or self.chi2_per_dof > 1 + excess
+        return self.problem.priors.pose_scatter.std > 0 or self.chi2_per_dof > 1 + excess
 
     @property
     def errors_known(self) -> bool:
         """Whether nothing of what the residuals are compared with was estimated from them."""
-        return self.noise.known and self.problem.priors.rest_scatter.std == 0
+        return self.noise.known and self.problem.priors.pose_scatter.std == 0
 
     @property
     def p(self) -> FloatArray:
@@ -180,13 +180,11 @@ class Fit:
         ----------
         Satterthwaite, Biometrics Bulletin 2 (1946).
         """
-        problem, rest = self.problem, self.problem.priors.rest_scatter
+        problem, rest = self.problem, self.problem.priors.pose_scatter
         index = problem.unknowns.names.index(name)
         column = self.covariance[index]
         errors, own = 0.0, 0.0
-        for taken, white, way in zip(
-            self._taken, problem.whitening, self._rest_errors, strict=True
-        ):
+        for taken, white, way in zip(self._taken, problem.whitening, self._own_errors, strict=True):
             by_errors = taken @ column
             errors += float(by_errors @ by_errors)
             own += float(((by_errors @ white @ way) ** 2).sum())
@@ -253,11 +251,11 @@ class Fit:
     @property
     def _by_rest(self) -> list[FloatArray]:
         """Variance (R_j,) of each residual by the rest curvature of each repeat's own."""
-        return [(way**2).sum(axis=1) for way in self._rest_errors]
+        return [(way**2).sum(axis=1) for way in self._own_errors]
 
     @cached_property
-    def _rest_errors(self) -> list[FloatArray]:
-        return self.problem.rest_errors(self.point)
+    def _own_errors(self) -> list[FloatArray]:
+        return self.problem.own_errors(self.point)
 
     @property
     def _on_points(self) -> list[BoolArray]:
@@ -391,4 +389,4 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     apart = 0.0
     if different_poses(history, length) < DIFFERENT:
         apart = repeat_std(history, length, fit.noise.of_points.beside_repeats)
-    return Uncertainty(names, covariance, scatter, fit.problem.priors.rest_scatter, apart)
+    return Uncertainty(names, covariance, scatter, fit.problem.priors.pose_scatter, apart)

@@ -13,13 +13,13 @@ from dlo_casadi.estimation.repeats import (
     ScatterEstimate,
     ScatterSample,
     different_poses,
-    estimate_rest_scatter,
+    estimate_pose_scatter,
     with_repeats,
 )
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.rest_curvature import MODES, RestScatter
+from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
 from dlo_casadi.sensing.noise import (
     NoiseModel,
     NoiseSample,
@@ -28,7 +28,7 @@ from dlo_casadi.sensing.noise import (
     smooth_modes,
     tell_of_noise,
 )
-from dlo_casadi.thresholds import DIFFERENT, SCATTERED, SCATTERED_DEGREES
+from dlo_casadi.thresholds import DIFFERENT, SCATTER_APART, SCATTERED, SCATTERED_DEGREES
 
 # Slow displacements per pose that are kept out of the noise estimate: many while an effect may
 # be missing, few once the model is taken as complete, because noise is slow, too.
@@ -66,7 +66,7 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
     ----------
     MacKay, Neural Computation 4 (1992).
     """
-    repeats = fit.problem.priors.rest_scatter.std == 0 and not first
+    repeats = fit.problem.priors.pose_scatter.std == 0 and not first
     rough, estimated = first and SearchSettings.of(fit.model).converged_first, not fit.noise.known
     near = descend(fit, tolerance=1e-2)
     fit = near if near.converged or not rough else replace(fit, converged=False)
@@ -74,7 +74,7 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
         priors, noise = fit.problem.priors, fit.noise
         if first and round_ == 0 and noise.source == "declared":
             estimated = contradicted(fit)
-        rest = priors.rest_scatter
+        rest = priors.pose_scatter
         if round_ < 2:
             noise, rest = errors_of(fit, modes, estimated=estimated, repeats=repeats)
         roughness, scatter = roughness_of(fit), scatter_of(fit)
@@ -84,9 +84,9 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
             float(np.abs(np.log(scatter[ends] / priors.scatter[ends])).max()),
         )
         changed = abs(np.log(noise.std / fit.noise.std))
-        largest = max(rest.std, priors.rest_scatter.std)
-        same = abs(rest.std - priors.rest_scatter.std) <= 0.05 * largest
-        found = replace(priors, roughness_std=roughness, scatter=scatter, rest_scatter=rest)
+        largest = max(rest.std, priors.pose_scatter.std)
+        same = abs(rest.std - priors.pose_scatter.std) <= 0.05 * largest
+        found = replace(priors, roughness_std=roughness, scatter=scatter, pose_scatter=rest)
         fit = descend(fit.reweighed(noise, found))
         if moved < 0.1 and changed < 0.02 and same:
             break
@@ -111,7 +111,7 @@ def contradicted(fit: Fit) -> bool:
 
 def errors_of(
     fit: Fit, modes: int = SMOOTH_MODES, *, estimated: bool, repeats: bool
-) -> tuple[NoiseModel, RestScatter]:
+) -> tuple[NoiseModel, PoseScatter]:
     """Noise of the points and rest curvature of each repeat's own, from the residuals.
 
     The noise is estimated with all that the shape may do projected out. Lines of few points
@@ -142,9 +142,9 @@ def errors_of(
             noise, together = _white_noise(fit), True
     noise = replace(noise, readings=reading_noise_of(fit))
     if repeats:
-        return noise, RestScatter()
-    found = rest_scatter_of(fit, noise)
-    return replace(noise, std=found.noise * noise.std) if together else noise, found.rest
+        return noise, PoseScatter()
+    found = pose_scatter_of(fit, noise)
+    return replace(noise, std=found.noise * noise.std) if together else noise, found.scatter
 
 
 def first_reading_noise(
@@ -192,28 +192,52 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
     return replace(own, force=force, moment=moment)
 
 
-def rest_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
-    """Rest curvature of each repeat's own; see `estimate_rest_scatter`."""
+def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
+    """What each repeat has of its own, the likeliest; see `estimate_pose_scatter`."""
+    if different_poses(fit.problem.history, fit.model.cable.length) < DIFFERENT:
+        return ScatterEstimate(PoseScatter(), 1.0, 1.0, 0.0)
+    found = _scatter_of_source(fit, noise, PoseScatter())
+    if found.scatter.std == 0 and not (fit.beyond_noise or _beyond_tolerances(fit)):
+        return found
+    others = [
+        _scatter_of_source(fit, noise, PoseScatter(source=source))
+        for source in sources_in(fit.model)
+    ]
+    best, *others = sorted((found, *others), key=lambda item: item.deviance)
+    alike = [x.scatter for x in others if x.deviance < best.deviance + SCATTER_APART]
+    return replace(best, scatter=replace(best.scatter, rivals=tuple(alike)))
+
+
+def _beyond_tolerances(fit: Fit) -> bool:
+    """Whether the poses' ends differ from declared ones by more than their scatter, clearly."""
+    problem = fit.problem
+    own = fit.point.shapes.deviation[np.ix_(problem.used, problem.equilibria.used_deviations)]
+    return bool(((own / problem.deviation_std) ** 2).sum() > own.size + 2 * np.sqrt(2 * own.size))
+
+
+def _scatter_of_source(fit: Fit, noise: NoiseModel, scatter: PoseScatter) -> ScatterEstimate:
+    """The size of one thing that each repeat has of its own."""
     problem, point, lin = fit.problem, fit.point, fit.linearization
-    if different_poses(problem.history, fit.model.cable.length) < DIFFERENT:
-        return ScatterEstimate(RestScatter(), 1.0, 1.0)
     size, std = problem.unknowns.size, problem.deviation_std
-    moved = problem.moved_by_rest(point)
+    moved = problem.moved_by(point, scatter)
     kept = range(0, len(problem.used), -(-len(problem.used) // MOST_POSES))
     samples = []
     for k in kept:
         white = problem.measured[problem.used[k]].whitening(noise, point.projections[k])
         by = white @ lin.raw_directions[k]
-        samples.append(
-            ScatterSample(white @ lin.raw[k], white @ moved[k], by[:, size:] * std, by[:, :size])
-        )
+        own = by[:, size:] * std
+        # The poses' deviations are random, too: the residual is that without them.
+        deviation = point.shapes.deviation[problem.used[k], problem.equilibria.used_deviations]
+        e = white @ lin.raw[k] - own @ (deviation / std)
+        samples.append(ScatterSample(e, white @ moved[k], own, by[:, :size]))
     seen = problem.observed(point)
     shapes = np.array([seen[problem.used[k]].curve.nodes for k in kept])
     shapes = shapes - shapes[:, :1]
     gap = shapes[:, None] - shapes[None]
     distances = np.sqrt((gap**2).sum(axis=3).mean(axis=2))
     sparse = max(len(s) for s in point.projections) <= MODES
-    return estimate_rest_scatter(RestLikelihood(samples, distances), sparse=sparse)
+    likelihood = RestLikelihood(samples, distances, scatter.source)
+    return estimate_pose_scatter(likelihood, sparse=sparse)
 
 
 def _white_noise(fit: Fit) -> NoiseModel:
@@ -244,7 +268,8 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     length = model.cable.length
     size = problem.unknowns.size
     bases, left_over = [], []
-    rest = problem.moved_by_rest(point) if problem.priors.rest_scatter.std > 0 else None
+    scatter = problem.priors.pose_scatter
+    rest = problem.moved_by(point, scatter) if scatter.std > 0 else None
     kept = [problem.measured[j].on_points for j in problem.used]
     raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
     ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]

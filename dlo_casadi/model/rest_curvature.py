@@ -1,4 +1,4 @@
-"""Rest curvature: its basis of B-splines, and its random scatter from pose to pose."""
+"""Basis of B-splines of the rest curvature."""
 
 from dataclasses import dataclass
 
@@ -8,9 +8,6 @@ from scipy.interpolate import BSpline
 from dlo_casadi.arrays import FloatArray
 
 _DEGREE = 3
-# Number of cosines of a random rest curvature, and its trial correlation lengths as shares of L.
-MODES = 8
-SMOOTHNESS = (0.5, 0.25, 0.12)
 
 
 @dataclass(frozen=True)
@@ -57,36 +54,3 @@ class RestCurvature:
     def roughness(self) -> FloatArray:
         """Second differences (n_coefficients - 2, n_coefficients) of the coefficients."""
         return np.diff(np.eye(self.n_coefficients), n=2, axis=0)
-
-
-@dataclass(frozen=True)
-class RestScatter:
-    """Random rest curvature, a different one in each repeat of a pose.
-
-    Parameters
-    ----------
-    std : float [1/m]
-        Root mean square along the cable; 0 where the cable repeats.
-    smoothness : float
-        Correlation length as a share of the cable's.
-    dof : float
-        Degrees of freedom of the chi-square distribution of its estimated variance.
-    """
-
-    std: float = 0.0
-    smoothness: float = SMOOTHNESS[0]
-    dof: float = np.inf
-
-    @property
-    def sizes(self) -> FloatArray:
-        """Standard deviation (MODES,) [1/m] of each mode's coefficient."""
-        share = np.exp(-((np.arange(MODES) * np.pi * self.smoothness) ** 2) / 2)
-        return self.std * np.sqrt(share / share.sum())
-
-
-def modes_of(cells: FloatArray, length: float) -> FloatArray:
-    """Means of the modes f_k over cells (n_cells, 2) [m]: (n_cells, MODES)."""
-    k = np.arange(1, MODES)
-    primitive = np.sin(np.pi / length * np.multiply.outer(cells, k)) * length / (k * np.pi)
-    waves = (primitive[:, 1] - primitive[:, 0]) / (cells[:, 1] - cells[:, 0])[:, None]
-    return np.column_stack([np.ones(len(cells)), np.sqrt(2.0) * waves])

@@ -24,7 +24,14 @@ from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.report.words import ALWAYS, all_warnings
 from dlo_casadi.session.hypotheses import Suspicion
-from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage, StageName
+from dlo_casadi.session.outcome import (
+    Outcome,
+    PoseInput,
+    Repeatability,
+    RestCurvatureEstimate,
+    Stage,
+    StageName,
+)
 
 # What report.json has of a parameter of an added effect.
 _OF_EFFECT = ("value", "std", "unit")
@@ -54,7 +61,8 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         },
         "stages": [_stage(name, outcome) for name in names],
         "repeatability": {
-            "rest_curvature_std": repeats.rest_curvature_std,
+            "rest_curvature_std": repeats.scatter.rest_std,
+            "from_pose_to_pose": _scatter(repeats),
             "expected_spread_m": repeats.expected_spread,
             "source": repeats.source,
             "held_out_inside_90": outcome.inside_band,
@@ -249,6 +257,15 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
     return document
 
 
+def _scatter(repeats: Repeatability) -> dict[str, Any] | None:
+    """What differs from pose to pose, and what is not told from it."""
+    found = repeats.scatter
+    if not found.std:
+        return None
+    others = [other.source for other in found.rivals]
+    return {"source": found.source, "std": found.std, "unit": repeats.unit, "or": others}
+
+
 def fit_dict(fit: Fit) -> dict[str, Any]:
     """What a fit alone tells: the model, its parameters, covariance and state."""
     model = fit.model
@@ -291,8 +308,9 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
         "covariance": {"names": list(names), "values": covariance},
         "scatter": {
             "fixtures": dict(uncertainty.scatter),
-            "rest_curvature_std": uncertainty.rest_scatter.std,
-            "rest_curvature_smoothness": uncertainty.rest_scatter.smoothness,
+            "rest_curvature_std": uncertainty.pose_scatter.rest_std,
+            "rest_curvature_smoothness": uncertainty.pose_scatter.smoothness,
+            "from_pose_to_pose": fields_of(uncertainty.pose_scatter, "source", "std"),
             "hanging": uncertainty.repeat_std,
         },
     }

@@ -19,6 +19,7 @@ from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import DIFFERENT
@@ -233,8 +234,10 @@ class Repeatability:
 
     Parameters
     ----------
-    rest_curvature_std : float [1/m]
-        Of the rest curvature that each repeat has of its own; 0 where none was found.
+    scatter : PoseScatter
+        What each repeat has of its own; of no size where nothing was found.
+    unit : str
+        Of its size.
     expected_spread : float [m]
         RMS distance of two repeats of a pose, at the measured points.
     source : "repeats", "poses" or None
@@ -243,18 +246,20 @@ class Repeatability:
         in common; None where it could not be estimated.
     """
 
-    rest_curvature_std: float
+    scatter: PoseScatter
+    unit: str
     expected_spread: float
     source: Literal["repeats", "poses"] | None
 
     @classmethod
     def of(cls, fit: Fit) -> Self:
         """What a fit has found."""
-        rest = fit.problem.priors.rest_scatter.std
+        scatter = fit.problem.priors.pose_scatter
+        unit = scatter.unit(fit.model)
         if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
-            return cls(rest, float(np.sqrt(2) * fit.repeat_error), "poses")
+            return cls(scatter, unit, float(np.sqrt(2) * fit.repeat_error), "poses")
         spread = repeatability(fit.problem.history, fit.model.cable.length)
-        return cls(rest, spread or 0.0, None if spread is None else "repeats")
+        return cls(scatter, unit, spread or 0.0, None if spread is None else "repeats")
 
 
 @dataclass(frozen=True)

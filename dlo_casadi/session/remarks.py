@@ -13,6 +13,7 @@ from dlo_casadi.errors import counted
 from dlo_casadi.estimation.fit import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
 from dlo_casadi.thresholds import FIXTURES, UNSEEN
@@ -267,13 +268,12 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
             f"the model misses the points by {1e3 * fit.residual_rms:.2g} mm RMS, far more than "
             f"their noise: the fit weighs them as if that were {1e3 * fit.noise.std:.2g} mm"
         )
-    rest = fit.problem.priors.rest_scatter
+    rest = fit.problem.priors.pose_scatter
     if rest.std > 0:
         lines.append(
             "the cable does not come back to the same shape: two repeats of a pose differ by "
-            f"{1e3 * np.sqrt(2) * fit.repeat_error:.2g} mm RMS, as if each had a rest curvature "
-            f"of its own of {rest.std:.2g} 1/m; noise alone gives "
-            f"{1e3 * np.sqrt(2) * floor:.2g} mm. A model predicts their mean"
+            f"{1e3 * np.sqrt(2) * fit.repeat_error:.2g} mm RMS, as if each had {_own(rest, fit)}; "
+            f"noise alone gives {1e3 * np.sqrt(2) * floor:.2g} mm. A model predicts their mean"
         )
     if spread is not None or rest.std > 0:
         lines += [
@@ -308,6 +308,14 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
             "model.n larger?"
         )
     return lines
+
+
+def _own(scatter: PoseScatter, fit: Fit) -> str:
+    """What each pose has of its own, with its size, and what is not told from it."""
+    each = [
+        f"{one.words} of {one.std:.2g} {one.unit(fit.model)}" for one in (scatter, *scatter.rivals)
+    ]
+    return " or ".join(each)
 
 
 def _beside(fit: Fit, floor: float) -> str:

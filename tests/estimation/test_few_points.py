@@ -14,7 +14,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import threshold
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.session.fitting import nuisances
 from dlo_casadi.session.remarks import fit_warnings
 
@@ -75,8 +75,8 @@ def test_how_well_the_variance_of_a_parameter_is_known():
 
     def like(noise=1.0, rest=1.0, rest_dof=7.0):
         errors = replace(fit.noise, std=np.sqrt(noise) * fit.noise.std, slow_dof=30.0)
-        scatter = RestScatter(np.sqrt(rest) * 0.2, 0.25, rest_dof)
-        return fit.reweighed(errors, replace(fit.problem.priors, rest_scatter=scatter))
+        scatter = PoseScatter(np.sqrt(rest) * 0.2, 0.25, rest_dof)
+        return fit.reweighed(errors, replace(fit.problem.priors, pose_scatter=scatter))
 
     def slope(name):
         more, less = (like(**{name: factor}).covariance[0, 0] for factor in (1.01, 0.99))

@@ -364,7 +364,7 @@ def test_a_drift_comes_back():
         assert abs(fit.value(name) - exact) < 3 * fit.std(name), name
     assert fit.std("rest_curvature_drift.rate") < 0.02
     shuffled = fit_model(model, [measured[k] for k in (3, 0, 7, 5, 1, 6, 2, 4)], Tolerances(), STD)
-    assert shuffled.problem.priors.rest_scatter.std > 0 == fit.problem.priors.rest_scatter.std
+    assert shuffled.problem.priors.pose_scatter.std > 0 == fit.problem.priors.pose_scatter.std
 
 
 @pytest.mark.parametrize("markers", [False, True])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dlo_casadi.estimation.repeats import RestLikelihood, ScatterSample, estimate_rest_scatter
-from dlo_casadi.model.rest_curvature import MODES, RestScatter, modes_of
+from dlo_casadi.estimation.repeats import RestLikelihood, ScatterSample, estimate_pose_scatter
+from dlo_casadi.model.pose_scatter import MODES, PoseScatter, modes_of
 
 M, ROWS = 9, 6
 
@@ -12,7 +12,7 @@ M, ROWS = 9, 6
 def session(std: float, systematic: float = 0.0, seed: int = 0, rows: int = ROWS):
     """Poses in a row with random sensitivities: samples, distances of their shapes."""
     rng = np.random.default_rng(seed)
-    sizes = RestScatter(1.0, 0.5).sizes
+    sizes = PoseScatter(1.0, 0.5).sizes(MODES)
     place = np.linspace(0.0, 1.0, M)
     distances = np.abs(place[:, None] - place[None])
     common = rng.normal(size=(3, MODES))
@@ -34,13 +34,13 @@ def test_deviance_against_the_full_covariance(systematic):
     noise, std, smoothness, range_ = 1.3, 0.15, 0.25, 0.3
     likelihood = RestLikelihood(samples, distances)
     found, quadratic = likelihood.deviance(noise, std, systematic, smoothness, range_)
-    sizes = RestScatter(1.0, smoothness).sizes
+    sizes = PoseScatter(1.0, smoothness).sizes(MODES)
     alike = np.exp(-((distances / range_) ** 2) / 2)
     rest = np.zeros((M * ROWS, M * MODES))
     own = np.zeros((M * ROWS, M))
     for j, x in enumerate(samples):
         rows = slice(j * ROWS, (j + 1) * ROWS)
-        rest[rows, j * MODES : (j + 1) * MODES] = x.rest * sizes
+        rest[rows, j * MODES : (j + 1) * MODES] = x.random * sizes
         own[rows, j] = x.own[:, 0]
     between = np.kron(std**2 * np.eye(M) + systematic**2 * alike, np.eye(MODES))
     covariance = noise**2 * np.eye(M * ROWS) + rest @ between @ rest.T + own @ own.T
@@ -58,9 +58,9 @@ def test_deviance_against_the_full_covariance(systematic):
 def test_a_random_rest_curvature_is_found_beside_unknown_noise():
     """Nine poses of six numbers: within a third, on average over twenty sessions."""
     found = [
-        estimate_rest_scatter(RestLikelihood(*session(0.2, seed=k, rows=12))) for k in range(20)
+        estimate_pose_scatter(RestLikelihood(*session(0.2, seed=k, rows=12))) for k in range(20)
     ]
-    assert np.mean([x.rest.std for x in found]) == pytest.approx(0.2, rel=0.15)
+    assert np.mean([x.scatter.std for x in found]) == pytest.approx(0.2, rel=0.15)
     assert np.mean([x.noise for x in found]) == pytest.approx(1.0, rel=0.15)
     assert min(x.p_systematic for x in found) > 0.005 / 20
 
@@ -68,7 +68,7 @@ def test_a_random_rest_curvature_is_found_beside_unknown_noise():
 def test_a_cable_that_repeats_has_none():
     """A threshold of five percent for the best of three smoothnesses: three of twenty at most."""
     found = [
-        estimate_rest_scatter(RestLikelihood(*session(0.0, seed=k))).rest.std for k in range(20)
+        estimate_pose_scatter(RestLikelihood(*session(0.0, seed=k))).scatter.std for k in range(20)
     ]
     assert np.count_nonzero(found) <= 3
     assert np.median(found) == 0
@@ -78,9 +78,9 @@ def test_what_poses_that_are_alike_have_in_common_is_not_random():
     """A function of the pose, as a missing effect leaves it."""
     for seed in range(5):
         samples, distances = session(0.0, 0.5, seed)
-        found = estimate_rest_scatter(RestLikelihood(samples, distances))
+        found = estimate_pose_scatter(RestLikelihood(samples, distances))
         assert found.p_systematic < 1e-6
-        assert found.rest.std < 0.1
+        assert found.scatter.std < 0.1
 
 
 def test_modes_have_the_std_along_the_cable():
@@ -88,5 +88,5 @@ def test_modes_have_the_std_along_the_cable():
     cells = np.stack([np.arange(400), np.arange(1, 401)], axis=1) * 0.002
     waves = modes_of(cells, 0.8)
     for smoothness in (0.5, 0.12):
-        variance = (waves**2 @ RestScatter(0.3, smoothness).sizes ** 2).mean()
+        variance = (waves**2 @ PoseScatter(0.3, smoothness).sizes(MODES) ** 2).mean()
         assert variance == pytest.approx(0.09, rel=1e-4)  # means over cells instead of values

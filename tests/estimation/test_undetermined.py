@@ -83,7 +83,7 @@ def test_an_unknown_place_widens_no_band(fitted):
     without = covariance.copy()
     k = names.index(PLACE)
     without[k], without[:, k] = 0.0, 0.0
-    other = Uncertainty(names, without, whole.scatter, whole.rest_scatter, whole.repeat_std)
+    other = Uncertainty(names, without, whole.scatter, whole.pose_scatter, whole.repeat_std)
     found = band(whole)
     assert np.all(np.isfinite(found))
     assert np.allclose(found, band(other), rtol=1e-6) is not weighs

@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, tipping, tipping_of
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.report.documents import report_dict
 from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.session.remarks import doubts_of
@@ -182,7 +182,7 @@ def test_how_well_the_angle_is_known_follows_from_what_is_uncertain(even):
     def near(variances=None, scatter=None):
         names = tuple(variances or {})
         covariance = np.diag([(variances or {})[name] for name in names])
-        uncertainty = Uncertainty(names, covariance, scatter or {}, RestScatter())
+        uncertainty = Uncertainty(names, covariance, scatter or {}, PoseScatter())
         return tipping_of(MODEL, P, REST, pose, *pair, uncertainty)
 
     rolled = near({"end_roll": 0.03**2}, {"end_rotation_x": 0.04})

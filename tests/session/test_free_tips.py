@@ -15,7 +15,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.model.rest_curvature import RestScatter
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of
@@ -126,7 +126,7 @@ def test_a_cable_that_does_not_repeat_may_fall_to_either_side():
     eq = fallen(pose)
 
     def near(std):
-        known = Uncertainty((), np.zeros((0, 0)), {}, RestScatter(std))
+        known = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter(std))
         return tipping_of(MODEL, MODEL.nominal, STRAIGHT, pose, eq, eq.other_side, known)
 
     assert near(0.3).std == pytest.approx(10 * near(0.03).std, rel=1e-6)

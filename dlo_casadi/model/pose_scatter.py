@@ -1,0 +1,114 @@
+"""What differs at random from pose to pose, however often a pose is taken again."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.effects import RANDOM, Effect, Setup
+from dlo_casadi.model.cable_model import CableModel
+
+# Number of cosines of a random rest curvature, and its trial correlation lengths as shares of L.
+MODES = 8
+SMOOTHNESS = (0.5, 0.25, 0.12)
+REST_CURVATURE = "rest_curvature"
+# Label of the random effect in a model.
+LABEL = "from_pose_to_pose"
+
+
+@dataclass(frozen=True)
+class PoseScatter:
+    """One quantity that each pose has of its own: normal, zero on average.
+
+    Parameters
+    ----------
+    std : float
+        Standard deviation of each component, see `unit`; 0 where the cable repeats. Of a rest
+        curvature [1/m] the root mean square along the cable.
+    smoothness : float
+        Correlation length of a rest curvature, as a share of the cable's.
+    dof : float
+        Degrees of freedom of the chi-square distribution of the estimated variance.
+    source : str
+        `rest_curvature`, or the name of one of the RANDOM effects, whose parameters differ.
+    rivals : tuple of PoseScatter
+        What the data do not tell from it.
+    """
+
+    std: float = 0.0
+    smoothness: float = SMOOTHNESS[0]
+    dof: float = np.inf
+    source: str = REST_CURVATURE
+    rivals: tuple["PoseScatter", ...] = ()
+
+    def sizes(self, count: int) -> FloatArray:
+        """Standard deviations (count,) along the directions of `ways`."""
+        if self.source != REST_CURVATURE:
+            return np.full(count, self.std)
+        share = np.exp(-((np.arange(MODES) * np.pi * self.smoothness) ** 2) / 2)
+        return np.tile(self.std * np.sqrt(share / share.sum()), count // MODES)
+
+    @property
+    def rest_std(self) -> float:
+        """Standard deviation of the rest curvature [1/m]."""
+        return self.std if self.source == REST_CURVATURE else 0.0
+
+    @property
+    def words(self) -> str:
+        """What each pose has of its own, in words."""
+        known = RANDOM.get(self.source)
+        return known.at_random if known else "a rest curvature of its own"
+
+    def unit(self, model: CableModel) -> str:
+        """Unit of `std`."""
+        effect = effect_of(self.source, model)
+        return "1/m" if effect is None else effect.parameters(model.cable)[0].unit
+
+    def within(self, model: CableModel) -> CableModel:
+        """Return the model with the effect that differs from pose to pose, absent on average."""
+        effect = effect_of(self.source, model)
+        return model if effect is None or effect in model.effects else model.with_effect(effect)
+
+    def values(self, p: FloatArray, model: CableModel) -> FloatArray:
+        """Parameters of `within(model)` by those of the model."""
+        return np.concatenate([p, np.zeros(len(self.within(model).names) - len(p))])
+
+    def ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
+        """Directions (n_parameters, q), (n_rests, q) of parameters and rests of `within(model)`.
+
+        Each changes one component by a unit.
+        """
+        if self.source == REST_CURVATURE:
+            modes = modes_in(model)
+            return np.zeros((len(model.names), modes.shape[1])), modes
+        names = self.within(model).names
+        own = [k for k, name in enumerate(names) if name.startswith(f"{LABEL}.")]
+        return np.eye(len(names))[:, own], np.zeros((model.chain.n_rests, len(own)))
+
+
+def sources_in(model: CableModel) -> list[str]:
+    """What may differ from pose to pose beside the rest curvature."""
+    return [name for name in RANDOM if effect_of(name, model) is not None]
+
+
+def effect_of(source: str, model: CableModel) -> Effect | None:
+    """The RANDOM effect of that name, as it suits a model; None where it does not apply."""
+    setup = Setup(model.cable, model.start, model.end, model.gravity)
+    kind = RANDOM.get(source)
+    if kind is None or not kind.applies(setup):
+        return None
+    return replace(kind.made_for(setup), label=LABEL)
+
+
+def modes_in(model: CableModel) -> FloatArray:
+    """Modes (n_rests, axes MODES) of the rest curvature of a single pose, in a model's cells."""
+    axes = np.eye(len(model.node.strains))[:, -len(model.node.curvatures) :]
+    return np.kron(axes, modes_of(model.chain.cells, model.cable.length))
+
+
+def modes_of(cells: FloatArray, length: float) -> FloatArray:
+    """Means of the modes f_k over cells (n_cells, 2) [m]: (n_cells, MODES)."""
+    k = np.arange(1, MODES)
+    primitive = np.sin(np.pi / length * np.multiply.outer(cells, k)) * length / (k * np.pi)
+    waves = (primitive[:, 1] - primitive[:, 0]) / (cells[:, 1] - cells[:, 0])[:, None]
+    return np.column_stack([np.ones(len(cells)), np.sqrt(2.0) * waves])

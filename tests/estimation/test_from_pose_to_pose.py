@@ -1,0 +1,73 @@
+"""What differs at random from pose to pose is named, sized, and does not pull the stiffness."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+from hidden_sets import simulated
+
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import Uncertainty, displacements
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, sources_in
+from dlo_casadi.runtime.parallel import generator_of
+
+PLANE = CableData(0.6, 0.04, 0.005, 0.01)
+SPACE = CableData(0.6, 0.04, 0.005, 0.01, torsional_stiffness=0.008)
+IN_SPACE = HeldPose((0, 0, 0), (0.4, 0.1, -0.05), (0, 0, 0.1, 1), (0.1, 0, 0, 1))
+MODELS = {
+    "pins": (CableModel(PLANE, 12), HeldPose((0, 0), (0.42, 0.1))),
+    "clamps": (
+        CableModel(PLANE, 12, start="clamped", end="clamped"),
+        HeldPose((0, 0), (0.42, 0.1)),
+    ),
+    "space": (
+        CableModel(SPACE, 12, start="clamped", end="clamped", gravity=(0, 0, -9.81)),
+        IN_SPACE,
+    ),
+}
+
+
+def test_what_may_differ():
+    assert sources_in(MODELS["pins"][0]) == ["pin_moment", "length_error", "end_offset"]
+    assert sources_in(MODELS["clamps"][0]) == ["length_error", "clamp_angle", "end_offset"]
+    assert sources_in(MODELS["space"][0]) == ["length_error", "clamp_rotation", "end_offset"]
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_displacements_are_those_of_shapes_solved_anew(case):
+    model, pose = MODELS[case]
+    rest, s = np.zeros(model.chain.n_rests), model.chain.places
+    eq = solve_equilibrium(model, model.nominal, rest, pose)
+    for source in (REST_CURVATURE, *sources_in(model)):
+        scatter = PoseScatter(1e-5, source=source)
+        larger, p = scatter.within(model), scatter.values(model.nominal, model)
+        ways = zip(*(by.T for by in scatter.ways(model)), strict=True)
+        uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
+        found = displacements(model, model.nominal, rest, pose, eq, uncertainty, s)[1]
+        found = found[:, :, len(model.deviations) :]
+        sizes = scatter.sizes(found.shape[2] - len(pose.start))
+        for k, (by_p, by_rest) in enumerate(ways):
+            ahead, behind = (
+                solve_equilibrium(
+                    larger, p + x * by_p, rest + x * by_rest, pose, x_init=eq.x
+                ).points
+                for x in (1e-5, -1e-5)
+            )
+            there = (ahead - behind) / 2e-5 * sizes[k]
+            assert found[:, :, k] == pytest.approx(there, rel=1e-4, abs=1e-7 * sizes[k])
+
+
+def test_turned_clamps_are_named_and_leave_the_stiffness_alone():
+    found = simulated(generator_of(7, 1), 2, 0, "clamp_angle")
+    result = found.session.fit(diagnosis=False)
+    own = result.fit.problem.priors.pose_scatter
+    assert own.source == "clamp_angle"
+    assert own.std == pytest.approx(found.values["random.clamp_angle"], rel=0.5)
+    low, high = result.params["bending_stiffness"].interval_95
+    assert low < found.values["bending_stiffness"] < high
