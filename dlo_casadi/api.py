@@ -41,6 +41,19 @@ class Result(Outcome):
     """An `Outcome` that can show itself, write itself, and predict.
 
     In a notebook it is a short table; `print` gives the same as text.
+
+    Attributes
+    ----------
+    verdict : "complete", "effect_found", "unexplained" or None
+        None without a diagnosis.
+    effects : tuple of FoundEffect
+        What was added to the declared model: name, parameters, p_value, indistinguishable_from.
+    stages : tuple of Stage
+        Fits in order, the last one with the effects: name, parameters, rmse_fit, rmse_held_out [m].
+    warnings, doubts : tuple of str
+        What to know of the data, and why the numbers of the last stage may not hold.
+    candidates, unexplained, next_pose
+        All effects that were tried; the unknown load that is left; the pose that separates rivals.
     """
 
     def __str__(self) -> str:
@@ -237,7 +250,8 @@ class Session(Config):
         Raises
         ------
         DloError
-            If `diagnosis`, `progress` or `executor` is none.
+            If `diagnosis` is not True, False or None, `progress` has no method `step`, or
+            `executor` is not an `Executor`.
         MeasurementError
             If no pose can be read, or if the lines contradict the session beyond doubt.
         EstimationError

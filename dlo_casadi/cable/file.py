@@ -31,7 +31,9 @@ from dlo_casadi.config.values import (
     NonNegative,
     Number,
     OpenSection,
+    Place,
     Positive,
+    Quaternion,
     RestCoefficients,
     checked,
     implausible_sizes,
@@ -53,6 +55,8 @@ _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effect
 # Tolerance of a value at its bound, relative to the bound or the parameter's scale: rounding of
 # value = nominal + scale x, or exp(x), some 1e-14, and the tolerance of solvers.
 _ROUNDING = 1e-9
+# Relative tolerance of a covariance's symmetry and correlations: they are inverses of matrices.
+_DIGITS = 1e-6
 # Maximum number of folders that a message lists.
 _LISTED = 5
 _DAMAGED, _REMEDY = "damaged parameters", ".\n  Try: the file as a fit has written it."
@@ -126,8 +130,31 @@ class _Covariance(OpenSection):
     @property
     def complaint(self) -> str:
         size = len(self.names)
-        square = [len(row) for row in self.values] == [size] * size
-        return "" if square else f"{counted(size, 'row')} of as many values belong here"
+        if [len(row) for row in self.values] != [size] * size:
+            return f"{counted(size, 'row')} of as many values belong here"
+        if len(set(self.names)) != size:
+            return "a name stands here twice"
+        values = np.array(self.values, dtype=float).reshape(size, size)
+        variances = np.diag(values)
+        if np.any(variances < 0):
+            return f"the variance of {self.names[int(variances.argmin())]} is {variances.min():.3g}"
+        largest = np.outer(np.sqrt(variances), np.sqrt(variances))
+        for what, beyond in (
+            ("not symmetric", np.abs(values - values.T) > _DIGITS * largest),
+            ("larger than their deviations allow", np.abs(values) > (1 + _DIGITS) * largest),
+        ):
+            if np.any(beyond):
+                i, j = np.argwhere(beyond)[0]
+                return f"values of {self.names[i]} and {self.names[j]} are {what}"
+        return ""
+
+
+class _Fixtures(OpenSection):
+    start: Place | None = None
+    start_heading: Number | None = None
+    end_heading: Number | None = None
+    start_orientation: Quaternion | None = None
+    end_orientation: Quaternion | None = None
 
 
 class _Own(OpenSection):
@@ -165,11 +192,11 @@ class ParametersFile(OpenSection):
     state: _State
     covariance: Annotated[_Covariance, checked(lambda found: found.complaint)]
     scatter: _Scatter | None = None
-    fixtures: dict[str, Any] | None = None
+    fixtures: _Fixtures = _Fixtures()
     limits: Limits = Limits()
     explains: bool | None = None
     model_hash: Name
-    config: Name | None = None
+    config: Name = "unnamed"
     versions: dict[str, Any] | None = None
 
 
@@ -274,6 +301,10 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
         if len(found) != size:
             text = f"{counted(size, 'number')} belong here, found {len(found)}"
             yield ConfigProblem((key,), f"{key}: {text}")
+    start = file.fixtures.start
+    if start is not None and len(start) != len(file.gravity):
+        text = f"{counted(len(file.gravity), 'number')} belong here, found {len(start)}"
+        yield ConfigProblem(("fixtures", "start"), f"fixtures.start: {text}")
     coefficients = {f"rest_curvature[{k}]" for k in range(model.n_coefficients)}
     for name in set(file.covariance.names) - {*model.names, *coefficients}:
         text = f"covariance.names: nothing is called {show(name)}"
@@ -308,12 +339,12 @@ def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
         covariance=Covariance(names, covariance),
         uncertainty=Uncertainty(names, covariance, fixtures, pose_scatter, scatter.hanging),
         coefficients=np.array(file.rest_curvature.coefficients, dtype=float),
-        fixtures=file.fixtures or {},
+        fixtures=document.get("fixtures") or {},
         limits=file.limits,
         explains=file.explains,
         model_hash=file.model_hash,
         edited=parameters_hash(document) != file.model_hash,
-        config=str(file.config),
+        config=file.config,
         versions=file.versions or {},
         document=document,
     )

@@ -91,12 +91,11 @@ class Relaxation:
         cable = model.cable
         force = cable.mass * float(np.linalg.norm(model.gravity)) + p[0] / cable.length**2
         border = []
-        for name, multiplier in zip(model.border_names, model.are_multipliers, strict=True):
-            if multiplier:  # its row is a condition: a distance [m] or an angle [rad]
-                distance = "position" in name or ".pull_" in name
-                border.append(1 / END / (cable.length if distance else 1.0))
-            else:  # the row of a place is the balance of forces there [N]
+        for kind in model.border_kinds.values():
+            if kind == "place":  # its row is the balance of forces there [N]
                 border.append(1 / force)
+            else:  # a multiplier's is its condition
+                border.append(1 / END / (cable.length if kind == "distance" else 1.0))
         moments = model.chain.h / p[self._stiffness]
         return np.concatenate([moments, border]) / self.softness
 

@@ -267,19 +267,30 @@ class CableModel:
         return len(self.border_names)
 
     @cached_property
-    def border_names(self) -> tuple[str, ...]:
-        """Names of the unknowns beside the nodes: end conditions' multipliers, springs', clips'.
+    def border_kinds(self) -> dict[str, Literal["distance", "angle", "place"]]:
+        """Unknowns beside the nodes by their names: of end conditions, springs and clips.
 
-        A spring's place y [m] is an unknown of its own, held on the cable by a multiplier [N]: the
-        Hessian then couples neighbouring nodes only, see `SpringAt`. An eyelet's arc length [m] is
-        an unknown, too.
+        A multiplier is that of a condition on a distance [m] or an angle [rad]. A spring's place y
+        [m] is an unknown of its own, held on the cable by a multiplier [N]: the Hessian then
+        couples neighbouring nodes only, see `SpringAt`. An eyelet's arc length [m] is one, too.
         """
         places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
-        names = [f"spring_{k}.{name}" for k in range(self.n_springs) for name in (*places, *pulls)]
+        kinds: dict[str, Literal["distance", "angle", "place"]] = {}
+        for name in self.condition_names:
+            kinds[name] = "distance" if name in self._end_position else "angle"
+        for k in range(self.n_springs):
+            kinds |= {f"spring_{k}.{name}": "place" for name in places}
+            kinds |= {f"spring_{k}.{name}": "distance" for name in pulls}
         for k, kind in enumerate(self.clips):
-            names += [f"clip_{k}.{name}" for name in pulls]
-            names += [f"clip_{k}.place_s"] * (kind == "eyelet")
-        return (*self.condition_names, *names)
+            kinds |= {f"clip_{k}.{name}": "distance" for name in pulls}
+            if kind == "eyelet":
+                kinds[f"clip_{k}.place_s"] = "place"
+        return kinds
+
+    @cached_property
+    def border_names(self) -> tuple[str, ...]:
+        """Names of the unknowns beside the nodes, see `border_kinds`."""
+        return tuple(self.border_kinds)
 
     @cached_property
     def pulls(self) -> list[list[int]]:
@@ -308,12 +319,16 @@ class CableModel:
     @cached_property
     def are_multipliers(self) -> BoolArray:
         """Which of the border's unknowns are multipliers (n_border,); the others are places."""
-        return np.array([".place_" not in name for name in self.border_names], dtype=bool)
+        return np.array([kind != "place" for kind in self.border_kinds.values()], dtype=bool)
 
     @cached_property
     def condition_names(self) -> tuple[str, ...]:
         """Names of the end conditions: end position, then frames of clamps."""
         return self._held("end_position")
+
+    @property
+    def _end_position(self) -> tuple[str, ...]:
+        return tuple(f"end_position_{axis}" for axis in self.node.axes)
 
     def _held(self, place: str) -> tuple[str, ...]:
         """Names of the held components: of the end's place, which is called so, and of clamps."""

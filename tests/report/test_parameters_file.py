@@ -33,7 +33,7 @@ def file(outcome, tmp_path_factory):
 def fitted(name, *effects, n=10):
     """A quick fit of a bench session with more effects than declared."""
     config = load_config(BENCH / name / "session.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config, lambda *_: None))[:8]
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
     for effect in effects:
@@ -236,6 +236,32 @@ def damaged(file, tmp_path, change):
         (
             lambda d: d["parameters"]["end_offset.dx"].update(value=0.02, upper=0.01),
             "parameters.end_offset.dx.value: 0.02 m lies outside of its bounds",
+        ),
+        (lambda d: d.update(config=None), "config: text belongs here, found nothing"),
+        (
+            lambda d: d["covariance"]["values"][0].__setitem__(1, 1.0),
+            "values of bending_stiffness and",
+        ),
+        (
+            lambda d: d["covariance"]["values"][0].__setitem__(0, -1.0),
+            "the variance of bending_stiffness is -1",
+        ),
+        (
+            lambda d: d["covariance"]["names"].__setitem__(1, "bending_stiffness"),
+            "a name stands here twice",
+        ),
+        (
+            lambda d: d["covariance"]["names"].__setitem__(1, "stiffness"),
+            "covariance.names: nothing is called 'stiffness'",
+        ),
+        (
+            lambda d: d["fixtures"].update(start=[0.0, 0.0, 0.0]),
+            "fixtures.start: 2 numbers belong here, found 3",
+        ),
+        (lambda d: d["fixtures"].update(start="here"), "fixtures.start: "),
+        (
+            lambda d: d["fixtures"].update(start_heading="up"),
+            "fixtures.start_heading: a number belongs here, found 'up'",
         ),
         (
             lambda d: d["cable"].update(length=550.0),
