@@ -9,7 +9,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from check_matrix import CELLS, Row, matching, run_cell, summary
-from matrix.cells import admitted, pairwise
+from matrix.cells import admitted, covering, pairwise
 from matrix.sessions import SMALL
 
 
@@ -24,7 +24,14 @@ def test_few_cells_hold_all_pairs_that_a_configuration_admits():
     assert all(admitted(cell) for cell in CELLS)
 
 
-@pytest.mark.parametrize("cell", pairwise(), ids=lambda cell: cell.name)
+def cells():
+    """Those in which all pairs of levels meet; those that no level needs are long."""
+    few = covering(pairwise(), 1)
+    for cell in pairwise():
+        yield pytest.param(cell, id=cell.name, marks=[pytest.mark.long] * (cell not in few))
+
+
+@pytest.mark.parametrize("cell", list(cells()))
 def test_a_clean_session_goes_all_the_way(cell, tmp_path):
     """Check, fit, files, terminal, notebook, prediction, generated C; nothing hidden or found.
 

@@ -325,9 +325,10 @@ MISTAKES: list[tuple[Callable[[Path], Session], list[str]]] = [
     (points_with_rows_of_a_picture, ["with y pointing down", "rows count downwards"]),
     (points_with_y_down_between_ends_of_one_height, ["with y pointing down instead of up"]),
     (gravity_with_y_down, ["does not hang along gravity (0, 9.81)", "with gravity (0, -9.81)"]),
-    (
+    pytest.param(
         gravity_upwards_on_a_clamped_loop,
         ["does not hang along gravity (0, 9.81)", "with gravity (0, -9.81)"],
+        marks=pytest.mark.long,
     ),
     (board_hung_on_its_side, ["does not hang along gravity", "with gravity (9.81, 0)"]),
     (x_and_y_exchanged, ["with x and y exchanged", "in one frame"]),

@@ -126,7 +126,8 @@ class Chain:
 
     def by_strain(self, means: FloatArray) -> list[FloatArray]:
         """Parts (..., n_cells, q) of means (..., n_rests, q), one for each strain."""
-        return np.split(means, len(self.kind.node.strains), axis=-2)
+        count = means.shape[-2] // len(self.kind.node.strains)
+        return [means[..., k : k + count, :] for k in range(0, means.shape[-2], count)]
 
     def curvatures(self, means: FloatArray) -> FloatArray:
         """Curvatures (..., axes, n_cells) among strains (..., n_rests) of the cells."""

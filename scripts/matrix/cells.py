@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -48,8 +49,8 @@ CELLS = tuple(cell for levels in product(*LEVELS) if admitted(cell := Cell(*leve
 # Time of a run: by the number of its poses, for pictures that are drawn and read, in space.
 POSES = {"one": 1, "two": 2, "nine": 9}
 _PICTURES, _SPACE = 8, 2
-# New pairs that a cell must have more than another to be worth that much more time.
-_PAIRS_PER_TIME = 1 / 20
+# New sets of levels that a cell must have more than another to be worth that much more time.
+_NEW_PER_TIME = 1 / 20
 
 
 def cost(cell: Cell) -> float:
@@ -58,17 +59,22 @@ def cost(cell: Cell) -> float:
     return POSES[cell.poses] * pictures * (_SPACE if cell.frame == "space" else 1)
 
 
-def pairwise() -> tuple[Cell, ...]:
-    """Few cells in which every two levels of different factors meet.
+def covering(cells: Sequence[Cell], levels: int) -> tuple[Cell, ...]:
+    """Few of the cells in which every so many levels of different factors that meet in any meet.
 
-    Greedily: each next one has the most pairs that are new, less what its time counts for.
+    Greedily: each next one has the most that are new, less what its time counts for.
     """
-    pairs = {cell: frozenset(combinations(enumerate(cell), 2)) for cell in CELLS}
-    missing = frozenset().union(*pairs.values())
+    sets = {cell: frozenset(combinations(enumerate(cell), levels)) for cell in cells}
+    missing = frozenset().union(*sets.values())
     chosen: list[Cell] = []
     while missing:
-        new = {cell: len(own & missing) for cell, own in pairs.items() if own & missing}
-        best = max(new, key=lambda cell: new[cell] - _PAIRS_PER_TIME * cost(cell))
+        new = {cell: len(own & missing) for cell, own in sets.items() if own & missing}
+        best = max(new, key=lambda cell: new[cell] - _NEW_PER_TIME * cost(cell))
         chosen.append(best)
-        missing -= pairs[best]
+        missing -= sets[best]
     return tuple(chosen)
+
+
+def pairwise() -> tuple[Cell, ...]:
+    """Few cells in which every two levels of different factors meet."""
+    return covering(CELLS, 2)

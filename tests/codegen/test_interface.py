@@ -336,7 +336,7 @@ def test_code_does_not_grow_with_the_mesh():
     )  # another loop over segments, not another kernel per segment
 
 
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("compiler", ["gcc", pytest.param("clang", marks=pytest.mark.long)])
 @pytest.mark.parametrize(("element", "start", "end"), KINDS)
 def test_compiles_without_a_warning_and_with_another_prefix(
     tmp_path, compiler, element, start, end

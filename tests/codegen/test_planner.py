@@ -22,7 +22,7 @@ def missing():
 @pytest.mark.parametrize(
     ("where", "iterations", "limits"),
     [
-        ((), "300", ("bend_radius", "clearance")),
+        pytest.param((), "300", ("bend_radius", "clearance"), marks=pytest.mark.long),
         (("--space",), "100", ("bend_radius", "force", "twist", "clearance")),
     ],
     ids=["plane", "space"],
@@ -38,11 +38,13 @@ def test_a_path_is_planned_checked_and_drawn(tmp_path, where, iterations, limits
     assert (tmp_path / "plan.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("where", [(), ("--space",)], ids=["plane", "space"])
+@pytest.mark.parametrize(
+    "where", [(), pytest.param(("--space",), marks=pytest.mark.long)], ids=["plane", "space"]
+)
 def test_the_same_from_python(tmp_path, where):
     pytest.importorskip("ompl", reason="the PyPI package ompl is not installed")
     script = str(PLANNER / "plan_python.py")
     command = [sys.executable, script, "--output", str(tmp_path), *where]
-    run = subprocess.run([*command, "--seconds", "4"], capture_output=True, text=True)
+    run = subprocess.run([*command, "--seconds", "2"], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert (tmp_path / "plan_python.png").stat().st_size > 10_000

@@ -91,7 +91,12 @@ def test_a_named_branch_is_found_where_there_is_one_and_never_the_other(branch):
 
 @pytest.mark.parametrize(
     ("start", "end"),
-    [("pinned", "clamped"), ("clamped", "pinned"), ("clamped", "clamped"), ("pinned", "pinned")],
+    [
+        pytest.param("pinned", "clamped", marks=pytest.mark.long),
+        ("clamped", "pinned"),
+        pytest.param("clamped", "clamped", marks=pytest.mark.long),
+        ("pinned", "pinned"),
+    ],
 )
 def test_24_random_starts_find_nothing_lower(start, end):
     """scripts/benchmark.py --only starts counts it on hundreds: one in a hundred may be missed."""

@@ -413,7 +413,7 @@ def test_equal_input_gives_equal_bytes_and_code_does_not_grow_with_the_mesh():
     assert abs(sizes[1] - sizes[0]) < 40  # numbers that happen to agree share a line
 
 
-@pytest.mark.parametrize("compiler", ["gcc", "clang"])
+@pytest.mark.parametrize("compiler", ["gcc", pytest.param("clang", marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("element", "ends"),
     [

@@ -68,6 +68,7 @@ def test_a_plastic_set_is_found_beside_a_drift():
     assert found.after.value("plastic_set.share") == pytest.approx(0.3, rel=0.2)
 
 
+@pytest.mark.long
 def test_a_drift_is_a_plastic_set_without_a_yield_curvature():
     """The smaller of the two is named; the larger cannot be told from it."""
     fit = session("rest_curvature_drift", 0.15)
@@ -78,7 +79,7 @@ def test_a_drift_is_a_plastic_set_without_a_yield_curvature():
 
 def test_a_tether_is_found_and_is_no_point_force():
     fit = session("tether", *TETHER)
-    found = diagnose(fit, exclude=rivals_of("tether", "point_force", "lumped_mass"))
+    found = diagnose(fit, exclude=rivals_of("tether", "point_force"))
     assert found.verdict == "effect_found"
     assert named(found) == {"tether"}
     for name, true in zip(("stiffness", "position", "anchor_x", "anchor_y"), TETHER, strict=True):

@@ -85,6 +85,7 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
     assert fit.chi2_per_dof < 1.3
 
 
+@pytest.mark.long
 def test_with_another_effect_the_misfit_stays(base, near, screened):
     found = confirm_from_data(base, near, screened["stiffness_gradient"])
     assert found is None or found.fit.noise.source == "misfit"

@@ -89,11 +89,17 @@ def poses_in(where: str, pinned: bool) -> list[HeldPose]:
     ]
 
 
+def cases():
+    """Effects on a cable in the plane and in space; those that are in both are long in space."""
+    for where, gravity in GRAVITY.items():
+        for name, kind in EFFECTS.items():
+            if len(gravity) in kind.dimensions:
+                again = where == "space" and 2 in kind.dimensions
+                yield pytest.param(name, where, marks=[pytest.mark.long] * again)
+
+
 @pytest.mark.parametrize("has", [True, False], ids=["has it", "has not"])
-@pytest.mark.parametrize(
-    ("name", "where"),
-    [(k, w) for w in CABLES for k, kind in EFFECTS.items() if len(GRAVITY[w]) in kind.dimensions],
-)
+@pytest.mark.parametrize(("name", "where"), list(cases()))
 def test_a_fit_stays_finite(name, where, has):
     """It converges, or says that it has not, or what to try: never NaN."""
     held = "pinned" if name.endswith("_spring") else "clamped"

@@ -28,7 +28,7 @@ def pool():
 @pytest.mark.parametrize(
     ("name", "tried", "verdict"),
     [
-        ("thin", "gravity_tilt", "unexplained"),
+        pytest.param("thin", "gravity_tilt", "unexplained", marks=pytest.mark.long),
         ("softening", "bending_softening", "effect_found"),
     ],
 )

@@ -38,6 +38,8 @@ POSES = {
     "usual": (2.5, 0.5, "held_out"),
     "other": (3.5, 0.5, "held_out"),
 }
+# Of the session that is fitted.
+FITTED = ("high", "higher", "a", "even", "usual", "other")
 
 
 def ways(pose):
@@ -76,6 +78,8 @@ def session(folder):
     """A configuration of the poses, and the files of their markers."""
     rows = []
     for pose, s, points in drawn(POSES):
+        if pose.name not in FITTED:
+            continue
         table, header = np.column_stack([s, points]), "s_m,x_m,y_m,z_m"
         np.savetxt(folder / f"{pose.name}.csv", table, "%.7f", ",", header=header, comments="")
         rows.append(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import EFFECTS, CableData
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -24,7 +24,7 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
     config = load_config(BENCH / "short_clean" / "session.yaml")
     coarse = config.model.model_copy(update={"n": 6})
     estimation = config.estimation.model_copy(update={"algorithm1": False})
-    diagnosis = config.diagnosis.model_copy(update={"exclude": tuple(EFFECTS)})
+    diagnosis = config.diagnosis.model_copy(update={"enabled": False})
     config = config.model_copy(
         update={"model": coarse, "estimation": estimation, "diagnosis": diagnosis}
     )

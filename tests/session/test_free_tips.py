@@ -135,7 +135,7 @@ def test_a_cable_that_does_not_repeat_may_fall_to_either_side():
     assert not near(0.1).either
 
 
-@pytest.mark.parametrize("factor", [0.25, 10])
+@pytest.mark.parametrize("factor", [pytest.param(0.25, marks=pytest.mark.long), 10])
 def test_a_pose_on_the_other_side_does_not_count_against_the_fit(factor):
     """Predicted, it is 200 mm away; 30 points to 1 mm tell EI to a tenth of a per cent."""
     prior = replace(MODEL, cable=replace(MODEL.cable, bending_stiffness=factor * EI))

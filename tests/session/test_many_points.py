@@ -50,7 +50,7 @@ def fit_of(config, measured):
     return fit_declared(config, declared_model(config), measured)[0]
 
 
-@pytest.mark.parametrize("marked", [False, True])
+@pytest.mark.parametrize("marked", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_many_points_tell_what_all_of_them_do(tmp_path, marked):
     """The standard deviation of EI is that of a fit of every point; errors are those of points."""
     config, all_points = session(tmp_path, MANY // 2, marked, STD)

@@ -148,7 +148,10 @@ def test_files_out_of_step(session):
 
 @pytest.mark.parametrize(
     ("session", "gravity"),
-    [("markers", (9.81, 0.0, 0.0)), ("lines", (0.0, 0.0, 9.81))],
+    [
+        ("markers", (9.81, 0.0, 0.0)),
+        pytest.param("lines", (0.0, 0.0, 9.81), marks=pytest.mark.long),
+    ],
     indirect=["session"],
 )
 def test_gravity_is_held_against_the_load_that_the_shapes_show(session, gravity):

@@ -20,10 +20,8 @@ TRUTH = ROOT / "tests" / "data" / "bench_truth"
 true_effects = runpy.run_path(str(ROOT / "scripts" / "check_bench.py"))["true_effects"]
 # Photographs are fitted in tests/diagnosis/test_bench_sessions.py, a tether is on nobody's list,
 # and of 77 N m^2 gravity shows nothing.
-NAMES = [
-    "clamped", "drift", "held_askew", "held_headings", "long", "overhang", "short_clean",
-    "softening", "splice", "stretch", "taper", "thin", "two_effects",
-]  # fmt: skip
+NAMES = ["clamped", "held_askew", "held_headings", "long", "thin", "two_effects"]
+LONG = ["drift", "overhang", "short_clean", "softening", "splice", "stretch", "taper"]
 # Elements; on the splice, a tenth of the cable, two are too few: its end is 3.3 deviations off.
 MESH, FINER = 24, {"splice": 40}
 # Somebody who declares an effect knows it to a tenth.
@@ -40,7 +38,9 @@ def declared_effect(name: str, true: dict[str, float]) -> DeclaredEffect:
     return DeclaredEffect.model_validate({"name": name, "parameters": values})
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [*NAMES, *(pytest.param(name, marks=pytest.mark.long) for name in LONG)]
+)
 def test_stiffness_and_effects_are_those_of_the_truth(name):
     config = load_config(ROOT / "tests" / "data" / "bench" / name / "session.yaml")
     true = true_effects(name)

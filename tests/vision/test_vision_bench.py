@@ -72,7 +72,7 @@ def measure(config, truth_file):
     return shift, misses, np.array(shares), gaps
 
 
-@pytest.mark.parametrize("name", ["clean", "connector"])
+@pytest.mark.parametrize("name", [pytest.param("clean", marks=pytest.mark.long), "connector"])
 def test_rendered_sessions_are_measured_to_a_fortieth_of_a_pixel(name):
     """Of 1.9 mm; the shift by the light to a fiftieth of the diameter of 12.8 mm."""
     configs = {"clean": DATA / "bench/clean/session.yaml", "connector": ROOT / "configs/cable.yaml"}
