@@ -39,7 +39,7 @@ def clouds():
 
 @pytest.fixture(scope="module")
 def take():
-    return led(POSES, np.zeros((len(POSES), 0, 3)), rate=50.0)
+    return led(POSES, np.zeros((len(POSES), 0, 3)), rate=25.0)
 
 
 def errors(points, name):

@@ -23,7 +23,7 @@ CABLE = ("--mass", "0.03", "--diameter", "0.004")
 
 @pytest.fixture(scope="module")
 def take():
-    return rendered(SESSION, poses=4, rate=50.0)
+    return rendered(SESSION, poses=4, rate=25.0)
 
 
 def imported(files, output, *options):
@@ -86,6 +86,66 @@ def test_broken_files_are_told_and_nothing_is_written(kind, how, take, tmp_path,
     assert "Try: " in told
     assert "Traceback" not in told
     assert sorted(tmp_path.iterdir()) == before
+
+
+def swapped(take, axes, signs=(1.0, 1.0, 1.0)):
+    """Places in other axes, with quaternions as they were."""
+    bodies = {name: np.hstack([x[:, axes] * signs, x[:, 3:]]) for name, x in take.bodies.items()}
+    markers = {name: x[:, axes] * signs for name, x in take.markers.items()}
+    return replace(take, markers=markers, bodies=bodies)
+
+
+@pytest.mark.parametrize(
+    ("axes", "signs"),
+    [([1, 0, 2], (1, 1, 1)), ([0, 2, 1], (1, 1, 1)), ([0, 1, 2], (1, 1, -1))],
+    ids=["x and y", "y and z", "z mirrored"],
+)
+def test_places_in_other_axes_than_rotations(axes, signs, take, tmp_path, capsys):
+    files, options = WRITERS["vicon"](swapped(take, axes, signs), tmp_path)
+    assert imported(files, tmp_path / "loom", *options, *CABLE) == 2
+    assert "Try: " in capsys.readouterr().err
+    assert not (tmp_path / "loom").exists()
+
+
+def test_any_axis_of_a_body_may_be_the_cables_and_frames_may_be_lost(take, tmp_path):
+    """With z along the cable at the ends; a fifth of the frames lost, a marker in two poses."""
+    axes = Rotation.from_matrix(np.roll(np.eye(3), 1, axis=0))
+    bodies = {
+        name: np.hstack([x[:, :3], (Rotation.from_quat(x[:, 3:]) * axes).as_quat()])
+        for name, x in take.bodies.items()
+    }
+    random = np.random.default_rng(0)
+    markers = {
+        name: np.where(random.random((len(x), 1)) < 0.2, np.nan, x)
+        for name, x in take.markers.items()
+    }
+    markers["m03"][len(take.t) // 2 :] = np.nan
+    lost = replace(take, markers=markers, bodies=bodies)
+    files, options = WRITERS["vicon"](lost, tmp_path)
+    assert imported(files, tmp_path / "loom", *options, *CABLE) == 0
+    poses = load_config(tmp_path / "loom" / "session.yaml").experiment.poses
+    true = load_config(SESSION).experiment.poses
+    for pose, exact in zip(poses, true[:4], strict=True):
+        for side in ("start", "end"):
+            own, other = (getattr(x, f"{side}_orientation") for x in (pose, exact))
+            along = [Rotation.from_quat(q).as_matrix()[:, 0] for q in (own, other)]
+            assert along[0] == pytest.approx(along[1], abs=1e-3)
+    counts = [len(read_points(x.paths[0], x.start, x.end).points) for x in poses]
+    assert counts == [12, 12, 11, 11]
+
+
+def test_a_bag_of_other_topics(tmp_path, capsys):
+    writer = pytest.importorskip("rosbags.rosbag2").Writer(tmp_path / "chat", version=9)
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    with writer:
+        topic = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+        text = store.types["std_msgs/msg/String"]("hello")
+        writer.write(topic, 1, store.serialize_cdr(text, topic.msgtype))
+    assert imported([tmp_path / "chat"], tmp_path / "loom") == 2
+    told = capsys.readouterr().err
+    assert "/chatter (std_msgs/msg/String)" in told
+    assert "Try: record one or more of marker arrays" in told
 
 
 def test_values_that_nobody_knows_are_to_be_filled_in(take, tmp_path):

@@ -86,6 +86,10 @@ def along_cable(
         rolls = [Rotation.from_rotvec([k * np.pi / 2, 0, 0]).as_matrix() for k in range(4)]
         twists = [_twist(start, lines, end.turned(roll)) for roll in rolls]
         end = end.turned(rolls[int(np.argmin(np.abs(twists)))])
+        remarks.append(
+            "roll of the grippers: of four ways the one with the least twist of the cable; a fit "
+            "finds what is left as end_roll"
+        )
     return start, end
 
 

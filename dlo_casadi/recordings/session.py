@@ -262,8 +262,11 @@ def _cable_markers(
 ) -> dict[str, FloatArray]:
     """Places (P, 3) [m] of each of the cable's markers; nan in poses where it is not seen."""
     of_grippers = {part.strip() for name in (wishes.start, wishes.end) for part in name.split(",")}
+    on_bodies = tuple(f"{body}:" for body in recording.of("body"))  # as Motive and Vicon call them
     names = [
-        name for name in recording.of("marker") if wishes.cable in name and name not in of_grippers
+        name
+        for name in recording.of("marker")
+        if wishes.cable in name and name not in of_grippers and not name.startswith(on_bodies)
     ]
     nowhere = np.full(3, np.nan)
     found = {

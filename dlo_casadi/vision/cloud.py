@@ -82,9 +82,9 @@ def line_in_cloud(points: FloatArray, cable: KnownCable, camera: FloatArray | No
     if chain is None or chain.supported < _LEAST * cable.length:
         seen = 0.0 if chain is None else chain.supported
         raise VisionError(
-            f"no cable found in {counted(len(surface), 'point')}: strands of {seen:.3f} m of {cable.length:g} "
-            "m at best. Try: --color or --box, so that the cable alone is left; length and "
-            "diameter in metres; clouds and grippers in one frame."
+            f"no cable found in {counted(len(surface), 'point')}: strands of {seen:.3f} m of "
+            f"{cable.length:g} m at best. Try: --color or --box, so that the cable alone is left; "
+            "length and diameter in metres; clouds and grippers in one frame."
         )
     line = np.vstack(chain.strands)
     t = chord_length(line)
