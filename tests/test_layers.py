@@ -27,7 +27,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config": MECHANICS,
     "io": {*MECHANICS, "config"},
     "codegen": {*MECHANICS, "config", "io"},
-    "cable": {*MECHANICS, "config", "io", "codegen", "show"},
+    "export": {*MECHANICS, "io"},
+    "cable": {*MECHANICS, "config", "io", "codegen", "show", "export"},
     "vision": set(),
     "sensing": {*MECHANICS, "vision"},
     "estimation": {*MECHANICS, "sensing"},
@@ -37,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
 MAY_IMPORT["recordings"] = {"config", "vision"}
 MAY_IMPORT["session"] = {*FITTING, "cable", "paper", "config", "io", "vision", "runtime"}
+MAY_IMPORT["session"] |= {"export"}
 # A report reads results and solves nothing.
 MAY_IMPORT["report"] = {*MAY_IMPORT["session"], "session"} - {"equilibrium", "paper", "sensing"}
 MAY_IMPORT["report"] |= {"cable", "show"}

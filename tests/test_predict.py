@@ -395,3 +395,52 @@ def test_the_configuration_of_the_readme_is_one(tmp_path):
     config = load_config(tmp_path / "config.yaml")
     assert config.warnings == ()
     assert config.skipped == ()
+
+
+def test_a_checked_export_rests_nearest_to_the_measured_cable(loom, tmp_path, capsys, monkeypatch):
+    """Of the simulator's own stiffness, the first guess and the fitted one the last is the best."""
+    pytest.importorskip("mujoco", reason="the extra `peers` is not installed")
+    monkeypatch.chdir(tmp_path)
+    session = str(ROOT / "configs/markers_in_space.yaml")
+    code = main(
+        [
+            "export",
+            str(loom),
+            "--to",
+            "mujoco",
+            "--output",
+            "loom.xml",
+            "--segments",
+            "24",
+            "--check",
+            session,
+            "--figure",
+            "check.png",
+            "--json",
+        ]
+    )
+    told = json.loads(capsys.readouterr().out)
+
+    assert code == 0
+    assert told["files"] == ["loom.xml"]
+    assert (tmp_path / "check.png").stat().st_size > 10_000
+    found = told["check"]["summary"]
+    rms = [found[case]["to_measured"]["rms"] for case in ("default", "first guess", "identified")]
+    assert rms[2] < 0.5 * rms[1] < rms[1] < rms[0]
+    assert found["identified"]["to_prediction"]["largest"] < 0.01
+    assert not any(case["problems"] for case in found.values())
+
+
+def test_a_wrong_export_is_refused_before_anything_is_written(loom, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    held = ["--end", *map(str, IN_SPACE["end"]), "--end-orientation", "0.1", "-0.1", "0.1", "1"]
+    for more, said in (
+        (["--to", "mjx"], "MJX ignores bend and twist"),
+        (["--to", "mujocco"], "did you mean 'mujoco'"),
+        (["--to", "mujoco", "--figure", "a.png"], "--figure draws the check"),
+        (["--to", "mujoco", "--samples", "-1"], "--samples -1: 0 or more"),
+        (["--to", "mujoco", "--check", "gone.yaml"], "gone.yaml"),
+    ):
+        assert main(["export", str(loom), *held, *more]) == 2
+        assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,18 +1,19 @@
 """The curve of a cable, at the arc lengths that a caller asks for."""
 
-from dataclasses import replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.node import Frame
 
 # Rounding error allowed in arc lengths beyond the ends, as a share of the length.
 _ROUNDING = 1e-9
@@ -43,21 +44,34 @@ class CableCurve(NodeCurve):
             )
         return super().at(np.clip(places, 0.0, self.length), derivative)
 
+    @classmethod
+    def at_rest(
+        cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
+    ) -> Self:
+        """The curve of a model in an equilibrium, as its camera sees it."""
+        given = Inputs.of(p, rest, pose.vector[None])
+        return cls.of(model.cable.length, assembly_of(model).curve(eq.shapes, given)[0])
+
+    def frames(self, s: FloatArray, places: FloatArray, x: FloatArray) -> FloatArray:
+        """Material frames (K, d, d) at s [m]: columns are the tangent and the section's axes.
+
+        In a plane the second column is to the left. In space the roll about the tangent is
+        interpolated between the nodes, whose states are `x` (N, coordinates) at `places` (N,) [m].
+        """
+        tangents = self.at(s, 1)
+        tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+        if self.d == 2:
+            return np.stack([tangents, tangents[:, ::-1] * (-1.0, 1.0)], axis=2)
+        y = Rotation.from_quat(Frame.interpolated(s, places, x)).apply([0.0, 1.0, 0.0])
+        y -= (y * tangents).sum(axis=1, keepdims=True) * tangents
+        y /= np.linalg.norm(y, axis=1, keepdims=True)
+        return np.stack([tangents, y, np.cross(tangents, y)], axis=2)
+
 
 def curves_of(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
 ) -> tuple[CableCurve, CableCurve]:
     """The cable itself in a pose, and as the session's camera measures it."""
-    plain = model
-    effects = tuple(x for x in model.effects if not isinstance(x, MeasurementEffect))
-    if effects != model.effects:  # the true curve is that without the effects of the camera
-        plain = replace(model, effects=effects, priors={})
-    kept = [name in plain.names for name in model.names]
-    true, seen = (
-        CableCurve.of(
-            model.cable.length,
-            assembly_of(one).curve(eq.shapes, Inputs.of(q, rest, pose.vector[None]))[0],
-        )
-        for one, q in ((plain, p[kept]), (model, p))
-    )
+    models = (model.without_camera(p), (model, p))
+    true, seen = (CableCurve.at_rest(*one, rest, pose, eq) for one in models)
     return true, seen

@@ -1,25 +1,24 @@
 """A fitted cable with the uncertainty of its parameters, and its shape in one pose."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve, curves_of
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
-from dlo_casadi.cable.held import clip_texts, held_pose
+from dlo_casadi.cable.held import check_mesh, clip_texts, fixture_texts, held_pose, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Clip
-from dlo_casadi.config.values import MESH
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -33,15 +32,15 @@ from dlo_casadi.equilibrium.spread import (
 )
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError, counted
+from dlo_casadi.export.files import samples_of, write_rods
+from dlo_casadi.export.rod import Held
+from dlo_casadi.export.targets import target_of
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
-from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.rod.node import Frame, Heading
-from dlo_casadi.show.text import html_table, millimetres, vector
+from dlo_casadi.rod.node import Heading
+from dlo_casadi.show.text import html_table, millimetres
 
 # Points of a shape.
 _POINTS = 101
-# Distances [m] between a fixture and the cable that a table shows.
-_SHOWN = 5e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,13 +157,13 @@ class FittedCable(CasadiCable):
             ) from None
         beyond, known = eq.other_side, self.metadata.uncertainty
         if beyond is None:
-            return self._shape(pose, eq)
+            return self.shape_in(pose, eq)
         near = tipping_of(self.model, self.p, self.rest, pose, eq, beyond, known)
         if not near.either:
-            return self._shape(pose, eq)
+            return self.shape_in(pose, eq)
         own, others = sides_of(self.model, pose, eq, beyond)
-        other_side = self._shape(others, beyond)
-        return replace(self._shape(own, eq), other_side=other_side, tipping=near)
+        other_side = self.shape_in(others, beyond)
+        return replace(self.shape_in(own, eq), other_side=other_side, tipping=near)
 
     def compile(self, *, flags: Sequence[str] = ("-O2",)) -> CompiledSolver:
         """The cable as C, compiled and loaded: thousands of shapes a second.
@@ -181,6 +180,32 @@ class FittedCable(CasadiCable):
         """
         return CompiledSolver(self.model, self.p, self.rest, flags=flags)
 
+    def export(
+        self,
+        target: str,
+        path: str | PathLike[str],
+        *,
+        segments: int | None = None,
+        samples: int = 0,
+        seed: int = 0,
+        **held: Any,
+    ) -> list[Path]:
+        """Write the cable, its ends `held` as in `solve`, for a simulator; return the files.
+
+        `target` is a name of `export.targets.TARGETS`; `samples` more are drawn from the fit's
+        covariance: <path>_001, ... Without `segments` joints turn by 0.1 rad at most.
+
+        Raises
+        ------
+        DloError
+            If there is no such target, a file cannot be written, or as in `solve`.
+        """
+        to, known, first = target_of(target), self.metadata, self.solve(**held).held
+        fitted = (known.coefficients, known.covariance.names, known.covariance.values)
+        others = samples_of(first, *fitted, samples, seed)
+        origin = f"fitted cable {known.model_hash[:16]} of {known.config}"
+        return write_rods(to, Path(path), [first, *others], origin, segments, seed)
+
     def with_mesh(self, n: int | None = None, element: str | None = None) -> Self:
         """The same cable on another mesh.
 
@@ -192,10 +217,7 @@ class FittedCable(CasadiCable):
         """
         if n is None and element is None:
             return self
-        if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
-            raise DloError(f"n: a whole number, {MESH}, found {n!r}")
-        if element not in (None, *ELEMENTS):
-            raise DloError(f"element: one of {', '.join(ELEMENTS)} belongs here, found {element!r}")
+        check_mesh(n, element)
         if self.model.has_state:
             raise DloError(
                 f"{self.name!r} has a rest shape that changed from pose to pose, which is known on "
@@ -204,7 +226,8 @@ class FittedCable(CasadiCable):
         model = self.model.with_mesh(self.model.n if n is None else int(n), element)
         return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
 
-    def _shape(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
+    def shape_in(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
+        """The shape in an equilibrium."""
         return Shape(self, pose, eq, *curves_of(self.model, self.p, self.rest, pose, eq))
 
 
@@ -253,21 +276,15 @@ class Shape:
 
     @cached_property
     def frames(self) -> FloatArray:
-        """Material frames (101, d, d) at `s`: columns are the tangent and the section's axes.
-
-        In a plane the second column is to the left. In space the roll about the tangent is
-        interpolated between the nodes.
-        """
-        tangents = self.curve.at(self.s, 1)
-        tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-        if not self.cable.model.in_space:
-            return np.stack([tangents, tangents[:, ::-1] * (-1.0, 1.0)], axis=2)
+        """Material frames (101, d, d) at `s`, see `CableCurve.frames`."""
         places = node_places(self.cable.model.chain, self.pose.clips)
-        x = Frame.interpolated(self.s, places, self.equilibrium.x)
-        y = Rotation.from_quat(x).apply([0.0, 1.0, 0.0])
-        y -= (y * tangents).sum(axis=1, keepdims=True) * tangents
-        y /= np.linalg.norm(y, axis=1, keepdims=True)
-        return np.stack([tangents, y, np.cross(tangents, y)], axis=2)
+        return self.curve.frames(self.s, places, self.equilibrium.x)
+
+    @property
+    def held(self) -> Held:
+        """What an export is cut from."""
+        model, p = self.cable.model.without_camera(self.cable.p)
+        return Held(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
 
     @property
     def start_force(self) -> FloatArray:
@@ -342,10 +359,9 @@ class Shape:
 
     def plot(self) -> Figure:
         """The shape with the forces of the cable on its fixtures; in a plane with its band."""
-        other = self.other_side
+        other, forces = self.other_side, {"start": self.start_force}
         state = "stable" if self.stable else "NOT stable"
         radius = millimetres(self.min_bend_radius)
-        forces = {"start": self.start_force}
         if self.pose.end is not None:
             forces["end"] = self.end_force
         return draw_shape(
@@ -361,34 +377,18 @@ class Shape:
 
     def rows(self) -> list[tuple[str, str]]:
         """Quantities of the shape, and their values as text."""
-        rows, pose, points = [], self.pose, self.points
+        rows, pose, points = list[tuple[str, str]](), self.pose, self.points
         for side, at, reached in (("start", pose.start, points[0]), ("end", pose.end, points[-1])):
-            if at is None:
-                rows.append((side, "free"))
-                continue
-            rows.append((side, vector(at, "g", "m")))
-            if math.dist(at, reached) > _SHOWN:
-                place = vector(reached, ".5f", "m")
-                said = f"{place}: fixture errors of the fit included"
-                rows.append((f"{side} of the cable", said))
             force, moment = getattr(self, f"{side}_force"), getattr(self, f"{side}_moment")
-            rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
-            if getattr(self.cable.model, side) == "clamped":
-                said = vector(moment, ".4g", "N m") if moment.ndim else f"{moment:.4g} N m"
-                rows.append((f"moment of the cable on its {side}", said))
+            kind = getattr(self.cable.model, side)
+            rows += fixture_texts(side, kind, at, reached, force, moment)
         rows += clip_texts(pose.clips, self.equilibrium.clips)
         rows.append(("energy", f"{self.energy:.6g} J"))
         rows.append(("smallest bend radius", millimetres(self.min_bend_radius)))
         rows.append(("stable", "yes" if self.stable else "NO: the cable would not stay there"))
         other, near = self.other_side, self.tipping
         if other is not None and near is not None:
-            rows.append(("this side", f"`{self._side}`"))
-            said = (
-                f"`{other._side}`: {other.energy:.6g} J, up to "
-                f"{millimetres(self._apart(other))} away; equally low with the clamp turned by "
-                f"{near.angle:.2g} rad (known to {near.std:.2g} rad)"
-            )
-            rows.append(("also stable", said))
+            rows += side_texts((self._side, other._side), other.energy, self._apart(other), near)
         return rows
 
     def __str__(self) -> str:

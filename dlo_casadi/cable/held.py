@@ -1,24 +1,75 @@
 """How the ends of a fitted cable are held, from what a caller gives and what a session shares."""
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.config.clips import clip_problems
+from dlo_casadi.config.values import MESH
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
+from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, Clip, ClipLoad
-from dlo_casadi.show.text import vector
+from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.show.text import millimetres, vector
 
 # Whether in space -> key of a clamp's direction, unit, the other dimension's key, words, a place.
 _DIRECTIONS = {
     False: ("heading", " [rad]", "orientation", "two numbers of gravity", "[x, y]"),
     True: ("orientation", " [qx, qy, qz, qw]", "heading", "three numbers of gravity", "[x, y, z]"),
 }
+# Distances [m] between a fixture and the cable that a table shows.
+_SHOWN = 5e-6
+
+
+def fixture_texts(
+    side: str,
+    kind: str,
+    at: Sequence[float] | None,
+    reached: FloatArray,
+    force: FloatArray,
+    moment: FloatArray,
+) -> list[tuple[str, str]]:
+    """How an end is held at a place, where the cable is, and its reactions, as text."""
+    if at is None:
+        return [(side, "free")]
+    rows = [(side, vector(at, "g", "m"))]
+    if math.dist(at, reached) > _SHOWN:
+        place = vector(reached, ".5f", "m")
+        rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
+    rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
+    if kind == "clamped":
+        said = vector(moment, ".4g", "N m") if moment.ndim else f"{moment:.4g} N m"
+        rows.append((f"moment of the cable on its {side}", said))
+    return rows
+
+
+def side_texts(
+    sides: tuple[str, str], energy: float, apart: float, near: Tipping
+) -> list[tuple[str, str]]:
+    """The side on which a cable hangs, and the other one with its energy [J], as text."""
+    own, other = sides
+    said = (
+        f"`{other}`: {energy:.6g} J, up to {millimetres(apart)} away; equally low with the clamp "
+        f"turned by {near.angle:.2g} rad (known to {near.std:.2g} rad)"
+    )
+    return [("this side", f"`{own}`"), ("also stable", said)]
+
+
+def check_mesh(n: object, element: object) -> None:
+    """Raise DloError if there is no mesh of so many elements of that kind; None is the fit's."""
+    if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
+        raise DloError(f"n: a whole number, {MESH}, found {n!r}")
+    if element not in (None, *ELEMENTS):
+        raise DloError(f"element: one of {', '.join(ELEMENTS)} belongs here, found {element!r}")
 
 
 def clip_texts(clips: Sequence[Clip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:

@@ -45,10 +45,7 @@ HELD = (
     *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
     *("turns", "branch"),
 )
-
-
-@command(
-    PARAMETERS,
+POSE = (
     *(
         option(
             f"--{side}",
@@ -73,6 +70,12 @@ HELD = (
     ),
     option("--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"),
     BRANCH,
+)
+
+
+@command(
+    PARAMETERS,
+    *POSE,
     option("--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"),
     *LIMITS,
     option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),

@@ -8,7 +8,15 @@ from typing import Literal, Self
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
-from dlo_casadi.effects import CableData, Effect, Kinematics, Load, SectionLaw, StateEffect
+from dlo_casadi.effects import (
+    CableData,
+    Effect,
+    Kinematics,
+    Load,
+    MeasurementEffect,
+    SectionLaw,
+    StateEffect,
+)
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.clips import CLAMPS, ClipKind, clip_size
@@ -204,6 +212,14 @@ class CableModel:
         kept = tuple(effect for effect in self.effects if effect.label != label)
         priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
         return replace(self, effects=kept, priors=priors)
+
+    def without_camera(self, p: FloatArray) -> tuple[Self, FloatArray]:
+        """The model without the effects of the camera, and its part of `p`."""
+        effects = tuple(x for x in self.effects if not isinstance(x, MeasurementEffect))
+        if effects == self.effects:
+            return self, p
+        plain = replace(self, effects=effects, priors={})
+        return plain, p[[name in plain.names for name in self.names]]
 
     def with_mesh(self, n: int, element: str | None = None) -> Self:
         """Return the same model on another mesh."""

@@ -29,7 +29,7 @@ _CHECKED: dict[str, tuple[str, str, float]] = {
 _OPTIONAL = ("seen", "confidence", "pixel", "markers")
 
 
-def _table(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -> Table:
+def plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -> Table:
     """A table with columns of words, then of numbers."""
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     for column in words:
@@ -82,7 +82,7 @@ def _heading(outcome: Outcome) -> Text:
 
 def _parameter_table(outcome: Outcome) -> Table:
     """Fitted parameters of the last stage with their units, and what was kept fixed."""
-    table = _table(f"Parameters ({words.label_of(outcome.stages[-1], outcome)})", [])
+    table = plain_table(f"Parameters ({words.label_of(outcome.stages[-1], outcome)})", [])
     for column in ("parameter", "value", "95 % interval", ""):
         table.add_column(column, no_wrap=bool(column))
     for row in (
@@ -103,7 +103,7 @@ def _error_table(outcome: Outcome) -> Table:
     if not words.cross_validated(outcome):
         del columns["validated"]
     title = "Distance of the measured points from the predicted shape, RMS"
-    table = _table(title, ["stage"], list(columns.values()))
+    table = plain_table(title, ["stage"], list(columns.values()))
     for row in tables.stage_rows(outcome, "-"):
         table.add_row(row["label"], *(row[column] for column in columns))
     if outcome.measurement.readings:
@@ -125,7 +125,7 @@ def _newtons(errors: ReadingErrors) -> str:
 def candidate_table(outcome: Outcome) -> Table:
     """Every effect that was tried, in the order of `CANDIDATE_ORDER`."""
     numbers = ("score", "p-value", "cross-validated error")
-    table = _table(f"Effects that were tried: {words.CANDIDATE_ORDER}", ["effect"], numbers)
+    table = plain_table(f"Effects that were tried: {words.CANDIDATE_ORDER}", ["effect"], numbers)
     table.caption, table.caption_justify = words.p_value_note(outcome), "left"
     table.add_column("finding")
     for row in outcome.candidates:
@@ -137,7 +137,7 @@ def candidate_table(outcome: Outcome) -> Table:
 
 def _timing_table(outcome: Outcome) -> Table:
     """Wall-clock time of the parts of the run."""
-    table = _table("Time", ["part"], ["seconds"])
+    table = plain_table("Time", ["part"], ["seconds"])
     table.add_column("")
     *parts, total = tables.timing_rows(outcome)
     for row in parts:
@@ -152,11 +152,13 @@ def _timing_table(outcome: Outcome) -> Table:
 
 def prediction_table(shape: Shape, notes: Iterable[str] = ()) -> RenderableType:
     """Reactions, energy, stability and shape of one predicted pose."""
-    table = _table(f"{shape.cable.name}: predicted shape", ["quantity", "value"])
+    table = plain_table(f"{shape.cable.name}: predicted shape", ["quantity", "value"])
     for row in shape.rows():
         table.add_row(*row)
     axes = "xyz"[: shape.points.shape[1]]
-    points = _table("Points from start to end", [], [f"{column} [m]" for column in ("s", *axes)])
+    points = plain_table(
+        "Points from start to end", [], [f"{column} [m]" for column in ("s", *axes)]
+    )
     for s, point in zip(shape.s[::10], shape.points[::10], strict=True):
         points.add_row(f"{s:.4f}", *(f"{x:.5f}" for x in point))
     return Group(table, points, *(Text(note) for note in notes))
@@ -165,7 +167,7 @@ def prediction_table(shape: Shape, notes: Iterable[str] = ()) -> RenderableType:
 def limits_table(name: str, checks: Sequence[LimitCheck]) -> Table:
     """A row for each limit of each pose, and what decides."""
     numbers = ("value", "limit", "violated")
-    table = _table(f"{name}: limits", ["pose", "quantity"], numbers)
+    table = plain_table(f"{name}: limits", ["pose", "quantity"], numbers)
     for column in ("counted by", "tightest at", "verdict", "most of the variance"):
         table.add_column(column)
     colors = {"pass": "green", "risk": "yellow", "fail": "red"}
@@ -187,7 +189,7 @@ def check_table(config: Config, rows: Sequence[Mapping[str, Any]]) -> Table:
     known = {name for name, key in keys.items() if any(row[key] is not None for row in rows)}
     shown = [name for name in keys if name in known or name not in _OPTIONAL]
     title = f"{config.cable.name}: what was found, {config.cable.length:g} m declared"
-    table = _table(title, ["pose", "role"], shown)
+    table = plain_table(title, ["pose", "role"], shown)
     for row in rows:
         cells = dict.fromkeys(keys, "-")
         for name, (key, form, times) in _CHECKED.items():

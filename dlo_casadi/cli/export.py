@@ -1,0 +1,113 @@
+"""`dlo export`: a fitted cable as the file of a simulator."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from dlo_casadi.cable.file import load
+from dlo_casadi.cable.fitted_cable import FittedCable
+from dlo_casadi.cli.fitted import DRAWN, HELD, POSE
+from dlo_casadi.cli.options import PARAMETERS, Page, command, option
+from dlo_casadi.cli.watch import Watch
+from dlo_casadi.errors import DloError
+from dlo_casadi.export.files import losses
+from dlo_casadi.export.rod import Rod
+from dlo_casadi.export.targets import require, target_of
+
+# `--check` without a session.
+_NEAR = Path()
+
+
+@command(
+    PARAMETERS,
+    option("--to", required=True, metavar="SIMULATOR", help="mujoco or pyelastica"),
+    option("--output", type=Path, metavar="FILE", help="by default named after the session"),
+    option("--samples", type=int, default=0, metavar="N", help="cables more, from the covariance"),
+    option("--seed", type=int, default=0, metavar="N", help="of the samples (0)"),
+    option("--segments", type=int, metavar="N", help="links of the chain, instead of enough"),
+    option(
+        "--check",
+        type=Path,
+        nargs="?",
+        const=_NEAR,
+        metavar="SESSION",
+        help="relax it in the simulator in every held-out pose; SESSION is found if it is near",
+    ),
+    option("--figure", type=Path, metavar="FILE", help=f"draw the check: {', '.join(DRAWN)}"),
+    *POSE,
+    json="print files, losses and errors as JSON",
+)
+def export(chosen: argparse.Namespace) -> None:
+    """Write a fitted cable for a simulator: rest shape, stiffness and weight, in the pose that it
+    starts in, by default the session's first. The file's head says which number stands where.
+
+    dlo export results/cable --to mujoco                        cable.xml
+    dlo export results/cable --to mujoco --end 0.3 -0.1 --output rope.xml
+    dlo export results/cable --to mujoco --samples 50           cable_001.xml, ... beside it
+    dlo export results/cable --to pyelastica --check            is it the cable that was measured?
+    dlo export results/cable --to mujoco --check cable.yaml --figure check.png
+    """
+    from dlo_casadi.report.round_trip import draw_round_trip, round_trip_dict, round_trip_table
+    from dlo_casadi.session.round_trip import round_trip, session_of
+    from dlo_casadi.show.style import save_figure
+
+    target, cable = target_of(chosen.to), load(chosen.parameters)
+    if chosen.figure is not None and chosen.figure.suffix.lower() not in DRAWN:
+        raise DloError(f"--figure {chosen.figure}: the name must end in {', '.join(DRAWN)}")
+    if chosen.figure is not None and chosen.check is None:
+        raise DloError("--figure draws the check.\n  Try: with --check")
+    for name, least in (("samples", 0), ("seed", 0), ("segments", 4)):
+        value = getattr(chosen, name)
+        if value is not None and value < least:
+            raise DloError(f"--{name} {value}: {least} or more belongs here")
+    config = None
+    if chosen.check is not None:
+        require(target)
+        config = session_of(cable, None if chosen.check == _NEAR else chosen.check)
+    held = _held(cable, chosen)
+    path = chosen.output or Path(f"{cable.metadata.config}{target.suffix}")
+    shape = cable.solve(**held)
+    files = cable.export(
+        chosen.to,
+        path,
+        segments=chosen.segments,
+        samples=chosen.samples,
+        seed=chosen.seed,
+        **held,
+    )
+    rod = Rod.of(shape.held, chosen.segments)
+    lost = losses(shape.held, target, rod)
+    page = Page(chosen)
+    for feature, cost in lost.items():
+        page.warn(f"{target.title} cannot carry {feature}: {cost}")
+    others = f" and {len(files) - 1} more, seed {chosen.seed}" if chosen.samples else ""
+    page.say(f"{path}{others}: {len(rod.masses)} links")
+    told = {"files": [str(file) for file in files], "links": len(rod.masses), "not_carried": lost}
+    if config is not None:
+        with Watch(quiet=chosen.quiet) as watch:
+            rows = list(round_trip(cable, config, target, chosen.segments, watch.step))
+        told["check"] = round_trip_dict(rows)
+        page.print(round_trip_table(target, rows))
+        for problem in (row for row in rows if row.problem):
+            page.warn(f"{problem.pose}, {problem.case}: {problem.problem}")
+        page.say(f"default: {target.default_of}")
+        if chosen.figure is not None:
+            save_figure(chosen.figure, draw_round_trip(cable.name, target, rows))
+            page.say(f"Figure: {chosen.figure}")
+    page.data(told)
+
+
+def _held(cable: FittedCable, chosen: argparse.Namespace) -> dict[str, Any]:
+    """How the ends are held: as is said, or as in the session's first pose."""
+    from dlo_casadi.session.round_trip import session_of
+
+    held = {name: getattr(chosen, name) for name in HELD}
+    if any(value not in (None, 0.0) for value in held.values()):
+        return held
+    try:
+        config = session_of(cable, None if chosen.check in (None, _NEAR) else chosen.check)
+    except DloError:
+        return held
+    first = config.experiment.poses[0].held
+    branch = first.branch if first.branch != "previous" else None
+    return {**{name: getattr(first, name) for name in HELD}, "branch": branch}

@@ -1,0 +1,196 @@
+"""MuJoCo: bodies in a chain, each joined to the one before by three hinges with springs.
+
+No plugin: `mujoco.elasticity.cable` knows one stiffness for a whole cable, and is gone in MuJoCo 4.
+Springs of hinges are read by MuJoCo 3 and 4 and by MJX.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.export.relax import Relaxed, relax
+from dlo_casadi.export.rod import Fixture, Rod
+
+# Time step [s], and damping of a joint over its stiffness [s], which nobody has measured.
+STEP, DAMPING = 0.002, 0.03
+# Moduli [Pa] in bending and twist of the cable that comes with MuJoCo 3 (model/plugin/elasticity).
+DEFAULT = (4e6, 1e7)
+
+
+def write(rod: Rod, head: Sequence[str]) -> str:
+    """The model as MJCF."""
+    comment = "\n".join(f"  {line}".rstrip().replace("--", "–") for line in head)
+    bodies = "\n".join(_bodies(rod))
+    ends = f"\n    {_gripper('end', rod.end)}\n    </body>" if rod.end.kind != "free" else ""
+    return f"""<mujoco model="{_escaped(rod.name)}">
+  <!--
+{comment}
+  -->
+  <compiler angle="radian"/>
+  <option timestep="{STEP}" gravity="{_row(rod.gravity)}" integrator="implicitfast"/>
+  <default>
+    <default class="cable">
+      <geom type="capsule" size="{rod.radius:.9g}" fromto="0 0 0 {rod.h:.9g} 0 0" \
+contype="0" conaffinity="1" rgba="0.1 0.4 0.6 1"/>
+    </default>
+  </default>
+  <worldbody>
+    {_gripper("start", rod.start)}
+{bodies}
+    {"</body>" * (len(rod.masses) + 1)}{ends}
+  </worldbody>{_held(rod)}
+  <keyframe>
+    <key name="pose" qpos="{_row(_angles(rod))}"/>
+  </keyframe>
+</mujoco>
+"""
+
+
+def _row(values: FloatArray) -> str:
+    return " ".join(f"{value:.9g}" for value in np.ravel(values))
+
+
+def _escaped(text: str) -> str:
+    return text.translate({ord(c): f"&#{ord(c)};" for c in '&<>"'})
+
+
+def _turned(frame: Rotation) -> str:
+    return _row(np.roll(frame.as_quat(), 1))  # MuJoCo has w ahead
+
+
+def _gripper(side: str, fixture: Fixture) -> str:
+    """The body that holds an end, and, for the end, the site in it that the cable is held at."""
+    place, frame = fixture.offset
+    site = f'<site name="{side}" pos="{_row(place)}" quat="{_turned(frame)}"/>'
+    return (
+        f'<body name="{side}" mocap="true" pos="{_row(fixture.place)}" '
+        f'quat="{_turned(fixture.frame)}">{site if side == "end" else ""}'
+    )
+
+
+def _bodies(rod: Rod) -> list[str]:
+    stiffness, axes = rod.principal()
+    stiffness[1::2] = stiffness[1::2, ::-1]
+    rest = _in_axes(rod.rest_turns, axes)
+    place, frame = rod.start.offset
+    middle = len(rod.masses) - 1
+    lines = []
+    for k, mass in enumerate(rod.masses):
+        if k == 0 and rod.start.kind == "clamped":
+            inside = place - frame.apply([rod.h / 2, 0.0, 0.0])
+            lines.append(f'<body name="cable_0" pos="{_row(inside)}" quat="{_turned(frame)}">')
+        elif k == 0:
+            lines.append(f'<body name="cable_0" pos="{_row(place)}">{_pin(rod)}')
+        else:
+            joints = _hinges(rod, k, stiffness[k - 1] / rod.h, axes[k - 1], rest[k - 1])
+            lines.append(f'<body name="cable_{k}" pos="{rod.h:.9g} 0 0">{joints}')
+        lines[-1] += f'<geom class="cable" mass="{mass:.9g}"/>'
+        if k == middle and rod.end.kind != "free":
+            at = rod.h / 2 if rod.end.kind == "clamped" else rod.h
+            lines[-1] += f'<site name="cable_end" pos="{at:.9g} 0 0"/>'
+        for carried, s in rod.lumps:
+            if k == np.clip(np.searchsorted(rod.s, s) - 1, 0, middle):
+                at = (s - rod.s[k]) / (rod.s[1] - rod.s[0]) * rod.h
+                lines[-1] += (
+                    f'<geom type="sphere" pos="{at:.9g} 0 0" size="{2 * rod.radius:.9g}" '
+                    f'mass="{carried:.9g}" contype="0" conaffinity="1"/>'
+                )
+    return [f"    {line}" for line in lines]
+
+
+def _pin(rod: Rod) -> str:
+    """A pin at the start: damped as a joint is, so that nothing spins for ever."""
+    damping = DAMPING * float(np.linalg.eigvalsh(rod.bending[0])[0]) / rod.h
+    kind = 'type="ball"' if rod.in_space else 'type="hinge" axis="0 0 1"'
+    return f'<joint name="start_pin" {kind} damping="{damping:.9g}"/>'
+
+
+def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: FloatArray) -> str:
+    """Hinges about the principal axes; of a cable in a plane the one across it.
+
+    Their armature keeps each from oscillating by more than a radian in a step: MuJoCo integrates
+    springs explicitly, and a link of a few millimetres has next to no inertia about its axis.
+    """
+    about = dict(zip("xyz", axes.as_matrix().T, strict=True))
+    text = ""
+    for name, value, angle in zip(_order(k), stiffness, rest, strict=True):
+        if rod.in_space or name == "z":
+            text += (
+                f'<joint name="{name}_{k}" axis="{_row(about[name])}" stiffness="{value:.9g}" '
+                f'springref="{angle:.9g}" damping="{DAMPING * value:.9g}" '
+                f'armature="{STEP**2 * value:.9g}"/>'
+            )
+    return text
+
+
+def _order(k: int) -> str:
+    """Order of the hinges of joint k, 1 being the first.
+
+    Three turns b, c, ... one after the other also make one of b c / 2 about the third axis: the
+    opposite order in the next joint undoes it, which leaves an error of second order in h.
+    """
+    return "xyz" if k % 2 else "zyx"
+
+
+def _in_axes(turns: Rotation, axes: Rotation) -> FloatArray:
+    """Angles (n - 1, 3) [rad] of the hinges of each joint, in their order, for these turns."""
+    local = axes.inv() * turns * axes
+    odd = np.arange(len(local)) % 2 == 0
+    return np.where(odd[:, None], local.as_euler("XYZ"), local.as_euler("ZYX"))
+
+
+def _held(rod: Rod) -> str:
+    if rod.end.kind == "free":
+        return ""
+    kind = "weld" if rod.end.kind == "clamped" else "connect"
+    return f"""
+  <equality>
+    <{kind} name="end" site1="cable_end" site2="end" solref="{2 * STEP:g} 1" \
+solimp="0.9999 0.9999 0.001"/>
+  </equality>"""
+
+
+def _angles(rod: Rod) -> FloatArray:
+    """Positions of all joints in the pose."""
+    angles = _in_axes(rod.turns, rod.principal()[1])
+    if not rod.in_space:
+        angles = rod.turns.as_rotvec()[:, 2]
+    first = rod.frames[0]
+    start = np.zeros(0)
+    if rod.start.kind == "pinned":
+        start = np.roll(first.as_quat(), 1) if rod.in_space else first.as_rotvec()[2:]
+    return np.concatenate([start, angles.ravel()])
+
+
+def settle(text: str, rod: Rod) -> Relaxed:
+    """Relax a written model in MuJoCo."""
+    import mujoco as mj
+
+    model = mj.MjModel.from_xml_string(text)
+    model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET
+    data = mj.MjData(model)
+    mj.mj_resetDataKeyframe(model, data, 0)
+    links = [model.body(f"cable_{k}").id for k in range(len(rod.masses))]
+    before = 0.0
+
+    def advance(many: int) -> FloatArray:
+        if many:
+            mj.mj_step(model, data, nstep=many)
+        mj.mj_forward(model, data)
+        ahead = data.xmat[links[-1]].reshape(3, 3)[:, 0]
+        return np.vstack([data.xpos[links], data.xpos[links[-1]] + rod.h * ahead])
+
+    def halt() -> None:
+        nonlocal before
+        mj.mj_energyVel(model, data)
+        now = float(data.energy[1])
+        if now < before:
+            data.qvel[:] = 0.0
+            now = 0.0
+        before = now
+
+    nodes, seconds = relax(advance, halt, model.opt.timestep, "MuJoCo")
+    on_cable = data.efc_force[data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY][:3]
+    return Relaxed(nodes, -on_cable if len(on_cable) else np.zeros(3), seconds)

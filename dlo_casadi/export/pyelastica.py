@@ -1,0 +1,165 @@
+"""PyElastica: a Python file that makes a CosseratRod and holds its ends."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.export.relax import Relaxed, relax
+from dlo_casadi.export.rod import Fixture, Rod
+
+# Young's modulus and shear modulus [Pa] of PyElastica's first examples (Timoshenko beam).
+DEFAULT = (1e6, 1e4)
+# EA and GA over the cable's weight and buckling load, where no stretch was found: a strain of 2e-4.
+_STIFF = 5e3
+# Time step over the largest stable one.
+_COURANT = 0.4
+_BODY = '''
+
+def make_rod() -> ea.CosseratRod:
+    """The rod in the pose, with its rest shape, stiffness and masses."""
+    first = QUATERNIONS[0]
+    rod = ea.CosseratRod.straight_rod(
+        n_elements=len(QUATERNIONS),
+        start=NODES[0],
+        direction=NODES[1] - NODES[0],
+        normal=_directors(first)[0],
+        base_length=H * len(QUATERNIONS),
+        base_radius=RADIUS,
+        density=MASSES.sum() / (np.pi * RADIUS**2 * H * len(QUATERNIONS)),
+        youngs_modulus=4 * BENDING.max() / (np.pi * RADIUS**4),
+        position=NODES.T.copy(),
+        directors=np.stack([_directors(q) for q in QUATERNIONS], axis=2),
+        rest_kappa=REST_KAPPA.T.copy(),
+    )
+    for k, (xx, xy, yy, zz) in enumerate(BENDING):
+        rod.bend_matrix[..., k] = [[xx, xy, 0.0], [xy, yy, 0.0], [0.0, 0.0, zz]]
+    for k in range(len(QUATERNIONS)):
+        rod.shear_matrix[..., k] = np.diag([GA, GA, EA])
+        rod.mass_second_moment_of_inertia[..., k] = INERTIA * np.eye(3)
+        rod.inv_mass_second_moment_of_inertia[..., k] = np.eye(3) / INERTIA
+    rod.mass[:] = MASSES
+    return rod
+
+
+def hold(simulator: ea.BaseSystemCollection, rod: ea.CosseratRod) -> None:
+    """Put the rod under gravity and hold its ends where they are in the pose."""
+    simulator.append(rod)
+    simulator.constrain(rod).using(
+        ea.FixedConstraint,
+        constrained_position_idx=HELD_NODES,
+        constrained_director_idx=HELD_ELEMENTS,
+    )
+    simulator.add_forcing_to(rod).using(ea.GravityForces, acc_gravity=GRAVITY)
+    simulator.dampen(rod).using(
+        ea.AnalyticalLinearDamper, uniform_damping_constant=DAMPING, time_step=STEP
+    )
+
+
+def _directors(quaternion):
+    """Rows y, z, x of a frame (x, y, z, w): PyElastica has the tangent last."""
+    x, y, z, w = quaternion
+    frame = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return frame.T[[1, 2, 0]]
+'''
+
+
+def write(rod: Rod, head: Sequence[str]) -> str:
+    """The rod as a Python file: `make_rod()`, `hold(simulator, rod)`."""
+    count = len(rod.masses)
+    masses = np.zeros(count + 1)
+    masses[1:] += rod.masses / 2
+    masses[:-1] += rod.masses / 2
+    for carried, s in rod.lumps:
+        k = int(np.clip(np.searchsorted(rod.s, s) - 1, 0, count - 1))
+        share = (s - rod.s[k]) / (rod.s[1] - rod.s[0])
+        masses[[k, k + 1]] += carried * np.array([1 - share, share])
+    weight = masses.sum() * float(np.linalg.norm(rod.gravity))
+    length, stiffest = rod.h * count, float(rod.bending.max())
+    stiff = _STIFF * (weight + 4 * np.pi**2 * stiffest / length**2)
+    axial = min(rod.axial, stiff)
+    step = _COURANT * rod.h * np.sqrt(masses[1:-1].min() / rod.h / max(axial, stiff))
+    # As of a link about its end, and slow enough for the step in bending, twist and shear.
+    fastest = stiff * rod.h + 4 * max(stiffest, float(rod.torsion.max())) / rod.h
+    inertia = max(masses.mean() * rod.h**2 / 3, fastest * (step / _COURANT) ** 2 / 4)
+    held = [_held(rod.start, 0, 1), _held(rod.end, -1, -2)]
+    about = [rod.bending[:, 0, 0], rod.bending[:, 0, 1], rod.bending[:, 1, 1], rod.torsion]
+    numbers = [
+        ("H", f"{rod.h:.12g}", "length of an element [m]"),
+        ("RADIUS", f"{rod.radius:.9g}", "[m]"),
+        ("GRAVITY", _array(rod.gravity), "[m/s^2]"),
+        ("EA", f"{axial:.9g}", "[N]"),
+        ("GA", f"{stiff:.9g}", "[N], so stiff that shear does not matter"),
+        ("INERTIA", f"{inertia:.9g}", "of an element [kg m^2], raised until STEP is stable"),
+        ("STEP", f"{step:.6g}", "time step [s]"),
+        ("DAMPING", "10.0", "[1/s], which nobody has measured"),
+        ("HELD_NODES", str(sum((nodes for nodes, _ in held), ())), ""),
+        ("HELD_ELEMENTS", str(sum((elements for _, elements in held), ())), ""),
+        ("NODES", _array(rod.nodes), "[m]"),
+        ("QUATERNIONS", _array(rod.frames.as_quat()), "frames of the elements (x, y, z, w)"),
+        ("MASSES", _array(masses), "of the nodes [kg]"),
+        ("BENDING", _array(np.column_stack(about)), "yy, yz, zz, torsion [N m^2]"),
+        ("REST_KAPPA", _array(rod.rest[:, [1, 2, 0]]), "about y, z, and twist [1/m]"),
+    ]
+    lines = [f"# {line}".rstrip() for line in head]
+    lines += ["", "import elastica as ea", "import numpy as np", ""]
+    for name, value, meaning in numbers:
+        lines += [f"# {meaning}"] * bool(meaning) + [f"{name} = {value}"]
+    return "\n".join(lines) + "\n" + _BODY
+
+
+def _held(fixture: Fixture, first: int, second: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Nodes and elements that a fixture holds."""
+    kinds: dict[str, Any] = {"clamped": ((first, second), (first,)), "pinned": ((first,), ())}
+    found: tuple[tuple[int, ...], tuple[int, ...]] = kinds.get(fixture.kind, ((), ()))
+    return found
+
+
+def _array(values: FloatArray) -> str:
+    rows = ",\n    ".join(f"{np.vectorize(_rounded)(row).tolist()}" for row in values)
+    return f"np.array([\n    {rows},\n])"
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.12g}")
+
+
+def settle(text: str, rod: Rod) -> Relaxed:
+    """Relax a written rod in PyElastica."""
+    import elastica as ea
+
+    made: dict[str, Any] = {}
+    exec(compile(text, "export", "exec"), made)
+
+    class Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping):
+        """PyElastica mixes its features in by inheritance."""
+
+    simulator, cable = Simulator(), made["make_rod"]()
+    made["hold"](simulator, cable)
+    simulator.finalize()
+    stepper, time, before, step = ea.PositionVerlet(), 0.0, 0.0, made["STEP"]
+
+    def advance(many: int) -> FloatArray:
+        nonlocal time
+        for _ in range(many):
+            time = stepper.step(simulator, time, step)
+        return np.array(cable.position_collection.T)
+
+    def halt() -> None:
+        nonlocal before
+        now = float((cable.mass * cable.velocity_collection**2).sum())
+        if now < before:
+            cable.velocity_collection[:] = cable.omega_collection[:] = now = 0.0
+        before = now
+
+    nodes, seconds = relax(advance, halt, step, "PyElastica")
+    at_end = [k for k in made["HELD_NODES"] if k < 0]
+    weight = np.outer(made["GRAVITY"], cable.mass[at_end])
+    return Relaxed(nodes, (cable.internal_forces[:, at_end] + weight).sum(axis=1), seconds)

@@ -1,0 +1,413 @@
+"""A fitted cable in one pose as a chain of rigid segments: all that a simulator needs to know.
+
+Segments of equal length h are joined at the nodes between them. A joint stands for the cable within
+h / 2 of it: its stiffness is EI / h and GJ / h, its rest rotation exp(h kappa_0). A clamp holds a
+segment whose middle is the cable's end: half of it is inside the clamp. Shapes are then of second
+order in h.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal, Self
+
+import casadi as ca
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.effects import (
+    BoundaryEffect,
+    Effect,
+    Kinematics,
+    Load,
+    SectionLaw,
+    StateEffect,
+)
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import node_places
+from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
+from dlo_casadi.rod.element import Cell
+from dlo_casadi.rod.node import Heading
+
+# What a target may be able to carry, beyond a straight uniform round cable with its weight.
+Feature = Literal[
+    "rest shape",
+    "anisotropy",
+    "stiffness along the cable",
+    "lumped mass",
+    "stretch",
+    "softening",
+    "load across gravity",
+    "point force",
+    "spring",
+    "spring at an end",
+    "compliance of a clamp",
+    "change of the rest shape",
+    "clips",
+]
+# GJ / EI of a cable whose session lay in a plane: that of a solid round rod.
+ROUND = 1 / 1.3
+# Largest turn of a joint in the pose [rad], and numbers of segments, of a mesh that is not given.
+TURN, SEGMENTS = 0.1, (40, 200)
+# Steps in which the segments are turned until they reach the end.
+_CLOSING = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A cable in an equilibrium of one pose: what a `Rod` is cut from.
+
+    Parameters
+    ----------
+    model : CableModel
+        Without the effects of the camera.
+    p : (n_parameters,)
+    rest : (n_rests,) [1/m]
+    pose : HeldPose
+    curve : NodeCurve
+        The true curve, by declared arc length.
+    x : (n_nodes, coordinates)
+        States of the model's nodes.
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    pose: HeldPose
+    curve: NodeCurve
+    x: FloatArray
+
+    @classmethod
+    def solved(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> "Held":
+        """The cable where it is predicted to be."""
+        eq = solve_equilibrium(model, p, rest, pose)
+        rows = assembly_of(model).curve(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
+        return cls(model, p, rest, pose, NodeCurve.of(model.cable.length, rows), eq.x)
+
+
+@dataclass(frozen=True)
+class Fixture:
+    """What holds an end: as declared, and the end of the cable itself, world axes.
+
+    `kind` is "pinned", "clamped" or "free"; places (3,) [m]; frames with x along the cable.
+    """
+
+    kind: str
+    place: FloatArray
+    frame: Rotation
+    cable_place: FloatArray
+    cable_frame: Rotation
+
+    @property
+    def offset(self) -> tuple[FloatArray, Rotation]:
+        """Place and frame of the cable's end in the fixture's."""
+        back = self.frame.inv()
+        return back.apply(self.cable_place - self.place), back * self.cable_frame
+
+
+@dataclass(frozen=True, eq=False)
+class Rod:
+    """A cable in a pose as n segments of the length `h` [m].
+
+    Parameters
+    ----------
+    name : str
+    in_space : bool
+        False where the cable stayed in the plane z = 0 and nothing is known of the rest.
+    s : (n + 1,) [m]
+        Arc lengths of the nodes; those inside clamps lie beyond [0, L].
+    nodes : (n + 1, 3) [m]
+    frames : (n,) rotations
+        Material frames of the segments: x along the cable, y and z the section's axes.
+    bending : (n - 1, 2, 2) [N m^2]
+        Of each joint, about the material axes y and z.
+    torsion : (n - 1,) [N m^2]
+    rest : (n - 1, 3) [1/m]
+        Twist and curvatures about y and z of each joint without load.
+    masses : (n,) [kg]
+    lumps : (m, 2)
+        Mass [kg] and arc length [m] of compact masses.
+    axial : float [N]
+        EA; infinite where no stretch was found.
+    radius : float [m]
+    gravity : (3,) [m/s^2]
+    start, end : Fixture
+    features : dict
+        What it has beyond a straight uniform round cable: feature -> labels of the effects.
+    """
+
+    name: str
+    in_space: bool
+    h: float
+    s: FloatArray
+    nodes: FloatArray
+    frames: Rotation
+    bending: FloatArray
+    torsion: FloatArray
+    rest: FloatArray
+    masses: FloatArray
+    lumps: FloatArray
+    axial: float
+    radius: float
+    gravity: FloatArray
+    start: Fixture
+    end: Fixture
+    features: dict[Feature, tuple[str, ...]]
+
+    @classmethod
+    def of(cls, held: Held, segments: int | None = None) -> Self:
+        """Cut a cable into segments, by default as many as keep each joint's turn below `TURN`."""
+        model, p, pose, curve = held.model, held.p, held.pose, held.curve
+        terms, length = lagrangian_of(model), model.cable.length
+        true, true_length = _numbers(terms, p, pose, *_held(terms))
+        if segments is None:
+            sharpest = np.linalg.norm(curve.at(np.linspace(0, length, 400), 2), axis=1).max()
+            segments = int(np.clip(np.ceil(sharpest * length / TURN), *SEGMENTS))
+        clamped = [kind == "clamped" for kind in (model.start, model.end)]
+        h = length / (segments - sum(clamped) / 2)
+        s = h * (np.arange(segments + 1) - clamped[0] / 2)
+        fixtures = _fixtures(model, pose, true, curve)
+        stretch = float(true_length) / length
+        nodes, frames = _segments(held, fixtures, s, h * stretch)
+        mass, gravity = _weights(terms, p, pose)
+        bending, torsion = _stiffness(terms, p, pose, s, h)
+        cover = np.clip(s, 0.0, length)
+        compliance = float(_numbers(terms, p, pose, terms.axial_compliance)[0])
+        features = features_of(model, p, pose)
+        if np.abs(held.rest).max(initial=0.0) > 0:
+            features["rest shape"] = ()
+        if pose.clips:
+            features["clips"] = ()
+        return cls(
+            name=model.cable.name,
+            in_space=model.in_space,
+            h=h * stretch,
+            s=s,
+            nodes=nodes,
+            frames=frames,
+            bending=bending,
+            torsion=torsion,
+            rest=_rest(model, held.rest, s[1:-1], h),
+            masses=mass * np.diff(cover),
+            lumps=_lumps(terms, p, pose, gravity),
+            axial=1 / compliance if compliance > 0 else np.inf,
+            radius=model.cable.diameter / 2,
+            gravity=gravity,
+            start=fixtures[0],
+            end=fixtures[1],
+            features=features,
+        )
+
+    def with_stiffness(self, bending: float, torsion: float) -> Self:
+        """A straight cable of uniform stiffness [N m^2] in its place: what nobody has measured."""
+        count = len(self.torsion)
+        return replace(
+            self,
+            bending=np.tile(bending * np.eye(2), (count, 1, 1)),
+            torsion=np.full(count, torsion),
+            rest=np.zeros((count, 3)),
+        )
+
+    def principal(self) -> tuple[FloatArray, Rotation]:
+        """Stiffnesses (n - 1, 3) [N m^2] about the principal axes of each joint, and those axes.
+
+        First GJ about x, then the two of bending. The axes (n - 1,) are in the material frame; of
+        an isotropic section they are that frame.
+        """
+        values, vectors = np.linalg.eigh(self.bending)
+        round_ = np.ptp(values, axis=1) < 1e-9 * values[:, 1]
+        angle = np.where(round_, 0.0, np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
+        axes = Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 0.0])
+        return np.column_stack([self.torsion, values]), axes
+
+    @property
+    def turns(self) -> Rotation:
+        """Rotations (n - 1,) from each segment's frame to the next one's in the pose."""
+        return self.frames[:-1].inv() * self.frames[1:]
+
+    @property
+    def rest_turns(self) -> Rotation:
+        """The same without load."""
+        return Rotation.from_rotvec(self.h * self.rest)
+
+
+def features_of(model: CableModel, p: FloatArray, pose: HeldPose) -> dict[Feature, tuple[str, ...]]:
+    """Features of a model's effects, each with the labels of those that cause it."""
+    terms = lagrangian_of(model)
+    found: dict[Feature, tuple[str, ...]] = {}
+    for effect, local in terms.effects_of(Effect):
+        for feature in _features(effect, terms, local, p, pose):
+            found[feature] = (*found.get(feature, ()), effect.label)
+    return found
+
+
+def _features(
+    effect: Effect, terms: Lagrangian, local: dict[str, ca.SX], p: FloatArray, pose: HeldPose
+) -> list[Feature]:
+    """What an effect needs of a target; places of the ends and weights are carried by all."""
+    cable, found = terms.model.cable, list[Feature]()
+    if isinstance(effect, SectionLaw):
+        cell, square = Cell(ca.SX.sym("s"), ca.SX(1e-3), 1e-3), ca.SX.sym("square")
+        if not effect.isotropic:
+            found.append("anisotropy")
+        if not effect.along(cell, cable, local).is_constant():
+            found.append("stiffness along the cable")
+        if not effect.of_bend(square, cable, local).is_constant():
+            found.append("softening")
+    elif isinstance(effect, Kinematics) and effect.extensible:
+        found.append("stretch")
+    elif isinstance(effect, Load):
+        gravity = terms.felt_gravity
+        total = effect.resultant(ca.SX(0), gravity, cable, local)
+        load, down = _numbers(terms, p, pose, total + 0 * gravity, gravity)
+        across = load - down * float(load @ down) / max(float(down @ down), 1e-12)
+        if np.linalg.norm(across) > 0:
+            found.append("load across gravity")
+        if effect.forces(gravity, local):
+            found.append("lumped mass" if effect.carried else "point force")
+        if effect.n_springs:
+            found.append("spring")
+    elif isinstance(effect, BoundaryEffect):
+        first, last = terms.moved
+        if not ca.SX(effect.energy(first, last, local)).is_zero():
+            found.append("spring at an end")
+        if any(not ca.SX(c).is_zero() for c in effect.compliance(local)):
+            found.append("compliance of a clamp")
+    elif isinstance(effect, StateEffect):
+        found.append("change of the rest shape")
+    return found
+
+
+def _held(terms: Lagrangian) -> tuple[ca.SX, ca.SX]:
+    return terms.true_ends.vector, terms.model.cable.length * terms.stretch
+
+
+def _numbers(
+    terms: Lagrangian, p: FloatArray, pose: HeldPose, *expressions: ca.SX
+) -> list[FloatArray]:
+    """Values of expressions of the parameters, the pose and no deviation."""
+    of = ca.Function("numbers", [terms.p, terms.pose, terms.deviation], [*expressions])
+    found = of.call([p, pose.vector, np.zeros(terms.deviation.numel())])
+    return [np.array(value).squeeze() for value in found]
+
+
+def _spatial(vector: FloatArray) -> FloatArray:
+    """Vectors (..., 2 or 3) as ones in space: a plane is z = 0."""
+    out = np.zeros((*vector.shape[:-1], 3))
+    out[..., : vector.shape[-1]] = vector
+    return out
+
+
+def _frame(state: FloatArray) -> Rotation:
+    """Frames of nodes (..., coordinates): of headings [rad] those that turn about z."""
+    if state.shape[-1] == Heading.coordinates:
+        return Rotation.from_rotvec(state * [0.0, 0.0, 1.0])
+    return Rotation.from_quat(state)
+
+
+def _fixtures(
+    model: CableModel, pose: HeldPose, true: FloatArray, curve: NodeCurve
+) -> tuple[Fixture, Fixture]:
+    """Both fixtures; of what is not clamped the frame is the world's."""
+    d, c = model.node.dimension, model.node.coordinates
+    edges = np.cumsum([d, d, c])
+    parts = [np.split(ends, edges) for ends in (pose.ends, true)]
+    out = []
+    for k, kind in enumerate((model.start, model.end)):
+        (place, frame), (cable_place, cable_frame) = (
+            (_spatial(part[k]), _frame(part[2 + k])) for part in parts
+        )
+        if kind != "clamped":
+            frame = cable_frame = Rotation.identity()
+        if kind == "free":
+            place = cable_place = _spatial(curve.at(np.array([curve.length])))[0]
+        out.append(Fixture(kind, place, frame, cable_place, cable_frame))
+    return out[0], out[1]
+
+
+def _segments(
+    cable: Held, fixtures: tuple[Fixture, Fixture], s: FloatArray, h: float
+) -> tuple[FloatArray, Rotation]:
+    """Nodes and frames of equal segments along the curve, closed between the fixtures."""
+    start, end = fixtures
+    model, length = cable.model, cable.model.cable.length
+    middles = np.clip((s[:-1] + s[1:]) / 2, 0.0, length)
+    places = node_places(model.chain, cable.pose.clips)
+    frames = _frame(model.node.interpolated(middles, places, cable.x))
+    ways = np.diff(_spatial(cable.curve.at(np.clip(s, 0.0, length))), axis=0)
+    first, last = start.cable_place, end.cable_place
+    held = [k for k, side in ((0, start), (-1, end)) if side.kind == "clamped"]
+    for k in held:
+        ways[k] = (start, end)[k].cable_frame.apply([1.0, 0.0, 0.0])
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    if 0 in held:
+        first = first - h / 2 * ways[0]
+    if -1 in held:
+        last = last + h / 2 * ways[-1]
+    free = np.setdiff1d(np.arange(len(ways)), np.array(held, dtype=int) % len(ways))
+    for _ in range(_CLOSING if end.kind != "free" else 0):
+        gap = (last - first) / h - ways.sum(axis=0)
+        ways[free] += gap / len(free)
+        ways[free] /= np.linalg.norm(ways[free], axis=1, keepdims=True)
+    nodes = np.vstack([first, first + h * np.cumsum(ways, axis=0)])
+    # The smallest rotations that align the frames with the segments.
+    before = frames.apply([1.0, 0.0, 0.0])
+    axis = np.cross(before, ways)
+    sine, cosine = np.linalg.norm(axis, axis=1), (before * ways).sum(axis=1)
+    angle = np.arctan2(sine, cosine) / np.maximum(sine, 1e-300)
+    turned = (Rotation.from_rotvec(axis * angle[:, None]) * frames).as_quat()
+    for k in held:
+        turned[k] = (start, end)[k].cable_frame.as_quat()
+    return nodes, Rotation.from_quat(turned)
+
+
+def _weights(terms: Lagrangian, p: FloatArray, pose: HeldPose) -> tuple[float, FloatArray]:
+    """Mass per length [kg/m] that all loads along gravity make, and gravity (3,) with its tilt."""
+    cable = terms.model.cable
+    total, gravity = _numbers(terms, p, pose, terms.resultant(0.0), terms.felt_gravity)
+    square = float(gravity @ gravity)
+    mass = float(total @ gravity) / square if square > 0 else cable.mass
+    return mass / cable.length, _spatial(gravity)
+
+
+def _lumps(terms: Lagrangian, p: FloatArray, pose: HeldPose, gravity: FloatArray) -> FloatArray:
+    """Compact masses (m, 2): mass [kg], arc length [m]."""
+    loads = [item for item in terms.effects_of(Load) if item[0].carried]
+    forces = [f for effect, local in loads for f in effect.forces(terms.felt_gravity, local)]
+    if not forces or not gravity.any():
+        return np.zeros((0, 2))
+    found = [_numbers(terms, p, pose, item.force, item.position) for item in forces]
+    g = gravity[: terms.node.dimension]
+    return np.array([[force @ g / (g @ g), place] for force, place in found])
+
+
+def _stiffness(
+    terms: Lagrangian, p: FloatArray, pose: HeldPose, s: FloatArray, h: float
+) -> tuple[FloatArray, FloatArray]:
+    """Bending (n - 1, 2, 2) and torsional (n - 1,) stiffness [N m^2] of the joints."""
+    section, model = terms.section, terms.model
+    cells = np.clip(np.stack([s[1:-1] - h / 2, s[1:-1] + h / 2]), 0.0, model.cable.length)
+    along = [section.along(Cell(ca.SX(a), ca.SX(b - a), h)) for a, b in cells.T]
+    factor, bending, torsion = _numbers(
+        terms, p, pose, ca.vertcat(*along), section.bending, section.torsion
+    )
+    if not model.in_space:
+        bending, torsion = bending * np.eye(2), bending * ROUND
+    return factor[:, None, None] * bending, factor * torsion
+
+
+def _rest(model: CableModel, rest: FloatArray, s: FloatArray, h: float) -> FloatArray:
+    """Rest strains (n - 1, 3) [1/m] of joints at s: means over the cable within h / 2 of them."""
+    chain, out = model.chain, np.zeros((len(s), 3))
+    edges = np.append(chain.cells[:, 0], chain.cells[-1, 1])
+    low, high = (np.clip(s + side * h / 2, *edges[[0, -1]]) for side in (-1, 1))
+    for k, means in enumerate(np.split(rest, len(model.node.strains))):
+        turned = np.append(0.0, np.cumsum(means * np.diff(edges)))
+        angle = CubicSpline(edges, turned)
+        column = k if model.in_space else 2
+        out[:, column] = (angle(high) - angle(low)) / (high - low)
+    return out

@@ -1,0 +1,183 @@
+"""An exported cable relaxed in its simulator, beside our prediction and what was measured."""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.fitted_cable import FittedCable, Shape
+from dlo_casadi.config import Config, Pose, load_config
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.errors import ConfigError, EquilibriumError
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.export.rod import ROUND, Rod
+from dlo_casadi.export.targets import Target, require
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.session.measure import calibrated, measured_poses, read_inputs
+
+# Whose stiffness a simulator is given, in the order of tables.
+CASES = ("default", "first guess", "identified")
+# Chords of a relaxed shape that measured points are compared with.
+_CHORDS = 400
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Root mean square and largest distance of two shapes, as shares of the length."""
+
+    rms: float
+    largest: float
+
+    @classmethod
+    def of(cls, distances: FloatArray, length: float) -> "Distance":
+        """Of distances [m]."""
+        square = float(np.mean(np.square(distances)))
+        return cls(np.sqrt(square) / length, float(np.max(distances)) / length)
+
+
+@dataclass(frozen=True, eq=False)
+class Relaxation:
+    """One held-out pose in a simulator, with the stiffness of one of `CASES`.
+
+    Parameters
+    ----------
+    pose, case : str
+    to_prediction : Distance or None
+        From our prediction with the identified cable, at equal arc lengths; None if it did not
+        come to rest, see `problem`.
+    to_measured : Distance or None
+        From the measured points, as a fit compares them.
+    force, predicted_force : (3,) [N]
+        Of the cable on its end fixture: in the simulator, and as we predict it.
+    measured_force : (d,) [N] or None
+    points, predicted, measured : (K, d) [m]
+        What is drawn.
+    links : int
+    lost : tuple of str
+        Features of the identified cable that the target cannot carry.
+    problem : str
+    """
+
+    pose: str
+    case: str
+    to_prediction: Distance | None
+    to_measured: Distance | None
+    force: FloatArray | None
+    predicted_force: FloatArray
+    measured_force: FloatArray | None
+    points: FloatArray
+    predicted: FloatArray
+    measured: FloatArray
+    links: int
+    lost: tuple[str, ...]
+    problem: str = ""
+
+
+def session_of(cable: FittedCable, given: Path | None) -> Config:
+    """The session that a cable was fitted to: as given, or by its name near its results and here.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be found, or is another one.
+    """
+    name, source = f"{cable.metadata.config}.yaml", cable.metadata.path
+    places = [Path(), Path("configs"), *([] if source is None else source.resolve().parents[1:4])]
+    found = [given] if given else [p / name for p in places if (p / name).is_file()]
+    for path in found:
+        fitted = cable.metadata.document.get("config_hash")
+        if given or hashlib.sha256(path.read_bytes()).hexdigest() == fitted:
+            return load_config(path)
+    raise ConfigError(
+        f"the session {name} that {cable.name!r} was fitted to is not here.\n"
+        "  Try: --check SESSION.yaml"
+    )
+
+
+def round_trip(
+    cable: FittedCable,
+    config: Config,
+    target: Target,
+    segments: int | None,
+    step: Callable[[str, int, int], None],
+    poses: int | None = None,
+) -> Iterator[Relaxation]:
+    """Relax a cable in every held-out pose; in every pose if none was held out.
+
+    With a number of `poses`, in so many of them, and of the fitted ones if those are too few.
+
+    Raises
+    ------
+    DloError
+        If the target simulates nothing or is not installed.
+    """
+    require(target)
+    quiet: Callable[[str, int, int], None] = lambda *_: None  # noqa: E731
+    config = calibrated(config, quiet)
+    measured = measured_poses(config, read_inputs(config, quiet))
+    declared = config.experiment.poses
+    predictions = predict_poses(cable.model, cable.p, cable.rest, [item.pose for item in measured])
+    order = sorted(range(len(measured)), key=lambda j: not measured[j].held_out)
+    held_out = sum(item.held_out for item in measured) or len(measured)
+    chosen = [j for j in order if predictions[j] is not None][: poses or held_out]
+    model = cable.model
+    guess = (model.cable.bending_stiffness, model.cable.torsional_stiffness)
+    for count, j in enumerate(chosen):
+        found = predictions[j]
+        assert found is not None
+        shape = cable.shape_in(measured[j].pose, found.equilibrium)
+        rod = Rod.of(shape.held, segments)
+        given = {
+            "default": rod.with_stiffness(*target.default_stiffness(rod.radius)),
+            "first guess": rod.with_stiffness(guess[0], guess[1] or ROUND * guess[0]),
+            "identified": rod,
+        }
+        for k, case in enumerate(CASES):
+            step(f"{declared[j].name}, {case}", len(CASES) * count + k, len(CASES) * len(chosen))
+            yield _relaxed(declared[j], case, shape, given[case], measured[j], target)
+    step("relax", 1, 1)
+
+
+def _relaxed(
+    pose: Pose, case: str, shape: Shape, rod: Rod, measured: MeasuredPose, target: Target
+) -> Relaxation:
+    length, d = shape.cable.length, shape.curve.d
+    s = np.linspace(0.0, length, _CHORDS + 1)
+    ours, seen = shape.curve.at(s), shape.seen.at(s)
+    reading = pose.readings.get("end_force")
+    nothing = Relaxation(
+        pose.name,
+        case,
+        None,
+        None,
+        None,
+        predicted_force=shape.end_force,
+        measured_force=None if reading is None else np.array(reading),
+        points=np.zeros((0, d)),
+        predicted=ours,
+        measured=measured.points if measured.readable else np.zeros((0, d)),
+        links=len(rod.masses),
+        lost=tuple(target.dropped(rod)),
+    )
+    assert target.settle is not None
+    try:
+        at_rest = target.settle(target.write(rod, []), rod)
+    except EquilibriumError as error:
+        return replace(nothing, problem=error.message.partition("\n")[0])
+    points = CubicSpline(rod.s, at_rest.nodes)(s)[:, :d]
+    curve = NodeCurve(length, points + seen - ours, None)
+    inside = (rod.s >= 0) & (rod.s <= length)
+    gap = np.linalg.norm(points - ours, axis=1)
+    out_of_plane = np.abs(at_rest.nodes[inside, d:]).max(initial=0.0)
+    told = measured.has_line or measured.readable
+    return replace(
+        nothing,
+        to_prediction=Distance.of(np.hypot(gap, out_of_plane), length),
+        to_measured=Distance.of(measured.distances(curve), length) if told else None,
+        force=at_rest.end_force[:d],
+        points=points,
+    )

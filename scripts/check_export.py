@@ -1,0 +1,81 @@
+"""Fitted cables in MuJoCo and PyElastica: at rest there, beside our prediction and the measurement.
+
+    python scripts/check_export.py RESULTS=SESSION.yaml ... [--poses 3] [--to mujoco pyelastica]
+
+RESULTS are folders of `dlo fit`. Of each cable the first held-out poses are relaxed, and fit poses
+if too few were held out, with the stiffness of the simulator's own example, with the declared first
+guess and with the identified cable. Exit code 1 if a shape of the identified cable is more than 1 %
+of the length from our prediction although the target carries all of it, or if it is not the nearest
+of the three to what was measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import dlo_casadi as dlo
+from dlo_casadi.config import load_config
+from dlo_casadi.export.targets import TARGETS
+from dlo_casadi.report.round_trip import summary
+from dlo_casadi.session.round_trip import CASES, round_trip
+
+# Largest distance from our prediction, as a share of the length.
+ALLOWED = 0.01
+
+
+def main() -> int:
+    """Relax all cables and print one line for each."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("cables", nargs="+", metavar="RESULTS=SESSION.yaml")
+    parser.add_argument("--poses", type=int, default=3)
+    parser.add_argument("--segments", type=int)
+    able = [name for name, target in TARGETS.items() if target.settle is not None]
+    parser.add_argument("--to", nargs="+", choices=able, default=able)
+    chosen = parser.parse_args()
+    wrong = 0
+    print("errors in % of the length: largest from our prediction; RMS from measured, of", *CASES)
+    for text in chosen.cables:
+        folder, _, session = text.partition("=")
+        cable, config = dlo.load(folder), load_config(session)
+        for name in chosen.to:
+            target, begin = TARGETS[name], time.process_time()
+            rows = list(
+                round_trip(
+                    *(cable, config, target, chosen.segments, lambda *_: None),
+                    poses=chosen.poses,
+                )
+            )
+            found = summary(rows)
+            lost = {feature for row in rows for feature in row.lost}
+            ours = found["identified"]["to_prediction"]
+            measured = [found[case]["to_measured"] for case in CASES]
+            largest = 100 * ours["largest"] if ours else float("inf")
+            shares = [100 * x["rms"] if x else float("inf") for x in measured]
+            forces = [found[case]["force_to_prediction"] for case in CASES]
+            good = shares[2] == min(shares) and (largest <= 100 * ALLOWED or bool(lost))
+            wrong += not good
+            print(
+                f"{Path(folder).name:12s} {target.title:10s} {rows[0].links:4d} links, "
+                f"{len(rows) // 3} poses   {largest:7.3f}   ",
+                *(f"{share:8.3f}" for share in shares),
+                "  force [N]",
+                *("     -" if f is None else f"{f:6.3g}" for f in forces),
+                f"  {time.process_time() - begin:5.1f} s",
+                "" if good else "  NOT AS IT SHOULD BE",
+                f"  not carried: {', '.join(lost)}" if lost else "",
+                flush=True,
+            )
+            for case in CASES:
+                for problem in found[case]["problems"]:
+                    print(f"    {case}: {problem}")
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

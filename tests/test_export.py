@@ -1,0 +1,172 @@
+"""Fitted cables as files of simulators, and back: what rests there is what we predict."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.effects import EFFECTS, CableData
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.errors import DloError, OutputError
+from dlo_casadi.export.files import losses, samples_of, write_rods
+from dlo_casadi.export.rod import Held, Rod
+from dlo_casadi.export.targets import TARGETS, target_of
+from dlo_casadi.model.cable_model import CableModel
+
+SPACE = CableData(0.6, 0.03, 0.004, 0.015, "loom <&>", torsional_stiffness=0.011)
+PLANE = CableData(0.8, 0.2, 0.012, 0.3, "rope")
+MASS, PLACE, RATIO = 0.02, 0.25, 3.0
+
+
+def in_space(*effects, **values):
+    """A curved cable between two clamps, far from straight."""
+    model = CableModel(SPACE, 20, "quadratic", "clamped", "clamped", (0, 0, -9.81), n_rest=4)
+    for effect in effects:
+        model = model.with_effect(EFFECTS[effect]())
+    p = model.nominal.copy()
+    for name, value in values.items():
+        p[model.names.index(name.replace("__", "."))] = value
+    rest = model.rest_basis @ np.array([0.5, 2.0, 1.0, 0.2, 0.3, 1.0, 0.8, 0.1])
+    turned = tuple(Rotation.from_rotvec([0.6, -0.4, 0.7]).as_quat())
+    pose = HeldPose(
+        (0.1, 0.2, 0.3), (0.45, 0.3, 0.35), start_orientation=(0, 0, 0, 1), end_orientation=turned
+    )
+    return Held.solved(model, p, rest, pose)
+
+
+def in_plane(start="pinned", end="pinned"):
+    model = CableModel(PLANE, 20, "quadratic", start, end, n_rest=4)
+    rest = model.rest_basis @ np.array([0.5, 2.0, 1.0, 0.2])
+    pose = HeldPose((0.1, 0.2), (0.6, 0.1) if end != "free" else None, start_heading=0.3)
+    return Held.solved(model, model.nominal, rest, pose)
+
+
+def off(held, rod, nodes):
+    """Largest distance of nodes from our curve at the same arc length, over the length."""
+    inside = (rod.s >= 0) & (rod.s <= held.model.cable.length * (1 + 1e-12))
+    ours = np.zeros((inside.sum(), 3))
+    ours[:, : held.curve.d] = held.curve.at(rod.s[inside])
+    return np.linalg.norm(nodes[inside] - ours, axis=1).max() / held.model.cable.length
+
+
+CASES = {
+    "space": lambda: in_space(),
+    "mass": lambda: in_space("lumped_mass", lumped_mass__mass=MASS, lumped_mass__position=PLACE),
+    "flat": lambda: in_space(
+        "bending_anisotropy", bending_anisotropy__ratio=RATIO, bending_anisotropy__angle=0.4
+    ),
+    "plane": in_plane,
+    "overhang": lambda: in_plane("clamped", "free"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_rod_lies_on_the_curve(case):
+    """Chords of n links are off an arc by h^2 k / 8; the links have the cable's mass."""
+    held = CASES[case]()
+    rod = Rod.of(held, 40)
+
+    assert off(held, rod, rod.nodes) < 1e-3
+    assert np.linalg.norm(np.diff(rod.nodes, axis=0), axis=1) == pytest.approx(rod.h, rel=1e-6)
+    assert rod.frames.apply([1.0, 0.0, 0.0]) == pytest.approx(np.diff(rod.nodes, axis=0) / rod.h)
+    assert rod.masses.sum() == pytest.approx(held.model.cable.mass)
+
+
+def test_what_effects_are_to_a_rod():
+    rod = Rod.of(CASES["mass"](), 20)
+    assert rod.lumps == pytest.approx(np.array([[MASS, PLACE]]))
+    stiffness, axes = Rod.of(CASES["flat"](), 20).principal()
+    assert stiffness == pytest.approx(np.tile([0.011, 0.015, 0.045], (19, 1)))
+    assert np.abs(axes.as_matrix()[:, 2, 1] / axes.as_matrix()[:, 1, 1]) == pytest.approx(
+        np.tan(0.4)
+    )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_mujoco_rests_where_we_predict(case):
+    pytest.importorskip("mujoco", reason="the extra `peers` is not installed")
+    held, target = CASES[case](), TARGETS["mujoco"]
+    rod = Rod.of(held, 40)
+
+    at_rest = target.settle(target.write(rod, ["a -- b"]), rod)
+
+    assert off(held, rod, at_rest.nodes) < 1e-2
+    if held.model.end == "free":
+        assert not at_rest.end_force.any()
+
+
+def test_an_unstressed_rod_keeps_its_rest_shape_in_mujoco():
+    """Without weight, one end free: every joint is at its rest angle, the force is zero."""
+    mj = pytest.importorskip("mujoco", reason="the extra `peers` is not installed")
+    held = in_space()
+    rod = Rod.of(held, 30)
+    rod = replace(rod, gravity=np.zeros(3), end=replace(rod.end, kind="free"))
+    at_rest = TARGETS["mujoco"].settle(TARGETS["mujoco"].write(rod, []), rod)
+
+    turns = [rod.frames[0]]
+    for turn in rod.rest_turns:
+        turns.append(turns[-1] * turn)
+    ways = np.array([frame.apply([1.0, 0.0, 0.0]) for frame in turns])
+    exact = np.vstack([rod.nodes[0], rod.nodes[0] + rod.h * np.cumsum(ways, axis=0)])
+    assert at_rest.nodes == pytest.approx(exact, abs=1e-5), mj.__version__
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_file_says_what_it_holds(target, tmp_path):
+    held = CASES["mass"]()
+    kind = TARGETS[target]
+    (path,) = write_rods(kind, tmp_path / f"loom{kind.suffix}", [held], "of a test", 10, 0)
+    text = path.read_text()
+
+    assert f"written by dlo-casadi for {kind.title}" in text
+    assert "EI 0.015 N m^2, GJ 0.011 N m^2, mass 0.05 kg" in text
+    assert "compact mass of 0.02 kg at 0.25 m" in text
+    assert re.search(r"Not carried:\n\W+nothing", text)
+
+
+def test_what_is_not_carried_is_named_with_its_size():
+    held = in_space("tether", tether__stiffness=20.0, tether__position=0.3)
+    found = losses(held, TARGETS["mujoco"], Rod.of(held, 10))
+
+    assert list(found) == ["spring"]
+    share = re.fullmatch(r"tether left out; .* moves by up to ([\d.]+) % of .*", found["spring"])
+    without = in_space()
+    s = np.linspace(0, 0.6, 101)
+    moved = np.linalg.norm(held.curve.at(s) - without.curve.at(s), axis=1).max() / 0.6
+    assert float(share[1]) == pytest.approx(100 * moved, rel=0.05)  # two digits
+
+
+def test_samples_scatter_as_the_covariance_says():
+    held = CASES["space"]()
+    names = ["bending_stiffness", "torsional_stiffness", "rest_curvature[1]"]
+    std = np.array([0.1 * 0.015, 0.5 * 0.011, 0.2])
+    coefficients = np.linalg.lstsq(held.model.rest_basis, held.rest)[0]
+    drawn = samples_of(held, coefficients, names, np.diag(std**2), 40, 3)
+
+    p = np.array([item.p for item in drawn])
+    assert (p[:, :2] > 0).all()
+    assert np.log(p[:, 0] / 0.015).std() == pytest.approx(0.1, rel=0.3)  # 40 of them: 11 %
+    assert np.log(p[:, 1] / 0.011).std() == pytest.approx(0.5, rel=0.3)
+    again = samples_of(held, coefficients, names, np.diag(std**2), 2, 3)
+    assert (again[1].rest == drawn[1].rest).all()
+    assert (again[1].curve.nodes == drawn[1].curve.nodes).all()
+
+
+def test_only_exports_are_replaced(tmp_path):
+    held, path = in_plane(), tmp_path / "rope.xml"
+    write_rods(TARGETS["mujoco"], path, [held, held], "of a test", 10, 0)
+    assert "sample 1 of 1, seed 0" in (tmp_path / "rope_001.xml").read_text()
+    write_rods(TARGETS["mujoco"], path, [held], "of a test", 10, 0)
+    path.write_text("mine")
+    with pytest.raises(OutputError, match=r"rope\.xml is from elsewhere"):
+        write_rods(TARGETS["mujoco"], path, [held], "of a test", 10, 0)
+    assert path.read_text() == "mine"
+
+
+def test_unknown_simulators_and_mjx_are_refused_with_a_way_out():
+    with pytest.raises(DloError, match=r"'mujuco'; did you mean 'mujoco'\?\n  Try: mujoco, "):
+        target_of("mujuco")
+    with pytest.raises(DloError, match=r"MJX ignores bend and twist .*\n  Try: --to mujoco"):
+        target_of("mjx")
