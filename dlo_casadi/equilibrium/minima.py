@@ -126,6 +126,8 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
     there = np.flatnonzero(balanced)
     converged = np.zeros(m, dtype=bool)
     converged[there] = matrix.subset(there).negative() == wanted
+    ordered = assembly.clipped(now, given).in_order
+    balanced, converged = balanced & ordered, converged & ordered
     return Minima(now, balanced, converged, energy, iterations)
 
 
@@ -299,6 +301,7 @@ def _balanced(
     imbalance = float(np.abs(force.x).max())
     inside = bool(np.abs(bends(now)).max() < JOINT_BOUND + AT_BOUND)
     balanced = imbalance <= BALANCE * float(matrix.scale[0]) < np.inf
+    inside = inside and bool(assembly.clipped(now, given).in_order[0])
     if not (inside and balanced and residual <= END_TOLERANCE):
         return None
     stable = int(matrix.negative()[0]) == model.n_multipliers + len(active)

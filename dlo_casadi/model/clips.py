@@ -162,6 +162,12 @@ class Clipped:
             clamps.append(ClampNode(index, frame, held))
         return cls(chain, at, tuple(clamps), places)
 
+    @property
+    def in_order(self) -> BoolArray:
+        """Whether the clips (m,) follow each other along the cable, eyelets within it."""
+        low, high = np.zeros(len(self.at)), np.full(len(self.at), self.chain.length)
+        return np.asarray(np.all(np.diff(np.column_stack([low, self.at, high])) > 0, axis=1))
+
     def carried(self, both: FloatArray) -> FloatArray:
         """Nodes (m, n_segments, 2 coordinates) of segments, with the frames of clamped clips."""
         c, rows = both.shape[2] // 2, np.arange(len(both))
