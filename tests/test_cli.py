@@ -189,7 +189,7 @@ def test_an_interrupted_fit_keeps_the_earlier_results(config, tmp_path, capsys, 
     ("number", "begun"),
     [
         (signal.SIGINT, "read the poses"),
-        (signal.SIGTERM, "read the poses"),
+        pytest.param(signal.SIGTERM, "read the poses", marks=pytest.mark.long),
         (signal.SIGINT, "fit the declared model"),
     ],
 )

@@ -116,6 +116,7 @@ def test_few_elements_are_as_good_as_81_links():
 # ---- benchmarks --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_one_set_of_the_monte_carlo():
     """The same numbers wherever it runs; its errors are of the size of the bound."""
     rng = [monte_carlo.generator_of(0, 3) for _ in range(2)]

@@ -109,6 +109,7 @@ def test_24_random_starts_find_nothing_lower(start, end):
         np.testing.assert_allclose(held.points, shape["points"], atol=1e-7)
 
 
+@pytest.mark.long
 def test_random_clamped_cables_in_space_have_stable_equilibria():
     """scripts/benchmark.py --only space_random solves a hundred thousand."""
     rng = np.random.default_rng(0)

@@ -17,16 +17,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="session")
 def report():
-    """Function that runs a bench session, of photographs twelve poses; gives its report."""
+    """Function that runs a bench session and gives its report."""
 
     @cache
     def of(name: str) -> dict:
-        if name != "connector":
-            path = ROOT / "tests" / "data" / "bench" / name / "session.yaml"
-            return report_dict(run_session(load_config(path)))
-        config = load_config(ROOT / "configs" / "cable.yaml")
-        few = config.experiment.model_copy(update={"poses": config.experiment.poses[:12]})
-        return report_dict(run_session(config.model_copy(update={"experiment": few})))
+        config = ROOT / "tests" / "data" / "bench" / name / "session.yaml"
+        if name == "connector":
+            config = ROOT / "configs" / "cable.yaml"
+        return report_dict(run_session(load_config(config)))
 
     return of
 

@@ -46,8 +46,8 @@ def test_a_stiffness_that_gravity_cannot_show_is_called_so(report):
     ("session", "name", "parameter", "true"),
     [
         ("overhang", "bending_softening", "curvature_scale", 6.0),
-        ("connector", "lumped_mass", "mass", 0.07),
-        ("connector", "lumped_mass", "position", 0.52),
+        pytest.param("connector", "lumped_mass", "mass", 0.07, marks=pytest.mark.long),
+        pytest.param("connector", "lumped_mass", "position", 0.52, marks=pytest.mark.long),
     ],
 )
 def test_an_undeclared_effect_is_found_and_the_error_falls(report, session, name, parameter, true):
@@ -65,6 +65,7 @@ def test_an_undeclared_effect_is_found_and_the_error_falls(report, session, name
     assert after["rmse_held_out"] <= limit * found["measurement"]["std"]
 
 
+@pytest.mark.long
 def test_every_stage_is_in_the_report_of_photographs(report):
     found = report("connector")
     names = [item["name"] for item in found["stages"]]

@@ -77,9 +77,10 @@ def test_a_drift_is_a_plastic_set_without_a_yield_curvature():
     assert named(found) == {"plastic_set", "rest_curvature_drift"}
 
 
+@pytest.mark.long
 def test_a_tether_is_found_and_is_no_point_force():
     fit = session("tether", *TETHER)
-    found = diagnose(fit, exclude=rivals_of("tether", "point_force"))
+    found = diagnose(fit, exclude=rivals_of("tether", "point_force", "lumped_mass"))
     assert found.verdict == "effect_found"
     assert named(found) == {"tether"}
     for name, true in zip(("stiffness", "position", "anchor_x", "anchor_y"), TETHER, strict=True):

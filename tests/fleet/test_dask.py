@@ -52,6 +52,7 @@ def test_a_worker_killed_by_its_task_is_replaced(cluster, tmp_path):
     assert (tmp_path / "mark").exists()
 
 
+@pytest.mark.long
 def test_a_worker_killed_in_the_middle_changes_no_digit(cluster, fleet, expected, tmp_path):
     killed = []
 

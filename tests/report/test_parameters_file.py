@@ -349,6 +349,7 @@ def test_values_at_their_bounds_are_read_as_they_were_written(outcome, tmp_path,
         assert not metadata.edited
 
 
+@pytest.mark.long
 def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
     """IPOPT widens bounds by 1e-8 of them; here the softness would be -5e-10 m."""
     fit, _ = fitted("short_clean", BendingSoftening())

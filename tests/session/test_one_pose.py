@@ -83,7 +83,7 @@ def session(folder, boundary, cable, waves, ends, seed):
 @pytest.mark.parametrize(
     "case",
     [
-        "between pins",
+        pytest.param("between pins", marks=pytest.mark.long),
         pytest.param("from a clamp to a pin", marks=pytest.mark.long),
         "from a clamp to a free tip",
     ],

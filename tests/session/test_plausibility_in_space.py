@@ -150,10 +150,11 @@ def test_files_out_of_step(session):
     ("session", "gravity"),
     [
         ("markers", (9.81, 0.0, 0.0)),
-        pytest.param("lines", (0.0, 0.0, 9.81), marks=pytest.mark.long),
+        ("lines", (0.0, 0.0, 9.81)),
     ],
     indirect=["session"],
 )
+@pytest.mark.long
 def test_gravity_is_held_against_the_load_that_the_shapes_show(session, gravity):
     config, inputs = session[0], session[1][::3]
     experiment = config.experiment.model_copy(update={"gravity": gravity})
