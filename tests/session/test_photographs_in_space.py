@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.cli import main
-from dlo_casadi.config import Camera, dump_yaml, load_config, read_yaml
+from dlo_casadi.config import DeclaredCamera, dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import DloError
 from dlo_casadi.report.page import failure_page
 from dlo_casadi.report.page_pictures import view_pictures
@@ -99,7 +99,7 @@ def test_a_camera_of_another_picture_size_is_told(config):
     """A matrix for half the width and height: named, with what to multiply."""
     pose = config.experiment.poses[0]
     only = pose.model_copy(update={"files": pose.files[1:2]})
-    camera = Camera(matrix=((540.0, 0.0, 321.0), (0.0, 540.0, 237.0), (0.0, 0.0, 1.0)))
+    camera = DeclaredCamera(matrix=((540.0, 0.0, 321.0), (0.0, 540.0, 237.0), (0.0, 0.0, 1.0)))
     measurement = config.experiment.measurement.model_copy(update={"camera": camera})
     experiment = config.experiment.model_copy(update={"poses": (only,), "measurement": measurement})
     (item,) = read_inputs(config.model_copy(update={"experiment": experiment}), lambda *_: None)
