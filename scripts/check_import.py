@@ -73,8 +73,7 @@ def clouds(folder: Path) -> bool:
         seen = depth_cloud(shapes[pose.name], 0.5 * cable.diameter, PLACE, UP, random)
         write_ply(folder / f"{pose.name}.ply", *seen)
     write_grippers(led(poses, np.zeros((len(poses), 0, 3))), folder / "grippers.csv")
-    options = ["--up", "y", "--camera", ",".join(map(str, PLACE)), "--quiet"]
-    options += ["--color", ",".join(map(str, CABLE))]
+    options = ["--up", "y", "--camera", *map(str, PLACE), "--color", *map(str, CABLE), "--quiet"]
     for key in ("length", "diameter", "mass", "bending_stiffness"):
         options += [f"--{key.replace('_', '-')}", str(getattr(cable, key))]
     files = map(str, [*sorted(folder.glob("*.ply")), folder / "grippers.csv"])

@@ -24,7 +24,7 @@ PLACE, UP = np.array([0.25, -0.1, 1.3]), np.array([0.0, 1.0, 0.0])
 CONFIG = load_config(DATA / "space" / "space_photos" / "session.yaml")
 POSES = CONFIG.experiment.poses[:2]
 KNOWN = ("--length", "0.9", "--diameter", "0.007", "--mass", "0.09")
-SEEN = ("--camera", ",".join(map(str, PLACE)), "--color", ",".join(map(str, CABLE)), "--up", "y")
+CAMERA, COLOR = ("--camera", *map(str, PLACE)), ("--color", *map(str, CABLE))
 SHAPES = np.load(DATA / "space_truth" / "space_photos" / "truth_shapes.npz")
 
 
@@ -75,7 +75,7 @@ def write(kind, clouds, take, folder):
         seen = tuple((t, *cloud) for t, cloud in zip(times, clouds, strict=True))
         bag = replace(take, clouds=seen, camera=tuple(PLACE), offset=0.0)
         files, _ = write_mcap(bag, folder)
-        return files, ["--color", ",".join(map(str, CABLE)), "--up", "y", "--end", "flange"]
+        return files, [*COLOR, "--up", "y", "--end", "flange"]
     write_grippers(take, folder / "grippers.csv")
     for k, (points, colors) in enumerate(clouds):
         cable = of_color(colors, CABLE)
@@ -86,8 +86,8 @@ def write(kind, clouds, take, folder):
         else:
             np.save(folder / f"{k}.npy", 1e3 * points[cable])
     files = [*sorted(folder.glob(f"*.{kind}")), folder / "grippers.csv"]
-    options = {"ply": SEEN, "pcd": SEEN[2:], "npy": (*SEEN[:2], *SEEN[4:], "--units", "mm")}
-    return files, list(options[kind])
+    options = {"ply": (*CAMERA, *COLOR), "pcd": COLOR, "npy": (*CAMERA, "--units", "mm")}
+    return files, [*options[kind], "--up", "y"]
 
 
 def imported(files, output, options):
@@ -127,7 +127,7 @@ def test_broken_clouds_are_told_and_nothing_is_written(how, said, clouds, take, 
     if how == "nan":
         write_ply(files[0], np.nan * clouds[0][0], clouds[0][1])
     if how == "another colour":
-        options[3] = "0,255,0"
+        options = [*CAMERA, "--color", "0", "255", "0"]
     if how == "one too few":
         files = files[1:]
     if how == "another frame":

@@ -156,6 +156,19 @@ def test_values_that_nobody_knows_are_to_be_filled_in(take, tmp_path):
         assert f"{key}: FILL_IN" in text
 
 
+def test_markers_alone_and_a_free_end(take, tmp_path):
+    """Nobody knows where the cable is held, or how long it is beyond its last marker."""
+    files, _ = WRITERS["vicon"](take, tmp_path)
+    assert imported(files[:1], tmp_path / "alone", *CABLE) == 0
+    text = (tmp_path / "alone" / "session.yaml").read_text()
+    assert "start: FILL_IN, start_orientation: FILL_IN" in text
+    assert "length: FILL_IN" in text
+    assert imported(files, tmp_path / "free", *CABLE, "--end", "free", "--length", "0.6") == 0
+    config = load_config(tmp_path / "free" / "session.yaml")
+    assert config.experiment.boundary.end == "free"
+    assert config.experiment.poses[0].end is None
+
+
 def test_a_recording_that_is_never_still(take, tmp_path, capsys):
     wave = np.sin(3.0 * take.t)[:, None] * [0.1, 0.0, 0.0]
     moving = replace(

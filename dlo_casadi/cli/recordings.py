@@ -5,7 +5,7 @@ import os
 from dataclasses import fields
 from pathlib import Path
 
-from dlo_casadi.cli.options import Page, command, option
+from dlo_casadi.cli.options import Option, Page, command, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import load_config
 from dlo_casadi.config.template import schema_text
@@ -33,8 +33,12 @@ _CABLE = {
 }
 
 
-def _vector(text: str) -> tuple[float, ...]:
-    return tuple(float(part) for part in text.split(","))
+def _vector(name: str, axes: str, text: str) -> Option:
+    """An option of several numbers, as many as its axes."""
+    kept = tuple(axes.split())
+    many = "+" if kept[-1] == "..." else len(kept)
+    shown = kept[0] if many == "+" else kept
+    return option(name, type=float, nargs=many, default=(), metavar=shown, help=text)
 
 
 @command(
@@ -48,22 +52,14 @@ def _vector(text: str) -> tuple[float, ...]:
     option("--output", type=Path, required=True, metavar="DIR", help="folder of the session"),
     option("--start", default="start", metavar="NAME", help="body, or markers O,X,Y, at the start"),
     option("--end", default="end", metavar="NAME", help=f"the same at the end; or {FREE}"),
-    *(
-        option(
-            f"--{side}-offset",
-            type=_vector,
-            default=(0.0, 0.0, 0.0),
-            metavar="X,Y,Z",
-            help=f"m, where the cable leaves the {side} body, in its axes",
-        )
-        for side in ("start", "end")
-    ),
+    _vector("--start-offset", "X Y Z", "m, where the cable leaves the start body, in its axes"),
+    _vector("--end-offset", "X Y Z", "the same of the end body"),
     option("--cable", default="", metavar="TEXT", help="part of the names of its markers"),
-    option("--at", type=_vector, default=(), metavar="S,S,...", help="m, arc lengths of markers"),
+    _vector("--at", "S ...", "m, arc lengths of the markers from the start"),
     option("--up", choices="xyz", help="axis that points up; as usual in the format when absent"),
-    option("--camera", type=_vector, default=(), metavar="X,Y,Z", help="m, that saw the clouds"),
-    option("--color", type=_vector, default=(), metavar="R,G,B", help="of the cable in clouds"),
-    option("--box", type=_vector, default=(), metavar="X,Y,Z,X,Y,Z", help="m, corners about it"),
+    _vector("--camera", "X Y Z", "m, place of the camera that saw the clouds"),
+    _vector("--color", "R G B", "of the cable in clouds, 0 to 255"),
+    _vector("--box", "X Y Z X Y Z", "m, two corners between which the cable is in clouds"),
     option("--units", choices=("m", "mm"), default="m", help="of clouds; default %(default)s"),
     option("--hold", type=float, default=0.5, metavar="S", help="shortest pose; %(default)s s"),
     option("--held-out", type=int, default=4, metavar="N", help="one in N; default %(default)s"),
@@ -80,7 +76,7 @@ def import_(chosen: argparse.Namespace) -> None:
 
     dlo import take.csv --output loom --mass 0.03 --diameter 0.004
     dlo import markers.c3d bag/ --output loom --start fixed --end flange
-    dlo import cloud_*.ply robot.csv --output loom --color 230,110,20 --length 0.9 --diameter 0.007
+    dlo import cloud_*.ply robot.csv --output loom --color 230 110 20 --length 0.9 --diameter 0.007
     dlo import points.c3d --output loom --start left_o,left_x,left_y --end free
     """
     if os.path.lexists(chosen.output):
@@ -122,12 +118,12 @@ def import_(chosen: argparse.Namespace) -> None:
     page.say(f"{target}: {counted(len(session.poses), 'pose')}{filling}\nthen: {follow}")
 
 
-def _write(session: Imported, folder: Path, cable: dict[str, str] | None = None) -> None:
+def _write(session: Imported, folder: Path) -> None:
     """Write a configuration, its schema and its points into a folder."""
     for name, (points, s) in session.points.items():
         write_points(folder / name, points, s)
     write_file(folder / "schema.json", schema_text())
-    write_file(folder / _NAME, session.text(cable))
+    write_file(folder / _NAME, session.text())
 
 
 def _mistakes(session: Imported, folder: Path) -> list[str]:

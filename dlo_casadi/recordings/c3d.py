@@ -48,8 +48,11 @@ def read_c3d(path: Path) -> Recording:
             "holds no labelled points.\n  Try: label the markers before the export.",
             pose=path.name,
         )
-    t = np.arange(places.shape[2]) / float(point["RATE"][0])
-    scale = factor(point["UNITS"][0], path.name)
+    rate = float(np.ravel(point.get("RATE", [0.0]))[0])
+    if rate <= 0.0:
+        raise MeasurementError(f"POINT:RATE is {rate:g} Hz.\n  {_AGAIN}", pose=path.name)
+    t = np.arange(places.shape[2]) / rate
+    scale = factor("".join(point.get("UNITS", [])[:1]) or "mm", path.name)  # mm by the standard
     streams = [Stream(labels[k], "marker", t, scale * places[:, k].T, path.name) for k in named]
     screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
     own = screen.lstrip("+") if screen.lstrip("+") in ("x", "y", "z") else "z"

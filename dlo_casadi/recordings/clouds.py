@@ -1,5 +1,6 @@
 """Files of point clouds: PLY, PCD and NPY."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,11 @@ _PLY |= {"uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float6
 class View:
     """How clouds were seen, and which of their points are the cable."""
 
-    camera: tuple[float, ...] = ()
+    camera: Sequence[float] = ()
     """Place of the camera [m], in the frame of the file."""
-    color: tuple[float, ...] = ()
+    color: Sequence[float] = ()
     """Colour of the cable: red, green, blue, 0 to 255; all points when empty."""
-    box: tuple[float, ...] = ()
+    box: Sequence[float] = ()
     """x, y, z of two corners [m] between which the cable is; everywhere when empty."""
     units: str = "m"
     """Unit of the files, which do not tell it."""

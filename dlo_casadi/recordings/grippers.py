@@ -37,7 +37,7 @@ def find_gripper(
         third = np.cross(first, y - o)
         third /= np.linalg.norm(third, axis=1, keepdims=True)
         frames = np.stack([first, np.cross(third, first), third], axis=2)
-        return Gripper(o + frames @ np.array(offset), frames)
+        return Gripper(o + frames @ np.array(offset or np.zeros(3)), frames)
     bodies = recording.of("body")
     if not bodies and name == side:
         return None
@@ -49,7 +49,7 @@ def find_gripper(
         )
     values = _means(stills, f"body {name}", recording)
     frames = Rotation.from_quat(values[:, 3:]).as_matrix()
-    return Gripper(values[:, :3] + frames @ np.array(offset), frames)
+    return Gripper(values[:, :3] + frames @ np.array(offset or np.zeros(3)), frames)
 
 
 def _means(stills: Sequence[Still], key: str, recording: Recording) -> FloatArray:

@@ -1,6 +1,6 @@
 """From a recording to the files of a session: poses, grippers' frames, markers along the cable."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import Any
@@ -36,12 +36,12 @@ class Wishes:
     its x axis, and one on the side of y."""
     end: str = "end"
     """The same of the end; `free` if nothing holds it."""
-    start_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
-    """Where the cable leaves the start body, in its axes [m]."""
-    end_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+    start_offset: Sequence[float] = ()
+    """Where the cable leaves the start body, in its axes [m]; at its origin when empty."""
+    end_offset: Sequence[float] = ()
     cable: str = ""
     """What the names of the cable's markers contain; all that are left when empty."""
-    at: tuple[float, ...] = ()
+    at: Sequence[float] = ()
     """Arc lengths of its markers from the start [m], ascending; measured in the poses if empty."""
     hold: float = 0.5
     """Shortest still stretch that is a pose [s]."""
@@ -60,6 +60,8 @@ class Imported:
     """Of each CSV file."""
     cable: dict[str, str]
     """What is known of the cable, as text."""
+    length: float
+    """Length [m] of the cable as far as it is known."""
     poses: tuple[dict[str, str], ...]
     end: str
     remarks: tuple[str, ...]
@@ -83,10 +85,11 @@ class Imported:
 
         Shapes tell stiffness over weight alone: any mass serves, and a fit finds its stiffness.
         """
-        length = float(self.cable["length"])
+        length = self.length
         diameter = float(self.cable.get("diameter", 0.01 * length))
         mass = float(self.cable.get("mass", _DENSITY * np.pi / 4 * diameter**2 * length))
-        found = {"diameter": diameter, "mass": mass, "bending_stiffness": _guess(mass, length)}
+        found = {"length": length, "diameter": diameter, "mass": mass}
+        found["bending_stiffness"] = _guess(mass, length)
         return {**{key: f"{value:.4g}" for key, value in found.items()}, **self.cable}
 
 
@@ -134,14 +137,16 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             for line, here in zip(lines, seen.T, strict=True)
         ]
     readings = _readings(recording, stills, wishes, remarks)
-    known = {"length": length, **wishes.known}
+    whole = {"length": length} if start and end else {}  # beyond the last marker nobody knows it
+    known = {**whole, **wishes.known}
     if "mass" in known and "bending_stiffness" not in known:
-        known["bending_stiffness"] = _guess(known["mass"], known["length"])
+        known["bending_stiffness"] = _guess(known["mass"], length)
         remarks.append("bending_stiffness: a guess from weight and length")
     return Imported(
         name,
         {f"pose_{k:02d}.csv": shown for k, shown in enumerate(points, start=1)},
         {key: f"{value:.6g}" for key, value in known.items()},
+        known.get("length", length),
         tuple(
             {"remark": told[k], **_declared(k, start, end, wishes), **readings[k]}
             for k in range(len(stills))
@@ -290,9 +295,10 @@ def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> l
     in which the shortest tree that joins all of them is the cable itself.
     """
     places = np.array([*markers.values()])
-    away: Callable[[FloatArray, FloatArray], float] = lambda a, b: float(  # noqa: E731
-        np.nanmax(np.linalg.norm(a - b, axis=1), initial=0.0)
-    )
+
+    def away(a: FloatArray, b: FloatArray) -> float:
+        return float(np.nanmax(np.linalg.norm(a - b, axis=1), initial=0.0))
+
     apart = np.array([[away(a, b) for b in places] for a in places])
     tree = minimum_spanning_tree(apart)
     neighbours = np.bincount(np.concatenate(tree.nonzero()), minlength=len(places))
@@ -321,7 +327,8 @@ def _along(
     s, length = _arc_lengths(start, places, end)
     fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
     declared = wishes.known.get("length")
-    if declared is not None and abs(length / declared - 1.0) > _LONGER:
+    longer = length / declared - 1.0 if declared else 0.0
+    if longer > _LONGER or (start and end and longer < -_LONGER):
         raise MeasurementError(
             f"the cable is {length:.4f} m long {fixtures} (a spline through the markers), but "
             f"--length is {declared:g} m.\n  Try: --length between the fixtures; "
@@ -375,6 +382,11 @@ def _arc_lengths(
         for i, j, span in zip(seen, seen[1:], lengths, strict=False):
             if j == i + 1:
                 row[i] = span
+    if np.isnan(spans).all(axis=0).any():
+        raise MeasurementError(
+            "two neighbouring markers of the cable are seen together in no pose.\n  Try: fill "
+            "their gaps, or leave one of them out: --cable"
+        )
     found = np.nanmean(spans, axis=0)
     s = np.concatenate([[0.0], np.cumsum(found)])
     first = 0 if start is None else 1
