@@ -163,7 +163,7 @@ class Session(Config):
         Of one component of a reading; estimated when absent.
     camera, board, reference : mapping, optional
         Of photographs, as in a configuration.
-    tolerances, model, estimation, diagnosis : mapping, optional
+    tolerances, model, estimation, diagnosis, limits : mapping, optional
         As in a configuration: `diagnosis={"enabled": False}`.
 
     Raises
@@ -195,6 +195,7 @@ class Session(Config):
         model: Mapping[str, Any] | None = None,
         estimation: Mapping[str, Any] | None = None,
         diagnosis: Mapping[str, Any] | None = None,
+        limits: Mapping[str, float] | None = None,
         **unknown: Any,
     ) -> None:
         equipment = _given(camera=camera, board=board, reference=reference)
@@ -203,8 +204,8 @@ class Session(Config):
         measurement["kind"] = "images" if pictures else "centerlines"
         experiment = {"measurement": measurement, "poses": poses}
         experiment |= _given(gravity=gravity, boundary=boundary, tolerances=tolerances)
-        options = _given(model=model, estimation=estimation, diagnosis=diagnosis) | unknown
-        given = plain({"cable": cable, "experiment": experiment, **options})
+        options = _given(model=model, estimation=estimation, diagnosis=diagnosis, limits=limits)
+        given = plain({"cable": cable, "experiment": experiment, **options, **unknown})
         checked = checked_config(Arguments(given, tuple(signature(Session).parameters)), Config)
         super().__init__(**{name: getattr(checked, name) for name in checked.model_fields_set})
         self._warnings, self._skipped = checked.warnings, checked.skipped

@@ -1,7 +1,9 @@
 """Limits of a shape: value, probability, where it is tight, and messages for bad input."""
 
 import json
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +28,7 @@ from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
 
 KNOWN = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter())
+BENCH = Path(__file__).parent / "data/bench/short_clean"
 DOWN, UP = -np.pi / 2, np.pi / 2
 
 
@@ -132,7 +135,7 @@ def test_probability_is_the_share_of_shapes_that_the_compiled_solver_finds():
 def fitted(tmp_path_factory):
     """A folder of results of a quick fit, and a list of poses."""
     folder = tmp_path_factory.mktemp("fitted")
-    config = load_config("tests/data/bench/short_clean/session.yaml")
+    config = load_config(BENCH / "session.yaml")
     measured = measured_poses(config, read_inputs(config, lambda *_: None))
     declared = declared_model(config)
     fit = fit_model(declared.model.with_mesh(10), measured[:3], declared.tolerances, 3e-4)
@@ -228,3 +231,46 @@ def test_from_python_limits_are_a_mapping(fitted):
     with pytest.raises(ConfigError, match="bend"):
         shape.check({"bend": 0.05})
     assert [str(x).partition(":")[0] for x in shape.check({"force": 1e3})] == ["pass"]
+
+
+# ---- limits of a session ------------------------------------------------------------------------
+
+
+def test_a_session_checks_its_poses_and_shows_where_they_are_tight(tmp_path):
+    from dlo_casadi import Session, load
+    from dlo_casadi.report.documents import report_dict
+
+    path = BENCH / "session.yaml"
+    text = path.read_text().replace("file: ", f"file: {path.parent}/")
+    (tmp_path / "session.yaml").write_text(
+        f"{text}\nlimits: {{bend_radius: 0.1}}\nestimation: {{algorithm1: false}}\n"
+    )
+    result = Session.load(tmp_path / "session.yaml").fit(diagnosis=False)
+    rows = report_dict(result)["limits"]
+    assert [row["pose"] for row in rows] == list(result.stages[-1].shapes)
+    for row in rows:
+        assert row["verdict"] == ("fail" if row["value"] < 0.1 else row["verdict"])
+    folder = result.write(tmp_path / "results")
+    assert (folder / "figures" / "limits.png").stat().st_size > 10_000
+    page = (folder / "report.html").read_text()
+    assert 'id="chart-limits"' in page
+    (check,) = load(folder).solve((0.3, -0.1)).check()  # as the session declared
+    assert check.limit == 0.1
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ("{bend_radius: 50}", "did you mean 0.05?"),
+        ("{moment: 1.0}", "no end is clamped"),
+        ("{force: -1}", "larger than 0"),
+        ("{clearance: 0.01}", "no obstacles"),
+        ("{bendradius: 0.05}", "bend_radius"),
+    ],
+)
+def test_a_configuration_with_other_limits_is_refused(tmp_path, limits, said):
+    path = BENCH / "session.yaml"
+    text = path.read_text().replace("file: ", f"file: {path.parent}/")
+    (tmp_path / "session.yaml").write_text(f"{text}\nlimits: {limits}\n")
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        load_config(tmp_path / "session.yaml")

@@ -74,6 +74,7 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
         *wrong_effects(config),
         *_impossible_values(config.experiment, config.cable.length),
         *_wrong_clips(config.experiment, config.cable.length),
+        *config.limit_problems,
     ]:
         raise source.error(problems)
 

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, mo
 from dlo_casadi.config.clips import Clip
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.measuring import Centerlines, DeclaredTolerances, Images
-from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, ModelOptions
+from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, Limits, ModelOptions
 from dlo_casadi.config.problems import PLACEHOLDER, ConfigProblem, Contradiction, show
 from dlo_casadi.config.values import (
     STIFFNESS,
@@ -347,6 +347,8 @@ class Config(ConfigSection):
     """How the parameters are estimated."""
     diagnosis: Annotated[DiagnosisOptions, optional(DiagnosisOptions)] = DiagnosisOptions()
     """The search for missing effects."""
+    limits: Annotated[Limits, optional(Limits)] = Limits()
+    """What the cable must keep in every pose, checked with a probability."""
 
     _path: Path | None = None
     _warnings: tuple[str, ...] = ()
@@ -402,6 +404,14 @@ class Config(ConfigSection):
         if self.path is None:
             return dump_yaml(self.model_dump(exclude_unset=True))
         return self.path.read_text(encoding="utf-8-sig", errors="replace")
+
+    @property
+    def limit_problems(self) -> list[ConfigProblem]:
+        """Limits that have no meaning for this cable."""
+        given, ends = self.experiment, self.experiment.boundary
+        held = {ends.start, ends.end, *(clip.kind for x in given.poses for clip in x.clips)}
+        found = self.limits.problems(sorted(held), given.in_space, self.cable.length)
+        return [ConfigProblem(("limits", *place), text) for place, text in found]
 
     @property
     def measured_poses(self) -> tuple[Pose, ...]:

@@ -91,6 +91,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "structure": outcome.structure
         and dict(zip(("before", "after"), map(asdict, outcome.structure), strict=True)),
         "hidden_weight": weight and asdict(weight),
+        "limits": [check.as_dict() for check in outcome.limits],
     }
     plain: dict[str, Any] = finite(document)
     return plain
@@ -250,6 +251,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
         document["cable"]["youngs_modulus"] = config.cable.youngs_modulus
     document["explains"] = outcome.stages[-1].explains
     document["fixtures"] = shared_fixtures(config)
+    document |= {"limits": config.limits.given} if config.limits.given else {}
     document["model_hash"] = parameters_hash(document)
     document["config"] = config.name
     document["config_hash"] = _hash(config)

@@ -58,6 +58,7 @@ def print_summary(console: Console, outcome: Outcome) -> None:
             _error_table(outcome),
             "",
             *(Text(line) for line in words.verdict_lines(outcome)),
+            *([limits_table(outcome.config.cable.name, outcome.limits)] if outcome.limits else []),
             *blank,
             *warnings,
             "",

@@ -9,6 +9,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate
+from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import Diagnosis, Verdict
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, NextPose
@@ -356,6 +357,8 @@ class Outcome:
         The last stage's fit, from which parameters.yaml is written.
     hidden_weight : HiddenWeight or None
         A weight that the shapes do not tell from stiffness.
+    limits : tuple of LimitCheck
+        Of all predicted poses, where the session declares limits.
     """
 
     config: Config
@@ -376,6 +379,7 @@ class Outcome:
     structure: tuple[Structure, Structure] | None = None
     cross_validated: float | None = None
     hidden_weight: HiddenWeight | None = None
+    limits: tuple[LimitCheck, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
 
     def stage(self, name: StageName) -> Stage | None:

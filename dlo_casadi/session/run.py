@@ -34,7 +34,7 @@ from dlo_casadi.session.outcome import (
     found_effects,
 )
 from dlo_casadi.session.plausibility import without_implausible
-from dlo_casadi.session.stages import fit_stage, fitted_parameters
+from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_parameters
 
 
 class Progress(Protocol):
@@ -174,6 +174,7 @@ def fit_session(
             fit=fit,
             warnings=tuple(warnings),
             versions=versions(),
+            limits=checked_limits(config.limits, fit, [item.pose for item in measured]),
             **found,
         )
     )

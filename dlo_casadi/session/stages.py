@@ -7,7 +7,10 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate
+from dlo_casadi.cable.limits import LimitCheck, limit_checks
+from dlo_casadi.config import Limits
 from dlo_casadi.effects.mass_error import MASS_FACTOR
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import on_other_side
 from dlo_casadi.equilibrium.spread import (
     Uncertainty,
@@ -16,6 +19,7 @@ from dlo_casadi.equilibrium.spread import (
     spread_across,
     tipping_of,
 )
+from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.estimation.constrained import EnergyGap, Interval
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
@@ -233,6 +237,26 @@ class _Model:
             known_to.covariance / np.outer(std, std),
         )
         return gap.value < UNSEEN * gap.std
+
+
+def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple[LimitCheck, ...]:
+    """Checks of all poses that have a prediction, in their order; none without limits."""
+    if not limits.given:
+        return ()
+    found, known = predict_poses(fit.model, fit.p, fit.rest, poses), uncertainty_of(fit)
+    return tuple(
+        check
+        for pose, one in zip(poses, found, strict=True)
+        if one is not None
+        for check in limit_checks(
+            CasadiCable(fit.model, fit.p, one.rest),
+            fit.coefficients,
+            pose,
+            one.equilibrium,
+            known,
+            limits,
+        )
+    )
 
 
 def _reading_errors(

@@ -33,6 +33,7 @@ KEYS = {
     "next_pose": type(None),
     "structure": type(None),
     "hidden_weight": type(None),
+    "limits": list,
 }
 
 
