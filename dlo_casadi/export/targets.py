@@ -105,7 +105,8 @@ TARGETS = {
 # Simulators that cannot take a cable -> why, and what to use.
 REFUSED = {
     "mjx": "MJX ignores bend and twist of MuJoCo's cable plugin: every cable is limp in it.\n"
-    "  Try: --to mujoco; its file has no plugin but hinges with springs, which MJX does read."
+    "  Try: --to mujoco: hinges with springs and no plugin. MJX loads it; shapes there were not "
+    "checked."
 }
 
 

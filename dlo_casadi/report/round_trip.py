@@ -92,7 +92,7 @@ def draw_round_trip(title: str, target: Target, rows: Sequence[Relaxation]) -> F
     """Measured points, our prediction and the shapes at rest of some poses."""
     names = list(dict.fromkeys(row.pose for row in rows))[:_DRAWN]
     spatial = rows[0].predicted.shape[1] == 3
-    with style.styled((4.2 * len(names), 4.6)) as drawing:
+    with style.styled((4.8 * len(names), 5.2)) as drawing:
         for k, name in enumerate(names):
             axes: Any = drawing.add_subplot(
                 1, len(names), k + 1, projection="3d" if spatial else None
@@ -109,6 +109,8 @@ def draw_round_trip(title: str, target: Target, rows: Sequence[Relaxation]) -> F
             axes.set_aspect("equal", adjustable="datalim")
             axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: 2 + spatial]})
             axes.set_title(name)
-        drawing.legend(loc="outside lower center", ncols=5)
+            if spatial:
+                axes.set_box_aspect(None, zoom=0.85)  # the label of z lies outside the axes
+        drawing.legend(loc="outside lower center", ncols=3)
         drawing.suptitle(title, fontsize=12)
     return drawing
