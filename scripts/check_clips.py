@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clip, node_places
+from dlo_casadi.model.clips import HeldClip, node_places
 
 ELEMENTS = 32
 # Starts of IPOPT, and the largest distance of a clip from the free cable, as a share of the length.
@@ -75,7 +75,7 @@ def random_pose(
         clamp = kind in ("clamped", "swivel")
         direction = {"orientation": tuple(frame)} if spatial else {"heading": float(frame[0])}
         own = direction if clamp else {}
-        clips.append(Clip(kind, tuple(place), None if kind == "eyelet" else float(s), **own))
+        clips.append(HeldClip(kind, tuple(place), None if kind == "eyelet" else float(s), **own))
     model = CableModel(
         cable, ELEMENTS, n_rest=0, gravity=gravity, clips=tuple(c.kind for c in clips), **ends
     )
@@ -147,7 +147,7 @@ def check_bvp() -> None:
 
     for n in (40, 80, 160):
         model = CableModel(CableData(1.0, 0.2, 0.01, stiffness), n, n_rest=0, clips=("pinned",))
-        pose = HeldPose((0.0, 0.0), end, clips=(Clip("pinned", place, at),))
+        pose = HeldPose((0.0, 0.0), end, clips=(HeldClip("pinned", place, at),))
         (eq,) = solve_equilibria(model, model.nominal, np.zeros(n), [pose])
         given = Inputs.of(model.nominal, np.zeros(n), pose.vector[None])
         curve = NodeCurve.of(1.0, assembly_of(model).curve(eq.shapes, given)[0])

@@ -16,7 +16,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clip
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.session.measure import draw_steps
 
 ROOT = Path(__file__).parents[1]
@@ -54,9 +54,9 @@ def draw_examples() -> None:
 def draw_clips() -> None:
     """A cable that a pinned clip, a saddle and an eyelet hold between its ends."""
     clips = (
-        Clip("pinned", (0.2, 0.06), 0.28, name="pinned"),
-        Clip("clamped", (0.42, 0.1), 0.56, heading=-0.5, name="clamped"),
-        Clip("eyelet", (0.62, 0.0), name="eyelet"),
+        HeldClip("pinned", (0.2, 0.06), 0.28, name="pinned"),
+        HeldClip("clamped", (0.42, 0.1), 0.56, heading=-0.5, name="clamped"),
+        HeldClip("eyelet", (0.62, 0.0), name="eyelet"),
     )
     kinds = tuple(clip.kind for clip in clips)
     model = CableModel(CableData(1.0, 0.06, 0.005, 0.01), n=40, n_rest=0, clips=kinds)

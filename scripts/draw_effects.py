@@ -19,7 +19,7 @@ from dlo_casadi.effects import CableData, Setup
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clip, ClipKind
+from dlo_casadi.model.clips import ClipKind, HeldClip
 from dlo_casadi.report.canvas import BLACK, BLUE, GREY, WIDTH, line_of, styled
 from dlo_casadi.report.scene import seen
 
@@ -112,10 +112,10 @@ def poses_in_space() -> list[HeldPose]:
     ]
 
 
-def middle_clip(pose: HeldPose) -> Clip:
+def middle_clip(pose: HeldPose) -> HeldClip:
     """A clip that holds the middle of the cable somewhat below the middle of its ends."""
     place = (np.array(pose.start) + np.array(pose.end)) / 2
-    return Clip("pinned", (*place[:-1], place[-1] - 0.1), LENGTH / 2)
+    return HeldClip("pinned", (*place[:-1], place[-1] - 0.1), LENGTH / 2)
 
 
 def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) -> list[FloatArray]:

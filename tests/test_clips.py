@@ -19,7 +19,7 @@ from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clip
+from dlo_casadi.model.clips import HeldClip
 
 LENGTH, EI = 1.0, 0.02  # m, N m^2
 CABLE = CableData(LENGTH, mass=0.2, diameter=0.01, bending_stiffness=EI)
@@ -38,7 +38,7 @@ def solved(clips, to=(0.8, 0.1), n=40, cable=CABLE, **held):
 def test_a_beam_on_three_supports():
     """Clapeyron: M0 + 4 M1 + M2 = -w l^2 / 2 of equal spans l, with M2 = -w o^2 / 2."""
     span, over, stiff = 0.45, 0.1, replace(CABLE, bending_stiffness=200.0)
-    supports = [Clip("eyelet", (span, 0.0)), Clip("eyelet", (2 * span, 0.0))]
+    supports = [HeldClip("eyelet", (span, 0.0)), HeldClip("eyelet", (2 * span, 0.0))]
     _, _, eq = solved(supports, None, cable=stiff, end="free")
     w = 9.81 * CABLE.mass / LENGTH
     middle = 1.25 * w * span - 0.75 * w * over**2 / span
@@ -54,7 +54,7 @@ def test_an_elastica_pinned_at_mid_span_converges_to_two_half_waves():
     force = EI * (2 * ellipk(m) / half) ** 2
     errors = []
     for n in (20, 40):
-        clip = Clip("pinned", (chord, 0.0), 0.5)
+        clip = HeldClip("pinned", (chord, 0.0), 0.5)
         _, _, eq = solved([clip], (2 * chord, 0.0), n, gravity=(0.0, 0.0))
         assert np.abs(eq.clips[0].force).max() < 1e-9
         errors.append(abs(np.linalg.norm(eq.end_force) / force - 1))
@@ -66,7 +66,7 @@ def test_equal_tension_on_both_sides_of_an_eyelet():
     """T + EI k^2 / 2 - w y is the same all along a heavy elastica, and through an eyelet, too."""
     drops = []
     for n in (20, 40):
-        _, _, eq = solved([Clip("eyelet", (0.42, 0.12))], (0.7, 0.25), n)
+        _, _, eq = solved([HeldClip("eyelet", (0.42, 0.12))], (0.7, 0.25), n)
         first, last = (np.array([np.cos(phi), np.sin(phi)]) for phi in eq.phi[[0, -1]])
         drops.append(-eq.end_force @ last - eq.start_force @ first)  # T at the end minus the start
     assert eq.stable
@@ -77,7 +77,7 @@ def test_equal_tension_on_both_sides_of_an_eyelet():
 
 def test_a_rod_clamped_in_three_places_is_two_rods():
     middle, end = (0.4, 0.1), (0.75, -0.05)
-    clip = Clip("clamped", middle, 0.5, heading=0.3)
+    clip = HeldClip("clamped", middle, 0.5, heading=0.3)
     clamps = {"start": "clamped", "end": "clamped"}
     _, _, whole = solved([clip], end, 20, start_heading=0.5, end_heading=-0.4, **clamps)
     half = replace(CABLE, length=0.5, mass=0.1)
@@ -97,8 +97,8 @@ def turned(*vector):
 
 
 IN_SPACE = (
-    Clip("swivel", (0.3, 0.1, -0.05), 0.36, orientation=turned(0.2, 0.1, 0.4)),
-    Clip("eyelet", (0.6, 0.1, 0.05)),
+    HeldClip("swivel", (0.3, 0.1, -0.05), 0.36, orientation=turned(0.2, 0.1, 0.4)),
+    HeldClip("eyelet", (0.6, 0.1, 0.05)),
 )
 
 
@@ -144,8 +144,8 @@ def test_loads_on_clips_are_minus_the_derivatives_of_the_energy():
 @pytest.mark.parametrize("second", ["pinned", "eyelet"])
 def test_ipopt_finds_the_same_minimum(second):
     clips = (
-        Clip("clamped", (0.31, 0.05), 0.36, heading=0.3),
-        Clip(second, (0.57, -0.02), 0.7 if second == "pinned" else None),
+        HeldClip("clamped", (0.31, 0.05), 0.36, heading=0.3),
+        HeldClip(second, (0.57, -0.02), 0.7 if second == "pinned" else None),
     )
     model, pose, eq = solved(clips, (0.75, 0.1), 20)
     rest = np.zeros(model.chain.n_rests)
@@ -183,12 +183,12 @@ def test_the_tangent_is_the_derivative_of_the_balance():
 @pytest.mark.parametrize(
     ("clips", "said"),
     [
-        ([Clip("pinned", (0.5, 0.3), 0.4, name="first")], "first are 0.5831 m apart"),
-        ([Clip("eyelet", (0.5, 0.6))], "the start and the end are 1.3.* 1.0000 m of cable"),
+        ([HeldClip("pinned", (0.5, 0.3), 0.4, name="first")], "first are 0.5831 m apart"),
+        ([HeldClip("eyelet", (0.5, 0.6))], "the start and the end are 1.3.* 1.0000 m of cable"),
         (
             [
-                Clip("clamped", (0.3, 0.1), 0.4, heading=0.0),
-                Clip("clamped", (0.31, 0.1), 0.411, heading=0.0),
+                HeldClip("clamped", (0.3, 0.1), 0.4, heading=0.0),
+                HeldClip("clamped", (0.31, 0.1), 0.411, heading=0.0),
             ],
             "nearer to each other than an element",
         ),
@@ -200,13 +200,13 @@ def test_clips_that_leave_no_room(clips, said):
 
 
 def test_a_pose_with_other_clips_than_the_model():
-    model, pose, _ = solved([Clip("pinned", (0.4, 0.15), 0.47)])
+    model, pose, _ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(EquilibriumError, match="the pose has the clips none, the model pinned"):
         solve_equilibrium(model, model.nominal, np.zeros(40), replace(pose, clips=()))
 
 
 def test_the_c_solver_refuses_clips():
-    model, *_ = solved([Clip("pinned", (0.4, 0.15), 0.47)])
+    model, *_ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(DloError, match="1 clip"):
         generate(model, model.nominal, np.zeros(40))
 
@@ -215,7 +215,7 @@ def test_the_c_solver_refuses_clips():
 def test_effects_of_clips_and_their_derivatives(kind):
     """A moved clip is a clip elsewhere; the first derivatives are those of the moved equilibria."""
     heading = 0.3 if kind == "clamped" else None
-    clips = (Clip(kind, (0.31, 0.05), 0.37, heading=heading), Clip("eyelet", (0.57, -0.02)))
+    clips = (HeldClip(kind, (0.31, 0.05), 0.37, heading=heading), HeldClip("eyelet", (0.57, -0.02)))
     kinds = tuple(clip.kind for clip in clips)
     effects = (ClipOffset(clip=0), ClipOffset(clip=1), ClipSlip())
     model = CableModel(CABLE, n=20, n_rest=0, clips=kinds, effects=effects)

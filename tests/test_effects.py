@@ -38,7 +38,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clip
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
 
@@ -59,7 +59,10 @@ EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WHERE = (*(("plane", e) for e in ELEMENTS), *(("space", e) for e in ELEMENTS_IN_SPACE))
 CLIPPED = {"clip_offset", "clip_slip"}
-CLIPS = {"plane": Clip("pinned", (0.3, -0.1), 0.37), "space": Clip("pinned", (0.3, 0, 0), 0.37)}
+CLIPS = {
+    "plane": HeldClip("pinned", (0.3, -0.1), 0.37),
+    "space": HeldClip("pinned", (0.3, 0, 0), 0.37),
+}
 CASES = [
     (name, where, element)
     for where, element in WHERE

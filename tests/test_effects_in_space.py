@@ -27,7 +27,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clip
+from dlo_casadi.model.clips import HeldClip
 
 FLAT = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 CABLE = replace(FLAT, torsional_stiffness=0.03)
@@ -107,7 +107,7 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
         models.append(model)
         ps.append(p)
         rests.append(np.repeat([rest] if len(g) == 2 else [0.0, 0.0, rest], model.chain.n_cells))
-    clips = [Clip("pinned", place, 0.22) for place in ((0.2, 0.0), (0.2, 0.0, 0.0))]
+    clips = [HeldClip("pinned", place, 0.22) for place in ((0.2, 0.0), (0.2, 0.0, 0.0))]
     pose = HeldPose((0.0, 0.0), (0.5, -0.1), *headings, clips=(clips[0],))
     first, last = (tuple(Rotation.from_rotvec([0, 0, a]).as_quat()) for a in headings)
     same = HeldPose(

@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, Clip, ClipLoad
+from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.show.text import millimetres, vector
 
@@ -72,7 +72,7 @@ def check_mesh(n: object, element: object) -> None:
         raise DloError(f"element: one of {', '.join(ELEMENTS)} belongs here, found {element!r}")
 
 
-def clip_texts(clips: Sequence[Clip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:
+def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:
     """Clips, and the forces and moments of the cable on them, as text."""
     rows = []
     for clip, load in zip(clips, loads, strict=True):

@@ -15,8 +15,8 @@ from dlo_casadi.io.points import write_points
 from dlo_casadi.recordings import (
     FORMATS,
     FREE,
+    CloudView,
     Imported,
-    View,
     Wishes,
     make_session,
     read_recording,
@@ -86,7 +86,7 @@ def import_(chosen: argparse.Namespace) -> None:
         **{item.name: getattr(chosen, item.name) for item in fields(Wishes) if item.name in chosen},
         known={key: value for key, value in known.items() if value is not None},
     )
-    view = View(**{item.name: getattr(chosen, item.name) for item in fields(View)})
+    view = CloudView(**{item.name: getattr(chosen, item.name) for item in fields(CloudView)})
     with Watch(quiet=chosen.quiet) as watch:
         watch.step("read", 0, 3)
         recording = read_recording(chosen.file, chosen.up, view)

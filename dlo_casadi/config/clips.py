@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Literal, Protocol
 
 from dlo_casadi.config.values import ConfigSection, Name, NonNegative, Number, Place, Quaternion
-from dlo_casadi.model.clips import Clip as HeldClip
+from dlo_casadi.model.clips import HeldClip
 
 
 class Clip(ConfigSection):

@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.model.clips import Clip
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.node import Frame, Heading, Node, quaternion_product
 
 Branch = Literal["ccw", "cw"]
@@ -41,7 +41,7 @@ class HeldPose:
     name : str
     camera_center : (float, float, float), optional [m]
         Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
-    clips : tuple of Clip
+    clips : tuple of HeldClip
         What holds the cable between its ends, in the order along it.
     """
 
@@ -55,7 +55,7 @@ class HeldPose:
     branch: PoseBranch | None = None
     name: str = "pose"
     camera_center: tuple[float, float, float] | None = None
-    clips: tuple[Clip, ...] = ()
+    clips: tuple[HeldClip, ...] = ()
 
     @property
     def node(self) -> type[Node]:

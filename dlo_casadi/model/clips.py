@@ -25,7 +25,7 @@ CLAMPS = ("clamped", "swivel")
 
 
 @dataclass(frozen=True)
-class Clip:
+class HeldClip:
     """A clip of one pose as declared.
 
     Parameters
@@ -83,7 +83,7 @@ class ClipLoad:
     moment: FloatArray
 
 
-def clip_rows(clips: Sequence[Clip], loads: Sequence[ClipLoad]) -> list[dict[str, Any]]:
+def clip_rows(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[dict[str, Any]]:
     """Clips and what the cable does to them, as plain data in SI units."""
     return [
         {
@@ -98,7 +98,7 @@ def clip_rows(clips: Sequence[Clip], loads: Sequence[ClipLoad]) -> list[dict[str
 
 
 def clip_size(node: type[Node]) -> int:
-    """Size of `Clip.vector`."""
+    """Size of `HeldClip.vector`."""
     return node.dimension + node.coordinates + 1
 
 
@@ -278,13 +278,13 @@ def moved_rest(chain: Chain, inside: ca.SX, low: ca.SX, width: ca.SX) -> ca.SX:
     return ca.vertcat(*own)
 
 
-def clamped_nodes(chain: Chain, clips: Sequence[Clip]) -> tuple[int, ...]:
+def clamped_nodes(chain: Chain, clips: Sequence[HeldClip]) -> tuple[int, ...]:
     """Nodes that the clamped clips hold: the nearest ones."""
     at = np.array([clip.at for clip in clips if clip.kind in CLAMPS], dtype=float)
     return tuple(np.rint(at / chain.h).astype(int).clip(1, chain.n - 1).tolist())
 
 
-def node_places(chain: Chain, clips: Sequence[Clip]) -> FloatArray:
+def node_places(chain: Chain, clips: Sequence[HeldClip]) -> FloatArray:
     """Arc lengths (n_nodes,) [m] of the nodes, those that clamped clips hold moved to them."""
     places = chain.places.copy()
     held = [clip.at for clip in clips if clip.kind in CLAMPS]

@@ -1,6 +1,6 @@
 """Recordings of laboratories to sessions: motion capture, ROS bags, point clouds."""
 
-from dlo_casadi.recordings.clouds import View
+from dlo_casadi.recordings.clouds import CloudView
 from dlo_casadi.recordings.read import FORMATS, read_recording
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.session import FREE, Imported, Wishes, make_session
@@ -9,10 +9,10 @@ __all__ = [
     "FORMATS",
     "FREE",
     "Cloud",
+    "CloudView",
     "Imported",
     "Recording",
     "Stream",
-    "View",
     "Wishes",
     "make_session",
     "read_recording",

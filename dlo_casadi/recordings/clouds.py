@@ -19,7 +19,7 @@ _PLY |= {"uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float6
 
 
 @dataclass(frozen=True)
-class View:
+class CloudView:
     """How clouds were seen, and which of their points are the cable."""
 
     camera: Sequence[float] = ()

@@ -7,11 +7,11 @@ from pathlib import Path
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings.bags import read_bag
 from dlo_casadi.recordings.c3d import read_c3d
-from dlo_casadi.recordings.clouds import View, read_cloud
+from dlo_casadi.recordings.clouds import CloudView, read_cloud
 from dlo_casadi.recordings.mocap_csv import read_mocap_csv
 from dlo_casadi.recordings.recording import Recording, together
 
-WHOLE = View()  # all points of clouds in metres
+WHOLE = CloudView()  # all points of clouds in metres
 
 # Ending of a name -> reader of a file.
 FORMATS: dict[str, Callable[[Path], Recording]] = {
@@ -27,7 +27,9 @@ FORMATS: dict[str, Callable[[Path], Recording]] = {
 }
 
 
-def read_recording(paths: Sequence[Path], up: str | None = None, view: View = WHOLE) -> Recording:
+def read_recording(
+    paths: Sequence[Path], up: str | None = None, view: CloudView = WHOLE
+) -> Recording:
     """Read the files of one recording.
 
     Parameters
@@ -36,7 +38,7 @@ def read_recording(paths: Sequence[Path], up: str | None = None, view: View = WH
         Files of the `FORMATS`; each has a clock of its own.
     up : "x", "y", "z" or None
         The axis that points up; as usual in each format when absent.
-    view : View
+    view : CloudView
         How clouds were seen, in the axes of their files.
 
     Raises

@@ -12,7 +12,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.model.clips import Clip
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import REACTIONS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
@@ -110,7 +110,7 @@ def test_a_fit_stays_finite(name, where, has):
     clips = ("pinned",) if name.startswith("clip_") else ()
     if clips:
         middles = [tuple(np.array(pose.end) / 2) for pose in poses]
-        held_at = [Clip("pinned", place, 0.45 * LENGTH) for place in middles]
+        held_at = [HeldClip("pinned", place, 0.45 * LENGTH) for place in middles]
         poses = [replace(pose, clips=(x,)) for pose, x in zip(poses, held_at, strict=True)]
     n = 2 * N if clips else N  # each span needs its own
     plain = CableModel(cable, n, "arc", held, held, gravity, n_rest=3, clips=clips)
