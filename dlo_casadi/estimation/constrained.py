@@ -308,8 +308,10 @@ def as_measured(fit: Fit) -> Fit:
             found = _refitted(found, gaps)
         except EstimationError:
             return fit
-    lost = fit.log_evidence - found.log_evidence
-    return found if lost < BIC_APART / 2 and not _gaps(found) else fit
+    else:
+        if _gaps(found):
+            return fit
+    return found if fit.log_evidence - found.log_evidence < BIC_APART / 2 else fit
 
 
 def _gaps(fit: Fit) -> list[EnergyGap]:
