@@ -100,12 +100,9 @@ class _Moving:
         slopes = unknowns.slopes(theta)[:, columns]
         still = np.zeros((len(rest), len(columns)))
         shapes = with_springs(problem.equilibria, self.shapes, p, rest)
-        along = problem.equilibria.directions(shapes, p, rest, slopes, still)
+        along = problem.equilibria.directions(shapes, p, rest, slopes, still, deviations=False)
         moved = problem.residuals(Values(theta, shapes, fit.point.projections), along)
-        return [
-            white @ change[:, : len(columns)]
-            for white, (_, change) in zip(problem.whitening, moved, strict=True)
-        ]
+        return [white @ change for white, (_, change) in zip(problem.whitening, moved, strict=True)]
 
 
 def with_springs(

@@ -237,6 +237,8 @@ class BatchEquilibrium:
         rest: FloatArray,
         slopes: FloatArray,
         rest_slopes: FloatArray,
+        *,
+        deviations: bool = True,
     ) -> Tangents:
         """Derivatives of the equilibria by the unknowns and by each pose's own deviations.
 
@@ -252,12 +254,13 @@ class BatchEquilibrium:
         Returns
         -------
         Tangents
-            Columns: the unknowns, then the model's deviations.
+            Columns: the unknowns, then, with `deviations`, the model's.
         """
         given = self.given(shapes, p, rest)
-        size, own = slopes.shape[1], len(self.used_deviations)
+        used = self.used_deviations if deviations else []
+        size, own = slopes.shape[1], len(used)
         deviation = np.zeros((len(self.model.deviation_names), size + own))
-        deviation[self.used_deviations, size + np.arange(own)] = 1.0
+        deviation[used, size + np.arange(own)] = 1.0
         by_p, by_rest = (np.pad(part, [(0, 0), (0, own)]) for part in (slopes, rest_slopes))
         still = self._still(given, by_rest, by_p, deviation)
         if not self.model.has_state:
