@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
-from dlo_casadi.rod.ends import deviation_names
 
 FloatArray = np.ndarray
 
@@ -16,7 +15,7 @@ def any_shapes(a: Assembly, m: int = 1, scale: float = 0.4) -> Shapes:
     rng = np.random.default_rng(0)
     x = a.node.moved(np.array(a.node.identity), rng.normal(scale=scale, size=(m, a.n, a.b)))
     lam = rng.normal(size=(m, a.k))
-    deviation = rng.normal(scale=0.01, size=(m, len(deviation_names(a.node))))
+    deviation = rng.normal(scale=0.01, size=(m, len(a.model.deviation_names)))
     return Shapes(x, lam, deviation)
 
 
@@ -32,7 +31,7 @@ def directions(a: Assembly, m: int, *names: str) -> Tangents:
         "lam": a.k,
         "p": len(a.model.parameters),
         "rest": a.chain.n_rests,
-        "deviation": len(deviation_names(a.node)),
+        "deviation": len(a.model.deviation_names),
     }
     q = sum(rows[name] for name in names)
     parts, used = {}, 0
