@@ -350,7 +350,7 @@ class RestLikelihood:
     def degrees(self, found: Variances, smoothness: float, range_: float | None) -> float:
         """Degrees of freedom with which the random part's variance is known.
 
-        -2 log likelihood of k degrees of freedom has the curvature 2 k by the logarithm of a std.
+        -2 log likelihood of k degrees of freedom has the curvature 4 k by the logarithm of a std.
         """
         step = 0.2
 
@@ -360,7 +360,7 @@ class RestLikelihood:
             return self.deviance(*sizes, smoothness, range_ or 1.0)[0]
 
         bend = (deviance(step) + deviance(-step) - 2 * deviance(0.0)) / step**2
-        return float(max(bend / 2, 1.0))
+        return float(max(bend / 4, 1.0))
 
 
 @dataclass(frozen=True)

@@ -203,6 +203,7 @@ def test_a_prediction_is_drawn(tmp_path, end):
     drawing = draw_shape(
         points,
         {"start": force} | ({"end": 0 * force} if end else {}),
+        clips={"middle": (points[10], force)} if end else {},
         band=np.linspace(0.0, 0.01, 21),
         other=-points if end else None,
         title="rope: predicted shape",
