@@ -204,8 +204,9 @@ def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
         for source in sources_in(fit.model)
     ]
     best, *others = sorted((found, *others), key=lambda item: item.deviance)
-    alike = [x.scatter for x in others if x.deviance < best.deviance + SCATTER_APART]
-    return replace(best, scatter=replace(best.scatter, rivals=tuple(alike)))
+    near = [x.scatter for x in others if x.deviance < best.deviance + SCATTER_APART]
+    alike = tuple(one for one in near if one.std > 0)
+    return replace(best, scatter=replace(best.scatter, rivals=alike))
 
 
 def _beyond_tolerances(fit: Fit) -> bool:
