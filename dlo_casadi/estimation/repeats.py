@@ -28,7 +28,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import minimize
 from scipy.special import chdtrc, chdtri
 
 from dlo_casadi.arrays import FloatArray
@@ -37,7 +36,9 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, SMOOTHNESS, PoseScatter
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.sensing.noise import NoiseModel, NoiseSample, estimate_noise, tell_of_noise
+from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
+from dlo_casadi.sensing.restricted import Deviance, most_likely
 from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE, SIGNIFICANCE
 
 # Of the length: beside a fixture all repeats are where it holds them.
@@ -215,12 +216,16 @@ class Variances:
     std, systematic : float [1/m]
     deviance : float
         -2 log restricted likelihood, up to a constant.
+    degrees : float
+        Degrees of freedom with which the variance std^2 is known: for k of them the curvature of
+        -2 log likelihood by log(std) is 4 k.
     """
 
     noise: float
     std: float
     systematic: float
     deviance: float
+    degrees: float
 
 
 class RestLikelihood:
@@ -263,42 +268,52 @@ class RestLikelihood:
 
     def deviance(
         self, noise: float, std: float, systematic: float, smoothness: float, range_: float
-    ) -> tuple[float, float]:
-        """-2 log restricted likelihood, and the quadratic form in it.
+    ) -> Deviance:
+        """Restricted deviance by the logarithms of the three sizes, see `sensing.restricted`.
 
-        By Woodbury's identity, with all poses' random parts in one matrix.
+        By Woodbury's identity in the random parts, V = noise^2 1 + Z B Z^T, pose by pose or, if
+        poses are correlated, with those of all poses in one block.
         """
         m, q, r = self.m, self.random.shape[1], self.modes
-        root = np.full(q, 1 / noise)
-        root[:r] *= PoseScatter(std, smoothness, source=self.source).sizes(r)
-        inside = self.random * root[:, None] * root
-        cross = self.cross * root[None, :, None]
+        sizes = PoseScatter(1.0, smoothness, source=self.source).sizes(r) ** 2
+        rest = np.diag(np.pad(sizes, (0, q - r)))
+        own: FloatArray = np.diag((np.arange(q) >= r) * 1.0)
+        by_std: FloatArray = 2 * std**2 * rest
+        inside, cross, by_systematic = self.random, self.cross, np.zeros((q, q))
         if systematic > 0 and m > 1:
-            size = systematic / std
             alike = np.exp(-((self.distances / range_) ** 2) / 2)
-            values, vectors = np.linalg.eigh(np.eye(m) + size**2 * alike)
-            mix = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-            shared = np.diag((np.arange(q) < r).astype(float))
-            spread = np.kron(mix, shared) + np.kron(np.eye(m), np.eye(q) - shared)
-            inside_all = spread @ block_diag(*inside) @ spread
-            factor = np.linalg.cholesky(np.eye(m * q) + inside_all)
-            logdet = 2 * float(np.log(np.diag(factor)).sum())
-            half = np.linalg.solve(factor, spread @ cross.reshape((m * q, -1)))
-            taken = half.T @ half
-        else:
-            factor = np.linalg.cholesky(np.eye(q) + inside)
-            logdet = 2 * float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
-            half = np.linalg.solve(factor, cross)
-            taken = np.einsum("mqa,mqb->ab", half, half)
-        gram = self.fixed - taken
-        x, y = gram[:-1, :-1], gram[:-1, -1]
-        quadratic = float(gram[-1, -1])
-        if len(x):
-            factor = np.linalg.cholesky(x + 1e-9 * np.trace(x) / len(x) * np.eye(len(x)))
-            logdet += 2 * float(np.log(np.diag(factor)).sum())
-            quadratic -= float((np.linalg.solve(factor, y) ** 2).sum())
-        quadratic /= noise**2
-        return self.free * 2 * np.log(noise) + logdet + quadratic, quadratic
+            by_systematic = 2 * systematic**2 * np.kron(alike, rest)
+            by_std, own = np.kron(np.eye(m), by_std), np.kron(np.eye(m), own)
+            inside, cross = block_diag(*inside)[None], cross.reshape((1, m * q, -1))
+        between, count = own + (by_std + by_systematic) / 2, inside.shape[1]
+        matrix = noise**2 * np.eye(count) + inside @ between
+        solved = np.linalg.solve(matrix, np.concatenate([inside, cross], axis=2))
+        inside, taken = solved[:, :, :count], solved[:, :, count:]  # Z^T V^-1 Z, Z^T V^-1 (X, y)
+        gram = self.fixed - np.einsum("mqa,mqb->ab", between @ cross, taken)
+        gram /= noise**2
+        x, y, spare = gram[:-1, :-1], gram[:-1, -1:], self.count - len(matrix) * count
+        root = np.linalg.cholesky(x + 1e-9 * np.trace(x) / max(len(x), 1) * np.eye(len(x)))
+        explained = np.linalg.solve(root, y)
+        hidden = np.linalg.solve(root, taken[:, :, :-1].transpose(0, 2, 1))
+        pull = taken[:, :, -1] - (explained.T @ hidden)[:, 0]  # Z^T P y
+        quadratic = float(gram[-1, -1] - (explained**2).sum())
+        logdet = 2 * float(np.log(root.diagonal()).sum() + spare * np.log(noise))
+        logdet += float(np.linalg.slogdet(matrix)[1].sum())
+
+        ways = [between, by_std, by_systematic]
+        diagonal = inside.sum(axis=0) - np.einsum("mpa,mpb->ab", hidden, hidden)
+        traces = np.array([(diagonal * way).sum() for way in ways])
+        moved = np.stack([pull @ way for way in ways])
+        squares = np.einsum("jmq,mq->j", moved, pull)
+        seen = np.einsum("mpq,jmq->jp", hidden, moved)
+        bend = np.einsum("jmq,mqk,imk->ji", moved, inside, moved, optimize=True) - seen @ seen.T
+        # P V P = P tells what belongs to the noise from what belongs to all random parts.
+        by_noise = 2 * (self.free - traces[0] - quadratic + squares[0])
+        information = bend.copy()
+        information[0] = information[:, 0] = 2 * (squares - bend[0])
+        information[0, 0] = 4 * (quadratic - 2 * squares[0] + bend[0, 0])
+        gradient = np.array([by_noise, *(traces - squares)[1:]])
+        return Deviance(logdet + quadratic, gradient, information)
 
     def best(
         self,
@@ -319,48 +334,20 @@ class RestLikelihood:
         weight : float
             Of a prior std^weight of the random part, which keeps it from zero.
         """
-        free = [True, std, range_ is not None]
-        low = guess * np.exp(_LOWEST)
+        sought = np.array([True, std, range_ is not None])
+        start = np.log([1.0, guess if std else guess * np.exp(_LOWEST), guess])
+        prior = 2 * weight * np.array([0.0, 1.0, 0.0])
 
-        def sizes(q: FloatArray) -> tuple[float, float, float]:
-            full = np.array([0.0, _LOWEST, -np.inf])
-            full[free] = np.clip(q, _LOWEST, _HIGHEST)
-            noise, random, systematic = np.exp(full)
-            return float(noise), float(max(guess * random, low)), float(guess * systematic)
+        def deviance(q: FloatArray) -> Deviance:
+            noise, size, systematic = np.exp(q) * [1, 1, sought[2]]
+            found = self.deviance(noise, size, systematic, smoothness, range_ or 1.0)
+            value = found.value - float(prior @ q)
+            return replace(found, value=value, gradient=found.gradient - prior)
 
-        def deviance(q: FloatArray) -> float:
-            outside = float(((q - np.clip(q, _LOWEST, _HIGHEST)) ** 2).sum())
-            prior = -2 * weight * np.log(sizes(q)[1])
-            try:
-                return self.deviance(*sizes(q), smoothness, range_ or 1.0)[0] + prior + outside
-            except np.linalg.LinAlgError:  # sizes so large that their sums are lost in rounding
-                return np.inf
-
-        count = sum(free)
-        start = np.zeros(count)
-        simplex = np.vstack([start, start - 1.5 * np.eye(count)])
-        found = minimize(
-            deviance,
-            start,
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 0.03, "fatol": 0.02, "maxfev": 80},
-        )
-        return Variances(*sizes(found.x), float(found.fun))
-
-    def degrees(self, found: Variances, smoothness: float, range_: float | None) -> float:
-        """Degrees of freedom with which the random part's variance is known.
-
-        -2 log likelihood of k degrees of freedom has the curvature 4 k by the logarithm of a std.
-        """
-        step = 0.2
-
-        def deviance(shift: float) -> float:
-            std = found.std * float(np.exp(shift))
-            sizes = (found.noise, std, found.systematic)
-            return self.deviance(*sizes, smoothness, range_ or 1.0)[0]
-
-        bend = (deviance(step) + deviance(-step) - 2 * deviance(0.0)) / step**2
-        return float(max(bend / 4, 1.0))
+        q, found = most_likely(deviance, start, start + sought * _LOWEST, start + sought * _HIGHEST)
+        noise, size, systematic = (np.exp(q) * [1, 1, sought[2]]).tolist()
+        known = float(max(found.information[1, 1] / 4, 1.0))
+        return Variances(noise, size, systematic, found.value, known)
 
 
 @dataclass(frozen=True)
@@ -415,8 +402,7 @@ def estimate_pose_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -
     without = likelihood.best(smoothness, range_, std=False, guess=guess)
     if not sparse and without.deviance - chosen.deviance < TELLING:
         return ScatterEstimate(PoseScatter(), without.noise, p_systematic, without.deviance)
-    dof = likelihood.degrees(chosen, smoothness, range_)
-    found = PoseScatter(chosen.std, smoothness, dof, source)
+    found = PoseScatter(chosen.std, smoothness, chosen.degrees, source)
     sizes = (chosen.noise, chosen.std, chosen.systematic)
-    deviance = likelihood.deviance(*sizes, smoothness, range_ or 1.0)[0]
+    deviance = likelihood.deviance(*sizes, smoothness, range_ or 1.0).value
     return ScatterEstimate(found, chosen.noise, p_systematic, deviance)

@@ -20,14 +20,8 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
-from dlo_casadi.sensing.noise import (
-    NoiseModel,
-    NoiseSample,
-    ReadingNoise,
-    estimate_noise,
-    smooth_modes,
-    tell_of_noise,
-)
+from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, smooth_modes
+from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.thresholds import DIFFERENT, SCATTER_APART, SCATTERED, SCATTERED_DEGREES
 
 # Slow displacements per pose that are kept out of the noise estimate: many while an effect may

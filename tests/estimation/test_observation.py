@@ -4,17 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from scipy.special import expit
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.sensing.noise import (
-    NoiseModel,
+from dlo_casadi.sensing.noise import NoiseModel, correlation, smooth_modes
+from dlo_casadi.sensing.noise_estimate import (
     NoiseSample,
-    correlation,
+    Profile,
     estimate_noise,
     restricted_deviance,
-    smooth_modes,
 )
 from dlo_casadi.sensing.sensors import Centerline
 
@@ -208,7 +209,7 @@ def test_restricted_likelihood_of_white_noise_is_unbiased():
     samples = [
         NoiseSample(x.residuals, x.places, x.weight, x.own, np.zeros((20, 0))) for x in samples
     ]
-    _, std = restricted_deviance(NoiseModel(1.0), samples)
+    std = restricted_deviance(NoiseModel(1.0), samples).std
     # 200 * 16 degrees of freedom: one standard deviation is 1.25 %.
     assert std == pytest.approx(3e-4, rel=0.04)
 
@@ -221,6 +222,46 @@ def test_white_noise_is_recovered():
     spacing = LENGTH / 80
     neighbours = found.covariance(np.array([0.0, spacing]), np.ones(2))[0, 1] / found.std**2
     assert neighbours < 0.1
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "matern", "gaussian"])
+def test_deviance_against_differences_and_the_textbook_form(kernel):
+    """Two components a point, means of one to three, averaged along the cable."""
+    rng = np.random.default_rng(0)
+    samples = []
+    for x in simulated(NoiseModel(3e-4, 0.5, 0.03), poses=3, points=30):
+        own = np.repeat(x.own, 2, axis=0) * rng.normal(size=(60, 1))
+        both = np.repeat(x.residuals, 2) + 1e-4 * rng.normal(size=60)
+        count = rng.integers(1, 4, size=30).astype(float)
+        shared = rng.normal(size=(60, 3))
+        samples.append(NoiseSample(both, x.places, x.weight, own, shared, 0.01, count))
+
+    def at(q: np.ndarray) -> Profile:
+        unit = NoiseModel(1.0, float(expit(q[0])), float(np.exp(q[1])), kernel)
+        return restricted_deviance(unit, samples)
+
+    q, step = np.array([0.3, np.log(0.04)]), 1e-5
+    ways = [(at(q + way), at(q - way)) for way in step * np.eye(2)]
+    slopes = [(a.value - b.value) / (2 * step) for a, b in ways]
+    growth = [np.log(a.std / b.std) / step for a, b in ways]
+    np.testing.assert_allclose(at(q).gradient, slopes, rtol=1e-6)
+    np.testing.assert_allclose(at(q).growth, growth, rtol=1e-6)
+
+    # The average information as it is written, with all rows in one matrix.
+    unit = NoiseModel(1.0, float(expit(q[0])), float(np.exp(q[1])), kernel)
+    places = [(x.distance, x.correlation_length, x.count) for x in samples]
+    covariance = block_diag(*(np.kron(unit.correlation(*x), np.eye(2)) for x in places))
+    ways = [unit.correlation_slopes(*x) for x in places]
+    moved = [block_diag(*(np.kron(way[k], np.eye(2)) for way in ways)) for k in (0, 1)]
+    own = block_diag(*(x.own for x in samples))
+    fixed = np.column_stack([np.concatenate([x.shared for x in samples]), own])
+    y, weight = np.concatenate([x.residuals for x in samples]), np.linalg.inv(covariance)
+    p = weight - weight @ fixed @ np.linalg.solve(fixed.T @ weight @ fixed, fixed.T @ weight)
+    count, variance = len(y) - fixed.shape[1], y @ p @ y / (len(y) - fixed.shape[1])
+    pulled = np.stack([way @ p @ y for way in moved])
+    by_size = pulled @ p @ y / variance
+    exact = pulled @ p @ pulled.T / variance - np.outer(by_size, by_size) / count
+    np.testing.assert_allclose(at(q).information, exact, rtol=1e-5)
 
 
 def test_directions_that_leave_a_photograph_alone_tell_nothing_of_its_noise():

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from dlo_casadi.estimation.repeats import RestLikelihood, ScatterSample, estimate_pose_scatter
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, modes_of
+from dlo_casadi.sensing.restricted import Deviance
 
 M, ROWS = 9, 6
 
@@ -33,7 +35,7 @@ def test_deviance_against_the_full_covariance(systematic):
     samples, distances = session(0.1)
     noise, std, smoothness, range_ = 1.3, 0.15, 0.25, 0.3
     likelihood = RestLikelihood(samples, distances)
-    found, quadratic = likelihood.deviance(noise, std, systematic, smoothness, range_)
+    found = likelihood.deviance(noise, std, systematic, smoothness, range_).value
     sizes = PoseScatter(1.0, smoothness).sizes(MODES)
     alike = np.exp(-((distances / range_) ** 2) / 2)
     rest = np.zeros((M * ROWS, M * MODES))
@@ -50,9 +52,44 @@ def test_deviance_against_the_full_covariance(systematic):
     weight = np.linalg.inv(covariance)
     information = x.T @ weight @ x
     projected = weight - weight @ x @ np.linalg.solve(information, x.T @ weight)
-    assert quadratic == pytest.approx(e @ projected @ e, rel=1e-6)
-    exact = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1] + quadratic
+    exact = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
+    exact += e @ projected @ e
     assert found == pytest.approx(exact, rel=1e-6)
+
+
+@pytest.mark.parametrize("systematic", [0.0, 0.2])
+def test_gradient_of_the_deviance_against_differences(systematic):
+    likelihood = RestLikelihood(*session(0.1))
+
+    def at(logs: np.ndarray) -> Deviance:
+        return likelihood.deviance(*np.array([1.3, 0.15, systematic]) * np.exp(logs), 0.25, 0.3)
+
+    step = 1e-5
+    slopes = [(at(way).value - at(-way).value) / (2 * step) for way in step * np.eye(3)]
+    np.testing.assert_allclose(at(np.zeros(3)).gradient, slopes, rtol=1e-6, atol=1e-6)
+
+
+def test_sizes_are_those_of_a_search_without_derivatives():
+    """Nelder and Mead's, from the same start, far below what a likelihood tells."""
+    for systematic in (0.0, 0.5):
+        samples, distances = session(0.2, systematic, seed=1)
+        likelihood = RestLikelihood(samples, distances)
+        found = likelihood.best(0.5, 0.3)
+        at = np.log([found.noise, found.std, found.systematic])
+
+        def deviance(q: np.ndarray, likelihood: RestLikelihood = likelihood) -> float:
+            return likelihood.deviance(*np.exp(q), 0.5, 0.3).value
+
+        options = {"xatol": 1e-4, "fatol": 1e-4}
+        least = minimize(deviance, at + 0.3, method="Nelder-Mead", options=options)
+        assert found.deviance == pytest.approx(least.fun, abs=0.02)
+
+
+def test_degrees_of_freedom_of_a_variance_that_noise_does_not_hide():
+    """All rows less two unknowns."""
+    samples, distances = session(50.0, seed=2)
+    found = RestLikelihood(samples, distances).best(0.12, None, guess=50.0)
+    assert found.degrees == pytest.approx(M * ROWS - 2, rel=0.01)
 
 
 def test_a_random_rest_curvature_is_found_beside_unknown_noise():
