@@ -279,7 +279,8 @@ class RestLikelihood:
         rest = np.diag(np.pad(sizes, (0, q - r)))
         own: FloatArray = np.diag((np.arange(q) >= r) * 1.0)
         by_std: FloatArray = 2 * std**2 * rest
-        inside, cross, by_systematic = self.random, self.cross, np.zeros((q, q))
+        by_systematic: FloatArray = np.zeros((q, q))
+        inside, cross = self.random, self.cross
         if systematic > 0 and m > 1:
             alike = np.exp(-((self.distances / range_) ** 2) / 2)
             by_systematic = 2 * systematic**2 * np.kron(alike, rest)

@@ -56,9 +56,13 @@ def most_likely(
             return _LOST, np.zeros(len(z))
         return found.value, np.asarray(scale * found.gradient)
 
-    bounds = Bounds((low - start) / scale, (high - start) / scale)
-    ending = {"gtol": _FLAT, "ftol": 1e-7}
-    at = np.zeros(len(start))
-    at = minimize(scaled, at, jac=True, method="L-BFGS-B", bounds=bounds, options=ending).x
-    q = np.clip(start + scale * at, low, high)
+    found = minimize(
+        scaled,
+        np.zeros(len(start)),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=Bounds((low - start) / scale, (high - start) / scale),
+        options={"gtol": _FLAT, "ftol": 1e-7},
+    )
+    q = np.clip(start + scale * found.x, low, high)
     return q, deviance(q)
