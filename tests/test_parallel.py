@@ -247,7 +247,7 @@ def test_a_killed_worker_loses_nothing(tmp_path):
     assert (tmp_path / "mark").exists(), "nothing was killed"
     logs = list((tmp_path / "logs").glob("worker-*.log"))
     text = "".join(path.read_text() for path in logs)
-    assert len(logs) >= 3, "each process keeps its own log: two, and at least one anew"
+    assert len(logs) >= 2, "each process keeps its own log, and at least one is anew"
     assert text.count("task 3 begins") == 2
     assert text.count("task 3 done") == 1
 

@@ -228,6 +228,13 @@ class Variances:
     degrees: float
 
 
+@dataclass(frozen=True)
+class InformedDeviance(Deviance):
+    """With the average information (k, k)."""
+
+    information: FloatArray
+
+
 class RestLikelihood:
     """Restricted likelihood of a session's poses.
 
@@ -268,7 +275,7 @@ class RestLikelihood:
 
     def deviance(
         self, noise: float, std: float, systematic: float, smoothness: float, range_: float
-    ) -> Deviance:
+    ) -> InformedDeviance:
         """Restricted deviance by the logarithms of the three sizes, see `sensing.restricted`.
 
         By Woodbury's identity in the random parts, V = noise^2 1 + Z B Z^T, pose by pose or, if
@@ -314,7 +321,7 @@ class RestLikelihood:
         information[0] = information[:, 0] = 2 * (squares - bend[0])
         information[0, 0] = 4 * (quadratic - 2 * squares[0] + bend[0, 0])
         gradient = np.array([by_noise, *(traces - squares)[1:]])
-        return Deviance(logdet + quadratic, gradient, information)
+        return InformedDeviance(logdet + quadratic, gradient, information)
 
     def best(
         self,
@@ -339,7 +346,7 @@ class RestLikelihood:
         start = np.log([1.0, guess if std else guess * np.exp(_LOWEST), guess])
         prior = 2 * weight * np.array([0.0, 1.0, 0.0])
 
-        def deviance(q: FloatArray) -> Deviance:
+        def deviance(q: FloatArray) -> InformedDeviance:
             noise, size, systematic = np.exp(q) * [1, 1, sought[2]]
             found = self.deviance(noise, size, systematic, smoothness, range_ or 1.0)
             value = found.value - float(prior @ q)

@@ -26,6 +26,9 @@ _SPARE_POINTS, _LEAST_DEGREES = 5, 6
 # Logit of the share and logarithm of the length over the cable's: where a search starts, and ends.
 _START = np.log([0.5, 0.04])
 _LIMITS = np.array([[-8.0, np.log(0.002)], [8.0, np.log(0.1)]])
+# Step of the differences that give the spread: far enough to see the likelihood's width, where it
+# is no parabola. And the curvature of a prior that keeps a length beyond the limits unlikely.
+_STEP, _BEYOND = 0.4, 20.0
 # Maximum number of poses used for the correlation, evenly spaced; the size of the noise uses all.
 _MOST_POSES = 60
 
@@ -100,13 +103,9 @@ class NoiseSample:
 
 @dataclass(frozen=True)
 class Profile(Deviance):
-    """Restricted deviance by logit(share) and log(length) with the scale profiled out.
-
-    `std` [m] is that scale, `growth` (k,) the derivative of its squared logarithm.
-    """
+    """By logit(share) and log(length), if correlated, with the scale `std` [m] profiled out."""
 
     std: float
-    growth: FloatArray
 
 
 def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> Profile:
@@ -141,35 +140,15 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> Profile
     explained = root @ (root.T @ cross)
     count -= len(shared)
     variance = float(gram[0, 0] - cross @ explained) / count
-
-    number = len(kept[0][-1])
-    trace, square, bend = np.zeros(number), np.zeros(number), np.zeros((number, number))
-    along = np.zeros((number, len(shared)))
-    for white, left, own, slopes in kept if number else ():
+    gradient = np.zeros(len(kept[0][-1]))
+    for white, left, own, slopes in kept if len(gradient) else ():
         # What is projected out, as an orthonormal basis, and last what is left of the residuals.
         basis = np.column_stack([left[:, 1:] @ root, own, left[:, 0] - left[:, 1:] @ explained])
-        points = len(white)
-        weighed = white.T @ basis.reshape((points, -1))
-        moved = slopes @ weighed
-        products = (weighed * moved).reshape((number, len(basis), -1)).sum(axis=1)
-        each = len(basis) // points
-        trace += each * (white.T @ white * slopes).sum(axis=(1, 2)) - products[:, :-1].sum(axis=1)
-        square += products[:, -1]
-        moved = moved.reshape((number, len(basis), -1))[..., -1]
-        hidden = moved @ weighed.reshape(basis.shape)[:, :-1]
-        seen = (white @ moved.reshape((number, points, each))).reshape((number, -1))
-        along += hidden[:, : len(shared)]
-        of_pose = hidden[:, len(shared) :]
-        bend += seen @ seen.T - of_pose @ of_pose.T
-    bend -= along @ along.T
-    growth = -square / (variance * count)
-    return Profile(
-        count * np.log(variance) + logdet,
-        trace + count * growth,
-        bend / variance - count * np.outer(growth, growth),
-        float(np.sqrt(variance)),
-        growth,
-    )
+        weighed = white.T @ basis.reshape((len(white), -1))
+        products = (weighed * (slopes @ weighed)).reshape((len(slopes), len(basis), -1)).sum(axis=1)
+        trace = len(basis) // len(white) * (white.T @ white * slopes).sum(axis=(1, 2))
+        gradient += trace - products[:, :-1].sum(axis=1) - products[:, -1] / variance
+    return Profile(count * np.log(variance) + logdet, gradient, float(np.sqrt(variance)))
 
 
 def estimate_noise(
@@ -236,12 +215,12 @@ class _Estimate:
 def _white(samples: list[NoiseSample], cable_length: float) -> _Estimate:
     found = restricted_deviance(NoiseModel(1.0), samples)
     noise = NoiseModel(found.std)
-    log_slow, _ = _log_slow(noise, samples, cable_length)
+    log_slow = _log_slow(noise, samples, cable_length)
     return _Estimate(noise, found.value, log_slow, 2 / _degrees(samples))
 
 
 def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel) -> _Estimate:
-    """Most likely share and length; the spread from the average information."""
+    """Most likely share and length; the spread from the curvature of the deviance there."""
 
     def unit(q: FloatArray) -> NoiseModel:
         return NoiseModel(1.0, float(expit(q[0])), cable_length * float(np.exp(q[1])), kernel)
@@ -250,25 +229,28 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
         # Uniform prior of the share: slow modes are projected out, and on photographs the
         # likelihood alone gave slow errors of 0.11 mm instead of 0.015 mm, with a smooth kernel.
         found, share = restricted_deviance(unit(q), samples), expit(q[0])
-        both = share * (1 - share)
-        return replace(
-            found,
-            value=found.value - 2 * float(np.log(4 * both)),
-            gradient=found.gradient + np.array([4 * share - 2, 0.0]),
-            information=found.information + np.diag([4 * both, 0.0]),
-        )
+        value = found.value - 2 * float(np.log(4 * share * (1 - share)))
+        return replace(found, value=value, gradient=found.gradient + np.array([4 * share - 2, 0.0]))
 
-    low, high = _LIMITS
-    q, found = most_likely(deviance, _START, low, high)
+    def beside(q: FloatArray) -> tuple[float, FloatArray]:
+        at = np.clip(q, *_LIMITS)
+        found = deviance(at)
+        noise = replace(unit(at), std=found.std)
+        return _log_slow(noise, samples, cable_length), found.gradient + _BEYOND * (q - at)
+
+    q, found = most_likely(deviance, _START, *_LIMITS)
     noise = replace(unit(q), std=found.std)
-    log_slow, slope = _log_slow(noise, samples, cable_length)
+    steps = _STEP * np.eye(2)
+    ahead, behind = ([beside(q + way * step) for step in steps] for way in (1, -1))
+    slope, bend = (
+        np.array([a[k] - b[k] for a, b in zip(ahead, behind, strict=True)]) / (2 * _STEP)
+        for k in (0, 1)
+    )
     # The covariance is twice the inverse Hessian of -2 log likelihood, at least the prior's part.
-    # At a bound, where that rises with a slope g, the variance is 4 / g^2 at most.
-    bend = found.information + np.outer(found.gradient, found.gradient) / 2
-    values, vectors = np.linalg.eigh(bend)
-    along = vectors.T @ (slope + found.growth)
+    values, vectors = np.linalg.eigh((bend + bend.T) / 2)
+    along = vectors.T @ slope
     spread = 2 / _degrees(samples) + 2 * float((along**2 / np.maximum(values, 0.04)).sum())
-    return _Estimate(noise, found.value, log_slow, spread)
+    return _Estimate(noise, found.value, _log_slow(noise, samples, cable_length), spread)
 
 
 def _degrees(samples: list[NoiseSample]) -> float:
@@ -277,25 +259,14 @@ def _degrees(samples: list[NoiseSample]) -> float:
     return float(max(own - samples[0].shared.shape[1], 1))
 
 
-def _log_slow(
-    noise: NoiseModel, samples: list[NoiseSample], cable_length: float
-) -> tuple[float, FloatArray]:
-    """Logarithm of the geometric mean of the variances of slow modes, taken of the middle pose.
-
-    And its derivatives (k,) by the parameters of the correlation, at a given size.
-    """
+def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float) -> float:
+    """Logarithm of the geometric mean of the variances of slow modes, taken of the middle pose."""
     sample = samples[len(samples) // 2]
     # Points at the fixtures, where sines vanish, determine no mode.
     count = min(SLOW_MODES, max(1, len(sample.places) - 3))
     modes = smooth_modes(sample.places, cable_length, count, free_end=False)
-    white = noise.whitening(sample.places, sample.weight, sample.correlation_length)
-    seen = white @ modes
-    information = seen.T @ seen
-    weighed = noise.std * sample.weight[:, None] * (white.T @ seen)
-    slopes = noise.correlation_slopes(sample.distance, sample.correlation_length)
-    by = np.linalg.solve(information, weighed.T @ slopes @ weighed)
-    value = -float(np.linalg.slogdet(information)[1])
-    return value / count, np.trace(by, axis1=1, axis2=2) / count
+    seen = noise.whitening(sample.places, sample.weight, sample.correlation_length) @ modes
+    return -float(np.linalg.slogdet(seen.T @ seen)[1]) / count
 
 
 def _slow_dof(found: list[_Estimate]) -> float:

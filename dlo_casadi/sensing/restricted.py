@@ -28,11 +28,10 @@ _LOST = 1e30
 
 @dataclass(frozen=True)
 class Deviance:
-    """D up to a constant, its gradient (k,) and average information (k, k) by the parameters."""
+    """D up to a constant, and its gradient (k,) by the parameters."""
 
     value: float
     gradient: FloatArray
-    information: FloatArray
 
 
 Found = TypeVar("Found", bound=Deviance)
@@ -41,28 +40,26 @@ Found = TypeVar("Found", bound=Deviance)
 def most_likely(
     deviance: Callable[[FloatArray], Found], start: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, Found]:
-    """Parameters (k,) of least deviance between bounds, and the deviance there.
+    """Parameters (k,) of least deviance between bounds, logits or logarithms, and the deviance.
 
-    L-BFGS-B in units of the information at the start. Newton steps with the information itself
-    take more evaluations: far from the optimum it is a tenth of the second derivative.
+    By L-BFGS-B. Newton steps with the average information take more evaluations: far from the
+    optimum it is a tenth of the second derivative.
     """
-    first = deviance(start)
-    scale = 1 / np.sqrt(1 + np.diag(first.information))
 
-    def scaled(z: FloatArray) -> tuple[float, FloatArray]:
+    def sloped(q: FloatArray) -> tuple[float, FloatArray]:
         try:
-            found = deviance(start + scale * z) if z.any() else first
+            found = deviance(q)
         except np.linalg.LinAlgError:
-            return _LOST, np.zeros(len(z))
-        return found.value, np.asarray(scale * found.gradient)
+            return _LOST, np.zeros(len(q))
+        return found.value, found.gradient
 
     found = minimize(
-        scaled,
-        np.zeros(len(start)),
+        sloped,
+        start.astype(float),
         jac=True,
         method="L-BFGS-B",
-        bounds=Bounds((low - start) / scale, (high - start) / scale),
+        bounds=Bounds(low.astype(float), high.astype(float)),
         options={"gtol": _FLAT, "ftol": 1e-7},
     )
-    q = np.clip(start + scale * found.x, low, high)
+    q = np.clip(found.x, low, high)
     return q, deviance(q)
