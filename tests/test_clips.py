@@ -243,6 +243,16 @@ def test_effects_of_clips_and_their_derivatives(kind):
         assert change.curve[..., k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
 
 
+def test_an_offset_brings_a_clip_within_reach():
+    clip = HeldClip("pinned", (0.4, 0.31), 0.5)  # 0.506 m from the start
+    model = CableModel(CABLE, n=20, n_rest=0, clips=("pinned",), effects=(ClipOffset(),))
+    pose, rest = HeldPose((0.0, 0.0), (0.7, 0.1), clips=(clip,)), np.zeros(20)
+    with pytest.raises(EquilibriumError, match=r"clip are 0\.5061 m apart, with 0\.5000 m"):
+        solve_equilibrium(model, model.nominal, rest, pose)
+    eq = solve_equilibrium(model, model.nominal - np.array([0.0, 0.0, 0.02]), rest, pose)
+    assert eq.stable
+
+
 SESSION = """\
 cable: {name: harness, length: 0.8, mass: 0.05, diameter: 0.005, bending_stiffness: 0.01}
 experiment:
@@ -284,3 +294,13 @@ def test_clips_that_cannot_be_declared_so(tmp_path, old, new, said):
     (tmp_path / "session.yaml").write_text(SESSION.replace(old, new))
     with pytest.raises(ConfigError, match=said):
         load_config(tmp_path / "session.yaml")
+
+
+def test_a_clip_that_is_some_millimetres_off_leaves_no_pose_out(tmp_path):
+    (tmp_path / "a.csv").touch()
+    path = tmp_path / "session.yaml"
+    path.write_text(SESSION.replace("[0.25, 0.05]", "[0.31, 0.01]"))  # 10 mm too far
+    assert not load_config(path).skipped
+    path.write_text(SESSION.replace("[0.25, 0.05]", "[0.325, 0.01]"))  # 25 mm
+    with pytest.raises(ConfigError, match=r"0\.3252 m apart, with 0\.3 m of cable"):
+        load_config(path)

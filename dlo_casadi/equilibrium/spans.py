@@ -28,6 +28,7 @@ from dlo_casadi.equilibrium.guesses import (
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import tangents
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame
 
@@ -78,9 +79,10 @@ def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
     found = [_Holder(0.0, start, first if model.start == "clamped" else None)]
-    for clip in pose.clips:
-        rolls = clip.kind == "swivel"
-        found.append(_Holder(clip.at, np.array(clip.place), clip.frame, rolls))
+    places, at = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
+    for k, clip in enumerate(pose.clips):
+        s = None if clip.kind == "eyelet" else float(at[k, 0])
+        found.append(_Holder(s, places[:, k], clip.frame, clip.kind == "swivel"))
     own = last if model.end == "clamped" else None
     found.append(_Holder(model.cable.length, None if model.end == "free" else end, own))
     return found

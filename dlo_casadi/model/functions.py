@@ -355,15 +355,22 @@ class Functions:
         return ca.Function("spring_places", [self.terms.p], [ca.vertcat(ca.SX(0, 1), *places)])
 
     @cached_property
-    def arc_lengths(self) -> ca.Function:
-        """(p, pose) -> true arc lengths (n_clips,) [m] of the clips; zero of eyelets."""
-        found = ca.vertcat(ca.SX(0, 1), *(s for _, s in self.terms.true_ends.clips))
-        return ca.Function("arc_lengths", [self.terms.p, self.terms.pose], [found])
+    def true_clips(self) -> ca.Function:
+        """(p, pose) -> true places (dimension, n_clips) and arc lengths (n_clips,) of clips [m].
+
+        Without a pose's own deviations; the arc lengths of eyelets are zero.
+        """
+        clips = self.terms.true_ends.clips
+        places = ca.horzcat(ca.SX(self.node.dimension, 0), *(place for place, _ in clips))
+        at = ca.vertcat(ca.SX(0, 1), *(s for _, s in clips))
+        still = ca.SX.zeros(self.terms.deviation.shape)
+        outputs = ca.substitute([places, at], [self.terms.deviation], [still])
+        return ca.Function("true_clips", [self.terms.p, self.terms.pose], outputs)
 
     @cached_property
     def slips(self) -> FloatArray:
-        """Derivatives of `arc_lengths` by parameters (n_clips, n_parameters): numbers."""
-        at = self.arc_lengths(self.terms.p, self.terms.pose)
+        """Derivatives of arc lengths by parameters (n_clips, n_parameters): numbers."""
+        _, at = self.true_clips(self.terms.p, self.terms.pose)
         return np.array(ca.evalf(ca.jacobian(at, self.terms.p)))
 
     @cached_property

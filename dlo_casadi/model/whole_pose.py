@@ -208,7 +208,7 @@ def _segment_arguments(
     rest = ca.reshape(ca.sparsify(ca.DM(inside)) @ s.rest, -1, chain.n_segments)
     place: Any = ca.DM(chain.layout.segments.T)
     if model.clips:
-        at = ca.vertsplit(ca.SX(functions_of(model).arc_lengths(s.p, s.pose)))
+        at = ca.vertsplit(ca.SX(functions_of(model).true_clips(s.p, s.pose)[1]))
         for k, row in model.sliding.items():
             at[k] = s.lam[row]
         places = ca.SX(ca.DM(chain.places))
