@@ -7,10 +7,6 @@ from typing import Any, Literal, Protocol
 from dlo_casadi.config.values import ConfigSection, Name, NonNegative, Number, Place, Quaternion
 from dlo_casadi.model.clips import HeldClip
 
-# Error of a clip's place, in lengths of the cable, beyond which a span that is too short for its
-# chord is a mistake in the configuration; smaller ones are for the fit to find.
-CLIP_OFF = 0.02
-
 
 class Clip(ConfigSection):
     """A clip that holds the cable between its ends."""
@@ -89,10 +85,7 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
 
 
 def too_short(pose: _Clipped, length: float, slack: float) -> str:
-    """Why a pose cannot be: a span is longer than its cable, or empty.
-
-    By more than a slack [m] and what a clip may be off.
-    """
+    """Why a pose cannot be: a span is longer than its cable, by more than a slack [m]; or empty."""
     names = ["the start", *(clip.name for clip in pose.held.clips), "the end"]
     places = [pose.start, *(clip.place for clip in pose.clips), pose.end]
     at = [0.0, *(clip.at for clip in pose.clips), length]
@@ -105,7 +98,7 @@ def too_short(pose: _Clipped, length: float, slack: float) -> str:
         s, start = at[k], at[low]
         if s is None or start is None:
             continue
-        if straight > s - start + slack + CLIP_OFF * length:
+        if straight > s - start + slack:
             return (
                 f"{names[low]} and {names[k]} are {straight:.4g} m apart"
                 f"{' by way of the eyelets' if k > low + 1 else ''}, with {s - start:.4g} m of "

@@ -346,6 +346,33 @@ def rolled(u: FloatArray, frames: Rotation, clamps: Turned, roll: float) -> Floa
     return same_sign((frames * about).as_quat())
 
 
+def frames_along(
+    s: FloatArray,
+    axes: FloatArray,
+    held: Sequence[tuple[float, Sequence[float] | FloatArray | None]],
+    turns: float,
+) -> FloatArray:
+    """Frames (k, 4) at arc lengths s (k,) [m] with these tangents (k, 3).
+
+    Parameters
+    ----------
+    held : sequence of (arc length [m], frame or None)
+        The ends and all between them that hold the roll of the cable, in order. From one to the
+        next its roll is spread evenly.
+    turns : float
+        Of twist before the end, see `HeldPose`.
+    """
+    frames = np.zeros((len(s), 4))
+    for (low, first), (high, last) in pairwise(held):
+        inside = (s >= low - 1e-9) & (s <= high + 1e-9)
+        u = (s[inside] - low) / (high - low)
+        both = frame_rotation(first), frame_rotation(last)
+        turned, roll = carried(u, axes[inside], both)
+        own = turns if high == held[-1][0] and None not in both else 0.0
+        frames[inside] = rolled(u, turned, both, nearest_roll(roll, own))
+    return same_sign(frames)
+
+
 def nearest_roll(roll: float, aimed: float) -> float:
     """The roll [rad], up to full turns, that is nearest to `aimed` [turns].
 
@@ -368,8 +395,8 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
     """Nodes (n_nodes, coordinates) along a measured line, from its chords.
 
     The chords are some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In
-    a plane headings are continuous along the cable; in space the roll of the end clamp nearest to
-    `turns` is spread evenly.
+    a plane headings are continuous along the cable; in space the rolls of clamped clips, and that
+    of the end clamp nearest to `turns`, are spread evenly.
     """
     last = [] if pose.end is None else [chain.length]
     at = np.maximum.accumulate(np.concatenate([[0.0], places, last]))
@@ -384,10 +411,10 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
         return np.interp(chain.places, middles, headings)[:, None]
     tangents = np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
-    clamps = (
-        frame_rotation(pose.start_orientation if chain.start_clamped else None),
-        frame_rotation(pose.end_orientation if chain.end_clamped else None),
-    )
-    u = chain.places / chain.length
-    frames, roll = carried(u, tangents, clamps)
-    return rolled(u, frames, clamps, nearest_roll(roll, 0.0 if None in clamps else pose.turns))
+    clips = [(clip.at, clip.frame) for clip in pose.clips if clip.kind == "clamped"]
+    held = [
+        (0.0, pose.start_orientation if chain.start_clamped else None),
+        *((at, frame) for at, frame in clips if at is not None),
+        (chain.length, pose.end_orientation if chain.end_clamped else None),
+    ]
+    return frames_along(chain.places, tangents, held, pose.turns)

@@ -17,12 +17,9 @@ from dlo_casadi.equilibrium.guesses import (
     arc_headings,
     arc_into_clamps,
     arc_tangents,
-    carried,
-    frame_rotation,
+    frames_along,
     guessed_frames,
     guesses,
-    nearest_roll,
-    rolled,
     smallest_turn,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -263,22 +260,12 @@ def _in_space(
             inside = (places >= span.start - 1e-9) & (places <= span.end + 1e-9)
             u = np.clip((places[inside] - span.start) / span.length, 0.0, 1.0)
             axes[inside] = _axes(model, span, quarter, u)
-        frames = np.zeros((len(places), 4))
         edges: list[tuple[float, FloatArray | None]] = list(clamps)
         if not edges or edges[0][0] > 0:
             edges.insert(0, (0.0, None))
         if edges[-1][0] < length:
             edges.append((length, None))
-        for (low, first), (high, last) in pairwise(edges):
-            inside = (places >= low - 1e-9) & (places <= high + 1e-9)
-            u = (places[inside] - low) / (high - low)
-            both = frame_rotation(first), frame_rotation(last)
-            turned, roll = carried(u, axes[inside], both)
-            turns = pose.turns if high == length and None not in both else 0.0
-            frames[inside] = rolled(u, turned, both, nearest_roll(roll, turns))
-        # Neighbours carry quaternions of the same sign.
-        flips = np.where((frames[1:] * frames[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-        yield frames * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+        yield frames_along(places, axes, edges, pose.turns)
 
 
 def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatArray:
