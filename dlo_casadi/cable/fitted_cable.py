@@ -141,8 +141,7 @@ class FittedCable(CasadiCable):
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         pose = held_pose(self.model, self.metadata.fixtures, asked | {"clips": list(clips)})
-        model = replace(self.model, clips=tuple(clip.kind for clip in pose.clips))
-        return (replace(self, model=model) if pose.clips else self)._solved(pose)
+        return self.with_clips([clip.kind for clip in pose.clips])._solved(pose)
 
     def _solved(self, pose: HeldPose) -> "Shape":
         try:

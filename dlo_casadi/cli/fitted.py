@@ -17,6 +17,7 @@ from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
 from dlo_casadi.fleet.shape_table import Plan
+from dlo_casadi.model.clips import CLIP_KINDS
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 
@@ -287,6 +288,7 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
     PARAMETERS,
     option("--output", type=Path, required=True, help="folder for the C files"),
     option("--prefix", default="dlo", help="begins all public names (dlo)"),
+    option("--clips", nargs="+", default=(), choices=CLIP_KINDS, help="what holds it between"),
     *MESH,
     json="print files and hash as JSON",
 )
@@ -297,8 +299,10 @@ def generate_solver(chosen: argparse.Namespace) -> None:
 
     dlo generate-solver results/cable/parameters.yaml --output solver
     dlo generate-solver results/cable --output solver --prefix rope --elements 40
+    dlo generate-solver results/loom --output solver --clips pinned pinned
     """
     cable = load(chosen.parameters).with_mesh(chosen.elements, chosen.element)
+    cable = cable.with_clips(chosen.clips)
     solver = generate(cable.model, cable.p, cable.rest, chosen.prefix)
     written = solver.write(chosen.output)
     page = Page(chosen)

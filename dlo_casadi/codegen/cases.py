@@ -1,16 +1,18 @@
 """Differences between the solvers of a cable in a plane and in space."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
 from typing import ClassVar
 
+import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.kernels import Kernels, kernels_of
+from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.equilibrium.solve import coarse_rest
 from dlo_casadi.errors import DloError
@@ -47,7 +49,35 @@ class Case:
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
         """Kernels of its meshes by their names in C, the cable's own first."""
-        return {"kernel": kernels_of(self.model, self.p, self.rest, self.inline)}
+        return {"kernel": self.kernels(self.model, self.rest)}
+
+    def kernels(self, model: CableModel, rest: FloatArray) -> Kernels:
+        """Kernels of a mesh, without what holds the cable between its ends."""
+        inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
+        bare = replace(model, clips=(), effects=tuple(inside))
+        p = np.array([self.p[model.names.index(name)] for name in bare.names])
+        return kernels_of(bare, p, rest, self.inline, held=self.holds > 0)
+
+    @property
+    def holds(self) -> int:
+        """Number of clips and tethers that hold the cable between its ends."""
+        return len(self.model.clips) + len(self.tethers)
+
+    @cached_property
+    def tethers(self) -> list[FloatArray]:
+        """Of each tether arc length over length, anchor [m] and inverse stiffness [m/N] (d + 2,).
+
+        V = k |r|^2 / 2 - f . r + constant, with the anchor f / k. One of no stiffness is one of a
+        billionth of the cable's.
+        """
+        terms, length = self.lagrangian, self.model.cable.length
+        least = 1e-9 * self.p[self.model.stiffness_indices[0]] / length**3
+        rows = []
+        for spring in terms.springs:
+            k = ca.fmax(spring.stiffness, least)
+            rows.append(ca.vertcat(spring.position / length, spring.force / k, 1 / k))
+        found = ca.Function("tethers", [terms.p], [ca.horzcat(ca.SX(0, 0), *rows)])
+        return list(np.array(found(self.p)).T)
 
     @property
     def numbers(self) -> list[float]:
@@ -147,6 +177,8 @@ class _SpaceCase(Case):
     name, try_steps = "space", 12
     # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
     doubles, coarse_shapes = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 8
+    # Of a segment that is held inside.
+    held_doubles = 58 + 3 + 9 + 9 + 9 + 6 + 13
     # Fewest arcs of the coarse mesh, and number of fine elements in each. Of 3,000 random clamped
     # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
     # guesses on the fine mesh.
@@ -173,7 +205,7 @@ class _SpaceCase(Case):
             return found
         coarse = self.model.with_mesh(self.coarse_elements, "arc")
         rest = coarse_rest(self.model, coarse, self.rest)
-        return found | {"coarse_kernel": kernels_of(coarse, self.p, rest, self.inline)}
+        return found | {"coarse_kernel": self.kernels(coarse, rest)}
 
     @property
     def clamps(self) -> FloatArray:
@@ -202,7 +234,21 @@ class _SpaceCase(Case):
         bends = chain.curvatures(self.rest) * np.diff(chain.cells, axis=1).ravel()
         length = self.length
         first = [length, length / model.n, *model.gravity]
-        return [*first, *self.load, *self.clamps, *bends.T.ravel()]
+        return [*first, *self.load, *self.clamps, *bends.T.ravel(), *self.holding]
+
+    @property
+    def holding(self) -> list[float]:
+        """Declared length [m]; of each clip what is true minus declared, and each tether."""
+        length = self.model.cable.length
+        places, at = (
+            np.array(x)
+            for x in functions_of(self.model).true_clips(self.p, np.zeros(self.model.n_pose))
+        )
+        clips: list[FloatArray] = [
+            np.array([s / length, *place, 0.0])
+            for s, place in zip(at.ravel(), places.T, strict=True)
+        ]
+        return [length, *(float(x) for row in (*clips, *self.tethers) for x in row)]
 
     @property
     def values(self) -> dict[str, int | str]:
@@ -212,8 +258,11 @@ class _SpaceCase(Case):
         # steps. The template checks the number.
         guesses = 3 if self.model.end == "free" else 8
         return {
-            "WORKSPACE": self.doubles * (n + 2) + 4 * self.coarse_shapes * (coarse + 1),
+            "WORKSPACE": (self.doubles + 9 * self.holds) * (n + 2)
+            + 4 * self.coarse_shapes * (coarse + 1)
+            + self.held_doubles * self.holds,
             "COARSE": coarse,
+            "SHAPES": self.coarse_shapes,
             "FIRST": 0,
             "GIVES_START": 0,
             "GIVES_END": 0,

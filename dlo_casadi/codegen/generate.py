@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.cases import Case, case_of, template
-from dlo_casadi.codegen.kernels import c_number, size_of_code, table_to_c, text_of
+from dlo_casadi.codegen.kernels import KernelText, c_number, size_of_code, table_to_c
 from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
@@ -86,7 +86,7 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
     content = {
         "cable": [model.cable.length, model.cable.mass],
         "mesh": [model.n, model.element],
-        "boundary": [model.start, model.end],
+        "boundary": [model.start, model.end, *model.clips],
         "gravity": list(map(float, model.gravity)),
         "effects": [
             [type(effect).__name__, effect.label]
@@ -108,7 +108,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
     model, node, kind = case.model, case.model.node, case.model.chain.kind
     effects = comment(", ".join(effect.name for effect in model.effects)) or "none"
     held = f"start {model.start}, end {model.end}"
-    table, (kernels, loops, kernel_numbers) = case.table, text_of(case.meshes)
+    table, text = case.table, KernelText.of(case.meshes)
     values = case.values
     return values | {
         "PREFIX": prefix,
@@ -134,10 +134,13 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
         "SMOOTH": kind.smooth,
         "SPINS": model.may_spin and not case.rest.any(),
         "TABLE": table_to_c(table),
-        "EXTRA": kernel_numbers,
+        "EXTRA": text.size,
         "CODE": size_of_code(case.meshes.values(), table),
-        "KERNELS": kernels,
-        "LOOPS": loops,
+        "KERNELS": text.functions,
+        "LOOPS": text.loops,
+        "HELD": text.holders,
+        "HOLDS": case.holds,
+        "CLIPS": len(model.clips),
         "TRY_STEPS": case.try_steps,
         "PATH_STEPS": int(values["STEPS"]) + case.try_steps * (2 * FINEST + 13),
     }
@@ -184,6 +187,20 @@ def fill(text: str, values: dict[str, str], prefix: str) -> str:
     return marked(text, values)
 
 
+def _cannot_hold(model: CableModel) -> str:
+    """Why the C solver cannot hold a cable between its ends; empty if it can, or need not."""
+    if not model.clips:
+        return ""
+    if not model.in_space or model.end == "free":
+        how = "with a free end" if model.in_space else "in a plane"
+        return f"the C solver has clips of cables in space with both ends held, not {how}"
+    if others := sorted(set(model.clips) - {"pinned"}):
+        return (
+            f"the C solver has pinned clips alone, and this cable has {' and '.join(others)} ones"
+        )
+    return ""
+
+
 def generate(
     model: CableModel,
     p: FloatArray,
@@ -214,22 +231,19 @@ def generate(
         If the prefix is not a C identifier or an effect cannot be generated.
     """
     check_prefix(prefix)
-    if model.clips:
-        raise DloError(
-            "the C solver holds a cable at its ends alone, and this one has "
-            f"{counted(len(model.clips), 'clip')}.\n  Try: solve(..., clips=...) of Python."
-        )
+    if wrong := _cannot_hold(model):
+        raise DloError(f"{wrong}.\n  Try: solve(..., clips=...) of Python, which knows them.")
     p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
     if len(p) != len(model.parameters) or len(rest) != model.chain.n_rests:
         raise DloError(
             f"p has {len(p)} and rest {len(rest)} entries; the model has "
             f"{len(model.parameters)} parameters and {model.chain.n_rests} rest curvatures"
         )
-    if model.shape_dependent_loads:
+    if model.shape_dependent_loads and not model.in_space:
         loads = " and ".join(model.shape_dependent_loads)
         raise DloError(
             f"no solver can be generated for a cable with {loads}: the force depends on the shape, "
-            "and the generated solver knows dead loads only.\n"
+            "and the generated solver of a plane knows dead loads only.\n"
             "  Try: dlo predict, or dlo_casadi.predict, which know it."
         )
     digest = solver_hash(model, p, rest)

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from math import isfinite
@@ -17,6 +17,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
+from dlo_casadi.rod.in_frame import SegmentDerivatives
 
 # Largest difference of two numbers that count as equal: rounding of the mesh.
 _ROUNDING = 1e-14
@@ -66,9 +67,17 @@ class Kernel:
         row = f"table + {table_at} + (j - {first}) * {width}" if width else "table"
         state = self.function.numel_in(0) // 2
         return f"""\
-    for (j = {first}; j < {last}; ++j)
-        {name}(x + {state} * j, lam, {row}, table,
+    FOR_SEGMENTS({first}, {last})
+        {name}(x + {state} * j, FORCE, {row}, table,
         {" " * len(name)} segment + SEGMENT * j);"""
+
+    def at_holder(self, name: str, table_at: int) -> str:
+        """Statement that calls it for segment j, in which something holds the cable."""
+        width, state = self.rows.shape[1], self.function.numel_in(0) // 2
+        return f"""\
+    copy(row, table + {table_at} + j * {width}, {width});
+    row[{width}] = share;
+    {name}(x + {state} * j, lam, row, table, out);"""
 
     def text(self, name: str) -> str:
         """The function in C."""
@@ -92,17 +101,24 @@ class Kernels:
 
     `segments` are in the order of the cable; `ends` is the energy of the holders, if any, as a
     function of the first and last node; `shared` (n_parameters,) or (0,) are the parameters in the
-    table, before the segments' rows.
+    table, before the segments' rows. `holder` is any segment inside of which a clip or a tether
+    holds the cable, at a share of it that follows its row.
     """
 
     segments: tuple[Kernel, ...]
     ends: ca.Function | None
     shared: FloatArray
+    holder: Kernel | None = None
+
+    @property
+    def all(self) -> list[Kernel]:
+        """Kernels of segments, then that of a segment with a holder inside."""
+        return [*self.segments, *([] if self.holder is None else [self.holder])]
 
     @property
     def table(self) -> list[float]:
         """Numbers that the kernels read: shared ones, then the rows of all segments."""
-        rows = [kernel.rows.ravel() for kernel in self.segments]
+        rows = [kernel.rows.ravel() for kernel in self.all]
         return [float(number) for number in np.concatenate([self.shared, *rows])]
 
     @property
@@ -113,33 +129,54 @@ class Kernels:
     @property
     def code_size(self) -> int:
         """Approximate size of their machine code in bytes."""
-        return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.segments))
+        return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.all))
 
 
-def text_of(meshes: dict[str, Kernels]) -> tuple[str, str, int]:
-    """C functions of all meshes, the statements that call them, and the length of their table.
+@dataclass(frozen=True)
+class KernelText:
+    """C text of the kernels of all meshes.
 
-    With two meshes the second one is called if `w->coarse` is set.
+    `functions`, `loops` that call them for the segments, `holders` for one that holds the cable;
+    `size`: length of their table. With two meshes the second one is called if `w->coarse` is set.
     """
-    functions: list[str] = []
-    loops: list[str] = []
-    at = 0
-    for name, kernels in meshes.items():
-        statements, at = [], at + len(kernels.shared)
-        for k, kernel in enumerate(kernels.segments):
-            functions.append(kernel.text(f"{name}_{k}"))
-            statements.append(kernel.loop(f"{name}_{k}", at))
-            at += kernel.rows.size
-        if kernels.ends is not None:
-            functions.append(_ends_text(kernels.ends))
-        loops.append("\n".join(statements))
-    fine, *coarse = loops
+
+    functions: str
+    loops: str
+    holders: str
+    size: int
+
+    @classmethod
+    def of(cls, meshes: dict[str, Kernels]) -> "KernelText":
+        """Text of the kernels of meshes by the mesh's name."""
+        functions: list[str] = []
+        loops: list[str] = []
+        holders: list[str] = []
+        at = 0
+        for name, kernels in meshes.items():
+            statements, at = [], at + len(kernels.shared)
+            for k, kernel in enumerate(kernels.segments):
+                functions.append(kernel.text(f"{name}_{k}"))
+                statements.append(kernel.loop(f"{name}_{k}", at))
+                at += kernel.rows.size
+            if kernels.holder is not None:
+                functions.append(kernels.holder.text(f"{name}_held"))
+                holders.append(kernels.holder.at_holder(f"{name}_held", at))
+                at += kernels.holder.rows.size
+            if kernels.ends is not None:
+                functions.append(_ends_text(kernels.ends))
+            loops.append("\n".join(statements))
+        text = "\n".join(functions)
+        helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
+        return cls("\n".join([*helpers, text]), _by_mesh(loops), _by_mesh(holders), at)
+
+
+def _by_mesh(statements: list[str]) -> str:
+    """Statements for the mesh in use, of those for the fine and, if there is one, the coarse."""
+    text, *coarse = statements or [""]
     for inside in coarse:
         inside = re.sub("^", "    ", inside, flags=re.MULTILINE)
-        fine = f"    if (w->coarse) {{\n{inside}\n        return;\n    }}\n{fine}"
-    text = "\n".join(functions)
-    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
-    return "\n".join([*helpers, text]), fine, at
+        text = f"    if (w->coarse) {{\n{inside}\n        return;\n    }}\n{text}"
+    return text
 
 
 def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
@@ -150,8 +187,13 @@ def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
     return 25_000 + sum(kernels.code_size for kernels in meshes) + 8 * len(numbers)
 
 
-def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True) -> Kernels:
-    """Kernels of a model at given parameters; `inline` as in `generate`."""
+def kernels_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True, held: bool = False
+) -> Kernels:
+    """Kernels of a model at given parameters; `inline` as in `generate`.
+
+    The model has neither clips nor tethers; `held`: whether the solver has.
+    """
     places = model.chain.layout.segments
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
@@ -169,7 +211,47 @@ def kernels_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool 
         for first, last in pairwise(edges)
     )
     shared = np.zeros(0) if inline else np.asarray(p, float)
-    return Kernels(segments, _ends(model, parameters), shared)
+    holder = _holder(model, parameters, places[0], own) if held else None
+    return Kernels(segments, _ends(model, parameters), shared, holder)
+
+
+def _holder(model: CableModel, p: ca.SX, first: FloatArray, own: FloatArray) -> Kernel:
+    """Kernel of any segment, with a holder at the share `row[-1]` of it."""
+    held = replace(model, clips=("pinned",))
+    row = ca.SX.sym("row", own.shape[1] + 1)
+    start, share = row[0], row[-1]
+    place = ca.vertcat(start, first[1], start, *first[3:], start + share * model.chain.h)
+    still = ca.SX.zeros(len(held.deviation_names))
+    shares = ca.vertcat(lagrangian_of(model).shares(p, place[: len(first)]), share)
+    numbers = SegmentNumbers(p, row[1:-1], place, still, shares)
+    return Kernel((0, len(own)), own, partial(_told_held, held, numbers, row))
+
+
+def _told_held(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function:
+    """As `_told` for a segment that is held inside: lam are the force beyond and that inside.
+
+    After what `_told` has: derivatives by the force inside, first, then with the first node, the
+    last node, the force beyond and itself; and derivatives by the place on the cable [1/m]: of the
+    Lagrangian, of its gradient by the first node, the last node, the force beyond and that inside.
+    """
+    d = model.node.dimension
+    x, lam = ca.SX.sym("x", 2 * model.node.coordinates), ca.SX.sym("lam", 2 * d)
+    found = lagrangian_of(model).in_frame(x, ca.reshape(lam, d, 2), numbers).derivatives()
+    found = found.about(found.turn, found.turn)
+    inside = found.lam_lam[:d, d:], found.lam_lam[d:, d:]
+    more = [found.by_lam[d:], *(_rows(part[:, d:]) for part in found.mixed)]
+    more += [_rows(inside[0]), _triangle(inside[1])]
+    slopes = ca.vertcat(found.value, *found.slopes, found.by_lam)
+    by_place = ca.jacobian(slopes, row[-1]) / model.chain.h
+    plain = replace(
+        found,
+        by_lam=found.by_lam[:d],
+        mixed=(found.mixed[0][:, :d], found.mixed[1][:, :d]),
+        lam_lam=found.lam_lam[:d, :d],
+    )
+    arguments = [x, lam, row, _symbols(numbers.p)]
+    outputs = [ca.densify(ca.vertcat(*_in_order(plain), *more, by_place))]
+    return ca.Function("kernel", arguments, ca.cse(outputs))
 
 
 def _kernel(
@@ -233,7 +315,11 @@ def _of_headings(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumber
 def _of_frames(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
     """Derivatives are by increments about the world's axes."""
     found = lagrangian_of(model).in_frame(x, lam, numbers).derivatives()
-    found = found.about(found.turn, found.turn)
+    return _in_order(found.about(found.turn, found.turn))
+
+
+def _in_order(found: SegmentDerivatives) -> list[ca.SX]:
+    """Derivatives in space in the order of `_told`."""
     (first, between, last), mixed = found.bends, found.mixed
     bends = [_triangle(first), _rows(between), _triangle(last)]
     borders = [*map(_rows, mixed), _triangle(found.lam_lam)]

@@ -1,7 +1,7 @@
 """Arguments and results of the compiled solver, and the memory layout of its C structures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -35,7 +35,8 @@ _HINTS = {
     "iteration_limit": "warm: the shape of a pose nearby.",
     "not_finite": "finite numbers for start, end and directions.",
     "unstable": "another branch, or a pose nearby.",
-    "bad_argument": "in space a pose without a branch, and orientations that are not zero.",
+    "bad_argument": "in space a pose without a branch, orientations that are not zero, clips in "
+    "their order and not two in one element.",
     "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
     "turns_shed": "fewer turns, or the end farther from the start.",
 }
@@ -69,6 +70,10 @@ class CompiledShape:
         +1 counter-clockwise from start to end, -1 clockwise; 0 in space.
     status : str
         One of STATUSES; all numbers are zero unless it is "ok".
+    clip_forces : (n_clips + n_tethers, dimension) [N]
+        Of the cable on each clip, then on each tether.
+    clip_grip : (n_clips + n_tethers,) [N]
+        Their parts along the cable, forward: what a clip holds against slipping.
     """
 
     points: FloatArray
@@ -84,6 +89,8 @@ class CompiledShape:
     iterations: int
     turn: int
     status: str
+    clip_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    clip_grip: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,7 @@ class Slope:
 
     In a plane by end x, y [m], start heading, end heading [rad], k = 4. In space by start x, y, z
     [m], the rotation of the start about the world's axes x, y, z [rad], and the same of the end,
-    k = 12.
+    k = 12, then of each clip its arc length and its place x, y, z [m].
 
     Parameters
     ----------
@@ -114,6 +121,7 @@ class Slope:
     end_force : (dimension, k)
     moments : (2, increment, k)
     min_bend_radius : (k,)
+    clip_forces : (n_clips + n_tethers, dimension, k)
     """
 
     points: FloatArray
@@ -121,6 +129,7 @@ class Slope:
     end_force: FloatArray
     moments: FloatArray
     min_bend_radius: FloatArray
+    clip_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -198,10 +207,15 @@ def records_of(model: CableModel) -> Records:
     """Layouts of the structures of a model's solver."""
     node, n, nodes = model.node, model.n + 1, model.chain.n_nodes
     d, turn = node.dimension, node.increment
-    k = 2 * turn + (2 * d if model.in_space else d)
-    forces = {"start_force": (d,), "end_force": (d,), "moments": (2, turn)}
+    k, holds = 2 * turn + (2 * d if model.in_space else d), len(model.clips) + model.n_springs
+    k += (1 + d) * len(model.clips)
+    forces: dict[str, tuple[int, ...]] = {"start_force": (d,), "end_force": (d,)}
+    forces |= {"clip_forces": (holds, d), "clip_grip": (holds,)} if holds else {}
+    forces |= {"moments": (2, turn)}
     scalars = ("energy", "min_bend_radius", "max_twist", "end_error", "imbalance")
-    slope = {"points": (n, d, k), "rotations": (nodes, turn, k), "end_force": (d, k)}
+    slope: dict[str, tuple[int, ...]] = {"points": (n, d, k), "rotations": (nodes, turn, k)}
+    slope["end_force"] = (d, k)
+    slope |= {"clip_forces": (holds, d, k)} if holds else {}
     slope |= {"moments": (2, turn, k), "min_bend_radius": (k,)}
     gap = {"distance": (), "place": (), "point": (d,), "normal": (d,), "gradient": (k,)}
     return Records(
@@ -277,7 +291,13 @@ def _row(model: CableModel, pose: object) -> FloatArray:
         raise DloError(f"numbers belong in a pose, found {pose!r}") from None
     if len(numbers) != EndConditions.size(model.node) + 1:
         raise DloError(f"{said}an orientation must have 4 numbers, found {pose!r}")
-    return numbers[: pose_size(model)]
+    kinds = tuple(clip.kind for clip in pose.clips)
+    if kinds != model.clips:
+        own, others = (", ".join(x) or "none" for x in (kinds, model.clips))
+        raise DloError(f"{said}the pose has the clips {own}, the solver {others}")
+    clips = [[clip.at or 0.0, *clip.place] for clip in pose.clips]
+    ends = EndConditions.size(model.node) + int(model.in_space)
+    return np.concatenate([numbers[:ends], *clips])
 
 
 def no_equilibrium(status: str, pose: AnyPose, length: float) -> str:

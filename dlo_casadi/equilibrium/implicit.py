@@ -40,8 +40,9 @@ LEAST_FRAME = 1e-6
 
 
 def pose_size(model: CableModel) -> int:
-    """Size of dlo_pose in the C header: both ends and, in space, `turns`."""
-    return EndConditions.size(model.node) + int(model.in_space)
+    """Size of dlo_pose in the C header: both ends, in space `turns`, then the clips."""
+    clips = (1 + model.node.dimension) * len(model.clips)
+    return EndConditions.size(model.node) + int(model.in_space) + clips
 
 
 def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> HeldPose:

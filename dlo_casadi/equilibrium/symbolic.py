@@ -1,9 +1,9 @@
 """A cable whose parameters have values as CasADi functions, for problems of one's own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import casadi as ca
 import numpy as np
@@ -23,6 +23,7 @@ from dlo_casadi.equilibrium.pose import SIGNS, Branch
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, shape
 
 # Smallest curvature [1/m] that is told from none: the norm of two has no derivative at zero.
@@ -54,6 +55,10 @@ class CasadiCable:
     model: CableModel
     p: FloatArray
     rest: FloatArray
+
+    def with_clips(self, clips: Sequence[ClipKind]) -> Self:
+        """Return the same cable held by clips of these kinds, in the order along it."""
+        return replace(self, model=replace(self.model, clips=tuple(clips)))
 
     def function(
         self,

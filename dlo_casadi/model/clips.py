@@ -9,7 +9,7 @@ frame, so that no element has a jump of curvature inside.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -21,6 +21,7 @@ from dlo_casadi.rod.node import Heading, Node, quaternion_product
 
 # A swivel is a clamp in space in which the cable may roll about its axis.
 ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
+CLIP_KINDS: tuple[ClipKind, ...] = get_args(ClipKind)
 CLAMPS = ("clamped", "swivel")
 
 

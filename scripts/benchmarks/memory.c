@@ -39,6 +39,14 @@ static void draw_pose(dlo_pose *pose, unsigned long *state)
             pose->end_orientation[k] = uniform(state) - 0.5;
         }
         pose->turns = floor(3.0 * uniform(state)) - 1.0;
+#if DLO_CLIPS
+        for (k = 0; k < 3 * DLO_CLIPS; ++k) {
+            dlo_clip *const clip = pose->clips + k / 3;
+            const double share = (k / 3 + 0.8 + 0.4 * uniform(state)) / (DLO_CLIPS + 1);
+            clip->at = share * DLO_LENGTH;
+            clip->place[k % 3] = share * pose->end[k % 3] + 0.1 * DLO_LENGTH * uniform(state);
+        }
+#endif
     }
 #else
     pose->start_heading = 3.0 * uniform(state) - 1.5;
