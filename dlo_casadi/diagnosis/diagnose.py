@@ -10,7 +10,7 @@ import numpy as np
 
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.next_measurement import HiddenWeight, NextPose, hidden_weight, next_pose
+from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
 from dlo_casadi.diagnosis.refits import (
     Confirmed,
     confirm,
@@ -43,7 +43,7 @@ from dlo_casadi.diagnosis.structure import (
 )
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
 from dlo_casadi.effects import PointLoad
-from dlo_casadi.estimation.fit import fine_enough
+from dlo_casadi.estimation.fit import at_random, fine_enough
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
@@ -143,53 +143,7 @@ def diagnose(
         default it stays.
     """
     run_in = executor or InProcess()
-    search = Search(fit, center, exclude, significance, max_effects, step, run_in, finest)
-    # Where left-out poses are not even reached no effect can be followed: first the force.
-    lost = search.loses_poses and fit.noise.source != "misfit"
-    force = estimate_unknown_force(fit, search.executor) if lost else None
-    found = search.run(force)
-    if found.unexplained and force is not None:
-        found = search.run()
-    elif found.unexplained:
-        force = estimate_unknown_force(fit if found.added else found.fit, search.executor)
-        found = search.with_cause_of(force, found)
-    if found.unexplained and found.added:
-        found = search.without_wrong_causes(found, force)
-        if found.added or not fit.errors_known:
-            force = estimate_unknown_force(found.fit, search.executor)
-    tried = {row.name for row in found.ranked}
-
-    def named(item: AddedEffect) -> AddedEffect:
-        rivals = [rival.candidate for rival in item.rivals]
-        return replace(item, equivalents=equivalents(found.fit, item.candidate, tried, rivals))
-
-    return Diagnosis(
-        before=fit,
-        after=found.fit,
-        validation_before=search.validation,
-        validation_after=found.validation,
-        structure_before=structure_of(fit, screening_degrees(fit)),
-        structure_after=found.structure,
-        added=tuple(map(named, found.added)),
-        ranked=found.ranked,
-        unexplained=found.unexplained,
-        pull=force if found.unexplained else None,
-        weight=None if found.unexplained else hidden_weight(found.fit, exclude),
-    )
-
-
-def separating_pose(diagnosis: Diagnosis) -> NextPose | None:
-    """Pose that separates an added effect from its closest rival.
-
-    Both as fits on the mesh of the search.
-    """
-    for item in diagnosis.added:
-        if item.rivals:
-            rival = item.rivals[0]
-            found = next_pose(diagnosis.after, rival.fit)
-            names = (item.candidate.name, rival.candidate.name)
-            return None if found is None else replace(found, separates=names)
-    return None
+    return Search(fit, center, exclude, significance, max_effects, step, run_in, finest).closed()
 
 
 @dataclass(frozen=True)
@@ -266,6 +220,45 @@ class Search:
             return []
         return Screen(current, listed).run(screening_degrees(current), self.executor)
 
+    def closed(self) -> Diagnosis:
+        """What is found, wrong causes withdrawn."""
+        fit = self.declared
+        # Where left-out poses are not even reached no effect can be followed: first the force.
+        lost = self.loses_poses and fit.noise.source != "misfit"
+        force = estimate_unknown_force(fit, self.executor) if lost else None
+        found = self.run(force)
+        other = self.at_random(found)
+        if other is not None:
+            return replace(self, declared=other).closed()
+        if found.unexplained and force is not None:
+            found = self.run()
+        elif found.unexplained:
+            force = estimate_unknown_force(fit if found.added else found.fit, self.executor)
+            found = self.with_cause_of(force, found)
+        if found.unexplained and found.added:
+            found = self.without_wrong_causes(found, force)
+            if found.added or not fit.errors_known:
+                force = estimate_unknown_force(found.fit, self.executor)
+        tried = {row.name for row in found.ranked}
+
+        def named(item: AddedEffect) -> AddedEffect:
+            rivals = [rival.candidate for rival in item.rivals]
+            return replace(item, equivalents=equivalents(found.fit, item.candidate, tried, rivals))
+
+        return Diagnosis(
+            before=fit,
+            after=found.fit,
+            validation_before=self.validation,
+            validation_after=found.validation,
+            structure_before=structure_of(fit, screening_degrees(fit)),
+            structure_after=found.structure,
+            added=tuple(map(named, found.added)),
+            ranked=found.ranked,
+            unexplained=found.unexplained,
+            pull=force if found.unexplained else None,
+            weight=None if found.unexplained else hidden_weight(found.fit, self.exclude),
+        )
+
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
 
@@ -330,6 +323,16 @@ class Search:
         self.step("search for a missing effect", self.max_effects, self.max_effects)
         listed = tuple(replace(row, reason=lost.get(row.name, "")) for row in ranked)
         return self._ended(*self._pruned(current, added), listed)
+
+    def at_random(self, found: Found) -> Fit | None:
+        """The declared model with random effects, if it misfits and they explain more than `found`."""
+        scatter = found.fit.problem.priors.pose_scatter
+        if self.declared.noise.source != "misfit" or not (found.unexplained or scatter.std):
+            return None
+        near = at_random(self.declared)
+        if near is None or not (found.unexplained or near.log_evidence > found.fit.log_evidence):
+            return None
+        return fine_enough(near, near.model.n, finest=self.finest)[0] if self.finest else near
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
         """Backward step: without the effects that a later one has made superfluous.

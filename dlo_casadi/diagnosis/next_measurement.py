@@ -9,6 +9,7 @@ from scipy.special import chdtri
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
+from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -191,6 +192,20 @@ class NextPose:
     separation: float
     reading: NextReading
     separates: tuple[str, ...] = ()
+
+
+def separating_pose(fit: Fit, added: Sequence[AddedEffect]) -> NextPose | None:
+    """Pose that separates one of a fit's added effects from its closest rival.
+
+    Both as fits on the mesh of the search.
+    """
+    for item in added:
+        if item.rivals:
+            rival = item.rivals[0]
+            found = next_pose(fit, rival.fit)
+            names = (item.candidate.name, rival.candidate.name)
+            return None if found is None else replace(found, separates=names)
+    return None
 
 
 def next_pose(first: Fit, second: Fit) -> NextPose | None:

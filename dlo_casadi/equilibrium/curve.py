@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray, IntArray
+from dlo_casadi.arrays import FloatArray, IntArray, cross
 from dlo_casadi.equilibrium.pose import HeldPose
 
 _NEWTON_STEPS = 12
@@ -159,32 +159,39 @@ class NodeCurve:
         square = (line**2).sum(axis=1) - 2 * points @ line.T
         return self.projections(points, self.grid[square.argmin(axis=1)])
 
-    def normals(self, s: FloatArray) -> FloatArray:
-        """Unit normals (K, d - 1, d): in the plane to the left of the direction of travel.
-
-        In space the pair is transported along the curve without twist: errors of neighbouring
-        points are then compared in the same directions.
-        """
+    def tangents(self, s: FloatArray) -> FloatArray:
+        """Unit tangents (K, d) at arc lengths s [m]."""
         t = self.at(s, 1)
-        t = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
-        if self.d == 2:
-            return np.stack([-t[:, 1], t[:, 0]], axis=1)[:, None]
-        first = np.eye(3)[np.abs(t).argmin(axis=1)]
-        first = first - (first * t).sum(axis=1, keepdims=True) * t
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        second = np.cross(t, first)
-        # The first normal of each point, carried to the next by the smallest rotation.
-        before, ahead, near = first[:-1], t[1:], 1 + (t[:-1] * t[1:]).sum(axis=1)
-        share = (ahead * before).sum(axis=1) / np.maximum(near, 1e-12)
-        carried = before - share[:, None] * (t[:-1] + ahead)
-        turn = np.arctan2((carried * second[1:]).sum(axis=1), (carried * first[1:]).sum(axis=1))
-        angle = np.concatenate([[0.0], np.cumsum(turn)])[:, None]
-        cos, sin = np.cos(angle), np.sin(angle)
-        return np.stack([cos * first + sin * second, cos * second - sin * first], axis=1)
+        return np.asarray(t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300))
+
+    def normals(self, s: FloatArray) -> FloatArray:
+        """Unit normals (K, d - 1, d), see `across`."""
+        return across(self.tangents(s))
 
     def distances(self, points: FloatArray) -> FloatArray:
         """Distance (K,) [m] of each point to the nearest place on the curve."""
         return np.linalg.norm(points - self.at(self.nearest(points)), axis=1)
+
+
+def across(t: FloatArray) -> FloatArray:
+    """Unit normals (K, d - 1, d) of tangents (K, d): in the plane to the left of them.
+
+    In space the pair is transported from each point to the next without twist.
+    """
+    if t.shape[1] == 2:
+        return np.stack([-t[:, 1], t[:, 0]], axis=1)[:, None]
+    first = np.eye(3)[np.abs(t).argmin(axis=1)]
+    first = first - (first * t).sum(axis=1, keepdims=True) * t
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = cross(t, first)
+    # The first normal of each point, carried to the next by the smallest rotation.
+    before, ahead, near = first[:-1], t[1:], 1 + (t[:-1] * t[1:]).sum(axis=1)
+    share = (ahead * before).sum(axis=1) / np.maximum(near, 1e-12)
+    carried = before - share[:, None] * (t[:-1] + ahead)
+    turn = np.arctan2((carried * second[1:]).sum(axis=1), (carried * first[1:]).sum(axis=1))
+    angle = np.concatenate([[0.0], np.cumsum(turn)])[:, None]
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([cos * first + sin * second, cos * second - sin * first], axis=1)
 
 
 def chord_places(points: FloatArray, pose: HeldPose, length: float) -> FloatArray:

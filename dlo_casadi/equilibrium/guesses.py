@@ -4,12 +4,11 @@ The generated solver tries the same ones with the same numbers: codegen/template
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, cross
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -258,7 +257,7 @@ def guessed_frames(
     along = chord / max(float(np.linalg.norm(chord)), 1e-12)
     side = down - (down @ along) * along
     if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
-        side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+        side = cross(along, np.eye(3)[np.argmin(np.abs(along))])
     found: list[FloatArray] = []
     others: list[FloatArray] = []
     aimed = turns = 0.0 if None in clamps else pose.turns
@@ -280,13 +279,14 @@ def frame_rotation(frame: Sequence[float] | FloatArray | None) -> Rotation | Non
 
 
 def smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
-    """Smallest rotation of the unit vector a into b."""
-    axis = np.cross(a, b)
-    cosine = float(a @ b)
-    if cosine < -1 + 1e-12:
-        axis = np.cross(a, np.eye(3)[np.argmin(np.abs(a))])
-        return Rotation.from_rotvec(np.pi * axis / np.linalg.norm(axis))
-    return Rotation.from_quat(np.append(axis, 1 + cosine))
+    """Smallest rotations of unit vectors a (..., 3) into b (..., 3)."""
+    axis, real = cross(a, b), 1 + (a * b).sum(axis=-1, keepdims=True)
+    opposite = real < 1e-12
+    if opposite.any():
+        aside = cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)])
+        aside /= np.linalg.norm(aside, axis=-1, keepdims=True)
+        axis, real = np.where(opposite, aside, axis), np.where(opposite, 0.0, real)
+    return Rotation.from_quat(np.concatenate([axis, real], axis=-1))
 
 
 def arc_tangents(u: FloatArray, chord: FloatArray, side: FloatArray) -> FloatArray:
@@ -330,13 +330,15 @@ def carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotati
     for bend in bends:
         axes = Rotation.from_rotvec(bend).apply(axes)
     first = clamps[0] or smallest_turn(_FORWARD, axes[0])
-    frames = [smallest_turn(first.apply(_FORWARD), axes[0]) * first]
-    for before, after in pairwise(axes):
-        frames.append(smallest_turn(before, after) * frames[-1])
+    quaternions = [(smallest_turn(first.apply(_FORWARD), axes[0]) * first).as_quat()]
+    x, y, z, w = smallest_turn(axes[:-1], axes[1:]).as_quat().T
+    for turn in np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]]).T:
+        quaternions.append(quaternions[-1] @ turn)
+    frames = Rotation.from_quat(quaternions)
     if clamps[1] is None:
-        return Rotation.concatenate(frames), 0.0
+        return frames, 0.0
     x, _, _, w = (frames[-1].inv() * clamps[1]).as_quat()
-    return Rotation.concatenate(frames), float(np.pi - (np.pi - 2 * np.arctan2(x, w)) % (2 * np.pi))
+    return frames, float(np.pi - (np.pi - 2 * np.arctan2(x, w)) % (2 * np.pi))
 
 
 def rolled(u: FloatArray, frames: Rotation, clamps: Turned, roll: float) -> FloatArray:

@@ -11,7 +11,7 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, cross
 from dlo_casadi.equilibrium.guesses import (
     arc_half_angle,
     arc_headings,
@@ -281,7 +281,7 @@ def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatAr
     along = span.chord / max(float(np.linalg.norm(span.chord)), 1e-12)
     side = down - (down @ along) * along
     if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
-        side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+        side = cross(along, np.eye(3)[np.argmin(np.abs(along))])
     turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
     axes = arc_tangents(u, span.chord / span.length, turned)
     arc = arc_tangents(np.array([0.0, 1.0]), span.chord / span.length, turned)

@@ -101,8 +101,6 @@ def fit_model(
     theta = unknowns.pack(first, np.zeros(model.n_coefficients))
     fit = _searched(problem, theta)
     different = different_poses(measured, model.cable.length)
-    if different >= DIFFERENT and fit.noise.source == "misfit":
-        return _at_random(fit) or fit
     doubtful = fit.residual_rms > SearchSettings.of(model).other_minima * model.cable.length
     if different >= DIFFERENT and fit.beyond_noise and doubtful:
         # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
@@ -119,8 +117,10 @@ def fit_model(
     return fit
 
 
-def _at_random(fit: Fit) -> Fit | None:
+def at_random(fit: Fit) -> Fit | None:
     """The fit to a misfit, if that is explained by what differs from pose to pose; else None."""
+    if different_poses(fit.problem.history, fit.model.cable.length) < DIFFERENT:
+        return None
     known = fit.noise.before or fit.noise
     found = pose_scatter_of(fit.reweighed(known), known).scatter
     if not found.std:

@@ -11,10 +11,17 @@ from typing import Any, Protocol
 import numpy as np
 
 from dlo_casadi.config import Config
-from dlo_casadi.diagnosis.diagnose import diagnose, separating_pose
+from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals
-from dlo_casadi.estimation.fit import SEARCH_MESH, fine_enough, mesh_error, refine_mesh
+from dlo_casadi.estimation.fit import (
+    SEARCH_MESH,
+    at_random,
+    fine_enough,
+    mesh_error,
+    refine_mesh,
+)
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES
@@ -153,7 +160,7 @@ def fit_session(
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])
     if not config.diagnosis.enabled:
-        fit = as_measured(fit)
+        fit = as_measured((fit.noise.source == "misfit" and at_random(fit)) or fit)
     stages = [*stages, own if fit is best else staged(fit)]
     progress.step("compare with simpler fits", 1, 1)
     clock.lap("fit")
@@ -257,7 +264,7 @@ def close_the_loop(
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
-    next_pose = separating_pose(diagnosis) if diagnosis.added else None
+    next_pose = separating_pose(diagnosis.after, diagnosis.added)
     if diagnosis.added or diagnosis.unexplained:
         parameters = fitted_parameters(declared, profile_intervals(declared), reported)
         stages[-1] = replace(stages[-1], parameters=parameters)

@@ -59,10 +59,28 @@ def test_a_line_in_space_is_compared_across_its_tangent():
     np.testing.assert_allclose(places, s, atol=1e-8)
     residual = line.residual(now, places).reshape(12, 2)
     np.testing.assert_allclose(
-        np.einsum("kn,knd->kd", residual, now.curve.normals(places)), offset, atol=1e-9
+        np.einsum("kn,knd->kd", residual, line.normals(now.curve, places)), offset, atol=1e-9
     )
     along = line.components(now.curve, s, t[..., None])
     np.testing.assert_allclose(along, 0.0, atol=1e-9)
+
+
+def test_residuals_of_a_line_in_space_hardly_roll_with_the_curve():
+    """Against differences; normals carried along the curve itself roll: 12 % of the change."""
+    s, nodes = np.linspace(0.05, 0.85, 60), np.linspace(0.0, LENGTH, 101)
+    now, line = seen(100), Centerline(helix(s)[0] + 0.01 * np.sin(5 * s)[:, None], np.ones(60))
+    wave = 0.1 * np.stack([nodes * np.sin(6 * nodes), nodes**2, np.cos(9 * nodes)], axis=1)
+
+    def residual(share: float) -> np.ndarray:
+        curve = NodeCurve(LENGTH, now.curve.nodes + share * wave, None)
+        moved = Observed(curve, np.zeros(0))
+        return line.residual(moved, line.located(moved, s))
+
+    flat = Observed(NodeCurve(LENGTH, now.curve.nodes, None), np.zeros(0))
+    along = ObservedChange(wave[:, :, None], np.zeros((0, 1)))
+    change = line.linearized(flat, line.located(flat, s), along)[1][:, 0]
+    difference = (residual(1e-4) - residual(-1e-4)) / 2e-4
+    assert np.linalg.norm(change - difference) < 0.005 * np.linalg.norm(change)
 
 
 def test_markers_are_compared_in_all_directions_at_their_arc_lengths():
