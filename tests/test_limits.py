@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.stats import norm
 
 from dlo_casadi.cable.limits import LimitCheck, limit_checks
@@ -241,10 +242,11 @@ def test_a_session_checks_its_poses_and_shows_where_they_are_tight(tmp_path):
     from dlo_casadi.report.documents import report_dict
 
     path = BENCH / "session.yaml"
-    text = path.read_text().replace("file: ", f"file: {path.parent}/")
-    (tmp_path / "session.yaml").write_text(
-        f"{text}\nlimits: {{bend_radius: 0.1}}\nestimation: {{algorithm1: false}}\n"
-    )
+    session = yaml.safe_load(path.read_text().replace("file: ", f"file: {path.parent}/"))
+    session["experiment"]["poses"] = session["experiment"]["poses"][:4]
+    session |= {"limits": {"bend_radius": 0.1}, "estimation": {"algorithm1": False}}
+    session["model"] = session.get("model", {}) | {"n": 20}
+    (tmp_path / "session.yaml").write_text(yaml.safe_dump(session))
     result = Session.load(tmp_path / "session.yaml").fit(diagnosis=False)
     rows = report_dict(result)["limits"]
     assert [row["pose"] for row in rows] == list(result.stages[-1].shapes)

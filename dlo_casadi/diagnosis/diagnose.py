@@ -8,18 +8,11 @@ from typing import Literal
 
 import numpy as np
 
+from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
-from dlo_casadi.diagnosis.refits import (
-    Confirmed,
-    confirm,
-    confirm_cause,
-    confirm_from_data,
-    from_data,
-    refit_without,
-    screened_from_data,
-)
+from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
@@ -340,7 +333,7 @@ class Search:
         An effect has to be as significant as when it was added, and worth its parameters.
         """
         for effect in added[:-1]:
-            smaller = refit_without(fit, effect.candidate)
+            smaller = refits.refit_without(fit, effect.candidate)
             if smaller is None:
                 continue
             screened = self._screened(smaller)
@@ -360,19 +353,24 @@ class Search:
         significant = [x for x in screened if p_values[x.candidate.name] < self.significance]
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
-        return list(map_in_order(self.executor, partial(confirm, current), worthy))
+        return list(map_in_order(self.executor, partial(refits.confirm, current), worthy))
 
     def _from_data(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
         Beside a misfit scores tell nothing, and a refit leads where the declared model has gone.
+        Where no candidate explains the shapes from its first start, all are tried from others, too.
         """
-        near, softness = from_data(current)
+        near, softness = refits.from_data(current)
         listed = candidates_of(near, self.center, self.exclude)
-        screened = screened_from_data(near, softness, listed)
+        screened = refits.screened_from_data(near, softness, listed)
         likely = [x for x in screened if x.score >= NEAR_LEADER * screened[0].score]
-        refit = partial(confirm_from_data, current, near)
-        return screened, list(map_in_order(self.executor, refit, likely[:REFITTED]))
+        for starts in (1, 3):
+            refit = partial(refits.confirm_from_data, current, near, starts=starts)
+            tried = list(map_in_order(self.executor, refit, likely[:REFITTED]))
+            if explained_by(current, tried):
+                break
+        return screened, tried
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.
@@ -380,7 +378,7 @@ class Search:
         Two free forces in each pose would gain more than their price if the law were wrong.
         """
         loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
-        refit = partial(confirm_cause, self.declared, force)
+        refit = partial(refits.confirm_cause, self.declared, force)
         free = 2 * len(self.declared.problem.used) + 1
         price = free * np.log(self.declared.problem.n_residuals)
         return [

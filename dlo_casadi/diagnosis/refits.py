@@ -138,13 +138,16 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
     return Confirmed.of(screened, base, fit)
 
 
-def confirm_from_data(base: Fit, near: Fit, screened: Screened) -> Confirmed | None:
+def confirm_from_data(
+    base: Fit, near: Fit, screened: Screened, *, starts: int = 3
+) -> Confirmed | None:
     """Fit with a candidate added, from the relaxed base; None if that leads to no equilibrium.
 
-    Weighed as the base where the candidate does not bring it to the noise of the points.
+    From so many starts at most. Weighed as the base where the candidate does not bring it to the
+    noise of the points.
     """
     with suppress(EstimationError):
-        fit = _fit_from_data(near, screened)
+        fit = _fit_from_data(near, screened, starts)
         if fit is not None and misfits(fit):
             fit = descend(fit.reweighed(base.noise, base.problem.priors))
         elif fit is not None:
@@ -153,7 +156,7 @@ def confirm_from_data(base: Fit, near: Fit, screened: Screened) -> Confirmed | N
     return None
 
 
-def _fit_from_data(near: Fit, screened: Screened) -> Fit | None:
+def _fit_from_data(near: Fit, screened: Screened, starts: int) -> Fit | None:
     """The fit that a relaxed model leads to with a candidate, from the first start that succeeds.
 
     Starts: the relaxed shapes with the candidate not there yet; the measured shapes anew, in
@@ -167,7 +170,7 @@ def _fit_from_data(near: Fit, screened: Screened) -> Fit | None:
         partial(_anew, near, screened.candidate, places),
         partial(_beside, near, screened.candidate, screened.start),
     )
-    for way in ways:
+    for way in ways[:starts]:
         fit = way()
         if fit and (best is None or fit.point.objective < best.point.objective):
             best = fit

@@ -4,6 +4,7 @@ The generated solver tries the same ones with the same numbers: codegen/template
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
