@@ -318,7 +318,7 @@ class Search:
         return self._ended(*self._pruned(current, added), listed)
 
     def at_random(self, found: Found) -> Fit | None:
-        """The declared model with random effects, if it misfits and they explain more than `found`."""
+        """The declared model with random effects, if it misfits and they explain more."""
         scatter = found.fit.problem.priors.pose_scatter
         if self.declared.noise.source != "misfit" or not (found.unexplained or scatter.std):
             return None
