@@ -35,8 +35,7 @@ def main() -> int:
     parser.add_argument("cables", nargs="+", metavar="RESULTS=SESSION.yaml")
     parser.add_argument("--poses", type=int, default=3)
     parser.add_argument("--segments", type=int)
-    able = [name for name, target in TARGETS.items() if target.settle is not None]
-    parser.add_argument("--to", nargs="+", choices=able, default=able)
+    parser.add_argument("--to", nargs="+", choices=[*TARGETS], default=[*TARGETS])
     chosen = parser.parse_args()
     wrong = 0
     print("errors in % of the length: largest from our prediction; RMS from measured, of", *CASES)

@@ -97,6 +97,69 @@ def test_mujoco_rests_where_we_predict(case):
         assert not at_rest.end_force.any()
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("target", ["newton", "usd"])
+@pytest.mark.parametrize("case", ["space", "mass", "plane", "overhang"])
+def test_newton_rests_where_we_predict(case, target):
+    """From a Python file, and from USD by Newton's own importer."""
+    for package in TARGETS[target].packages:
+        pytest.importorskip(package, reason="the extra `newton` is not installed")
+    held = CASES[case]()
+    rod = Rod.of(held, 40)
+
+    at_rest = TARGETS[target].settle(TARGETS[target].write(rod, ["a -- b"]), rod)
+
+    assert off(held, rod, at_rest.nodes) < 1e-2
+
+
+def test_a_usd_file_is_valid_and_holds_the_rod():
+    """As usd-core reads it; turns of the frames that normals span are those without load."""
+    pxr = pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Sdf, Usd, UsdGeom, UsdValidation
+
+    assert pxr
+    rod = Rod.of(CASES["flat"](), 12)
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    assert layer.ImportFromString(TARGETS["usd"].write(rod, ['"quoted"']))
+    stage = Usd.Stage.Open(layer)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert not UsdValidation.ValidationContext(validators).Validate(stage)
+
+    curve = UsdGeom.BasisCurves.Get(stage, "/World/cable")
+    assert np.array(curve.GetPointsAttr().Get()) == pytest.approx(rod.nodes, abs=1e-6)
+    read = lambda name: np.array(curve.GetPrim().GetAttribute(f"physics:{name}").Get())  # noqa: E731
+    assert read("masses").sum() == pytest.approx(rod.masses.sum(), rel=1e-6)
+    x = np.diff(read("restShapePoints"), axis=0) / rod.h
+    z = read("restNormals")[:-1]
+    frames = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=2))
+    turns = (frames[:-1].inv() * frames[1:]).as_rotvec()
+    assert turns == pytest.approx(rod.h * rod.rest, abs=1e-5)
+    material = stage.GetPrimAtPath("/World/material").GetAttribute
+    bending = material("physics:curvesBendStiffness").Get()
+    assert bending == pytest.approx((1 + RATIO) / 2 * 0.015, rel=1e-6)
+    for side, fixture in (("start", rod.start), ("end", rod.end)):
+        attached = stage.GetPrimAtPath(f"/World/hold_{side}").GetAttribute
+        to_world = UsdGeom.Xformable.Get(stage, f"/World/{side}").ComputeLocalToWorldTransform(0)
+        held = [to_world.Transform(tuple(map(float, p))) for p in attached("physics:coords1").Get()]
+        assert np.array(held[0]) == pytest.approx(fixture.cable_place, abs=1e-6)
+
+
+def test_one_bending_stiffness_costs_what_it_moves():
+    """Of a flat cable Newton has the mean of both: it is told how far that moves the shape."""
+    held = CASES["flat"]()
+    found = losses(held, TARGETS["newton"], Rod.of(held, 10))
+
+    mean = in_space()
+    p = mean.p.copy()
+    p[mean.model.names.index("bending_stiffness")] = (1 + RATIO) / 2 * 0.015
+    mean = Held.solved(mean.model, p, mean.rest, mean.pose)
+    s = np.linspace(0, 0.6, 101)
+    moved = 100 * np.linalg.norm(held.curve.at(s) - mean.curve.at(s), axis=1).max() / 0.6
+    assert list(found) == ["anisotropy"]
+    share = re.search(r"moves by up to ([\d.]+) %", found["anisotropy"])
+    assert float(share[1]) == pytest.approx(moved, rel=0.05)
+
+
 def test_an_unstressed_rod_keeps_its_rest_shape_in_mujoco():
     """Without weight, one end free: every joint is at its rest angle, the force is zero."""
     mj = pytest.importorskip("mujoco", reason="the extra `peers` is not installed")

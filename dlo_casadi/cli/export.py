@@ -12,7 +12,7 @@ from dlo_casadi.cli.watch import Watch
 from dlo_casadi.errors import DloError
 from dlo_casadi.export.files import losses
 from dlo_casadi.export.rod import Rod
-from dlo_casadi.export.targets import require, target_of
+from dlo_casadi.export.targets import TARGETS, require, target_of
 
 # `--check` without a session.
 _NEAR = Path()
@@ -20,7 +20,7 @@ _NEAR = Path()
 
 @command(
     PARAMETERS,
-    option("--to", required=True, metavar="SIMULATOR", help="mujoco or pyelastica"),
+    option("--to", required=True, metavar="SIMULATOR", help=f"one of {', '.join(TARGETS)}"),
     option("--output", type=Path, metavar="FILE", help="by default named after the session"),
     option("--samples", type=int, default=0, metavar="N", help="cables more, from the covariance"),
     option("--seed", type=int, default=0, metavar="N", help="of the samples (0)"),
@@ -44,6 +44,7 @@ def export(chosen: argparse.Namespace) -> None:
     dlo export results/cable --to mujoco                        cable.xml
     dlo export results/cable --to mujoco --end 0.3 -0.1 --output rope.xml
     dlo export results/cable --to mujoco --samples 50           cable_001.xml, ... beside it
+    dlo export results/cable --to usd                           cable.usda: a curve with its physics
     dlo export results/cable --to pyelastica --check            is it the cable that was measured?
     dlo export results/cable --to mujoco --check cable.yaml --figure check.png
     """

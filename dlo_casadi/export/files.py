@@ -58,14 +58,18 @@ def write_rods(
 
 def losses(cable: Held, target: Target, rod: Rod) -> dict[Feature, str]:
     """Features that a target cannot carry: which effects, and how far the shape moves without."""
-    return {item: _cost(cable, item, rod.features[item]) for item in target.dropped(rod)}
+    return {item: _cost(cable, rod, item) for item in target.dropped(rod)}
 
 
-def _cost(cable: Held, feature: Feature, labels: Sequence[str]) -> str:
+def _cost(cable: Held, rod: Rod, feature: Feature) -> str:
+    labels = rod.features[feature]
     model, pose, rest = cable.model, cable.pose, cable.rest
     length, known = model.cable.length, dict(zip(model.names, cable.p, strict=True))
     if feature == "clips":
         model, pose = replace(model, clips=()), replace(pose, clips=())
+    if feature in ("anisotropy", "stiffness along the cable"):  # what is left is the mean
+        known["bending_stiffness"] = float(rod.mean_bending.mean())
+        known["torsional_stiffness"] = float(rod.torsion.mean())
     if feature == "rest shape":
         rest = np.zeros_like(rest)
     for label in labels:

@@ -8,6 +8,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.export.relax import Relaxed, relax
 from dlo_casadi.export.rod import Fixture, Rod
+from dlo_casadi.export.text import array, head_of_python
 
 # Young's modulus and shear modulus [Pa] of PyElastica's first examples (Timoshenko beam).
 DEFAULT = (1e6, 1e4)
@@ -73,17 +74,10 @@ def _directors(quaternion):
 
 def write(rod: Rod, head: Sequence[str]) -> str:
     """The rod as a Python file: `make_rod()`, `hold(simulator, rod)`."""
-    count = len(rod.masses)
-    masses = np.zeros(count + 1)
+    masses = rod.lumps_at(rod.s)
     masses[1:] += rod.masses / 2
     masses[:-1] += rod.masses / 2
-    for carried, s in rod.lumps:
-        k = int(np.clip(np.searchsorted(rod.s, s) - 1, 0, count - 1))
-        share = (s - rod.s[k]) / (rod.s[1] - rod.s[0])
-        masses[[k, k + 1]] += carried * np.array([1 - share, share])
-    weight = masses.sum() * float(np.linalg.norm(rod.gravity))
-    length, stiffest = rod.h * count, float(rod.bending.max())
-    stiff = _STIFF * (weight + 4 * np.pi**2 * stiffest / length**2)
+    stiff, stiffest = rod.inextensible(_STIFF), float(rod.bending.max())
     axial = min(rod.axial, stiff)
     step = _COURANT * rod.h * np.sqrt(masses[1:-1].min() / rod.h / max(axial, stiff))
     # As of a link about its end, and slow enough for the step in bending, twist and shear.
@@ -94,7 +88,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     numbers = [
         ("H", f"{rod.h:.12g}", "length of an element [m]"),
         ("RADIUS", f"{rod.radius:.9g}", "[m]"),
-        ("GRAVITY", _array(rod.gravity), "[m/s^2]"),
+        ("GRAVITY", array(rod.gravity), "[m/s^2]"),
         ("EA", f"{axial:.9g}", "[N]"),
         ("GA", f"{stiff:.9g}", "[N], so stiff that shear does not matter"),
         ("INERTIA", f"{inertia:.9g}", "of an element [kg m^2], raised until STEP is stable"),
@@ -102,17 +96,13 @@ def write(rod: Rod, head: Sequence[str]) -> str:
         ("DAMPING", "10.0", "[1/s], which nobody has measured"),
         ("HELD_NODES", str(sum((nodes for nodes, _ in held), ())), ""),
         ("HELD_ELEMENTS", str(sum((elements for _, elements in held), ())), ""),
-        ("NODES", _array(rod.nodes), "[m]"),
-        ("QUATERNIONS", _array(rod.frames.as_quat()), "frames of the elements (x, y, z, w)"),
-        ("MASSES", _array(masses), "of the nodes [kg]"),
-        ("BENDING", _array(np.column_stack(about)), "yy, yz, zz, torsion [N m^2]"),
-        ("REST_KAPPA", _array(rod.rest[:, [1, 2, 0]]), "about y, z, and twist [1/m]"),
+        ("NODES", array(rod.nodes), "[m]"),
+        ("QUATERNIONS", array(rod.frames.as_quat()), "frames of the elements (x, y, z, w)"),
+        ("MASSES", array(masses), "of the nodes [kg]"),
+        ("BENDING", array(np.column_stack(about)), "yy, yz, zz, torsion [N m^2]"),
+        ("REST_KAPPA", array(rod.rest[:, [1, 2, 0]]), "about y, z, and twist [1/m]"),
     ]
-    lines = [f"# {line}".rstrip() for line in head]
-    lines += ["", "import elastica as ea", "import numpy as np", ""]
-    for name, value, meaning in numbers:
-        lines += [f"# {meaning}"] * bool(meaning) + [f"{name} = {value}"]
-    return "\n".join(lines) + "\n" + _BODY
+    return head_of_python(head, ["elastica as ea", "numpy as np"], numbers) + _BODY
 
 
 def _held(fixture: Fixture, first: int, second: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -120,15 +110,6 @@ def _held(fixture: Fixture, first: int, second: int) -> tuple[tuple[int, ...], t
     kinds: dict[str, Any] = {"clamped": ((first, second), (first,)), "pinned": ((first,), ())}
     found: tuple[tuple[int, ...], tuple[int, ...]] = kinds.get(fixture.kind, ((), ()))
     return found
-
-
-def _array(values: FloatArray) -> str:
-    rows = ",\n    ".join(f"{np.vectorize(_rounded)(row).tolist()}" for row in values)
-    return f"np.array([\n    {rows},\n])"
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.12g}")
 
 
 def settle(text: str, rod: Rod) -> Relaxed:

@@ -34,7 +34,11 @@ class Relaxed:
 
 
 def relax(
-    advance: Callable[[int], FloatArray], halt: Callable[[], None], step: float, name: str
+    advance: Callable[[int], FloatArray],
+    halt: Callable[[], None],
+    step: float,
+    name: str,
+    speed: float = REST_SPEED,
 ) -> tuple[FloatArray, float]:
     """Nodes (n + 1, 3) [m] at rest, and the simulated time [s].
 
@@ -48,6 +52,8 @@ def relax(
     halt : callable
         Sets all velocities to zero if the kinetic energy is smaller than at the last call.
     step : float [s]
+    speed : float [m/s]
+        Below it a node is at rest; larger for a simulator of single precision.
 
     Raises
     ------
@@ -65,6 +71,6 @@ def relax(
                 f"{name} does not come to rest: after {time:.3g} s a node still moves by "
                 f"{fastest:.2g} m/s.\n  Try: fewer segments, or a pose nearer to the cable's."
             )
-        still = still + 1 if fastest < REST_SPEED else 0
+        still = still + 1 if fastest < speed else 0
         halt()
     return nodes, time

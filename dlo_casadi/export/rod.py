@@ -225,6 +225,31 @@ class Rod:
         return np.column_stack([self.torsion, values]), axes
 
     @property
+    def mean_bending(self) -> FloatArray:
+        """EI (n - 1,) [N m^2] of the joints: the mean about all axes of a section."""
+        return np.trace(self.bending, axis1=1, axis2=2) / 2
+
+    def inextensible(self, factor: float) -> float:
+        """EA [N] of so many times weight and buckling load: a strain of about 1 / factor."""
+        weight = (self.masses.sum() + self.lumps[:, 0].sum()) * np.linalg.norm(self.gravity)
+        buckling = 4 * np.pi**2 * self.bending.max() / (self.h * len(self.masses)) ** 2
+        return float(factor * (weight + buckling))
+
+    def lumps_at(self, s: FloatArray) -> FloatArray:
+        """Compact masses [kg] carried by points at arc lengths s, each by its two neighbours."""
+        out = np.zeros(len(s))
+        for mass, place in self.lumps:
+            k = int(np.clip(np.searchsorted(s, place) - 1, 0, len(s) - 2))
+            share = (place - s[k]) / (s[k + 1] - s[k])
+            out[[k, k + 1]] += mass * np.array([1 - share, share])
+        return out
+
+    @property
+    def link_masses(self) -> FloatArray:
+        """Masses (n,) [kg] of the links with the compact ones."""
+        return self.masses + self.lumps_at((self.s[1:] + self.s[:-1]) / 2)
+
+    @property
     def turns(self) -> Rotation:
         """Rotations (n - 1,) from each segment's frame to the next one's in the pose."""
         return self.frames[:-1].inv() * self.frames[1:]
@@ -233,6 +258,16 @@ class Rod:
     def rest_turns(self) -> Rotation:
         """The same without load."""
         return Rotation.from_rotvec(self.h * self.rest)
+
+    @property
+    def unloaded(self) -> tuple[FloatArray, Rotation]:
+        """Nodes (n + 1, 3) [m] and frames (n,) without load, with the first link in its place."""
+        frames = [self.frames[0]]
+        for turn in self.rest_turns:
+            frames.append(frames[-1] * turn)
+        rest = Rotation.concatenate(frames)
+        steps = self.h * np.cumsum(rest.apply([1.0, 0.0, 0.0]), axis=0)
+        return np.vstack([self.nodes[0], self.nodes[0] + steps]), rest
 
 
 def features_of(model: CableModel, p: FloatArray, pose: HeldPose) -> dict[Feature, tuple[str, ...]]:

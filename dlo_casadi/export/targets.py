@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import numpy as np
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.export import mujoco, pyelastica
+from dlo_casadi.export import mujoco, newton, pyelastica, usd
 from dlo_casadi.export.relax import Relaxed
 from dlo_casadi.export.rod import Feature, Rod
 
@@ -28,13 +28,13 @@ class Target:
     title : str
     suffix : str
         Of its files.
-    package : str
-        Module that has to be installed to relax a cable in it.
+    packages : tuple of str
+        Modules that have to be installed to relax a cable in it, and the `extra` that has them.
     carries : frozenset of Feature
     write : callable
         The text of a file: of a rod, and the lines of its head.
-    settle : callable or None
-        Relaxes a written file in the simulator; None where it only describes.
+    settle : callable
+        Relaxes a written file in the simulator.
     default : (float, float) [Pa]
         Moduli in bending and twist that its own example of a cable has, and `default_of` it.
     places : tuple of str
@@ -43,10 +43,11 @@ class Target:
 
     title: str
     suffix: str
-    package: str
+    packages: tuple[str, ...]
+    extra: str
     carries: frozenset[Feature]
     write: Callable[[Rod, Sequence[str]], str]
-    settle: Callable[[str, Rod], Relaxed] | None
+    settle: Callable[[str, Rod], Relaxed]
     default: tuple[float, float]
     default_of: str
     places: tuple[str, ...]
@@ -54,7 +55,7 @@ class Target:
     @property
     def installed(self) -> bool:
         """Whether a cable can be relaxed in it here."""
-        return find_spec(self.package) is not None
+        return all(find_spec(name) is not None for name in self.packages)
 
     def default_stiffness(self, radius: float) -> tuple[float, float]:
         """EI and GJ [N m^2] of its own example's moduli with a round section."""
@@ -70,7 +71,8 @@ TARGETS = {
     "mujoco": Target(
         title="MuJoCo",
         suffix=".xml",
-        package="mujoco",
+        packages=("mujoco",),
+        extra="peers",
         carries=CHAIN,
         write=mujoco.write,
         settle=mujoco.settle,
@@ -88,7 +90,8 @@ TARGETS = {
     "pyelastica": Target(
         title="PyElastica",
         suffix=".py",
-        package="elastica",
+        packages=("elastica",),
+        extra="peers",
         carries=CHAIN | {"stretch"},
         write=pyelastica.write,
         settle=pyelastica.settle,
@@ -99,6 +102,46 @@ TARGETS = {
             "MASSES [kg] of the nodes; GRAVITY [m/s^2]; NODES [m] and QUATERNIONS: the shape",
             "EA, GA [N], INERTIA, STEP, DAMPING are not measured: they change motion, not rest",
             "(unless a stretch was found, EA and GA leave a strain of at most 0.02 %)",
+        ),
+    ),
+    "newton": Target(
+        title="Newton",
+        suffix=".py",
+        packages=("newton",),
+        extra="newton",
+        carries=CHAIN - {"anisotropy"} | {"stretch"},
+        write=newton.write,
+        settle=newton.settle,
+        default=newton.DEFAULT,
+        default_of="the softest cable of its example cable_twist",
+        places=(
+            "BENDING, TORSION [N m^2]: EI, GJ; over H the stiffness [N m/rad] of each joint. Of a",
+            "flat cable the mean EI: the solver takes one bending stiffness a joint",
+            "REST_NODES, REST_QUATERNIONS: the shape without load; MASSES [kg] of the links",
+            "NODES [m], QUATERNIONS: the shape; the first and the last link are the clamps",
+            "EA, GA [N], INERTIA are not measured, and there is no damping",
+            "(unless a stretch was found, EA and GA leave a strain of 1 % at most)",
+            "STEP, ITERATIONS: with larger steps SolverVBD comes to rest elsewhere",
+        ),
+    ),
+    "usd": Target(
+        title="USD",
+        suffix=".usda",
+        packages=("newton", "pxr"),
+        extra="newton",
+        carries=frozenset({"rest shape", "lumped mass", "stretch"}),
+        write=usd.write,
+        settle=usd.settle,
+        default=usd.DEFAULT,
+        default_of="the AOUSD proposal's of a material without values (E 1 MPa, Poisson 0.3)",
+        places=(
+            "material curvesBendStiffness, curvesTwistStiffness [N m^2]: EI, GJ, one for the cable",
+            "(means along it, and about both axes); curvesStretchStiffness, curvesShearStiffness:",
+            "EA, kGA [N], not measured (unless a stretch was found, a strain of 1 % at most)",
+            "cable restShapePoints [m], restNormals: the shape without load; masses [kg] of links",
+            "cable points [m], normals: the shape in this pose; start, end: the clamps",
+            "Importers that do not read restShapePoints drop the rest curvature: they take the",
+            "shape in this pose, or a straight one, for that without load. Newton 1.8 reads it",
         ),
     ),
 }
@@ -128,13 +171,12 @@ def target_of(name: str) -> Target:
 
 
 def require(target: Target) -> None:
-    """Raise DloError if cables cannot be relaxed in a target, or not here."""
-    if target.settle is None:
-        raise DloError(
-            f"{target.title} describes a cable and does not simulate it: nothing relaxes"
-        )
+    """Raise DloError if cables cannot be relaxed in a target here."""
     if not target.installed:
-        raise DloError(f"{target.title} is not installed.\n  Try: pip install 'dlo-casadi[peers]'")
+        raise DloError(
+            f"{' and '.join(target.packages)} is not installed.\n"
+            f"  Try: pip install 'dlo-casadi[{target.extra}]'"
+        )
 
 
 def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence[str]) -> list[str]:

@@ -113,7 +113,7 @@ def round_trip(
     Raises
     ------
     DloError
-        If the target simulates nothing or is not installed.
+        If the target is not installed.
     """
     require(target)
     quiet: Callable[[str, int, int], None] = lambda *_: None  # noqa: E731
@@ -163,7 +163,6 @@ def _relaxed(
         links=len(rod.masses),
         lost=tuple(target.dropped(rod)),
     )
-    assert target.settle is not None
     try:
         at_rest = target.settle(target.write(rod, []), rod)
     except EquilibriumError as error:

@@ -1,0 +1,150 @@
+"""USD: a linear curve with the deformable physics that the AOUSD working group proposes.
+
+The proposal is in no release of USD yet: its schemas and attributes are authored by name, and
+programs that do not know them see a curve.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.export import newton
+from dlo_casadi.export.relax import Relaxed
+from dlo_casadi.export.rod import Fixture, Rod
+from dlo_casadi.export.text import rounded
+
+# What the proposal assumes of a material that says nothing: E = 1 MPa, Poisson's ratio 0.3 [Pa].
+DEFAULT = (1e6, 1e6 / 2.6)
+# Distance [link lengths] of the points by which a clamp holds its link, against its roll.
+_LEVER = 5.0
+
+
+def write(rod: Rod, head: Sequence[str]) -> str:
+    """The rod as USDA: a curve, its material, two grippers and what attaches the curve to them."""
+    doc = "\n".join(head).replace('"', "'")
+    rest_nodes, rest_frames = rod.unloaded
+    count, stiff = len(rod.nodes), rod.inextensible(newton.STIFF)
+    gravity = float(np.linalg.norm(rod.gravity))
+    down = rod.gravity / gravity if gravity else np.array([0.0, 0.0, -1.0])
+    # Of each link the normal is its axis z; the last point begins no link.
+    normals, rest_normals = (
+        np.vstack([z, z[-1:]])
+        for z in (f.apply([0.0, 0.0, 1.0]) for f in (rod.frames, rest_frames))
+    )
+    return f'''#usda 1.0
+(
+    defaultPrim = "World"
+    doc = """{doc}"""
+    kilogramsPerUnit = 1
+    metersPerUnit = 1
+    upAxis = "{"Z" if rod.in_space else "Y"}"
+)
+
+def Xform "World"
+{{
+    def PhysicsScene "scene"
+    {{
+        vector3f physics:gravityDirection = {_row(down)}
+        float physics:gravityMagnitude = {gravity:.9g}
+    }}
+
+    def BasisCurves "cable" (
+        prepend apiSchemas = ["PhysicsDeformableBodyAPI", "PhysicsCurvesDeformableSimAPI", \
+"PhysicsCollisionAPI", "MaterialBindingAPI"]
+    )
+    {{
+        uniform token type = "linear"
+        int[] curveVertexCounts = [{count}]
+        point3f[] points = {_rows(rod.nodes)}
+        normal3f[] normals = {_rows(normals)} (
+            interpolation = "vertex"
+        )
+        float[] widths = [{2 * rod.radius:.9g}] (
+            interpolation = "constant"
+        )
+        float3[] extent = {_rows(_extent(rod))}
+        rel material:binding:physics = </World/material>
+        point3f[] physics:restShapePoints = {_rows(rest_nodes)}
+        normal3f[] physics:restNormals = {_rows(rest_normals)}
+        float[] physics:thicknesses = [{2 * rod.radius:.9g}]
+        token physics:thicknesses:elementType = "constant"
+        float[] physics:masses = {rounded(rod.link_masses)}
+        token physics:masses:elementType = "segment"
+    }}
+
+    def Material "material" (
+        prepend apiSchemas = ["PhysicsMaterialAPI", "PhysicsCurvesDeformableMaterialAPI"]
+    )
+    {{
+        float physics:curvesStretchStiffness = {min(rod.axial, stiff):.9g}
+        float physics:curvesShearStiffness = {stiff:.9g}
+        float physics:curvesBendStiffness = {rod.mean_bending.mean():.9g}
+        float physics:curvesTwistStiffness = {rod.torsion.mean():.9g}
+    }}
+{_gripper("start", rod.start, 0, rod)}{_gripper("end", rod.end, count - 2, rod)}}}
+'''
+
+
+def _gripper(side: str, fixture: Fixture, link: int, rod: Rod) -> str:
+    """A fixture, and the attachment of the cable to it."""
+    if fixture.kind == "free":
+        return ""
+    if fixture.kind == "clamped":  # in segment coordinates: share of the start, normal, binormal
+        lever = _LEVER * rod.h
+        kind, index = "segment", [link] * 3
+        on_link = np.array([[0.5, 0.0, 0.0], [0.5 - _LEVER, 0.0, 0.0], [0.5, lever, 0.0]])
+        middle = (rod.nodes[link] + rod.nodes[link + 1]) / 2
+        offsets = rod.frames[link].apply([[0.0, 0.0, 0.0], [lever, 0.0, 0.0], [0.0, 0.0, lever]])
+        places = middle + offsets
+    else:
+        node = link + (side == "end")
+        kind, index, on_link, places = "point", [node], np.zeros((0, 3)), rod.nodes[node : node + 1]
+    x, y, z, w = fixture.frame.as_quat()
+    on_fixture = fixture.frame.inv().apply(places - fixture.place)
+    coordinates = f"\n        vector3f[] physics:coords0 = {_rows(on_link)}" if len(on_link) else ""
+    return f'''
+    def Xform "{side}"
+    {{
+        double3 xformOp:translate = {_row(fixture.place)}
+        quatd xformOp:orient = {_row(np.array([w, x, y, z]))}
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]
+    }}
+
+    def PhysicsAttachment "hold_{side}"
+    {{
+        rel physics:src0 = </World/cable>
+        token physics:type0 = "{kind}"
+        int[] physics:indices0 = {index}{coordinates}
+        rel physics:src1 = </World/{side}>
+        token physics:type1 = "xform"
+        vector3f[] physics:coords1 = {_rows(on_fixture)}
+    }}
+'''
+
+
+def _row(values: FloatArray) -> str:
+    return f"({', '.join(map(str, rounded(values)))})"
+
+
+def _rows(values: FloatArray) -> str:
+    return f"[{', '.join(map(_row, values))}]"
+
+
+def _extent(rod: Rod) -> FloatArray:
+    return np.array([rod.nodes.min(axis=0) - rod.radius, rod.nodes.max(axis=0) + rod.radius])
+
+
+def settle(text: str, rod: Rod) -> Relaxed:
+    """Relax a written curve where it can be simulated today: in Newton, by its own importer."""
+    with newton.quietly():
+        import newton as simulator
+        from pxr import Sdf, Usd
+
+        layer = Sdf.Layer.CreateAnonymous(".usda")
+        layer.ImportFromString(text)
+        builder = simulator.ModelBuilder()
+        builder.add_usd(Usd.Stage.Open(layer), apply_up_axis_from_stage=True)
+        builder.color()
+        model = builder.finalize("cpu")
+    return newton.settled(model, rod, "Newton, from USD")
