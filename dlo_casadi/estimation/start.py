@@ -24,6 +24,9 @@ from dlo_casadi.model.cable_model import END_ROLL
 ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
 # Iterations for each of these rolls; number of rolls that are continued.
 FIRST_STEPS, FOLLOWED = 5, 2
+# Iterations of shapes and forces alone before that, of cables with clips: lines do not tell how the
+# cable bends at a clip, and a stiffness that is free runs away on the way.
+STEPS_AT_CLIPS = 15
 # Twist [rad] from which the other way round is tried: rolls are tried about one radian apart, and
 # the rest shape of a cable may be twisted by as much as a quarter of a turn.
 EITHER_WAY = np.pi / 2
@@ -77,7 +80,7 @@ def _along_lines(
         values = with_springs_in_place(
             problem, Values(rolled, *measured_shapes(problem, _roll(problem, rolled)))
         )
-        values = relaxation.solve(values, fixed, FIRST_STEPS)
+        values = _first_solved(relaxation, values, fixed)
         begun.append((relaxation.objective(values), values))
     likely = sorted(begun, key=lambda start: start[0])[:FOLLOWED]
     found = [relaxation.solve(values, fixed) for _, values in likely]
@@ -96,10 +99,18 @@ def weighed(problem: Problem, theta: FloatArray) -> Problem:
     problem = problem.weighed(values)
     if problem.noise.known:
         return problem
-    values = Relaxation(problem, SHAPES_ALONE).solve(values, steps=FIRST_STEPS)
+    values = _first_solved(Relaxation(problem, SHAPES_ALONE), values)
     left = problem.evaluate(values).data / problem.n_residuals
     noise = problem.noise.doubted(problem.noise.std * np.sqrt(left))
     return replace(problem, noise=noise).weighed(values)
+
+
+def _first_solved(relaxation: Relaxation, values: Values, fixed: BoolArray | None = None) -> Values:
+    """Values after the first iterations from measured shapes."""
+    if relaxation.problem.unknowns.model.clips:
+        every = np.ones(len(values.theta), dtype=bool)
+        values = relaxation.solve(values, every, STEPS_AT_CLIPS)
+    return relaxation.solve(values, fixed, FIRST_STEPS)
 
 
 def _either_way(problem: Problem, values: Values) -> Values:
