@@ -22,6 +22,13 @@ _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
         option("--centerlines", type=Path, metavar="DIR", help="folder of CSV files"),
     ),
     option("--space", action="store_true", help="a cable that leaves the plane, held by grippers"),
+    option(
+        "--clips",
+        nargs="+",
+        default=(),
+        choices=("pinned", "clamped", "eyelet"),
+        help="what holds it between its ends, in the order along the cable",
+    ),
     json="print what was written as JSON",
 )
 def new(chosen: argparse.Namespace) -> None:
@@ -32,6 +39,7 @@ def new(chosen: argparse.Namespace) -> None:
     dlo new rope.yaml --photographs photographs/
     dlo new rope.yaml --centerlines measured/
     dlo new loom.yaml --space --centerlines markers/
+    dlo new loom.yaml --space --clips pinned eyelet
     """
     target: Path = chosen.file
     if target.suffix not in (".yaml", ".yml"):
@@ -49,7 +57,7 @@ def new(chosen: argparse.Namespace) -> None:
     kind: Literal["images", "centerlines"] = (
         "images" if chosen.centerlines is None else "centerlines"
     )
-    text = template(target.stem, files, kind, chosen.space)
+    text = template(target.stem, files, kind, chosen.space, clips=chosen.clips)
     schema = target.with_name("schema.json")
     written = [target]
     if os.path.lexists(target):

@@ -23,6 +23,7 @@ def template(
     cable: Mapping[str, str] = {},
     poses: Sequence[Mapping[str, str]] = (),
     end: str = "clamped",
+    clips: Sequence[str] = (),
     remarks: Sequence[str] = (),
 ) -> str:
     """Text of a configuration with placeholders for what only its user knows.
@@ -43,6 +44,8 @@ def template(
         In space, for each file: what is known of its pose by its keys, and a `remark`.
     end : str
         How the end is held in space.
+    clips : sequence of str
+        Kinds of the clips of every pose.
     remarks : sequence of str
         Lines of comment that begin the configuration.
 
@@ -61,8 +64,16 @@ def template(
         in_space=in_space,
         cable=cable,
         end=end,
+        clips=[_clip(one, in_space) for one in clips],
         remarks=remarks,
     )
+
+
+def _clip(kind: str, in_space: bool) -> str:
+    """A clip with placeholders."""
+    keys = [] if kind == "eyelet" else ["at"]
+    keys += ["place"] + ["orientation" if in_space else "heading"] * (kind == "clamped")
+    return f"{{kind: {kind}, {', '.join(f'{key}: {PLACEHOLDER}' for key in keys)}}}"
 
 
 def _quoted(text: str) -> str:

@@ -21,6 +21,7 @@ from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.clamps import ComparedReading, misread, wrong_directions
+from dlo_casadi.session.clips import wrong_clips
 from dlo_casadi.session.ends import ENDS, POINTS
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import (
@@ -425,6 +426,6 @@ def _angle(pull: FloatArray | None, way: FloatArray) -> float:
 Question = Callable[[ReadSession], tuple[Suspicion, ...]]
 QUESTIONS: tuple[tuple[tuple[Question, ...], ...], ...] = (
     (ENDS,),
-    (*((ask,) for ask in POINTS), (wrong_directions,)),
+    (*((ask,) for ask in POINTS), (wrong_directions,), (wrong_clips,)),
     ((wrong_readings,), (ends_exchanged, hangs_elsewhere)),
 )
