@@ -97,6 +97,7 @@ def test_a_run_opens_one_pool_of_workers(tmp_path, monkeypatch, capsys):
     assert len(opened) == 1
 
 
+@pytest.mark.long
 def test_a_killed_worker_of_the_pool_changes_nothing(fleet, expected, tmp_path):
     killed = []
 
