@@ -13,11 +13,11 @@ from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
 from dlo_casadi.config import read_yaml
+from dlo_casadi.config.clips import KINDS
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
 from dlo_casadi.fleet.shape_table import Plan
-from dlo_casadi.model.clips import CLIP_KINDS
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 
@@ -288,7 +288,7 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
     PARAMETERS,
     option("--output", type=Path, required=True, help="folder for the C files"),
     option("--prefix", default="dlo", help="begins all public names (dlo)"),
-    option("--clips", nargs="+", default=(), choices=CLIP_KINDS, help="what holds it between"),
+    option("--clips", nargs="+", default=(), choices=KINDS, help="what holds it between"),
     *MESH,
     json="print files and hash as JSON",
 )

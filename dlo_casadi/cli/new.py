@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from dlo_casadi.cli.options import Page, command, one_of, option
+from dlo_casadi.config.clips import KINDS
 from dlo_casadi.config.template import schema_text, template
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
@@ -26,7 +27,7 @@ _PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
         "--clips",
         nargs="+",
         default=(),
-        choices=("pinned", "clamped", "eyelet"),
+        choices=KINDS,
         help="what holds it between its ends, in the order along the cable",
     ),
     json="print what was written as JSON",

@@ -237,6 +237,13 @@ class _SpaceCase(Case):
         return [*first, *self.load, *self.clamps, *bends.T.ravel(), *self.holding]
 
     @property
+    def example_clips(self) -> str:
+        """Clips of the pose of example.c, evenly along its chord."""
+        shares = np.linspace(0.0, 1.0, len(self.model.clips) + 2)[1:-1] * self.length
+        places = [f"{{{s:.4g}, {{{0.6 * s:.4g}, {0.1 * s:.4g}, {0.1 * s:.4g}}}}}" for s in shares]
+        return f",\n                           {{{', '.join(places)}}}" if places else ""
+
+    @property
     def holding(self) -> list[float]:
         """Declared length [m]; of each clip what is true minus declared, and each tether."""
         length = self.model.cable.length
@@ -261,6 +268,7 @@ class _SpaceCase(Case):
             "WORKSPACE": (self.doubles + 9 * self.holds) * (n + 2)
             + 4 * self.coarse_shapes * (coarse + 1)
             + self.held_doubles * self.holds,
+            "EXAMPLE_CLIPS": self.example_clips,
             "COARSE": coarse,
             "SHAPES": self.coarse_shapes,
             "FIRST": 0,

@@ -7,6 +7,9 @@ from typing import Any, Literal, Protocol
 from dlo_casadi.config.values import ConfigSection, Name, NonNegative, Number, Place, Quaternion
 from dlo_casadi.model.clips import HeldClip
 
+# Kinds of clips that a configuration may declare.
+KINDS = ("pinned", "clamped", "eyelet")
+
 
 class Clip(ConfigSection):
     """A clip that holds the cable between its ends."""

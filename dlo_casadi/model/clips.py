@@ -9,7 +9,7 @@ frame, so that no element has a jump of curvature inside.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -21,7 +21,6 @@ from dlo_casadi.rod.node import Heading, Node, quaternion_product
 
 # A swivel is a clamp in space in which the cable may roll about its axis.
 ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
-CLIP_KINDS: tuple[ClipKind, ...] = get_args(ClipKind)
 CLAMPS = ("clamped", "swivel")
 
 

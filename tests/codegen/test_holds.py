@@ -1,6 +1,7 @@
 """Clips and tethers of generated solvers in space, against Python's equilibria and differences."""
 
 import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -150,6 +151,16 @@ def test_a_cable_with_clips_is_the_same_cable(two):
     bare = CasadiCable(loom(0), p, rest)
     assert bare.with_clips(["pinned", "pinned"]).model == solver.model
     assert bare.with_clips(["pinned"]).with_clips([]).model == bare.model
+
+
+def test_the_example_solves_a_pose_with_clips(two, tmp_path):
+    two[0].source.write(tmp_path)
+    flags = ["-std=c99", "-O0", "-Wall", "-Wextra", "-Werror", "-o", "example"]
+    command = ["cc", *flags, "example.c", "dlo_solver.c", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    run = subprocess.run(["./example"], cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert "bend radius" in run.stdout
 
 
 def test_poses_with_other_clips(two):
