@@ -148,7 +148,8 @@ def _convex(
         diagonal = part.diagonal + shift[index, None, None, None] * unit
         corner = part.corner
         if turns.any():
-            corner = corner + shift[index, None, None] * np.diag(turns**2)
+            spare = np.zeros(corner.shape[1] - len(turns))
+            corner = corner + shift[index, None, None] * np.diag([*turns**2, *spare])
         return replace(part, diagonal=diagonal, corner=corner).factor()
 
     everyone = np.arange(len(scale))

@@ -31,6 +31,9 @@ from dlo_casadi.rod.node import Frame, Heading
 
 # Largest move of an end in one step [lengths, rad], so that shapes are followed up to a fold.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
+# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard, and the maximum
+# number of steps of each descent.
+SOFT, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-4), 20
 # Number of lowest minima of the coarse mesh, in space, that are solved on the model's own mesh,
 # beside the lowest on the other side.
 FEW = 2
@@ -296,7 +299,10 @@ class _PoseSearch:
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
-        return given, descend(assembly_of(self.model), shapes, given)
+        assembly = assembly_of(self.model)
+        for depth in SOFT if self.model.surfaces else ():
+            shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
+        return given, descend(assembly, shapes, given)
 
     def _descended(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes
@@ -317,7 +323,7 @@ class _PoseSearch:
         out: list[list[Equilibrium]] = [[] for _ in poses]
         for k, j in enumerate(of.tolist()):
             eq = equilibria.pop(0) if kept[k] else None
-            if eq is None and not self.model.in_space:
+            if eq is None and not self.model.in_space and not self.model.surfaces:
                 eq = by_ipopt(self.model, self.p, self.rest, poses[j], shapes.x[k, :, 0])
             if eq is not None:
                 out[j].append(eq)
@@ -346,7 +352,9 @@ class _PoseSearch:
                 mine += [int(k) for k in there[:1] if k not in mine]
             kept += mine
         nodes = model.node.interpolated(model.chain.places, coarse.chain.places, x[kept])
-        return of[kept], Shapes.declared(nodes, found.shapes.lam[kept], len(model.clips))
+        lam = np.zeros((len(kept), model.n_border))
+        lam[:, : model.n_lam] = found.shapes.lam[kept, : model.n_lam]
+        return of[kept], Shapes.declared(nodes, lam, len(model.clips))
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ the derivatives of both and of the measured curve.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -17,95 +18,19 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
+from dlo_casadi.model.contact import DEPTH, Touching
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.mapped import Mapped
+from dlo_casadi.model.stacked import Inputs as Inputs
+from dlo_casadi.model.stacked import Shapes as Shapes
+from dlo_casadi.model.stacked import Tangents as Tangents
 from dlo_casadi.rod.band import BandMatrix, Vector
-from dlo_casadi.rod.ends import deviation_names
-from dlo_casadi.rod.node import Frame, Heading
 
 # Step of differences by slips of clips, relative to the length.
 _SLIP = 1e-6
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
-_NODES = {node.coordinates: node for node in (Heading, Frame)}
-
-
-@dataclass(frozen=True)
-class Shapes:
-    """Stacked unknowns of m poses.
-
-    Parameters
-    ----------
-    x : (m, n_nodes, coordinates)
-        States of the nodes: of a planar cable, headings [rad].
-    lam : (m, n_border)
-        Multipliers of the end conditions; places and multipliers of springs.
-    deviation : (m, n_deviations)
-        Unknowns that each pose has of its own, see `deviation_names`.
-    """
-
-    x: FloatArray
-    lam: FloatArray
-    deviation: FloatArray
-
-    @classmethod
-    def declared(cls, x: FloatArray, lam: FloatArray, clips: int = 0) -> Shapes:
-        """Shapes without deviations from the declared ends and that number of clips."""
-        return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]], clips)))))
-
-    def subset(self, index: Any) -> Shapes:
-        """Shapes of some of the poses."""
-        return Shapes(self.x[index], self.lam[index], self.deviation[index])
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Inputs of the equilibria of m poses.
-
-    `p` (m, n_parameters), `rest` (m, n_rests) [1/m], `poses` (m, n_pose) as declared.
-    """
-
-    p: FloatArray
-    rest: FloatArray
-    poses: FloatArray
-
-    @classmethod
-    def of(cls, p: FloatArray, rest: FloatArray, poses: FloatArray) -> Inputs:
-        """Parameters and rest curvature of each pose, or the same for all."""
-        m = len(poses)
-        return cls(
-            np.broadcast_to(p, (m, p.shape[-1])), np.broadcast_to(rest, (m, rest.shape[-1])), poses
-        )
-
-    def subset(self, index: Any) -> Inputs:
-        """Those of some of the poses."""
-        return Inputs(self.p[index], self.rest[index], self.poses[index])
-
-
-@dataclass(frozen=True)
-class Tangents:
-    """Derivatives of the shapes and inputs of m poses along q directions.
-
-    `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
-    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q). `tangent`: the tangent matrices from
-    which those of the shapes were solved, if they were.
-    """
-
-    x: FloatArray
-    lam: FloatArray
-    p: FloatArray
-    rest: FloatArray
-    deviation: FloatArray
-    tangent: BandMatrix | None = None
-
-    def and_step(self, step: Vector) -> Tangents:
-        """These directions and, last, a step of the shapes alone (one column)."""
-        p, rest, deviation = (
-            np.pad(part, [(0, 0), (0, 0), (0, 1)]) for part in (self.p, self.rest, self.deviation)
-        )
-        x = np.concatenate([self.x, step.x], axis=-1)
-        return Tangents(x, np.concatenate([self.lam, step.y], axis=-1), p, rest, deviation)
 
 
 def _repeated(rows: FloatArray, count: int) -> FloatArray:
@@ -127,11 +52,20 @@ class Assembly:
         self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
         # Rows of the first node, of the last, and of the border.
         self._parts = slice(0, self.b), slice(self.b, 2 * self.b), slice(2 * self.b, None)
-        self._segments = self.chain.n_segments
+        # Rows, in derivatives of a segment, of a force at the end of the cable.
+        self._pull = [2 * self.b + row for row in model.end_pull]
+        self._segments, self.n_lam = self.chain.n_segments, model.n_lam
         # Numbers that tell the rest strains inside a segment.
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self._functions: dict[str, Mapped] = {}
+        self._depth = DEPTH
+
+    def softened(self, depth: float) -> Assembly:
+        """The same with softer obstacles, see `contact.DEPTH`."""
+        other = copy(self)
+        other._depth = depth
+        return other
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle without compiled functions: another process makes its own."""
@@ -156,12 +90,22 @@ class Assembly:
             self._functions[name] = Mapped(getattr(functions_of(self.model), name), count)
         return self._functions[name]
 
-    def _call_segments(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
+    def _call_segments(
+        self, name: str, shapes: Shapes, given: Inputs, touching: Touching | None = None
+    ) -> list[FloatArray]:
         """A function of a segment for all segments: outputs (m, n_segments, rows, columns)."""
+        lam = _repeated(shapes.lam[:, : self.n_lam], self._segments)
+        if touching := touching or self.touching(shapes, given):
+            lam = self._with_pulls(lam, touching.beyond)
+        return self._under(lam, name, shapes, given)
+
+    def _under(
+        self, lam: FloatArray, name: str, shapes: Shapes, given: Inputs
+    ) -> list[FloatArray]:
+        """The same under forces lam (m, n_segments, n_lam)."""
         count, clipped = self._segments, self.clipped(shapes, given)
         own = clipped.rest(self.chain.rest_inside(given.rest[..., None]))[..., 0]
-        alike = (shapes.lam, given.p, shapes.deviation)
-        lam, p, deviation = (_repeated(one, count) for one in alike)
+        p, deviation = (_repeated(one, count) for one in (given.p, shapes.deviation))
         both = clipped.carried(self._both(shapes.x))
         return self._mapped(name, count)(both, lam, p, own, clipped.segments(), deviation)
 
@@ -177,6 +121,42 @@ class Assembly:
             at[:, k] = shapes.lam[:, row]
         return Clipped.of(self.chain, kinds, declared, at, shapes.x)
 
+    def touching(self, shapes: Shapes, given: Inputs) -> Touching | None:
+        """Which nodes touch obstacles; None without obstacles.
+
+        The forces on them bend the elements a little: the second of two looks at the nodes counts.
+        """
+        if not self.model.surfaces:
+            return None
+        rows = plain = _repeated(shapes.lam[:, : self.n_lam], self._segments)
+        offsets, sizes = self.offsets(given.p), shapes.lam[:, self.n_lam :]
+        for _ in range(2):
+            (advance,) = self._under(rows, "segment_curve", shapes, given)
+            places = self._places(advance[..., : self.node.dimension, 0], given)
+            found = Touching.of(self.model, places, offsets, sizes, self._depth)
+            rows = self._with_pulls(plain, found.beyond)
+        return found
+
+    @staticmethod
+    def _places(steps: FloatArray, given: Inputs) -> FloatArray:
+        """Nodes (m, n + 1, d) [m] after advances (m, n, d)."""
+        start = given.poses[:, None, : steps.shape[2]]
+        return np.concatenate([start, steps], axis=1).cumsum(axis=1)
+
+    def offsets(self, p: FloatArray) -> FloatArray:
+        """How far surfaces are outwards of the declared ones (m, surfaces) [m]."""
+        return np.zeros((len(p), len(self.model.surfaces)))
+
+    def offsets_along(self, p: FloatArray) -> FloatArray:
+        """Change (m, surfaces, q) [m] of `offsets` along parameters (m, n_parameters, q)."""
+        return np.zeros((len(p), len(self.model.surfaces), p.shape[2]))
+
+    def _with_pulls(self, lam: FloatArray, beyond: FloatArray) -> FloatArray:
+        """Forces (m, n_segments, n_lam, ...) with others (m, n_segments, d, ...) at the end."""
+        out = np.array(lam)
+        out[:, :, self.model.end_pull] += beyond
+        return out
+
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, of (m, n_nodes, k, ...)."""
         return np.concatenate([nodes[:, : self._segments], nodes[:, self._next]], axis=2)
@@ -184,7 +164,7 @@ class Assembly:
     def _call_ends(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """A function of both ends: outputs (m, rows, columns)."""
         both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
-        others = (shapes.lam, given.p, given.poses, shapes.deviation)
+        others = (shapes.lam[:, : self.n_lam], given.p, given.poses, shapes.deviation)
         rows = [both, *(one[:, None] for one in others)]
         return [out[:, 0] for out in self._mapped(name, 1)(*rows)]
 
@@ -213,7 +193,8 @@ class Assembly:
 
     def balance(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, Vector, BandMatrix]:
         """Lagrangian (m,) [J], its gradient by increments and multipliers, and its Hessian."""
-        value, gradient, bend = self._call_segments("segment", shapes, given)
+        touching = self.touching(shapes, given)
+        value, gradient, bend = self._call_segments("segment", shapes, given, touching)
         end_value, end_gradient, end_bend = self._call_ends("at_ends", shapes, given)
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         matrix = self._held(self._band(bend, end_bend), given)
@@ -221,6 +202,11 @@ class Assembly:
         clipped, stiffness = self.clipped(shapes, given), self._stiffness(given)
         clipped.hold(force, shapes.x, stiffness)
         clipped.hold_matrix(matrix, stiffness)
+        if touching:
+            places = self._places(gradient[:, :, self._pull, 0], given)
+            gaps = touching.gaps(places, self.offsets(given.p))
+            total = total + touching.energy(places, gaps)
+            force, matrix = touching.added(force, gaps), touching.matrix(matrix, bend)
         return total, force, matrix
 
     def _stiffness(self, given: Inputs) -> FloatArray:
@@ -252,10 +238,14 @@ class Assembly:
 
     def imbalance(self, shapes: Shapes, given: Inputs) -> Vector:
         """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
-        (gradient,) = self._call_segments("segment_slope", shapes, given)
+        touching = self.touching(shapes, given)
+        (gradient,) = self._call_segments("segment_slope", shapes, given, touching)
         _, end_gradient, _ = self._call_ends("at_ends", shapes, given)
         force = self._added(gradient, end_gradient)
         self.clipped(shapes, given).hold(force, shapes.x, self._stiffness(given))
+        if touching:
+            places = self._places(gradient[:, :, self._pull, 0], given)
+            force = touching.added(force, touching.gaps(places, self.offsets(given.p)))
         return force
 
     def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
@@ -278,12 +268,17 @@ class Assembly:
 
     def imbalance_by(self, shapes: Shapes, given: Inputs, along: Tangents) -> Vector:
         """Change of the gradient at fixed nodes and multipliers, along p, rest and deviation."""
-        (segments,) = self._call_segments("segment_sensitivity", shapes, given)
+        touching = self.touching(shapes, given)
+        (segments,) = self._call_segments("segment_sensitivity", shapes, given, touching)
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         n_p = along.p.shape[1]
         at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
         clipped = self.clipped(shapes, given)
-        total = self._added(self.add_by_numbers(0.0, segments, along, clipped), at_ends)
+        changed = self.add_by_numbers(0.0, segments, along, clipped)
+        total = self._added(changed, at_ends)
+        if touching:
+            moved = changed[:, :, self._pull]
+            total = touching.along(total, moved, self.offsets_along(along.p))
         for slip, (more, less) in self.slipped(given, along):
             change = self.imbalance(shapes, more) - self.imbalance(shapes, less)
             total = total + Vector(change.x * slip[:, None, None], change.y * slip[:, None])
@@ -368,7 +363,8 @@ class Assembly:
     def readings_along(self, shapes: Shapes, given: Inputs, along: Tangents) -> FloatArray:
         """Change (m, n_reactions, q) of `readings` along directions."""
         by_ends, by_p, by_deviation = self._call_ends("reading_slopes", shapes, given)
-        moved = np.concatenate([along.x[:, 0], along.x[:, -1], along.lam], axis=1)
+        lam = along.lam[:, : self.n_lam]
+        moved = np.concatenate([along.x[:, 0], along.x[:, -1], lam], axis=1)
         return np.asarray(by_ends @ moved + by_p @ along.p + by_deviation @ along.deviation)
 
     # ---- state and strain ------------------------------------------------------------------------
@@ -436,7 +432,11 @@ class CurveSlopes:
         a, d = self.assembly, directions
         clipped = a.clipped(self.shapes, self.given)
         by_nodes, by_lam = np.split(self.by_moving, [2 * a.b], axis=-1)
-        steps: FloatArray = by_nodes @ a._both(d.x) + by_lam @ d.lam[:, None]
+        lam = d.lam[:, None, : a.n_lam]
+        if touching := a.touching(self.shapes, self.given):
+            pulled = touching.beyond_along(d.lam[:, a.n_lam :])
+            lam = a._with_pulls(np.repeat(lam, len(pulled[0]), axis=1), pulled)
+        steps: FloatArray = by_nodes @ a._both(d.x) + by_lam @ lam
         steps = a.add_by_numbers(steps, self.by_others, d, clipped)
         start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
         places, rates = a._stations(steps, start)

@@ -24,6 +24,7 @@ from dlo_casadi.model.rest_curvature import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
 from dlo_casadi.rod.ends import EndConditions, deviation_names
 from dlo_casadi.rod.node import Node
+from dlo_casadi.rod.obstacles import Obstacle
 
 StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
@@ -77,6 +78,8 @@ class CableModel:
         effects are nuisances within a declared tolerance, not findings.
     clips : tuple of ClipKind
         Kinds of the clips between the ends, in the order along the cable.
+    obstacles : tuple of Obstacle
+        What the cable may touch in all poses, without friction.
 
     Notes
     -----
@@ -93,6 +96,7 @@ class CableModel:
     n_rest: int = 9
     priors: Mapping[str, float] = field(default_factory=dict, hash=False)
     clips: tuple[ClipKind, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.gravity) != len(self.cable.axes):
@@ -101,8 +105,9 @@ class CableModel:
                 f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
                 "give both, in a plane neither"
             )
-        if self.clips and not self.chain.kind.smooth:
-            raise DloError(f"clips need a smooth element, found {self.element!r}; try 'quadratic'")
+        if (self.clips or self.obstacles) and not self.chain.kind.smooth:
+            what = "clips" if self.clips else "obstacles"
+            raise DloError(f"{what} need a smooth element, found {self.element!r}; try 'quadratic'")
         labels = [effect.label for effect in self.effects]
         for effect in self.effects:
             if labels.count(effect.label) > 1:
@@ -282,13 +287,42 @@ class CableModel:
         """Number of unknowns of the whole pose: `border_names`."""
         return len(self.border_names)
 
+    @property
+    def surfaces(self) -> tuple[Obstacle, ...]:
+        """All that the cable may touch."""
+        return self.obstacles
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of places at which the cable may touch obstacles, see `contact`."""
+        return len(self.surfaces) * (self.n - (self.end != "free"))
+
+    @property
+    def n_lam(self) -> int:
+        """Number of unknowns of the border on which segments depend: all but contact forces."""
+        return self.n_border - self.n_contacts
+
+    @property
+    def end_pull(self) -> list[int]:
+        """Rows of the border (dimension,) of a force at the end of the cable, if there are any.
+
+        With obstacles a free end has them, too, and they are zero: all forces beyond a segment
+        act on it as one at its end would.
+        """
+        free = self.end == "free"
+        if free and not self.surfaces:
+            return []
+        names = [f"free_end_{axis}" for axis in self.node.axes] if free else self._end_position
+        return [self.border_names.index(name) for name in names]
+
     @cached_property
     def border_kinds(self) -> dict[str, Literal["distance", "angle", "place"]]:
-        """Unknowns beside the nodes by their names: of end conditions, springs and clips.
+        """Unknowns beside the nodes by their names: of end conditions, springs, clips, contacts.
 
         A multiplier is that of a condition on a distance [m] or an angle [rad]. A spring's place y
         [m] is an unknown of its own, held on the cable by a multiplier [N]: the Hessian then
-        couples neighbouring nodes only, see `SpringAt`. An eyelet's arc length [m] is one, too.
+        couples neighbouring nodes only, see `SpringAt`. An eyelet's arc length [m] is one, too. The
+        multiplier of a contact is the size of its force [N]; they differ from mesh to mesh.
         """
         places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
         kinds: dict[str, Literal["distance", "angle", "place"]] = {}
@@ -301,6 +335,10 @@ class CableModel:
             kinds |= {f"clip_{k}.{name}": "distance" for name in pulls}
             if kind == "eyelet":
                 kinds[f"clip_{k}.place_s"] = "place"
+        if self.surfaces and self.end == "free":
+            kinds |= {f"free_end_{axis}": "distance" for axis in self.node.axes}
+        for k in range(self.n_contacts):
+            kinds[f"contact_{k} on {self.n}"] = "distance"
         return kinds
 
     @cached_property

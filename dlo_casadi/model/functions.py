@@ -125,7 +125,7 @@ class Functions:
     @cached_property
     def _framed(self) -> SegmentInFrame:
         """The segment in space, at this model's own symbols."""
-        free, lam = self.model.end == "free", self.terms.lam
+        free, lam = not self.model.end_pull, self.terms.lam
         multipliers = [ca.SX.zeros(3)] * free + [lam[rows] for rows in self._force_rows]
         _, _, p, rest, place, deviation = self._segment_arguments
         numbers = SegmentNumbers(p, rest, place, deviation, ca.SX(self.terms.shares(p, place)))
@@ -134,7 +134,7 @@ class Functions:
     @property
     def _force_rows(self) -> list[list[int]]:
         """Rows, in the border, of the forces on the end's holder, on springs and on clips."""
-        return [[0, 1, 2]] * (self.model.end != "free") + self.model.pulls
+        return [rows for rows in (self.model.end_pull, *self.model.pulls) if rows]
 
     @cached_property
     def _about_nodes(self) -> SegmentDerivatives:
@@ -145,8 +145,8 @@ class Functions:
     @property
     def _of_forces(self) -> ca.DM:
         """Matrix from both nodes and these forces to both nodes and the border."""
-        every = np.eye(6 + self.model.n_border)
-        none = [np.zeros((len(every), 3))] * (self.model.end == "free")
+        every = np.eye(6 + self.model.n_lam)
+        none = [np.zeros((len(every), 3))] * (not self.model.end_pull)
         forces = [every[:, 6 + np.array(rows)] for rows in self._force_rows]
         return ca.sparsify(ca.DM(np.hstack([every[:, :6], *none, *forces])))
 
@@ -169,8 +169,8 @@ class Functions:
         """
         node, rows = self.node, reaction_rows(self.node)
         forces = [self._reactions[rows[f"{side}_force"]] for side in ("start", "end")]
-        lam = (self.terms.lam[k] for k in range(self.model.n_border))
-        known = dict(zip(self.model.border_names, lam, strict=True))
+        lam = (self.terms.lam[k] for k in range(self.model.n_lam))
+        known = dict(zip(self.model.border_names, lam, strict=False))
         frames = zip(("start", "end"), ca.vertsplit(self.terms.x, node.coordinates), strict=True)
         moments = [
             node.to_world(

@@ -73,7 +73,7 @@ class Lagrangian:
         A declared pose, see `HeldPose.vector`.
     deviation : (n_deviations,)
         Unknowns of one pose of its own, see `deviation_names`.
-    lam : (n_border,)
+    lam : (n_lam,)
         Border: multipliers of the end conditions, then unknowns of springs and of clips.
     x, delta : (2 coordinates,), (2 increment,)
         Coordinates of the two nodes of a segment, or of the first and last; their increments.
@@ -90,7 +90,7 @@ class Lagrangian:
         self.p = ca.SX.sym("p", len(model.parameters))
         self.pose = ca.SX.sym("pose", model.n_pose)
         self.deviation = ca.SX.sym("deviation", len(model.deviation_names))
-        self.lam = ca.SX.sym("lam", model.n_border)
+        self.lam = ca.SX.sym("lam", model.n_lam)
         self.x = ca.SX.sym("x", 2 * self.node.coordinates)
         self.delta = ca.SX.sym("delta", 2 * self.node.increment)
         self.rest_strains = ca.SX.sym("rest", 3 * len(self.node.strains))
@@ -303,8 +303,8 @@ class Lagrangian:
     def work_of_multipliers(self, segment: Segment) -> ca.SX:
         """Work of the multipliers of places, of the end, springs and clips, along a segment [J]."""
         work = ca.SX(0)
-        if self.model.end != "free":
-            work = ca.dot(self.lam[: self.node.dimension], self.kind.advance(segment))
+        if self.model.end_pull:
+            work = ca.dot(self.lam[self.model.end_pull], self.kind.advance(segment))
         for k, rows in enumerate(self.model.pulls):
             share = self.share_symbols[len(self.dead_forces) + k]
             work += ca.dot(self.lam[rows], self.kind.advance(segment, share))

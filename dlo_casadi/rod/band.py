@@ -107,12 +107,16 @@ class BandMatrix:
         Rows of a node, columns of the next one.
     border : (m, n, b, k)
     corner : (m, k, k)
+    internal : int
+        How many unknowns, the last of the border, stand for outer products that A is to have in
+        addition: they are eliminated, and neither right-hand sides nor solutions have them.
     """
 
     diagonal: FloatArray
     upper: FloatArray
     border: FloatArray
     corner: FloatArray
+    internal: int = 0
 
     @property
     def _parts(self) -> tuple[FloatArray, ...]:
@@ -120,14 +124,26 @@ class BandMatrix:
 
     def subset(self, index: IntArray | BoolArray) -> BandMatrix:
         """Matrices of some of the poses."""
-        return BandMatrix(*(part[index] for part in self._parts))
+        return BandMatrix(*(part[index] for part in self._parts), self.internal)
 
     def replaced(self, index: IntArray, other: BandMatrix) -> BandMatrix:
         """Matrices of all poses, those of some taken from `other`."""
-        parts = [part.copy() for part in self._parts]
-        for part, new in zip(parts, other._parts, strict=True):
+        internal = max(self.internal, other.internal)
+        parts = [part.copy() for part in self._widened(internal)._parts]
+        for part, new in zip(parts, other._widened(internal)._parts, strict=True):
             part[index] = new
-        return BandMatrix(*parts)
+        return BandMatrix(*parts, internal)
+
+    def _widened(self, internal: int) -> BandMatrix:
+        """The same matrices with so many internal unknowns, the new ones without effect."""
+        more = internal - self.internal
+        if not more:
+            return self
+        size = self.corner.shape[1]
+        corner = np.pad(self.corner, [(0, 0), (0, more), (0, more)])
+        corner[:, range(size, size + more), range(size, size + more)] = 1.0
+        border = np.pad(self.border, [(0, 0), (0, 0), (0, 0), (0, more)])
+        return BandMatrix(self.diagonal, self.upper, border, corner, internal)
 
     def with_border(self, columns: FloatArray) -> BandMatrix:
         """Return the matrices with more conditions, columns (m, n, b, k'), in the border."""
@@ -167,7 +183,7 @@ class BandMatrix:
         return Vector(x, across + self.corner @ vector.y)
 
     def dense(self) -> FloatArray:
-        """Full matrices (m, n b + k, n b + k)."""
+        """Full matrices (m, n b + k, n b + k), without internal unknowns."""
         m, n, b, k = self.border.shape
         full = np.zeros((m, n * b + k, n * b + k))
         for i in range(n):
@@ -179,7 +195,9 @@ class BandMatrix:
         full[:, : n * b, n * b :] = self.columns
         full[:, n * b :, : n * b] = _transposed(self.columns)
         full[:, n * b :, n * b :] = self.corner
-        return full
+        kept = full.shape[1] - self.internal
+        own, across = full[:, kept:, kept:], full[:, :kept, kept:]
+        return full[:, :kept, :kept] - across @ np.linalg.solve(own, _transposed(across))
 
     def factor(self) -> BandFactor:
         """Eliminate the nodes."""
@@ -269,13 +287,17 @@ class BandFactor:
     def solve(self, right: Vector) -> Vector:
         """Solution of each pose for columns (m, n, b, q), (m, k, q), refined to rounding.
 
-        Conditions that depend on each other share their multiplier, the least one.
+        Conditions that depend on each other share their multiplier, the least one. Right-hand
+        sides have no rows of internal unknowns.
 
         Raises
         ------
         numpy.linalg.LinAlgError
             If a matrix is not finite.
         """
+        k, extra = right.y.shape[1], self.matrix.internal
+        if extra:
+            right = Vector(right.x, np.pad(right.y, [(0, 0), (0, extra), (0, 0)]))
         found = self._once(right)
         size = right.size
         before = np.inf
@@ -286,7 +308,7 @@ class BandFactor:
                 break
             before = worst
             found = found + self._once(left)
-        return found
+        return Vector(found.x, found.y[:, :k])
 
     @cached_property
     def negative(self) -> IntArray:
@@ -299,4 +321,6 @@ class BandFactor:
             values, _ = self._conditions
             total += (values < 0).sum(axis=1)
             singular = np.abs(values).min(axis=1) < ZERO_PIVOT
+        own = np.diagonal(self.matrix.corner, axis1=1, axis2=2)
+        total -= (own[:, own.shape[1] - self.matrix.internal :] < 0).sum(axis=1)
         return np.where(singular, -1, total)

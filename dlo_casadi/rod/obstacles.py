@@ -1,0 +1,107 @@
+"""Rigid obstacles without friction: planes, and capsules, of which spheres are a special case.
+
+Of a place X the distance g(X) from the surface, its gradient n (a unit normal, away from the
+obstacle) and its Hessian, which of a plane is zero and of a capsule (I - n n^T) / distance from the
+axis, without the axis's own direction where the nearest point of the axis is none of its ends.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+
+# Least distance [m] from an axis at which a normal is known.
+_ON_AXIS = 1e-12
+
+
+class Surface(NamedTuple):
+    """A surface near places.
+
+    `distance` (...) [m], positive outside; `normal` (..., d); `bends` (..., d, d - 1): vectors whose
+    outer products add up to the Hessian of the distance [1/m].
+    """
+
+    distance: FloatArray
+    normal: FloatArray
+    bends: FloatArray
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane through `point` (d,) [m]; the cable is on the side of its unit `normal` (d,)."""
+
+    point: tuple[float, ...]
+    normal: tuple[float, ...]
+    name: str = "plane"
+
+    def near(self, places: FloatArray) -> Surface:
+        """The surface near places (..., d) [m]."""
+        n = np.array(self.normal)
+        distance = (places - np.array(self.point)) @ n
+        bends = np.zeros((*places.shape, len(n) - 1))
+        return Surface(distance, np.broadcast_to(n, places.shape), bends)
+
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """As plain data."""
+        own = {"point": list(self.point), "normal": list(self.normal)}
+        return {"name": self.name, "kind": "plane", **own}
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All places within `radius` [m] of the line from `a` to `b` (d,) [m]; a sphere where a = b.
+
+    In a plane it is a disc or a stadium.
+    """
+
+    a: tuple[float, ...]
+    b: tuple[float, ...]
+    radius: float
+    name: str = "capsule"
+
+    def near(self, places: FloatArray) -> Surface:
+        """The surface near places (..., d) [m]."""
+        a, axis = np.array(self.a), np.subtract(self.b, self.a)
+        square = float(axis @ axis)
+        share = (places - a) @ axis / square if square else np.zeros(places.shape[:-1])
+        beside = (share > 0) & (share < 1)
+        gap = places - a - np.clip(share, 0.0, 1.0)[..., None] * axis
+        size = np.linalg.norm(gap, axis=-1, keepdims=True)
+        above = np.eye(len(a))[-1]
+        normal = np.where(size > _ON_AXIS, gap / np.maximum(size, _ON_AXIS), above)
+        bends = _across(normal, axis if square else above)
+        bends = bends / np.sqrt(np.maximum(size, _ON_AXIS))[..., None]
+        bends[..., -1] *= ~beside[..., None]
+        return Surface(size[..., 0] - self.radius, normal, bends)
+
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """As plain data."""
+        own = {"a": list(self.a), "b": list(self.b), "radius": self.radius}
+        return {"name": self.name, "kind": "capsule", **own}
+
+
+Obstacle = Plane | Capsule
+
+
+def _across(normal: FloatArray, axis: FloatArray) -> FloatArray:
+    """Unit vectors (..., d, d - 1) across normals (..., d); the last is the nearest to an axis."""
+    if len(axis) == 2:
+        return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)[..., None]
+    along = axis - (normal @ axis)[..., None] * normal
+    size = np.linalg.norm(along, axis=-1, keepdims=True)
+    other = np.eye(3)[np.abs(normal).argmin(axis=-1)]
+    other = other - (normal * other).sum(axis=-1, keepdims=True) * normal
+    along = np.where(size > 1e-6 * np.linalg.norm(axis), along, other)
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.stack([np.cross(normal, along), along], axis=-1)
+
+
+def surfaces_near(obstacles: Sequence[Obstacle], places: FloatArray) -> Surface:
+    """Surfaces near places (m, n, d) [m]: those of one obstacle after the other (m, n k)."""
+    each = [obstacle.near(places) for obstacle in obstacles]
+    return Surface(*(np.concatenate(part, axis=1) for part in zip(*each, strict=True)))
