@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
     from dlo_casadi.config import Clip as Clip
+    from dlo_casadi.config import Obstacle as Obstacle
     from dlo_casadi.config import Pose as Pose
     from dlo_casadi.effects import EFFECTS as EFFECTS
     from dlo_casadi.errors import ConfigError as ConfigError
@@ -35,7 +36,7 @@ _PUBLIC = {
     "cable.file": "load",
     "cable.fitted_cable": "FittedCable Shape",
     "codegen": "CompiledSolver",
-    "config": "Cable Clip Pose",
+    "config": "Cable Clip Obstacle Pose",
     "effects": "EFFECTS",
     "errors": "ConfigError DloError EquilibriumError EstimationError MeasurementError VisionError",
 }

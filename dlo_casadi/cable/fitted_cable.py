@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve, curves_of
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
-from dlo_casadi.cable.held import check_mesh, clip_texts, fixture_texts, held_pose, side_texts
+from dlo_casadi.cable.held import check_mesh, held_pose, held_surfaces, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.config import Clip
+from dlo_casadi.config import Clip, Obstacle
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -36,6 +36,7 @@ from dlo_casadi.export.files import samples_of, write_rods
 from dlo_casadi.export.rod import Held
 from dlo_casadi.export.targets import target_of
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
+from dlo_casadi.model.contact import Contact
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.show.text import html_table, millimetres
 
@@ -100,6 +101,7 @@ class FittedCable(CasadiCable):
         turns: float = 0.0,
         branch: Branch | None = None,
         clips: Sequence[Clip | Mapping[str, Any]] = (),
+        obstacles: Sequence[Obstacle | Mapping[str, Any]] = (),
     ) -> "Shape":
         """Predict the shape of the cable in a pose.
 
@@ -128,6 +130,8 @@ class FittedCable(CasadiCable):
         clips : sequence of Clip or dict
             What holds the cable between its ends, in the order along it, see `Clip`; none by
             default, whatever held it in the session.
+        obstacles : sequence of Obstacle or dict
+            What the cable may touch, see `Obstacle`; none by default.
 
         Raises
         ------
@@ -141,7 +145,9 @@ class FittedCable(CasadiCable):
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         pose = held_pose(self.model, self.metadata.fixtures, asked | {"clips": list(clips)})
-        return self.with_clips([clip.kind for clip in pose.clips])._solved(pose)
+        held = self.with_clips([clip.kind for clip in pose.clips])
+        surfaces = held_surfaces(self.model, obstacles)
+        return replace(held, model=replace(held.model, obstacles=surfaces))._solved(pose)
 
     def _solved(self, pose: HeldPose) -> "Shape":
         try:
@@ -315,6 +321,11 @@ class Shape:
         return dict(zip(names, self.equilibrium.clips, strict=True))
 
     @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Where the cable touches obstacles, from its start to its end, and the forces on them."""
+        return self.equilibrium.contacts
+
+    @property
     def energy(self) -> float:
         """Potential energy [J]."""
         return self.equilibrium.energy
@@ -353,8 +364,8 @@ class Shape:
         ConfigError, DloError
             If there is no limit, or one or a tolerance has no meaning for this cable.
         """
-        known = self.cable.metadata
-        return check_limits(self.cable, known, self.pose, self.equilibrium, limits, tolerances)
+        known, found = self.cable.metadata, self.equilibrium
+        return check_limits(self.cable, known, self.pose, found, limits, tolerances)
 
     def plot(self) -> Figure:
         """The shape with the forces of the cable on its fixtures; in a plane with its band."""
@@ -376,12 +387,7 @@ class Shape:
 
     def rows(self) -> list[tuple[str, str]]:
         """Quantities of the shape, and their values as text."""
-        rows, pose, points = list[tuple[str, str]](), self.pose, self.points
-        for side, at, reached in (("start", pose.start, points[0]), ("end", pose.end, points[-1])):
-            force, moment = getattr(self, f"{side}_force"), getattr(self, f"{side}_moment")
-            kind = getattr(self.cable.model, side)
-            rows += fixture_texts(side, kind, at, reached, force, moment)
-        rows += clip_texts(pose.clips, self.equilibrium.clips)
+        rows = reaction_texts(self.cable.model, self.pose, self.equilibrium, self.points)
         rows.append(("energy", f"{self.energy:.6g} J"))
         rows.append(("smallest bend radius", millimetres(self.min_bend_radius)))
         rows.append(("stable", "yes" if self.stable else "NO: the cable would not stay there"))
@@ -418,25 +424,21 @@ class Shape:
             "moment_on_start": self.start_moment.tolist(),
             "moment_on_end": self.end_moment.tolist(),
             "clips": clip_rows(pose.clips, self.equilibrium.clips),
+            "contacts": [contact.row for contact in self.contacts],
             "min_bend_radius": self.min_bend_radius,
             "points": self.points.tolist(),
             "band_90": self.band.tolist(),
-            "other_side": self._other_side_as_dict(),
+            "other_side": self._other_row,
         }
 
-    def _other_side_as_dict(self) -> dict[str, Any] | None:
+    @property
+    def _other_row(self) -> dict[str, Any] | None:
         """The other side as plain data, with its greatest distance [m] from this one."""
-        other, near = self.other_side, self.tipping
-        if other is None or near is None:
+        if (other := self.other_side) is None or (near := self.tipping) is None:
             return None
-        shape = other.as_dict()
-        del shape["other_side"]
-        return {
-            "tipping": near.angle,
-            "tipping_std": near.std,
-            "greatest_distance": self._apart(other),
-            **shape,
-        }
+        own = {"tipping": near.angle, "tipping_std": near.std}
+        shape = {"greatest_distance": self._apart(other), **other.as_dict()}
+        return {**own, **{k: x for k, x in shape.items() if k != "other_side"}}
 
     def _apart(self, other: "Shape") -> float:
         """Greatest distance [m] of points at equal arc lengths."""

@@ -12,13 +12,17 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.config.clips import clip_problems
+from dlo_casadi.config.obstacles import Obstacle, obstacle_problems
 from dlo_casadi.config.values import MESH
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
+from dlo_casadi.model.contact import Contact
 from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.obstacles import Obstacle as Surface
 from dlo_casadi.show.text import millimetres, vector
 
 # Whether in space -> key of a clamp's direction, unit, the other dimension's key, words, a place.
@@ -83,6 +87,47 @@ def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tup
             said = vector(load.moment, ".4g", "N m")
             rows.append((f"moment of the cable on {clip.name}", said))
     return rows
+
+
+def contact_texts(contacts: Sequence[Contact]) -> list[tuple[str, str]]:
+    """Where a cable touches obstacles, and its forces on them, as text."""
+    rows = []
+    for one in contacts:
+        where = (
+            f"from {one.start:.4g} to {one.end:.4g}" if one.end > one.start else f"{one.start:.4g}"
+        )
+        said = f"{vector(one.force, '.4g', 'N')} at {where} m of the cable"
+        rows.append((f"force of the cable on {one.obstacle}", said))
+    return rows
+
+
+def reaction_texts(
+    model: CableModel, pose: HeldPose, found: Equilibrium, points: FloatArray
+) -> list[tuple[str, str]]:
+    """All that holds a cable whose points (K, d) [m] begin and end so, and its reactions."""
+    rows = []
+    ends = (("start", pose.start, points[0]), ("end", pose.end, points[-1]))
+    forces = (found.start_force, found.end_force)
+    for (side, at, reached), force, moment in zip(ends, forces, found.moments, strict=True):
+        kind = getattr(model, side)
+        rows += fixture_texts(side, kind, at, reached, force, np.asarray(moment))
+    return rows + clip_texts(pose.clips, found.clips) + contact_texts(found.contacts)
+
+
+def held_surfaces(
+    model: CableModel, obstacles: Sequence[Obstacle | Mapping[str, Any]]
+) -> tuple[Surface, ...]:
+    """Obstacles for the statics, checked as those of a session.
+
+    Raises
+    ------
+    DloError
+        If one cannot be so.
+    """
+    listed = [x if isinstance(x, Obstacle) else Obstacle(**x) for x in obstacles]
+    if wrong := [x.message for x in obstacle_problems(listed, model.node.dimension)]:
+        raise DloError("; ".join(wrong))
+    return tuple(item.surface(k) for k, item in enumerate(listed, start=1))
 
 
 def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, Any]) -> HeldPose:

@@ -78,6 +78,7 @@ POSE = (
     PARAMETERS,
     *POSE,
     option("--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"),
+    option("--obstacles", type=Path, metavar="FILE", help="YAML: a list, as in an experiment"),
     *LIMITS,
     option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
     codes="2 is also a pose without an equilibrium",
@@ -98,11 +99,13 @@ def predict(chosen: argparse.Namespace) -> None:
     figure = chosen.figure
     if figure is not None and figure.suffix.lower() not in DRAWN:
         raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
-    clips = [] if chosen.clips is None else read_yaml(chosen.clips)
-    if not isinstance(clips, list):
-        raise DloError(f"{chosen.clips}: a list of clips belongs here: - {{kind: pinned, ...}}")
     asked = {name: getattr(chosen, name) for name in HELD}
-    shape = load(chosen.parameters).solve(**asked, clips=clips)
+    for name, kind in (("clips", "pinned"), ("obstacles", "plane")):
+        path = getattr(chosen, name)
+        asked[name] = [] if path is None else read_yaml(path)
+        if not isinstance(asked[name], list):
+            raise DloError(f"{path}: a list of {name} belongs here: - {{kind: {kind}, ...}}")
+    shape = load(chosen.parameters).solve(**asked)
     if figure is not None:
         save_figure(figure, shape.plot())
     # What a reader of the prediction should know of the file it came from.

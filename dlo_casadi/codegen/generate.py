@@ -189,6 +189,8 @@ def fill(text: str, values: dict[str, str], prefix: str) -> str:
 
 def _cannot_hold(model: CableModel) -> str:
     """Why the C solver cannot hold a cable between its ends; empty if it can, or need not."""
+    if model.surfaces:
+        return f"the C solver has no contact, this cable {counted(len(model.surfaces), 'obstacle')}"
     if not model.clips:
         return ""
     if not model.in_space or model.end == "free":
@@ -232,7 +234,7 @@ def generate(
     """
     check_prefix(prefix)
     if wrong := _cannot_hold(model):
-        raise DloError(f"{wrong}.\n  Try: solve(..., clips=...) of Python, which knows them.")
+        raise DloError(f"{wrong}.\n  Try: solve(...) of Python, which knows them.")
     p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
     if len(p) != len(model.parameters) or len(rest) != model.chain.n_rests:
         raise DloError(

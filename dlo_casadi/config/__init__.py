@@ -15,5 +15,6 @@ from dlo_casadi.config.load import (
     wrong_effects,
 )
 from dlo_casadi.config.measuring import Centerlines, DeclaredCamera, DeclaredTolerances, Images
+from dlo_casadi.config.obstacles import Obstacle
 from dlo_casadi.config.options import DeclaredEffect, EstimationOptions, Limits
 from dlo_casadi.config.sections import Cable, Config, Pose, SkippedPose

@@ -11,6 +11,7 @@ from typing import TypeVar
 from dlo_casadi.config.clips import clip_problems, clips_differ, too_short
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.measuring import DeclaredTolerances
+from dlo_casadi.config.obstacles import obstacle_problems
 from dlo_casadi.config.options import DeclaredEffect
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
@@ -74,6 +75,7 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
         *wrong_effects(config),
         *_impossible_values(config.experiment, config.cable.length),
         *_wrong_clips(config.experiment, config.cable.length),
+        *obstacle_problems(config.experiment.obstacles, len(config.experiment.gravity)),
         *config.limit_problems,
     ]:
         raise source.error(problems)
@@ -400,6 +402,7 @@ def declared_setup(config: Config) -> Setup:
         readings=tuple({name for pose in experiment.poses for name in pose.readings}),
         tolerances=experiment.tolerances.model_dump(),
         clips=experiment.clips,
+        obstacles=len(experiment.obstacles),
     )
 
 

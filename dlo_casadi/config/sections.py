@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, mo
 from dlo_casadi.config.clips import Clip
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.measuring import Centerlines, DeclaredTolerances, Images
+from dlo_casadi.config.obstacles import Obstacle
 from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, Limits, ModelOptions
 from dlo_casadi.config.problems import PLACEHOLDER, ConfigProblem, Contradiction, show
 from dlo_casadi.config.values import (
@@ -39,6 +40,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import counted, well_formed
 from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.ends import REACTIONS
+from dlo_casadi.rod.obstacles import Obstacle as Surface
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
 # a foam, to five times, which no metal of cables reaches.
@@ -287,6 +289,8 @@ class Experiment(ConfigSection):
     """What the files of the poses are: kind: images or kind: centerlines."""
     tolerances: Annotated[DeclaredTolerances, optional(DeclaredTolerances)] = DeclaredTolerances()
     """How well the declared values are known."""
+    obstacles: tuple[Obstacle, ...] = ()
+    """What the cable may touch, in all poses."""
     poses: tuple[Pose, ...]
     """The poses, in the order in which they were taken."""
 
@@ -294,6 +298,11 @@ class Experiment(ConfigSection):
     def in_space(self) -> bool:
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """The obstacles for the statics."""
+        return tuple(item.surface(k) for k, item in enumerate(self.obstacles, start=1))
 
     @property
     def clips(self) -> tuple[ClipKind, ...]:

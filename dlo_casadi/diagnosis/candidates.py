@@ -79,7 +79,7 @@ class Candidate:
 def setup_of(model: CableModel, **seen: Any) -> Setup:
     """How a model's cable is held, with what else is known of its measurement."""
     curved = model.n_coefficients > 0
-    seen["clips"] = model.clips
+    seen |= {"clips": model.clips, "obstacles": len(model.obstacles)}
     return Setup(model.cable, model.start, model.end, model.gravity, curved, **seen)
 
 

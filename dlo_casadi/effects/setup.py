@@ -37,6 +37,8 @@ class Setup:
         Largest |curvature - rest curvature| of all poses.
     clips : tuple of str
         Kinds of the clips between the ends.
+    obstacles : int
+        Number of obstacles that the cable may touch.
     """
 
     cable: CableData
@@ -53,3 +55,4 @@ class Setup:
     directions: tuple[float, float] = (0.0, 0.0)
     largest_bend: float | None = None
     clips: tuple[str, ...] = ()
+    obstacles: int = 0

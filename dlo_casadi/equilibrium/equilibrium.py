@@ -10,6 +10,7 @@ from dlo_casadi.equilibrium.pose import SIGNS, Branch
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad
+from dlo_casadi.model.contact import Contact
 from dlo_casadi.rod.ends import reaction_rows
 
 # Largest angle between neighbouring headings (Eq. 8; joints only) [rad].
@@ -68,6 +69,8 @@ class Equilibrium:
         None where there is none, and where the pose names its side.
     clips : tuple of ClipLoad
         What the cable does to its clips, in their order.
+    contacts : tuple of Contact
+        Where the cable touches obstacles, from its start to its end.
     """
 
     x: FloatArray
@@ -86,6 +89,7 @@ class Equilibrium:
     iterations: int
     other_side: "Equilibrium | None" = None
     clips: tuple[ClipLoad, ...] = ()
+    contacts: tuple[Contact, ...] = ()
 
     @property
     def shapes(self) -> Shapes:
@@ -169,7 +173,7 @@ def equilibria_of(
     strains = assembly.strain(shapes, given)
     on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(node)
     points = assembly.nodes(shapes, given)
-    on_clips = assembly.clip_loads(shapes, given)
+    on_clips, contacts = assembly.clip_loads(shapes, given), assembly.contacts(shapes, given)
     if bound_multipliers is None:
         bound_multipliers = np.zeros((len(shapes.x), chain.n_nodes - 1))
     out = []
@@ -198,6 +202,7 @@ def equilibria_of(
                 status=Status.STABLE if stable[j] else Status.UNSTABLE,
                 iterations=int(iterations[j]),
                 clips=on_clips[j],
+                contacts=contacts[j],
             )
         )
     return out

@@ -31,9 +31,9 @@ from dlo_casadi.rod.node import Frame, Heading
 
 # Largest move of an end in one step [lengths, rad], so that shapes are followed up to a fold.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
-# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard, and the maximum
-# number of steps of each descent.
-SOFT, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-4), 20
+# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
+# these that a given start skips, so that it stays on its side; maximum number of steps of each.
+SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-4), 2, 20
 # Number of lowest minima of the coarse mesh, in space, that are solved on the model's own mesh,
 # beside the lowest on the other side.
 FEW = 2
@@ -61,6 +61,8 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         return _no_equilibrium(pose, what, "see where these numbers come from.")
     if wrong := _wrong_clips(model, p, pose):
         return _no_equilibrium(pose, *wrong)
+    if wrong := _inside(model, pose):
+        return _no_equilibrium(pose, *wrong)
     if pose.end is None or model.extensible:
         return None
     ends, true_length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
@@ -74,6 +76,20 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         f"from the start, the cable is {length:.4f} m long"
     )
     return _no_equilibrium(pose, what, "end in metres? cable.length?")
+
+
+def _inside(model: CableModel, pose: HeldPose) -> tuple[str, str] | None:
+    """Why obstacles leave no equilibrium, and what to try: a fixture is inside of one."""
+    held = [("start", pose.start), ("end", pose.end)]
+    held += [(clip.name, clip.place) for clip in pose.clips]
+    for name, place in held:
+        for obstacle in model.surfaces if place is not None else ():
+            depth = -float(obstacle.near(np.array(place)).distance)
+            if depth > 0:
+                at = ", ".join(f"{x:.4f}" for x in place or ())
+                what = f"no equilibrium: the {name} ({at}) m is {depth:.4f} m inside"
+                return f"{what} {obstacle.name}", "the obstacle's place, or its normal."
+    return None
 
 
 def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
@@ -271,11 +287,13 @@ class _PoseSearch:
         if free and self.model.in_space and self.model.n > self.model.coarse.n:
             of, likely = self._likely([poses[j] for j in free])
             if len(of):
-                found = self._descended(poses, np.array(free)[of], likely)
+                found = self._descended(poses, np.array(free)[of], likely, near=True)
         left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
         if left:
             others = [poses[j] for j in left]
-            again = self._descended(others, *self._first(others, [starts[j] for j in left]))
+            near = all(starts[j] is not None for j in left)
+            first = self._first(others, [starts[j] for j in left])
+            again = self._descended(others, *first, near=near)
             for j, minima in zip(left, again, strict=True):
                 found[j] += minima
         return found
@@ -296,19 +314,19 @@ class _PoseSearch:
         return of, Shapes.declared(np.array(x), np.array(border), len(model.clips))
 
     def _descend(
-        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes
+        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool = False
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
         assembly = assembly_of(self.model)
-        for depth in SOFT if self.model.surfaces else ():
+        for depth in SOFT[KEEPING_SIDE * near :] if self.model.surfaces else ():
             shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
         return given, descend(assembly, shapes, given)
 
     def _descended(
-        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes
+        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool
     ) -> list[list[Equilibrium]]:
-        """Equilibria of each pose to which the energy descends from shapes `of` these poses."""
-        given, minima = self._descend(poses, of, shapes)
+        """Equilibria to which the energy descends from shapes `of` poses; see `_descend`."""
+        given, minima = self._descend(poses, of, shapes, near=near)
         kept = minima.balanced
         if not self.model.in_space:
             bends = np.abs(np.diff(minima.shapes.x[..., 0], axis=1))

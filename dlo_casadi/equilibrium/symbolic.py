@@ -240,8 +240,9 @@ class CasadiCable:
     def _inputs(self, parameters: bool | str | Sequence[str]) -> tuple[dict[str, Any], Any]:
         """Symbols of the pose and of the parameters asked for, and all parameters."""
         known = self.model.names
-        if self.model.clips:
-            raise DloError("a function of the pose has no clips yet.\n  Try: solve(..., clips=...)")
+        if wrong := ["clips"] * bool(self.model.clips) + ["obstacles"] * bool(self.model.surfaces):
+            said = " and ".join(wrong)
+            raise DloError(f"a function of the pose has no {said} yet.\n  Try: solve(...).")
         if not isinstance(parameters, bool | str | list | tuple):
             text = "True, False or names of parameters belong here, found"
             raise DloError(f"parameters: {text} {parameters!r}")

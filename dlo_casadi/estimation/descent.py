@@ -228,11 +228,12 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
 
 
 def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
-    """Nodes interpolated from one model's mesh to another's."""
+    """Nodes interpolated from one model's mesh to another's; contacts begin without forces."""
     if model.chain == other.chain:
         return shapes
     coarse, fine = model.chain.places, other.chain.places
-    return replace(shapes, x=other.chain.kind.node.interpolated(fine, coarse, shapes.x))
+    x = other.chain.kind.node.interpolated(fine, coarse, shapes.x)
+    return with_border_of(replace(shapes, x=x), model, other)
 
 
 def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:

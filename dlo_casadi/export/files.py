@@ -70,6 +70,8 @@ def _cost(cable: Held, rod: Rod, feature: Feature) -> str:
     if feature in ("anisotropy", "stiffness along the cable"):  # what is left is the mean
         known["bending_stiffness"] = float(rod.mean_bending.mean())
         known["torsional_stiffness"] = float(rod.torsion.mean())
+    if feature == "obstacles":
+        model = replace(model, obstacles=())
     if feature == "rest shape":
         rest = np.zeros_like(rest)
     for label in labels:

@@ -48,6 +48,7 @@ Feature = Literal[
     "compliance of a clamp",
     "change of the rest shape",
     "clips",
+    "obstacles",
 ]
 # GJ / EI of a cable whose session lay in a plane: that of a solid round rod.
 ROUND = 1 / 1.3
@@ -182,6 +183,8 @@ class Rod:
             features["rest shape"] = ()
         if pose.clips:
             features["clips"] = ()
+        if model.surfaces:
+            features["obstacles"] = ()
         return cls(
             name=model.cable.name,
             in_space=model.in_space,

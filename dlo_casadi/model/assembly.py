@@ -18,7 +18,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
-from dlo_casadi.model.contact import DEPTH, Touching
+from dlo_casadi.model.contact import DEPTH, Contact, Touching
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.mapped import Mapped
@@ -26,6 +26,7 @@ from dlo_casadi.model.stacked import Inputs as Inputs
 from dlo_casadi.model.stacked import Shapes as Shapes
 from dlo_casadi.model.stacked import Tangents as Tangents
 from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.rod.ends import reaction_rows
 
 # Step of differences by slips of clips, relative to the length.
 _SLIP = 1e-6
@@ -94,14 +95,11 @@ class Assembly:
         self, name: str, shapes: Shapes, given: Inputs, touching: Touching | None = None
     ) -> list[FloatArray]:
         """A function of a segment for all segments: outputs (m, n_segments, rows, columns)."""
-        lam = _repeated(shapes.lam[:, : self.n_lam], self._segments)
-        if touching := touching or self.touching(shapes, given):
-            lam = self._with_pulls(lam, touching.beyond)
+        touching = touching or self.touching(shapes, given)
+        lam = touching.lam if touching else _repeated(shapes.lam, self._segments)
         return self._under(lam, name, shapes, given)
 
-    def _under(
-        self, lam: FloatArray, name: str, shapes: Shapes, given: Inputs
-    ) -> list[FloatArray]:
+    def _under(self, lam: FloatArray, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """The same under forces lam (m, n_segments, n_lam)."""
         count, clipped = self._segments, self.clipped(shapes, given)
         own = clipped.rest(self.chain.rest_inside(given.rest[..., None]))[..., 0]
@@ -122,26 +120,16 @@ class Assembly:
         return Clipped.of(self.chain, kinds, declared, at, shapes.x)
 
     def touching(self, shapes: Shapes, given: Inputs) -> Touching | None:
-        """Which nodes touch obstacles; None without obstacles.
-
-        The forces on them bend the elements a little: the second of two looks at the nodes counts.
-        """
+        """Which nodes touch obstacles; None without obstacles."""
         if not self.model.surfaces:
             return None
-        rows = plain = _repeated(shapes.lam[:, : self.n_lam], self._segments)
-        offsets, sizes = self.offsets(given.p), shapes.lam[:, self.n_lam :]
-        for _ in range(2):
-            (advance,) = self._under(rows, "segment_curve", shapes, given)
-            places = self._places(advance[..., : self.node.dimension, 0], given)
-            found = Touching.of(self.model, places, offsets, sizes, self._depth)
-            rows = self._with_pulls(plain, found.beyond)
-        return found
+        d = self.node.dimension
 
-    @staticmethod
-    def _places(steps: FloatArray, given: Inputs) -> FloatArray:
-        """Nodes (m, n + 1, d) [m] after advances (m, n, d)."""
-        start = given.poses[:, None, : steps.shape[2]]
-        return np.concatenate([start, steps], axis=1).cumsum(axis=1)
+        def advances(lam: FloatArray) -> FloatArray:
+            return self._under(lam, "segment_curve", shapes, given)[0][:, :, :d, 0]
+
+        start, offsets = given.poses[:, :d], self.offsets(given.p)
+        return Touching.of(self.model, shapes.lam, start, offsets, self._depth, advances)
 
     def offsets(self, p: FloatArray) -> FloatArray:
         """How far surfaces are outwards of the declared ones (m, surfaces) [m]."""
@@ -150,12 +138,6 @@ class Assembly:
     def offsets_along(self, p: FloatArray) -> FloatArray:
         """Change (m, surfaces, q) [m] of `offsets` along parameters (m, n_parameters, q)."""
         return np.zeros((len(p), len(self.model.surfaces), p.shape[2]))
-
-    def _with_pulls(self, lam: FloatArray, beyond: FloatArray) -> FloatArray:
-        """Forces (m, n_segments, n_lam, ...) with others (m, n_segments, d, ...) at the end."""
-        out = np.array(lam)
-        out[:, :, self.model.end_pull] += beyond
-        return out
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, of (m, n_nodes, k, ...)."""
@@ -203,10 +185,8 @@ class Assembly:
         clipped.hold(force, shapes.x, stiffness)
         clipped.hold_matrix(matrix, stiffness)
         if touching:
-            places = self._places(gradient[:, :, self._pull, 0], given)
-            gaps = touching.gaps(places, self.offsets(given.p))
-            total = total + touching.energy(places, gaps)
-            force, matrix = touching.added(force, gaps), touching.matrix(matrix, bend)
+            total, force = touching.added(total, force, gradient[:, :, self._pull, 0])
+            matrix = touching.matrix(matrix, bend)
         return total, force, matrix
 
     def _stiffness(self, given: Inputs) -> FloatArray:
@@ -244,8 +224,7 @@ class Assembly:
         force = self._added(gradient, end_gradient)
         self.clipped(shapes, given).hold(force, shapes.x, self._stiffness(given))
         if touching:
-            places = self._places(gradient[:, :, self._pull, 0], given)
-            force = touching.added(force, touching.gaps(places, self.offsets(given.p)))
+            _, force = touching.added(np.zeros(()), force, gradient[:, :, self._pull, 0])
         return force
 
     def _band(self, bend: FloatArray, ends: FloatArray) -> BandMatrix:
@@ -354,18 +333,35 @@ class Assembly:
 
     def reactions(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `ends.REACTIONS`."""
-        return self._call_ends("reactions", shapes, given)[0][..., 0]
+        found, touching = (
+            self._call_ends("reactions", shapes, given)[0][..., 0],
+            self.touching(shapes, given),
+        )
+        return touching.held(found) if touching else found
 
     def readings(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """`reactions` as measured by sensors."""
-        return self._call_ends("readings", shapes, given)[0][..., 0]
+        found, touching = (
+            self._call_ends("readings", shapes, given)[0][..., 0],
+            self.touching(shapes, given),
+        )
+        return touching.held(found) if touching else found
+
+    def contacts(self, shapes: Shapes, given: Inputs) -> list[tuple[Contact, ...]]:
+        """Where the cables touch obstacles, for each of m poses."""
+        touching = self.touching(shapes, given)
+        return touching.contacts() if touching else [()] * len(shapes.x)
 
     def readings_along(self, shapes: Shapes, given: Inputs, along: Tangents) -> FloatArray:
         """Change (m, n_reactions, q) of `readings` along directions."""
         by_ends, by_p, by_deviation = self._call_ends("reading_slopes", shapes, given)
         lam = along.lam[:, : self.n_lam]
         moved = np.concatenate([along.x[:, 0], along.x[:, -1], lam], axis=1)
-        return np.asarray(by_ends @ moved + by_p @ along.p + by_deviation @ along.deviation)
+        change = by_ends @ moved + by_p @ along.p + by_deviation @ along.deviation
+        if touching := self.touching(shapes, given):
+            pulled = touching.lam_along(along.lam)[:, 0] - along.lam[:, : self.n_lam]
+            change[:, reaction_rows(self.node)["start_force"]] -= pulled[:, self.model.end_pull]
+        return np.asarray(change)
 
     # ---- state and strain ------------------------------------------------------------------------
 
@@ -432,10 +428,8 @@ class CurveSlopes:
         a, d = self.assembly, directions
         clipped = a.clipped(self.shapes, self.given)
         by_nodes, by_lam = np.split(self.by_moving, [2 * a.b], axis=-1)
-        lam = d.lam[:, None, : a.n_lam]
-        if touching := a.touching(self.shapes, self.given):
-            pulled = touching.beyond_along(d.lam[:, a.n_lam :])
-            lam = a._with_pulls(np.repeat(lam, len(pulled[0]), axis=1), pulled)
+        touching = a.touching(self.shapes, self.given)
+        lam = touching.lam_along(d.lam) if touching else d.lam[:, None]
         steps: FloatArray = by_nodes @ a._both(d.x) + by_lam @ lam
         steps = a.add_by_numbers(steps, self.by_others, d, clipped)
         start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))

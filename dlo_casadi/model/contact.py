@@ -20,21 +20,54 @@ Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002): primal-dual active sets a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
-from dlo_casadi.rod.obstacles import surfaces_near
+from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.rod.obstacles import Surface, surfaces_near
 
 # Depth [lengths] under a force as large as the cable's weight: it keeps apart contacts that depend
 # on each other.
 DEPTH = 1e-8
 # Gap [lengths] that counts as much as such a force in deciding whether a contact is active.
 BALANCED = 1e-2
+
+
+# Nodes so near to a surface [lengths] belong to the same contact as those beside them that press.
+CLOSE = 1e-4
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A stretch of the cable that touches an obstacle.
+
+    Parameters
+    ----------
+    obstacle : str
+    start, end : float [m]
+        Arc lengths where it begins and ends; equal where the cable touches in a point. Between
+        nodes they follow from the forces beside them: evenly spread in between, points at both.
+    force : (dimension,) [N]
+        Of the cable on the obstacle.
+    """
+
+    obstacle: str
+    start: float
+    end: float
+    force: FloatArray
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """As plain data in SI units."""
+        at = {"from": self.start, "to": self.end}
+        return {"obstacle": self.obstacle, **at, "force": self.force.tolist()}
 
 
 @dataclass(frozen=True)
@@ -44,39 +77,59 @@ class Touching:
     Parameters
     ----------
     model : CableModel
+    border : (m, k)
+        All unknowns beside the nodes, the sizes of the forces [N] last.
+    start : (m, d) [m]
+    offsets : (m, surfaces) [m]
+        How far the surfaces are outwards of the declared ones.
+    depth : float
+        See `DEPTH`.
     normal : (m, K, d)
     bends : (m, K, d, d - 1)
         See `obstacles.Surface`.
-    sizes : (m, K) [N]
-        Sizes of the forces, whether active or not.
+    gap : (m, K) [m]
     active : (m, K) bool
-    depth : float
-        See `DEPTH`.
     """
 
     model: CableModel
+    border: FloatArray
+    start: FloatArray
+    offsets: FloatArray
+    depth: float
     normal: FloatArray
     bends: FloatArray
-    sizes: FloatArray
+    gap: FloatArray
     active: BoolArray
-    depth: float
 
     @classmethod
     def of(
         cls,
         model: CableModel,
-        places: FloatArray,
+        border: FloatArray,
+        start: FloatArray,
         offsets: FloatArray,
-        sizes: FloatArray,
         depth: float,
+        advances: Callable[[FloatArray], FloatArray],
     ) -> Touching:
-        """Which nodes at these places (m, n + 1, d) [m] touch.
+        """Which nodes touch.
 
-        `offsets` (m, surfaces) [m]: how far the surfaces are outwards of the declared ones.
+        `advances`: those of the segments (m, n, d) [m] under forces (m, n, n_lam). The forces on
+        obstacles bend the segments a little: the second of two looks counts.
         """
-        gap, normal, bends = _near(model, places, offsets)
-        active = sizes * _per_force(model, BALANCED) > gap
-        return cls(model, normal, bends, sizes, active, depth)
+        m, d = start.shape
+        count = model.n_contacts
+        nowhere = np.zeros((m, count, d)), np.zeros((m, count, d, d - 1)), np.ones((m, count))
+        found = cls(model, border, start, offsets, depth, *nowhere, np.zeros((m, count), bool))
+        for _ in range(2):
+            gap, normal, bends = found._near(advances(found.lam))
+            active = found.sizes * _per_force(model, BALANCED) > gap
+            found = cls(model, border, start, offsets, depth, normal, bends, gap, active)
+        return found
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Sizes (m, K) [N] of the forces, whether active or not."""
+        return self.border[:, self.model.n_lam :]
 
     # ---- forces ----------------------------------------------------------------------------------
 
@@ -101,10 +154,26 @@ class Touching:
         """Sums (m, n, d) [N] of the forces on obstacles beyond the start of each segment."""
         return np.asarray(self.before.T @ self.pulls)
 
-    def beyond_along(self, sizes: FloatArray) -> FloatArray:
-        """Change (m, n, d, q) of `beyond` along changes (m, K, q) of the forces' sizes."""
+    @property
+    def lam(self) -> FloatArray:
+        """Unknowns (m, n, n_lam) beside the nodes as each segment feels them."""
+        found = np.repeat(self.border[:, None, : self.model.n_lam], self.model.n, axis=1)
+        found[:, :, self.model.end_pull] += self.beyond
+        return found
+
+    def lam_along(self, border: FloatArray) -> FloatArray:
+        """Change (m, n, n_lam, q) of `lam` along changes (m, k, q) of the border."""
+        lam, sizes = np.split(border, [self.model.n_lam], axis=1)
         change = self.normal[..., None] * (self.active[..., None] * sizes)[:, :, None]
-        return np.asarray(-np.einsum("ks,mkdq->msdq", self.before, change))
+        found = np.repeat(lam[:, None], self.model.n, axis=1)
+        found[:, :, self.model.end_pull] -= np.einsum("ks,mkdq->msdq", self.before, change)
+        return found
+
+    def held(self, reactions: FloatArray) -> FloatArray:
+        """Reactions (m, n_reactions), at the start without what obstacles hold."""
+        found, rows = reactions.copy(), reaction_rows(self.model.node)["start_force"]
+        found[:, rows] -= self.pulls.sum(axis=1)
+        return found
 
     @property
     def softness(self) -> FloatArray:
@@ -112,30 +181,55 @@ class Touching:
         depth, balanced = (_per_force(self.model, size) for size in (self.depth, BALANCED))
         return np.where(self.active, depth, balanced)
 
-    def gaps(self, places: FloatArray, offsets: FloatArray) -> FloatArray:
-        """Gaps (m, K) [m] of nodes (m, n + 1, d), zero where a contact is not active."""
-        return np.where(self.active, _near(self.model, places, offsets)[0], 0.0)
+    def _near(self, advances: FloatArray) -> Surface:
+        """Gaps, normals and bends of all obstacles."""
+        some = np.concatenate([self.start[:, None], advances], axis=1).cumsum(axis=1)
+        found = surfaces_near(self.model.surfaces, some[:, 1 : 1 + _count(self.model)])
+        outwards = np.repeat(self.offsets, _count(self.model), axis=1)
+        return found._replace(distance=found.distance - outwards - self.model.cable.diameter / 2)
 
-    def added(self, force: Vector, gaps: FloatArray) -> Vector:
-        """The gradient with the contacts' conditions, last.
+    def added(
+        self, total: FloatArray, force: Vector, advances: FloatArray
+    ) -> tuple[FloatArray, Vector]:
+        """The Lagrangian (m,) [J] and its gradient with contacts.
 
-        -g - lam / c of active ones, those of others bring their forces to zero [m].
+        The gradient ends with their conditions: -g - lam / c of active ones, those of others bring
+        their forces to zero [m].
         """
-        rows = -gaps - self.sizes * self.softness
-        y = np.concatenate([force.y, rows[..., None]], axis=1)
+        gaps = np.where(self.active, self._near(advances).distance, 0.0)
+        y = np.concatenate([force.y, (-gaps - self.sizes * self.softness)[..., None]], axis=1)
         y[:, self._no_pull] = 0.0
-        return Vector(force.x, y)
-
-    def energy(self, places: FloatArray, gaps: FloatArray) -> FloatArray:
-        """What the Lagrangian (m,) [J] has of contacts, less the work of `beyond`."""
-        work = (self.beyond * np.diff(places, axis=1)).sum(axis=(1, 2))
-        own = self.felt * (gaps + self.felt * self.softness / 2)
-        return np.asarray(-work - own.sum(axis=1))
+        work = (self.beyond * advances).sum(axis=(1, 2))
+        own = (self.felt * (gaps + self.felt * self.softness / 2)).sum(axis=1)
+        return total - work - own, Vector(force.x, y)
 
     @property
     def _no_pull(self) -> list[int]:
         """Rows of the border of a force at a free end."""
         return self.model.end_pull if self.model.end == "free" else []
+
+    def contacts(self) -> list[tuple[Contact, ...]]:
+        """Stretches of neighbouring nodes that touch, for each of m poses."""
+        h, count = self.model.chain.h, _count(self.model)
+        near, found = self.gap < CLOSE * self.model.cable.length, []
+        for sizes, pulls, close in zip(self.felt, self.pulls, near, strict=True):
+            own = []
+            for k, obstacle in enumerate(self.model.surfaces):
+                some = slice(k * count, (k + 1) * count)
+                edges = np.diff(np.pad(close[some].astype(int), 1))
+                ends = zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True)
+                for low, high in ends:
+                    pressed = np.flatnonzero(sizes[some][low:high])
+                    if not len(pressed):
+                        continue
+                    low, high = low + pressed[0], low + pressed[-1] + 1
+                    force = sizes[some][low:high]
+                    start = (low + 1) * h + _inwards(force, h)
+                    end = max(start, high * h - _inwards(force[::-1], h))
+                    total = pulls[some][low:high].sum(axis=0)
+                    own.append(Contact(obstacle.name, float(start), float(end), total))
+            found.append(tuple(sorted(own, key=lambda one: one.start)))
+        return found
 
     # ---- derivatives -----------------------------------------------------------------------------
 
@@ -204,7 +298,7 @@ class Touching:
         """Add contacts to the gradient's change at fixed nodes and multipliers.
 
         `moved` (m, n, d, q): the change of the advances; `offsets` (m, surfaces, q) [m]: that of
-        the surfaces.
+        the surfaces. That these turn the normals of round obstacles is left out.
         """
         rows = np.repeat(offsets, _count(self.model), axis=1) * self.active[..., None]
         rows[:, self._used] -= np.einsum("masd,msdq->maq", self._normals, moved)
@@ -213,18 +307,26 @@ class Touching:
         return Vector(change.x, y)
 
 
+def _inwards(force: FloatArray, h: float) -> float:
+    """How far [m] inside the first of the nodes with these forces [N] a contact begins.
+
+    At the distance x outside the fourth node, a point force Q and inwards of it the even force q of
+    the nodes that follow have the same sum F and moment about that node as the first four forces:
+    F = Q + q (x + h/2), M = Q x + q (x^2/2 - h^2/8).
+    """
+    if len(force) < 8:
+        return 0.0
+    total, arm = force[:4].sum(), h * (force[:4] @ [3, 2, 1, 0])
+    q = force[4:-3].mean() / h
+    a, b, c = -q / 2, total - q * h / 2, -q * h * h / 8 - arm
+    root = b * b - 4 * a * c
+    x = -2 * c / (b + np.sqrt(root)) if root > 0 and b > 0 else 3 * h
+    return float(np.clip(3 * h - x, -h, 2 * h))
+
+
 def _count(model: CableModel) -> int:
     """Number of nodes that may touch one obstacle."""
     return model.n_contacts // len(model.surfaces)
-
-
-def _near(
-    model: CableModel, places: FloatArray, offsets: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gaps (m, K) [m], normals and bends of all obstacles, see `obstacles.Surface`."""
-    some = places[:, 1 : 1 + _count(model)]
-    gap, normal, bends = surfaces_near(model.surfaces, some)
-    return gap - np.repeat(offsets, some.shape[1], axis=1) - model.cable.diameter / 2, normal, bends
 
 
 def _per_force(model: CableModel, gap: float) -> float:

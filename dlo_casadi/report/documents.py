@@ -153,6 +153,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
             if shape.readings
         },
         "clips": {pose: shape.clips for pose, shape in stage.shapes.items() if shape.clips},
+        "contacts": {pose: one.contacts for pose, one in stage.shapes.items() if one.contacts},
         **fields_of(stage, "rmse_fit_measured_branch", "rmse_held_out_measured_branch"),
         "other_branch": {
             pose: {
@@ -233,7 +234,7 @@ def fitted_cable(outcome: Outcome) -> FittedCable:
     """The fitted cable of a run, as `load` would read it from the run's file."""
     fit, metadata = outcome.fit, metadata_of(parameters_dict(outcome), outcome.config.path)
     # What held it in the session is no part of a cable.
-    return FittedCable(replace(fit.model, clips=()), fit.p, final_rest(fit), metadata)
+    return FittedCable(replace(fit.model, clips=(), obstacles=()), fit.p, final_rest(fit), metadata)
 
 
 def parameters_dict(outcome: Outcome) -> dict[str, Any]:

@@ -124,7 +124,8 @@ class BandMatrix:
 
     def subset(self, index: IntArray | BoolArray) -> BandMatrix:
         """Matrices of some of the poses."""
-        return BandMatrix(*(part[index] for part in self._parts), self.internal)
+        diagonal, upper, border, corner = (part[index] for part in self._parts)
+        return BandMatrix(diagonal, upper, border, corner, self.internal)
 
     def replaced(self, index: IntArray, other: BandMatrix) -> BandMatrix:
         """Matrices of all poses, those of some taken from `other`."""
@@ -132,7 +133,8 @@ class BandMatrix:
         parts = [part.copy() for part in self._widened(internal)._parts]
         for part, new in zip(parts, other._widened(internal)._parts, strict=True):
             part[index] = new
-        return BandMatrix(*parts, internal)
+        diagonal, upper, border, corner = parts
+        return BandMatrix(diagonal, upper, border, corner, internal)
 
     def _widened(self, internal: int) -> BandMatrix:
         """The same matrices with so many internal unknowns, the new ones without effect."""

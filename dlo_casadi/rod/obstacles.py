@@ -20,8 +20,8 @@ _ON_AXIS = 1e-12
 class Surface(NamedTuple):
     """A surface near places.
 
-    `distance` (...) [m], positive outside; `normal` (..., d); `bends` (..., d, d - 1): vectors whose
-    outer products add up to the Hessian of the distance [1/m].
+    `distance` (...) [m], positive outside; `normal` (..., d); `bends` (..., d, d - 1): vectors
+    whose outer products add up to the Hessian of the distance [1/m].
     """
 
     distance: FloatArray

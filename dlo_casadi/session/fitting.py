@@ -118,6 +118,7 @@ def declared_model(
         gravity=experiment.gravity,
         n_rest=REST_COEFFICIENTS if coefficients is None else coefficients,
         clips=experiment.clips,
+        obstacles=experiment.surfaces,
     )
     if END_ROLL in model.names:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
@@ -207,8 +208,8 @@ class Minimum(NamedTuple):
 
 
 def minimum_by_ipopt(fit: Fit) -> Minimum:
-    """Minimum of the batch NLP, from the Gauss-Newton fit's; none in space or with clips."""
-    if fit.model.in_space or fit.model.clips:
+    """Minimum of the batch NLP, from the Gauss-Newton fit's; none in space or held in between."""
+    if fit.model.in_space or fit.model.clips or fit.model.surfaces:
         return Minimum(searched=False)
     began = time.perf_counter()
     try:

@@ -104,6 +104,8 @@ class PoseShape:
         Of a held-out pose that tells no side, where there are two; None if it was not computed.
     clips : tuple of dict
         What the cable does to its clips, see `clip_rows`.
+    contacts : tuple of dict
+        Where it touches obstacles, see `Contact.row`.
     """
 
     curve: FloatArray
@@ -123,6 +125,7 @@ class PoseShape:
     expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     clips: tuple[Mapping[str, Any], ...] = ()
+    contacts: tuple[Mapping[str, Any], ...] = ()
 
     def inside_band(self, length: float, noise: float) -> BoolArray:
         """Whether each measured point (K,) lies in its 90 % band, noise included."""

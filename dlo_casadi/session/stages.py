@@ -68,6 +68,7 @@ def pose_shape(
         _branch_shape(other, item) if item.readable and other is not None else None,
         readings=item.readings_beside(prediction.seen),
         clips=tuple(clip_rows(item.pose.clips, eq.clips)),
+        contacts=tuple(contact.row for contact in eq.contacts),
     )
 
 

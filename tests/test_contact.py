@@ -1,0 +1,178 @@
+"""Contact with obstacles against closed forms, balance of forces, and differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.codegen import generate
+from dlo_casadi.config import load_config
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.obstacles import Capsule, Plane
+
+LENGTH, WEIGHT, EI, RADIUS = 1.0, 1.0, 0.02, 0.003  # m, N, N m^2, m
+CABLE = CableData(LENGTH, WEIGHT / 9.81, 2 * RADIUS, EI)
+LOOM = replace(CABLE, torsional_stiffness=0.015)
+TABLE = Plane((0.0, -0.15), (0.0, 1.0), "table")
+IN_SPACE = (
+    Plane((0.0, 0.0, -0.2), (0.1, 0.0, 0.995), "ramp"),
+    Capsule((0.21, -0.3, -0.19), (0.25, 0.3, -0.17), 0.03, "bar"),
+)
+HELD_IN_SPACE = HeldPose(
+    (0.0, 0.0, 0.0), (0.7, 0.1, 0.0), start_orientation=(0, 0, 0, 1.0), end_orientation=(0, 0, 0, 1)
+)
+
+
+def solved(cable, pose, *obstacles, n=20, x_init=None, **held):
+    down = (0.0,) * (len(pose.start) - 1) + (-9.81,)
+    model = CableModel(cable, n, n_rest=0, gravity=down, obstacles=obstacles, **held)
+    rest = np.zeros(model.chain.n_rests)
+    return model, solve_equilibrium(model, model.nominal, rest, pose, x_init=x_init)
+
+
+@pytest.fixture(scope="module")
+def loom():
+    """A cable in space that hangs over a bar and lies on a ramp."""
+    return solved(LOOM, HELD_IN_SPACE, *IN_SPACE, start="clamped", end="clamped")
+
+
+def test_a_heavy_beam_laid_on_a_table_lifts_off_where_beam_theory_says():
+    """EI w'''' = -q, w = w' = w'' = 0 at lift-off: H = q l^4 / (72 EI), held by 2/3 q l."""
+    height = 0.004  # slopes of 1 %
+    lift = (72 * EI * height / WEIGHT) ** 0.25
+    table = Plane((0.0, -height - RADIUS), (0.0, 1.0), "table")
+    model = CableModel(CABLE, 40, start="clamped", end="free", n_rest=0, obstacles=(table,))
+    pose = HeldPose((0.0, 0.0), start_heading=0.0)
+    found = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+    (contact,) = found.contacts
+    assert contact.obstacle == "table"
+    assert contact.start == pytest.approx(lift, rel=3e-3)
+    assert contact.end == pytest.approx(LENGTH, rel=3e-3)
+    assert -found.start_force[1] == pytest.approx(2 / 3 * WEIGHT * lift, rel=1e-3)
+    assert contact.force + found.start_force == pytest.approx([0.0, -WEIGHT], abs=1e-9)
+
+
+def test_tension_over_a_cylinder_follows_from_the_height():
+    """T + M^2 / (2 EI) - w y is the same everywhere, without friction on the cylinder, too."""
+    radius, pose = 0.1, HeldPose((-0.2, -0.25), (0.22, -0.15))
+    cylinder = Capsule((0.0, 0.0), (0.0, 0.0), radius, "cylinder")
+    over = np.linspace(0.23 + 2.03, 0.23 - 2.03, 41)[:, None]  # an arc between the ends
+    soft = replace(CABLE, bending_stiffness=2e-3)
+    _, found = solved(soft, pose, cylinder, n=40, x_init=over)
+    ahead = np.concatenate([np.cos(found.x), np.sin(found.x)], axis=1)
+    ends = found.end_force @ ahead[-1], -found.start_force @ ahead[0]
+    from_center = np.linalg.norm(found.points, axis=1)
+    assert from_center.min() == pytest.approx(radius + RADIUS, abs=1e-6)
+    (contact,) = found.contacts
+    on_all = contact.force + found.start_force + found.end_force
+    assert on_all == pytest.approx([0.0, -WEIGHT], abs=1e-9)
+    across = 1e-3 * np.linalg.norm(contact.force)
+    assert ends[0] - ends[1] == pytest.approx(-WEIGHT / LENGTH * 0.1, abs=across)
+
+
+def test_forces_balance_and_no_node_is_inside(loom):
+    model, found = loom
+    assert found.stable
+    assert {contact.obstacle for contact in found.contacts} == {"ramp", "bar"}
+    on_all = sum(c.force for c in found.contacts) + found.start_force + found.end_force
+    assert on_all == pytest.approx([0.0, 0.0, -WEIGHT], abs=1e-6)
+    for obstacle in IN_SPACE:
+        assert obstacle.near(found.points[1:-1]).distance.min() > RADIUS - 1e-6 * LENGTH
+    for contact in found.contacts:  # along the surface's normal, into the obstacle
+        obstacle = next(one for one in IN_SPACE if one.name == contact.obstacle)
+        place = found.points[round((contact.start + contact.end) / 2 / model.chain.h)]
+        assert contact.force @ obstacle.near(place).normal < 0
+
+
+def test_the_tangent_is_the_derivative_of_the_balance(loom):
+    model, found = loom
+    assembly, shapes = assembly_of(model), found.shapes
+    given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), HELD_IN_SPACE.vector[None])
+    dense = assembly.balance(shapes, given)[2].dense()[0]
+    nodes, step = 3 * model.chain.n_nodes, 1e-6
+    touching = nodes + model.n_lam + np.flatnonzero(found.multipliers[model.n_lam :] > 0)
+    for column in (3 * 3 + 1, 3 * 8 + 2, nodes + 1, touching[0], touching[-1]):
+        rows = []
+        for h in (step, -step):
+            delta = h * np.eye(len(dense))[column]
+            x = model.node.moved(shapes.x, delta[:nodes].reshape((*shapes.x.shape[:2], 3)))
+            moved = replace(shapes, x=x, lam=shapes.lam + delta[nodes:])
+            rows.append(assembly.imbalance(moved, given).rows[0, :, 0])
+        assert dense[:, column] == pytest.approx((rows[0] - rows[1]) / (2 * step), abs=2e-4)
+
+
+def test_derivatives_of_a_shape_that_touches():
+    """By EI and the roll of the end, beside equilibria on either side."""
+    model, found = solved(LOOM, HELD_IN_SPACE, IN_SPACE[0], start="clamped", end="clamped")
+    assert found.contacts
+    p, rest, q = model.nominal, np.zeros(model.chain.n_rests), len(model.names)
+    equilibria = BatchEquilibrium(model, [HELD_IN_SPACE])
+    along = equilibria.directions(found.shapes, p, rest, np.eye(q), np.zeros((len(rest), q)))
+    ((_, change),) = equilibria.observe(found.shapes, p, rest, along)
+    for k, step in ((0, 1e-5), (2, 1e-4)):
+        ends = []
+        for h in (step, -step):
+            there, _ = equilibria.solve(found.shapes, p + h * np.eye(q)[k], rest)
+            ends.append(equilibria.seen(there, p + h * np.eye(q)[k], rest)[0])
+        by = (ends[0].curve.numbers - ends[1].curve.numbers) / (2 * step)
+        assert change.curve[..., k] == pytest.approx(by, abs=2e-3 * np.abs(by).max())
+        read = (ends[0].readings - ends[1].readings) / (2 * step)
+        assert change.readings[:, k] == pytest.approx(read, abs=5e-3 * np.abs(read).max())
+
+
+def test_a_fixture_inside_of_an_obstacle():
+    with pytest.raises(
+        EquilibriumError, match=r"end \(0.7000, -0.2000\) m is 0.0500 m inside table"
+    ):
+        solved(CABLE, HeldPose((0.0, 0.0), (0.7, -0.2)), TABLE)
+
+
+def test_the_c_solver_refuses_obstacles():
+    model = CableModel(CABLE, 20, n_rest=0, obstacles=(TABLE,))
+    with pytest.raises(DloError, match="1 obstacle"):
+        generate(model, model.nominal, np.zeros(model.chain.n_rests))
+
+
+SESSION = """\
+cable: {name: laid, length: 0.8, mass: 0.05, diameter: 0.005, bending_stiffness: 0.01}
+experiment:
+  gravity: [0, -9.81]
+  boundary: {start: pinned, end: pinned}
+  measurement: {kind: centerlines, std: 3.0e-4}
+  obstacles:
+    - {name: table, kind: plane, point: [0, -0.1], normal: [0, 2]}
+    - {kind: sphere, center: [0.3, -0.2], radius: 0.05}
+  poses:
+    - {file: a.csv, start: [0, 0], end: [0.6, 0.1]}
+"""
+
+
+def test_a_session_with_obstacles(tmp_path):
+    (tmp_path / "a.csv").touch()
+    (tmp_path / "session.yaml").write_text(SESSION)
+    table, ball = load_config(tmp_path / "session.yaml").experiment.surfaces
+    assert table == Plane((0.0, -0.1), (0.0, 1.0), "table")
+    assert ball == Capsule((0.3, -0.2), (0.3, -0.2), 0.05, "obstacle_2")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (", normal: [0, 2]", "", "table: a plane needs normal"),
+        ("normal: [0, 2]", "normal: [0, 0]", "table: the normal of a plane is not zero"),
+        ("point: [0, -0.1]", "point: [0, 0, -0.1]", r"table: point: \[x, y\] belongs here"),
+        ("kind: sphere", "kind: sphere, a: [0, 0]", "obstacle_2: a sphere has no a, it has center"),
+        ("kind: sphere", "kind: sphere, name: table", "two obstacles are called table"),
+    ],
+)
+def test_obstacles_that_cannot_be_declared_so(tmp_path, old, new, said):
+    (tmp_path / "a.csv").touch()
+    (tmp_path / "session.yaml").write_text(SESSION.replace(old, new))
+    with pytest.raises(ConfigError, match=said):
+        load_config(tmp_path / "session.yaml")
