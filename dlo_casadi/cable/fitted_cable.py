@@ -146,8 +146,9 @@ class FittedCable(CasadiCable):
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         pose = held_pose(self.model, self.metadata.fixtures, asked | {"clips": list(clips)})
         held = self.with_clips([clip.kind for clip in pose.clips])
-        surfaces = held_surfaces(self.model, obstacles)
-        return replace(held, model=replace(held.model, obstacles=surfaces))._solved(pose)
+        if surfaces := held_surfaces(self.model, obstacles):
+            held = replace(held, model=replace(held.model, obstacles=surfaces))
+        return held._solved(pose)
 
     def _solved(self, pose: HeldPose) -> "Shape":
         try:
@@ -433,12 +434,10 @@ class Shape:
 
     @property
     def _other_row(self) -> dict[str, Any] | None:
-        """The other side as plain data, with its greatest distance [m] from this one."""
         if (other := self.other_side) is None or (near := self.tipping) is None:
             return None
-        own = {"tipping": near.angle, "tipping_std": near.std}
-        shape = {"greatest_distance": self._apart(other), **other.as_dict()}
-        return {**own, **{k: x for k, x in shape.items() if k != "other_side"}}
+        apart, tipping = self._apart(other), {"tipping": near.angle, "tipping_std": near.std}
+        return {**tipping, "greatest_distance": apart, **other.as_dict()}
 
     def _apart(self, other: "Shape") -> float:
         """Greatest distance [m] of points at equal arc lengths."""
@@ -447,5 +446,5 @@ class Shape:
     @property
     def _side(self) -> str:
         """What tells the side on which the cable hangs, as in a configuration."""
-        turns, branch = self.pose.turns, self.pose.branch
-        return f"turns: {turns:g}" if self.cable.model.in_space else f"branch: {branch}"
+        branch = f"branch: {self.pose.branch}"
+        return f"turns: {self.pose.turns:g}" if self.cable.model.in_space else branch
