@@ -181,10 +181,8 @@ class Rod:
         features = features_of(model, p, pose)
         if np.abs(held.rest).max(initial=0.0) > 0:
             features["rest shape"] = ()
-        if pose.clips:
-            features["clips"] = ()
-        if model.surfaces:
-            features["obstacles"] = ()
+        features |= {"clips": ()} if pose.clips else {}
+        features |= {"obstacles": ()} if model.surfaces else {}
         return cls(
             name=model.cable.name,
             in_space=model.in_space,
