@@ -24,8 +24,8 @@ from dlo_casadi.model.cable_model import END_ROLL
 ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
 # Iterations for each of these rolls; number of rolls that are continued.
 FIRST_STEPS, FOLLOWED = 5, 2
-# Iterations of shapes and forces alone before that, of cables with clips: lines do not tell how the
-# cable bends at a clip, and a stiffness that is free runs away on the way.
+# Iterations of shapes and forces alone before that, of cables in saddles and eyelets: lines do not
+# tell how the cable bends there, and a stiffness that is free runs away on the way.
 STEPS_AT_CLIPS = 15
 # Twist [rad] from which the other way round is tried: rolls are tried about one radian apart, and
 # the rest shape of a cable may be twisted by as much as a quarter of a turn.
@@ -107,7 +107,7 @@ def weighed(problem: Problem, theta: FloatArray) -> Problem:
 
 def _first_solved(relaxation: Relaxation, values: Values, fixed: BoolArray | None = None) -> Values:
     """Values after the first iterations from measured shapes."""
-    if relaxation.problem.unknowns.model.clips:
+    if set(relaxation.problem.unknowns.model.clips) - {"pinned"}:
         every = np.ones(len(values.theta), dtype=bool)
         values = relaxation.solve(values, every, STEPS_AT_CLIPS)
     return relaxation.solve(values, fixed, FIRST_STEPS)

@@ -172,10 +172,11 @@ def fit_declared(
 def first_mesh(model: CableModel) -> int:
     """Number of elements on which stiffnesses and shapes are searched for.
 
-    Cables bend sharply at clips: on 10 elements, of a cable in space through two clips, the true
-    parameters leave twice what they leave on 20.
+    Cables bend sharply at saddles and eyelets: on 10 elements, of a cable in space through one of
+    each, the true parameters leave twice what they leave on 20.
     """
-    return FIRST_MESH // len(model.node.curvatures) * (2 + len(model.clips)) // 2
+    more = sum(kind != "pinned" for kind in model.clips)
+    return FIRST_MESH // len(model.node.curvatures) * (2 + more) // 2
 
 
 def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) -> int:
