@@ -1,6 +1,7 @@
-"""Fitted cables in MuJoCo and PyElastica: at rest there, beside our prediction and the measurement.
+"""Fitted cables at rest in simulators, beside our prediction and the measurement.
 
-    python scripts/check_export.py RESULTS=SESSION.yaml ... [--poses 3] [--to mujoco pyelastica]
+    python scripts/check_export.py RESULTS=SESSION.yaml ... [--poses 3] [--to mujoco pyelastica
+        newton usd] [--segments N]
 
 RESULTS are folders of `dlo fit`. Of each cable the first held-out poses are relaxed, and fit poses
 if too few were held out, with the stiffness of the simulator's own example, with the declared first
@@ -38,7 +39,11 @@ def main() -> int:
     parser.add_argument("--to", nargs="+", choices=[*TARGETS], default=[*TARGETS])
     chosen = parser.parse_args()
     wrong = 0
-    print("errors in % of the length: largest from our prediction; RMS from measured, of", *CASES)
+    print(
+        "errors in % of the length: largest from our prediction; RMS from measured, of",
+        *CASES,
+        "; end force from ours, and of the identified cable from readings",
+    )
     for text in chosen.cables:
         folder, _, session = text.partition("=")
         cable, config = dlo.load(folder), load_config(session)
@@ -56,7 +61,10 @@ def main() -> int:
             measured = [found[case]["to_measured"] for case in CASES]
             largest = 100 * ours["largest"] if ours else float("inf")
             shares = [100 * x["rms"] if x else float("inf") for x in measured]
-            forces = [found[case]["force_to_prediction"] for case in CASES]
+            forces, read = (
+                [found[case][f"force_to_{key}"] for case in CASES]
+                for key in ("prediction", "measured")
+            )
             good = shares[2] == min(shares) and (largest <= 100 * ALLOWED or bool(lost))
             wrong += not good
             print(
@@ -65,6 +73,7 @@ def main() -> int:
                 *(f"{share:8.3f}" for share in shares),
                 "  force [N]",
                 *("     -" if f is None else f"{f:6.3g}" for f in forces),
+                *(f"from readings {f:.3g}" for f in read[-1:] if f is not None),
                 f"  {time.process_time() - begin:5.1f} s",
                 "" if good else "  NOT AS IT SHOULD BE",
                 f"  not carried: {', '.join(lost)}" if lost else "",

@@ -141,3 +141,47 @@ def test_broken_clouds_are_told_and_nothing_is_written(how, said, clouds, take, 
     assert "Try: " in told
     assert "Traceback" not in told
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_files_of_few_points_that_are_broken(clouds, take, tmp_path, capsys):
+    """PCD and NPY: a message with a remedy for each, and nothing written."""
+    for kind, how, said in (
+        ("pcd", "truncated", "ends after"),
+        ("pcd", "empty", "is no PCD file of points"),
+        ("pcd", "nan", "finite"),
+        ("pcd", "no z", "is no PCD file of points: 'z'"),
+        ("npy", "truncated", "is no NPY file of points"),
+        ("npy", "empty", "is no NPY file of points"),
+        ("npy", "nan", "finite"),
+        ("npy", "four columns", "(K, 3) or (K, 6) belongs there"),
+        ("npy", "no points", "holds no points"),
+        ("npy", "y and z exchanged", "one frame"),
+    ):
+        folder = tmp_path / f"{kind} {how}"
+        folder.mkdir()
+        files, options = write(kind, clouds, take, folder)
+        whole, file = files[0].read_bytes(), files[0]
+        points = np.load(file) if kind == "npy" else np.zeros((3, 3))
+        if how in ("truncated", "empty"):
+            file.write_bytes(whole[: len(whole) // 2] if how == "truncated" else b"")
+        elif how == "no z":
+            file.write_bytes(whole.replace(b"FIELDS x y z", b"FIELDS x y h", 1))
+        elif kind == "pcd":
+            write_pcd(file, np.nan * points, np.zeros((3, 3)), PLACE)
+        elif how == "y and z exchanged":
+            for each in files[:2]:
+                np.save(each, np.load(each)[:, [0, 2, 1]])
+        else:
+            broken = {
+                "nan": np.nan * points,
+                "four columns": points[:, [0, 1, 2, 2]],
+                "no points": points[:0],
+            }
+            np.save(file, broken[how])
+        before = sorted(folder.iterdir())
+        assert imported(files, folder / "loom", options) == 2, (kind, how)
+        told = capsys.readouterr().err
+        assert said in told, (kind, how, told)
+        assert "Try: " in told, (kind, how)
+        assert "Traceback" not in told
+        assert sorted(folder.iterdir()) == before

@@ -107,6 +107,22 @@ def test_places_in_other_axes_than_rotations(axes, signs, take, tmp_path, capsys
     assert not (tmp_path / "loom").exists()
 
 
+def test_one_world_frame_is_assumed_and_said(take, tmp_path, capsys):
+    """Of two systems 20 mm apart the length that the markers give scatters from pose to pose."""
+    scatter = []
+    for shift in (0.0, 0.02):
+        bodies = {name: x + shift * np.eye(7)[0] for name, x in take.bodies.items()}
+        folder = tmp_path / str(shift)
+        folder.mkdir()
+        files, options = WRITERS["vicon"](replace(take, bodies=bodies), folder)
+        main(["import", *map(str, files), "--output", str(folder / "loom"), *options, *CABLE])
+        told = " ".join(capsys.readouterr().out.split())
+        assert "come from several files, and nothing here registers them" in told
+        scatter.append(float(re.search(r"with a scatter of ([\d.]+) mm", told)[1]))
+    assert scatter[0] < 0.5  # 0.3 mm of noise in the session's own markers
+    assert scatter[1] > 1.0
+
+
 def test_any_axis_of_a_body_may_be_the_cables_and_frames_may_be_lost(take, tmp_path):
     """With z along the cable at the ends; a fifth of the frames lost, a marker in two poses."""
     axes = Rotation.from_matrix(np.roll(np.eye(3), 1, axis=0))

@@ -1,7 +1,8 @@
 """MuJoCo: bodies in a chain, each joined to the one before by three hinges with springs.
 
-No plugin: `mujoco.elasticity.cable` knows one stiffness for a whole cable, and is gone in MuJoCo 4.
-Springs of hinges are read by MuJoCo 3 and 4 and by MJX.
+No plugin: `mujoco.elasticity.cable` knows one stiffness for a whole cable, takes the initial shape
+(or, `flat`, a straight one) for that without load, and is gone in MuJoCo 4. Springs of hinges are
+read by MuJoCo 3 and 4 and by MJX.
 """
 
 from collections.abc import Sequence

@@ -80,7 +80,8 @@ TARGETS = {
         default_of="the cable that comes with MuJoCo 3 (model/plugin/elasticity/cable.xml)",
         places=(
             "joint stiffness [N m/rad]: EI / h about y, z; GJ / h about x; h: the length of a link",
-            "joint springref [rad]: h times the curvature and twist without load",
+            "joint springref [rad]: h times the curvature and twist without load (the cable plugin",
+            "of MuJoCo 3 would take the initial shape for that; it is gone in MuJoCo 4)",
             "geom mass [kg]; geom size [m]: half the diameter; option gravity [m/s^2]",
             "body start, body end: the clamps (mocap), move them; key pose: the shape in this pose",
             "joint damping, armature, and the softness of the end's constraint are not measured:",

@@ -130,9 +130,10 @@ def _cloud(path: Path, fields: list[tuple[str, str]], body: bytes, count: int, s
     """Points and colours of a table, as text or binary."""
     names = [name for name, _ in fields]
     if style == "ascii":
-        rows = np.array([line.split() for line in body.decode().splitlines()[:count]], float)
+        lines = [line.split()[: len(names)] for line in body.decode().splitlines()[:count]]
+        rows = [line for line in lines if len(line) == len(names)]
         held = len(rows)
-        columns = zip(fields, rows.T, strict=False)
+        columns = zip(fields, np.array(rows, float).reshape(held, -1).T, strict=False)
         table = {name: column.astype(kind) for (name, kind), column in columns}
     else:
         order = ">" if style == "binary_big_endian" else "<"

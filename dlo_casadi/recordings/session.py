@@ -113,6 +113,15 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     if wishes.end != FREE:
         end = find_gripper(wishes.end, wishes.end_offset, "end", stills, recording)
     remarks = [*recording.assumptions, *(offset.told for offset in offsets)]
+    files = {stream.clock.partition(" (")[0] for stream in recording.streams}
+    files |= {cloud.clock.partition(" (")[0] or cloud.name for cloud in recording.clouds}
+    if len(files) > 1 and start is not None:
+        remarks.append(
+            "world frame: cable and grippers are taken to have the same origin and axes, though "
+            "they come from several files, and nothing here registers them. If theirs differ, "
+            "calibrate both systems to one frame and export again, or record a bag whose TF joins "
+            "the frames"
+        )
     if start is None or (end is None and wishes.end != FREE):
         remarks.append(
             "no body holds the cable in this recording: fill in places and orientations, or "
@@ -324,7 +333,7 @@ def _along(
     remarks: list[str],
 ) -> tuple[FloatArray, float]:
     """Arc lengths (M,) [m] of the markers and of the cable, measured or as wished."""
-    s, length = _arc_lengths(start, places, end)
+    s, length, scatter = _arc_lengths(start, places, end)
     fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
     declared = wishes.known.get("length")
     longer = length / declared - 1.0 if declared else 0.0
@@ -334,7 +343,10 @@ def _along(
             f"--length is {declared:g} m.\n  Try: --length between the fixtures; "
             "--start-offset and --end-offset where the cable does not leave a body at its origin."
         )
-    remarks.append(f"length: {length:.4f} m along a spline {fixtures}, mean of all poses")
+    remarks.append(
+        f"length: {length:.4f} m along a spline {fixtures}, mean of all poses, with a scatter of "
+        f"{1e3 * scatter:.1f} mm; one of mm hints at different frames of cable and grippers"
+    )
     if not wishes.at:
         remarks.append(
             f"markers by arc length ({', '.join(names)}) along that spline; --at if they were "
@@ -352,8 +364,8 @@ def _along(
 
 def _arc_lengths(
     start: Gripper | None, places: FloatArray, end: Gripper | None
-) -> tuple[FloatArray, float]:
-    """Arc lengths (M,) [m] of markers from the start, and the cable's length [m].
+) -> tuple[FloatArray, float, float]:
+    """Arc lengths (M,) [m] of markers from the start, and the cable's length [m] and its scatter.
 
     Means over all poses of the lengths of a cubic spline through fixtures and markers, clamped in
     the grippers' directions.
@@ -390,4 +402,5 @@ def _arc_lengths(
     found = np.nanmean(spans, axis=0)
     s = np.concatenate([[0.0], np.cumsum(found)])
     first = 0 if start is None else 1
-    return s[first : first + len(places)], float(s[-1])
+    scatter = float(np.where(np.isnan(spans), found, spans).sum(axis=1).std())
+    return s[first : first + len(places)], float(s[-1]), scatter

@@ -22,7 +22,8 @@ _COLORS = {"default": style.GREY, "first guess": style.ORANGE, "identified": sty
 def summary(rows: Sequence[Relaxation]) -> dict[str, Any]:
     """Root mean square and largest errors of each case over all poses, as plain data.
 
-    Shapes as shares of the length, forces [N]; None where a pose did not come to rest.
+    Shapes as shares of the length, forces [N]; None where a pose did not come to rest. Forces are
+    compared with what was measured in the poses that have a reading.
     """
     out: dict[str, Any] = {}
     for case in CASES:
@@ -32,7 +33,7 @@ def summary(rows: Sequence[Relaxation]) -> dict[str, Any]:
             "to_prediction": _over([row.to_prediction for row in own]),
             "to_measured": _over([row.to_measured for row in own]),
             "force_to_prediction": _rms([(a, b) for a, b, _ in forces]),
-            "force_to_measured": _rms([(a, c) for a, _, c in forces]),
+            "force_to_measured": _rms([(a, c) for a, _, c in forces if c is not None]),
             "problems": [f"{row.pose}: {row.problem}" for row in own if row.problem],
         }
     plain: dict[str, Any] = finite(out)
@@ -48,7 +49,7 @@ def _over(distances: Sequence[Distance | None]) -> dict[str, float] | None:
 
 
 def _rms(pairs: Sequence[tuple[Any, Any]]) -> float | None:
-    if not pairs or any(a is None or b is None for a, b in pairs):
+    if not pairs or any(a is None for a, _ in pairs):
         return None
     return float(np.sqrt(np.mean([np.sum(np.square(a - b)) for a, b in pairs])))
 
