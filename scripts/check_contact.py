@@ -177,7 +177,7 @@ def check_random(count: int) -> None:
         if isinstance(eq, Equilibrium) and np.isfinite(energies[-1]):
             gap = (eq.energy - energies[-1]) / (abs(eq.energy) + 1e-3)
             found["same energy"] += abs(gap) < 1e-6
-            found["not lower than IPOPT"] += lowest < eq.energy - 1e-6 * (abs(eq.energy) + 1e-3)
+            found["IPOPT lower"] += lowest < eq.energy - 1e-6 * (abs(eq.energy) + 1e-3)
             worst = max(worst, abs(gap)) if abs(gap) < 1e-3 else worst
     print(
         f"random: {dict(found)}, largest difference of those alike {worst:.1e}, "

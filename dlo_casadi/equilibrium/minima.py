@@ -51,6 +51,9 @@ FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
 # the cable is then below rounding. Four of 336 descents of very soft cables with a tether came
 # back from beyond 1e6.
 RUNAWAY = 1e16
+# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
+# these that a given start skips, so that it stays on its side; maximum number of steps of each.
+SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-4), 2, 20
 # Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8
 # Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
@@ -129,6 +132,15 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
     ordered = assembly.clipped(now, given).in_order
     balanced, converged = balanced & ordered, converged & ordered
     return Minima(now, balanced, converged, energy, iterations)
+
+
+def descend_to_contact(
+    assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80, *, near: bool
+) -> Minima:
+    """As `descend`; obstacles are soft at first. `near`: whether shapes keep to their sides."""
+    for depth in SOFT[KEEPING_SIDE * near :] if assembly.model.surfaces else ():
+        shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
+    return descend(assembly, shapes, given, max_iterations)
 
 
 def _convex(

@@ -13,7 +13,7 @@ from dlo_casadi.equilibrium.equilibrium import (
     Equilibrium,
     equilibria_of,
 )
-from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend
+from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
 from dlo_casadi.equilibrium.spans import (
     border_of,
@@ -31,9 +31,6 @@ from dlo_casadi.rod.node import Frame, Heading
 
 # Largest move of an end in one step [lengths, rad], so that shapes are followed up to a fold.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
-# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
-# these that a given start skips, so that it stays on its side; maximum number of steps of each.
-SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-4), 2, 20
 # Number of lowest minima of the coarse mesh, in space, that are solved on the model's own mesh,
 # beside the lowest on the other side.
 FEW = 2
@@ -317,10 +314,7 @@ class _PoseSearch:
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool = False
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
-        assembly = assembly_of(self.model)
-        for depth in SOFT[KEEPING_SIDE * near :] if self.model.surfaces else ():
-            shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
-        return given, descend(assembly, shapes, given)
+        return given, descend_to_contact(assembly_of(self.model), shapes, given, near=near)
 
     def _descended(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool
