@@ -18,7 +18,7 @@ DEFAULT = (8e7, 4e7)
 # Rows are y, z, x of a link: Newton has the tangent last.
 AXES = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 # EA and GA over weight and buckling load, where no stretch was found: a strain of 1 % at that load.
-# With more, single precision holds nodes up: a force of EA times 1e-7 moves none of them.
+# With more, cables come to rest elsewhere, probably for the rounding of single precision.
 STIFF = 100.0
 # Time step over the largest that an explicit solver could take, and iterations in a step. They
 # matter at rest, too: what these do not correct of a step's free fall remains.
