@@ -24,7 +24,15 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Covariance, Estimate, Named
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
-from dlo_casadi.config import Cable, Config, Pose, any_photographs, checked_config, load_as
+from dlo_casadi.config import (
+    Cable,
+    Config,
+    Obstacle,
+    Pose,
+    any_photographs,
+    checked_config,
+    load_as,
+)
 from dlo_casadi.config.problems import Arguments
 from dlo_casadi.config.values import plain
 from dlo_casadi.errors import DloError
@@ -161,6 +169,8 @@ class Session(Config):
         Standard deviation of one coordinate of a point; estimated when absent.
     force_std, moment_std : float [N], [N m], optional
         Of one component of a reading; estimated when absent.
+    obstacles : sequence of Obstacle or mapping, optional
+        What the cable may touch, as in a configuration.
     camera, board, reference : mapping, optional
         Of photographs, as in a configuration.
     tolerances, model, estimation, diagnosis, limits : mapping, optional
@@ -185,6 +195,7 @@ class Session(Config):
         *,
         gravity: ArrayLike | None = None,
         boundary: Sequence[str] | None = None,
+        obstacles: Sequence[Obstacle | Mapping[str, Any]] | None = None,
         std: float | None = None,
         force_std: float | None = None,
         moment_std: float | None = None,
@@ -203,7 +214,9 @@ class Session(Config):
         measurement = _given(std=std, force_std=force_std, moment_std=moment_std) | equipment
         measurement["kind"] = "images" if pictures else "centerlines"
         experiment = {"measurement": measurement, "poses": poses}
-        experiment |= _given(gravity=gravity, boundary=boundary, tolerances=tolerances)
+        experiment |= _given(
+            gravity=gravity, boundary=boundary, tolerances=tolerances, obstacles=obstacles
+        )
         options = _given(model=model, estimation=estimation, diagnosis=diagnosis, limits=limits)
         given = plain({"cable": cable, "experiment": experiment, **options, **unknown})
         checked = checked_config(Arguments(given, tuple(signature(Session).parameters)), Config)

@@ -233,7 +233,7 @@ def test_ten_elements_are_five_times_closer_than_ten_links(name):
     assert bowed < link / 5, f"quadratic {bowed * 1e3:.3f} mm, link {link * 1e3:.3f} mm"
 
 
-@pytest.mark.parametrize("name", ["taper", "orange"])
+@pytest.mark.parametrize("name", [pytest.param("taper", marks=pytest.mark.long), "orange"])
 def test_elements_converge_on_bench_poses(name):
     """Second order of arcs and links, arcs closer; about fourth of quadratic elements."""
     meshes = {"quadratic": (10, 20, 40), "arc": (10, 20, 40), "link": (10, 20, 40)}

@@ -184,7 +184,7 @@ def test_other_fixtures_make_a_shape_less_certain(fitted, capsys):
         (["--limits", "force=eight"], "NAME=VALUE"),
         (["--limits", "moment=0.1"], "no end is clamped"),
         (["--limits", "twist=3"], "does not twist"),
-        (["--limits", "clearance=0.01"], "no obstacles"),
+        (["--limits", "clearance=0.01"], "may be touched"),
         (["--limits"], "no limit is given"),
         (["--limits", "force=9", "--tolerances", "end=2"], "such as 0.002"),
         (["--limits", "force=9", "--tolerances", "heading=0.1"], "Try: end, length"),
@@ -266,7 +266,7 @@ def test_a_session_checks_its_poses_and_shows_where_they_are_tight(tmp_path):
         ("{bend_radius: 50}", "did you mean 0.05?"),
         ("{moment: 1.0}", "no end is clamped"),
         ("{force: -1}", "larger than 0"),
-        ("{clearance: 0.01}", "no obstacles"),
+        ("{clearance: 0.01}", "may be touched"),
         ("{bendradius: 0.05}", "bend_radius"),
     ],
 )

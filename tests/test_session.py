@@ -142,6 +142,11 @@ BY_REFERENCE = {
             "kind": "images",
             "reference": {"pixels": [[10, 10], [500, 10]], "points": [[0.0, 0.0], [0.5, 0.0]]},
         },
+        "obstacles": [
+            {"name": "table", "kind": "plane", "point": [0.0, -0.3], "normal": [0.0, 1.0]},
+            {"kind": "sphere", "center": [0.2, -0.2], "radius": 0.02},
+            {"kind": "capsule", "a": [0.3, -0.2], "b": [0.4, -0.2], "radius": 0.02},
+        ],
         "poses": [{"file": "a.jpg", "start": [0.0, 0.0]}],
     },
 }
@@ -193,7 +198,7 @@ def of_schema(part: dict[str, Any], at: tuple[str, ...] = ()) -> set[tuple[str, 
 def test_every_key_of_the_schema_is_tried_here():
     tried = {leaf for tree in ALL.values() for leaf in leaves(tree)}
     tried = {tuple("*" if x == "mass" and len(leaf) > 3 else x for x in leaf) for leaf in tried}
-    refused = {("limits", "clearance")}  # until a session has obstacles
+    refused = {("limits", "clearance")}  # a session's obstacles may be touched
     assert of_schema(SCHEMA) - refused <= tried
 
 
@@ -224,6 +229,7 @@ def test_every_key_is_an_argument():
     keys = {
         *Config.model_fields,
         *IN_PLANE["experiment"],
+        *BY_REFERENCE["experiment"],
         *leaves(IN_PLANE["experiment"]["measurement"]),
     }
     keys |= {x[0] for x in leaves(IN_SPACE["experiment"]["measurement"])} | {"reference"}

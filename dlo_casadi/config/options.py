@@ -115,7 +115,7 @@ class Limits(ConfigSection):
     twist: Annotated[Positive, within(_TWIST)] | None = None
     """Greatest twist in space, the angle about the axis per length [1/m]."""
     clearance: Annotated[Positive, within(LENGTH._replace(least=1.0e-6))] | None = None
-    """Least distance of the cable's surface from obstacles [m]; none can be declared yet."""
+    """Least distance of the cable's surface from obstacles [m]; not checked yet."""
 
     @property
     def given(self) -> dict[str, float]:
@@ -138,7 +138,7 @@ class Limits(ConfigSection):
                 hint = f", did you mean {meant:g}?" if meant < length else ""
                 yield ConfigProblem((name,), f"{text}{hint}")
         if self.clearance is not None:
-            text = "limits.clearance: there is nothing to be clear of, a session has no obstacles"
+            text = "limits.clearance: a session's obstacles may be touched, no clearance is checked"
             hint = "leave it out; the compiled solver's clearance(shape, obstacles) measures it"
             yield ConfigProblem(("clearance",), f"{text}. Try: {hint}")
         if self.twist is not None and not in_space:

@@ -354,6 +354,7 @@ def test_noise_free_round_trip_is_exact():
     np.testing.assert_allclose(found.point.theta, exact, atol=1e-4)
 
 
+@pytest.mark.long
 def test_a_drift_comes_back():
     """Rate and stiffness from poses in order; in another one the cable seems not to repeat."""
     model = CableModel(CABLE, 10, effects=(RestCurvatureDrift(),), n_rest=4)

@@ -87,6 +87,7 @@ def test_every_key_of_the_schema_is_there(outcome):
             "moment_rmse_held_out",
             "readings",
             "clips",
+            "contacts",
             "rmse_fit_measured_branch",
             "rmse_held_out_measured_branch",
             "other_branch",
