@@ -27,7 +27,7 @@ class Target:
     ----------
     title : str
     suffix : str
-        Of its files.
+        End of the names of its files, where none is given.
     packages : tuple of str
         Modules that have to be installed to relax a cable in it, and the `extra` that has them.
     carries : frozenset of Feature
@@ -90,7 +90,7 @@ TARGETS = {
     ),
     "pyelastica": Target(
         title="PyElastica",
-        suffix=".py",
+        suffix="_pyelastica.py",
         packages=("elastica",),
         extra="peers",
         carries=CHAIN | {"stretch"},
@@ -107,7 +107,7 @@ TARGETS = {
     ),
     "newton": Target(
         title="Newton",
-        suffix=".py",
+        suffix="_newton.py",
         packages=("newton",),
         extra="newton",
         carries=CHAIN - {"anisotropy"} | {"stretch"},
