@@ -72,7 +72,8 @@ def agree(shape, eq):
     assert shape.energy == pytest.approx(eq.energy, abs=1e-11)
     assert shape.start_force == pytest.approx(eq.start_force, abs=1e-9)
     assert shape.end_force == pytest.approx(eq.end_force, abs=1e-9)
-    for own, load in zip(shape.clip_forces, eq.clips, strict=False):
+    # A tether's force, where there is one, stands behind those of the clips.
+    for own, load in zip(shape.clip_forces[: len(eq.clips)], eq.clips, strict=True):
         assert own == pytest.approx(load.force, abs=1e-9)
 
 
