@@ -118,8 +118,9 @@ def fit_model(
 
 
 def at_random(fit: Fit) -> Fit | None:
-    """The fit to a misfit, if that is explained by what differs from pose to pose; else None."""
-    if different_poses(fit.problem.history, fit.model.cable.length) < DIFFERENT:
+    """A fit that misfits, with what differs from pose to pose if that explains it; else None."""
+    different = different_poses(fit.problem.history, fit.model.cable.length)
+    if fit.noise.source != "misfit" or different < DIFFERENT:
         return None
     known = fit.noise.before or fit.noise
     found = pose_scatter_of(fit.reweighed(known), known).scatter

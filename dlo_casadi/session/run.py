@@ -160,7 +160,12 @@ def fit_session(
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])
     if not config.diagnosis.enabled:
-        fit = as_measured((fit.noise.source == "misfit" and at_random(fit)) or fit)
+        near = at_random(fit)
+        if near is not None:
+            fit, error = near, mesh_error(near)
+            if not config.model.n:
+                fit, error = fine_enough(near, near.model.n)
+        fit = as_measured(fit)
     stages = [*stages, own if fit is best else staged(fit)]
     progress.step("compare with simpler fits", 1, 1)
     clock.lap("fit")
