@@ -214,7 +214,7 @@ class Search:
         return Screen(current, listed).run(screening_degrees(current), self.executor)
 
     def closed(self) -> Diagnosis:
-        """What is found, wrong causes withdrawn."""
+        """What the search finds; effects that explain too little are withdrawn."""
         fit = self.declared
         # Where left-out poses are not even reached no effect can be followed: first the force.
         lost = self.loses_poses and fit.noise.source != "misfit"

@@ -38,8 +38,6 @@ from dlo_casadi.rod.obstacles import Surface, surfaces_near
 DEPTH = 1e-8
 # Gap [lengths] that counts as much as such a force in deciding whether a contact is active.
 BALANCED = 1e-2
-
-
 # Nodes so near to a surface [lengths] belong to the same contact as those beside them that press.
 CLOSE = 1e-4
 
