@@ -1,8 +1,9 @@
 """Gauss-Newton for the batch problem: the Levenberg-Marquardt method with a watchdog."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -56,29 +57,85 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
     problem, point = fit.problem, fit.point
     damping, gains = 0.0, [np.inf] * STALLED
     lin = fit.linearization
+    normal = problem.normal_equations(point, lin)
+    curvature = Curvature.none(len(point.theta))
     for _ in range(steps):
         limit = point.objective + 1e-9 * abs(point.objective)
-        before, trial = damping, _ahead(problem, point, lin, damping, limit, WATCHED)
+        model, before = curvature.added(normal), damping
+        trial = _ahead(problem, point, lin, model, damping, limit, WATCHED)
         least = least_decrease(problem, point, tolerance)
-        if trial is None and _promised(problem.normal_equations(point, lin)) < least:
+        if trial is None and _promised(normal) < least:
             # What a pose's deviations do to the poses after it, through a state, is left out.
             return Fit(problem, point, converged=True)
         while trial is None:
             damping = max(10 * damping, 1e-4)
             if damping > 1e8:
                 return Fit(problem, point)
-            trial = _ahead(problem, point, lin, damping, limit, WATCHED)
+            trial = _ahead(problem, point, lin, model, damping, limit, WATCHED)
         gains = [*gains[1:], point.objective - trial.objective]
         if damping == before:
             damping = damping / 10 if damping > 1e-6 else 0.0
-        point = trial
-        least = least_decrease(problem, point, tolerance)
+        least = least_decrease(problem, trial, tolerance)
         if gains[-1] < least and damping < 1e-2:
-            return Fit(problem, point, converged=True)
+            return Fit(problem, trial, converged=True)
         if sum(gains) < least:
-            return Fit(problem, point)
-        lin = problem.linearize(point)
+            return Fit(problem, trial)
+        step, lin = trial.theta - point.theta, problem.linearize(trial)
+        ahead = problem.normal_equations(trial, lin)
+        curvature = curvature.after(step, normal, ahead, gains[-1])
+        point, normal = trial, ahead
     return Fit(problem, point)
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """What Gauss-Newton leaves out of the Hessian of theta: residuals times their curvature.
+
+    Where a model lacks something, residuals are large, and Gauss-Newton steps go to and fro. A
+    secant update from gradients learns that part; it is used while it foretells gains better.
+
+    Parameters
+    ----------
+    matrix : (size, size)
+    used : bool
+
+    References
+    ----------
+    Dennis, Gay and Welsch, An adaptive nonlinear least-squares algorithm, ACM TOMS 7 (1981).
+    """
+
+    matrix: FloatArray
+    used: bool = False
+
+    @classmethod
+    def none(cls, size: int) -> Self:
+        """Of Gauss-Newton."""
+        return cls(np.zeros((size, size)))
+
+    def added(self, normal: Normal) -> Normal:
+        """Normal equations with it, if it is used and they stay convex."""
+        if not self.used:
+            return normal
+        hessian = normal.hessian + self.matrix
+        scale = np.sqrt(np.maximum(np.diag(normal.hessian), 1e-12))
+        convex = np.linalg.eigvalsh(hessian / np.outer(scale, scale))[0] > 0
+        return replace(normal, hessian=hessian) if convex else normal
+
+    def after(self, step: FloatArray, before: Normal, ahead: Normal, gain: float) -> Self:
+        """Updated by a step of theta that gained so much of the objective."""
+        change = ahead.gradient - before.gradient
+        if step @ change <= 0:
+            return self
+        told = -(before.gradient @ step + step @ before.hessian @ step / 2)
+        more = told - step @ self.matrix @ step / 2
+        used = bool(abs(more - gain) <= abs(told - gain)) if self.matrix.any() else True
+        missing = change - ahead.hessian @ step
+        own = float(step @ self.matrix @ step)
+        sized = self.matrix * min(1.0, abs(float(step @ missing) / own) if own else 1.0)
+        gap, slope = missing - sized @ step, float(change @ step)
+        both = np.outer(gap, change)
+        twice = float(step @ gap) * np.outer(change, change) / slope**2
+        return replace(self, matrix=sized + (both + both.T) / slope - twice, used=used)
 
 
 def least_decrease(problem: Problem, point: Point, tolerance: float = CONVERGED) -> float:
@@ -97,7 +154,13 @@ def _promised(normal: Normal) -> float:
 
 
 def _ahead(
-    problem: Problem, point: Point, lin: Linearization, damping: float, limit: float, more: int
+    problem: Problem,
+    point: Point,
+    lin: Linearization,
+    normal: Normal,
+    damping: float,
+    limit: float,
+    more: int,
 ) -> Point | None:
     """A point below a limit, in one step or with some more beyond one above it; else None.
 
@@ -108,17 +171,20 @@ def _ahead(
     ----------
     The watchdog technique: Chamberlain et al., Math. Programming Study 16 (1982).
     """
-    trial = _stepped(problem, point, lin, damping)
+    trial = _stepped(problem, point, lin, normal, damping)
     if trial is None or trial.objective <= limit:
         return trial
     if not more or trial.objective > WORSE * limit:
         return None
-    return _ahead(problem, trial, problem.linearize(trial), damping, limit, more - 1)
+    lin = problem.linearize(trial)
+    normal = problem.normal_equations(trial, lin)
+    return _ahead(problem, trial, lin, normal, damping, limit, more - 1)
 
 
-def _stepped(problem: Problem, point: Point, lin: Linearization, damping: float) -> Point | None:
+def _stepped(
+    problem: Problem, point: Point, lin: Linearization, normal: Normal, damping: float
+) -> Point | None:
     """The point after a damped step within reach; None if some pose loses its equilibrium."""
-    normal = problem.normal_equations(point, lin)
     lower, upper = problem.unknowns.reach(point.theta)
     scale = np.maximum(np.diag(normal.hessian), 1e-12)
     # A direction without any information (the place of a mass of zero) must not move.
