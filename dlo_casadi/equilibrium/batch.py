@@ -254,7 +254,8 @@ class BatchEquilibrium:
         Returns
         -------
         Tangents
-            Columns: the unknowns, then, with `deviations`, the model's.
+            Columns: the unknowns, then, with `deviations`, the model's; where poses leave a state
+            behind, those of the first pose, of the second, ...
         """
         given = self.given(shapes, p, rest)
         used = self.used_deviations if deviations else []
@@ -267,6 +268,10 @@ class BatchEquilibrium:
             return self._solved(shapes, given, still)
         after = self.assembly.state_after(shapes, given)
         if after[1].any() or not self.assembly.rest_stays(after):
+            more = [(0, 0), (0, (self.m - 1) * own)]
+            still = self._still(given, *(np.pad(part, more) for part in (by_rest, by_p, deviation)))
+            for j in range(1, self.m):
+                still.deviation[j] = np.roll(still.deviation[j], own * j, axis=1)
             _, _, matrix = self.assembly.balance(shapes, given)
             found = self._in_order(shapes, given, matrix, still, after)
             return replace(found, tangent=matrix)
@@ -328,15 +333,17 @@ class BatchEquilibrium:
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
         for j in range(self.m):
             one = np.array([j])
-            now = Tangents(x[one], lam[one], along.p[one], rest[one], along.deviation[one])
+            parts = (x[one], lam[one], along.p[one], rest[one], along.deviation[one])
+            # Deviations of later poses move nothing yet.
+            moving = np.any([part.any(axis=tuple(range(part.ndim - 1))) for part in parts], axis=0)
+            now = Tangents(*(part[..., moving] for part in parts))
             if now.p.any() or now.rest.any() or now.deviation.any():
                 now = self._solved(shapes.subset(one), given.subset(one), now, matrix.subset(one))
-            x[j], lam[j] = now.x[0], now.lam[0]
+            x[j][..., moving], lam[j][..., moving] = now.x[0], now.lam[0]
             if j + 1 < self.m:
                 slopes = tuple(part[one] for part in after)
-                rest[j + 1] = self.assembly.state_along(slopes, now.x, now.rest, now.p)[0]
-                # The effect of a pose's own deviation on later poses is neglected.
-                rest[j + 1][:, along.deviation.any(axis=(0, 1))] = 0.0
+                changed = self.assembly.state_along(slopes, now.x, now.rest, now.p)[0]
+                rest[j + 1][..., moving] = changed
         return replace(along, x=x, lam=lam, rest=rest)
 
     def observe(

@@ -57,7 +57,7 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
     problem, point = fit.problem, fit.point
     damping, gains = 0.0, [np.inf] * STALLED
     lin = fit.linearization
-    normal = problem.normal_equations(point, lin)
+    normal = problem.step_equations(point, lin)
     curvature = Curvature.none(len(point.theta))
     for _ in range(steps):
         limit = point.objective + 1e-9 * abs(point.objective)
@@ -65,7 +65,6 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
         trial = _ahead(problem, point, lin, model, damping, limit, WATCHED)
         least = least_decrease(problem, point, tolerance)
         if trial is None and _promised(normal) < least:
-            # What a pose's deviations do to the poses after it, through a state, is left out.
             return Fit(problem, point, converged=True)
         while trial is None:
             damping = max(10 * damping, 1e-4)
@@ -81,7 +80,7 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
         if sum(gains) < least:
             return Fit(problem, trial)
         step, lin = trial.theta - point.theta, problem.linearize(trial)
-        ahead = problem.normal_equations(trial, lin)
+        ahead = problem.step_equations(trial, lin)
         curvature = curvature.after(step, normal, ahead, gains[-1])
         point, normal = trial, ahead
     return Fit(problem, point)
@@ -177,7 +176,7 @@ def _ahead(
     if not more or trial.objective > WORSE * limit:
         return None
     lin = problem.linearize(trial)
-    normal = problem.normal_equations(trial, lin)
+    normal = problem.step_equations(trial, lin)
     return _ahead(problem, trial, lin, normal, damping, limit, more - 1)
 
 

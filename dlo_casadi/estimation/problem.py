@@ -88,17 +88,21 @@ class Linearization:
     by_theta : list of (R_j, size)
         Derivative of the residuals.
     by_deviation : list of (R_j, n_deviations)
+        By the pose's own deviations.
+    by_all : list of (R_j, fitted poses x n_deviations)
+        By those of all fitted poses, where poses leave a state behind; else empty.
     raw : list of (R_j,)
         Residuals, not whitened.
     raw_directions : list of (R_j, size + n_deviations)
         Their derivatives, not whitened.
     shapes : Tangents
-        Derivatives of the equilibria, by the unknowns and by each pose's deviations.
+        Derivatives of the equilibria, see `BatchEquilibrium.directions`.
     """
 
     residuals: list[FloatArray]
     by_theta: list[FloatArray]
     by_deviation: list[FloatArray]
+    by_all: list[FloatArray]
     raw: list[FloatArray]
     raw_directions: list[FloatArray]
     shapes: Tangents
@@ -362,24 +366,18 @@ class Problem:
     def linearize(self, point: Values) -> Linearization:
         """Whitened residuals and their exact first derivatives."""
         slopes = self.unknowns.slopes(point.theta), self.unknowns.rest_slopes
-        return self.linearize_along(point, self.equilibria.directions(*self.state(point), *slopes))
-
-    def linearize_along(
-        self, point: Values, along: Tangents, correction: Vector | None = None
-    ) -> Linearization:
-        """Residuals and derivatives for given derivatives of the shapes and parameters.
-
-        Parameters
-        ----------
-        correction : Vector, optional
-            How the shapes are about to move, one column; the residuals are those afterwards, to
-            first order.
-        """
-        ways = along if correction is None else along.and_step(correction)
-        out, size = Linearization([], [], [], [], [], along), self.unknowns.size
-        for white, (d, directions) in zip(self.whitening, self.residuals(point, ways), strict=True):
-            if correction is not None:
-                d, directions = d + directions[:, -1], directions[:, :-1]
+        along = self.equilibria.directions(*self.state(point), *slopes)
+        out = Linearization([], [], [], [], [], [], along)
+        size, own = self.unknowns.size, len(self.equilibria.used_deviations)
+        coupled = along.p.shape[2] > size + own
+        fitted = np.concatenate([size + own * j + np.arange(own) for j in self.used])
+        rows = zip(self.used, self.whitening, self.residuals(point, along), strict=True)
+        for j, white, (d, directions) in rows:
+            if coupled:
+                out.by_all.append(white @ directions[:, fitted])
+                first = size + own * j
+                kept = [*range(size), *range(first, first + own)]
+                directions = directions[:, kept]
             whitened = white @ directions
             out.residuals.append(white @ d)
             out.by_theta.append(whitened[:, :size])
@@ -408,12 +406,30 @@ class Problem:
             inner.append((block, cross, slope))
         return Normal(hessian, gradient, inner)
 
+    def step_equations(self, point: Values, lin: Linearization) -> Normal:
+        """Those of a descent: where poses leave a state behind, a deviation moves all later ones.
+
+        `inner` has one block, of all fitted poses' deviations.
+        """
+        if not lin.by_all:
+            return self.normal_equations(point, lin)
+        a, b, e = (np.concatenate(rows) for rows in (lin.by_theta, lin.by_all, lin.residuals))
+        precision = np.tile(1 / self.deviation_std**2, len(self.used))
+        own = point.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)].ravel()
+        block, cross, slope = b.T @ b + np.diag(precision), b.T @ a, b.T @ e + precision * own
+        solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+        hessian = self.precision + a.T @ a - cross.T @ solved[:, :-1]
+        gradient = self.precision @ (point.theta - self.mean) + a.T @ e - cross.T @ solved[:, -1]
+        return Normal(hessian, gradient, [(block, cross, slope)])
+
     def moved(self, along: Tangents, normal: Normal, step: FloatArray) -> tuple[Vector, FloatArray]:
         """How shapes, one column, and deviations (m, n_deviations) move with a step of theta."""
         own = np.zeros((self.equilibria.m, len(self.equilibria.used_deviations)))
-        for j, (block, cross, slope) in zip(self.used, normal.inner, strict=True):
-            own[j] = -np.linalg.solve(block, cross @ step + slope)
-        both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), own], axis=1)
+        found = [-np.linalg.solve(b, cross @ step + slope) for b, cross, slope in normal.inner]
+        own[self.used] = np.reshape(found, (len(self.used), -1))
+        coupled = along.p.shape[2] > len(step) + own.shape[1]
+        each = np.broadcast_to(own.ravel(), (len(own), own.size)) if coupled else own
+        both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), each], axis=1)
         shapes = Vector(along.x @ both[:, None, :, None], along.lam @ both[:, :, None])
         deviation = np.zeros((len(own), len(self.unknowns.model.deviation_names)))
         deviation[:, self.equilibria.used_deviations] = own

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.rod.band import BandMatrix
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame, Heading
 
@@ -82,11 +82,3 @@ class Tangents:
     rest: FloatArray
     deviation: FloatArray
     tangent: BandMatrix | None = None
-
-    def and_step(self, step: Vector) -> Tangents:
-        """These directions and, last, a step of the shapes alone (one column)."""
-        p, rest, deviation = (
-            np.pad(part, [(0, 0), (0, 0), (0, 1)]) for part in (self.p, self.rest, self.deviation)
-        )
-        x = np.concatenate([self.x, step.x], axis=-1)
-        return Tangents(x, np.concatenate([self.lam, step.y], axis=-1), p, rest, deviation)

@@ -241,21 +241,29 @@ def test_jacobian_by_the_unknowns_against_central_differences(element, markers):
             np.testing.assert_allclose(central, exact[:, k], rtol=0, atol=tolerance, err_msg=name)
 
 
+def own_part(by_all, j, columns):
+    return by_all[:, len(columns) * j : len(columns) * (j + 1)]
+
+
 def test_jacobian_by_the_deviations_against_central_differences():
-    """Of each pose's own end, on its own points."""
+    """Of each pose's own end, on its own points and, through a drift, on those of later poses."""
     problem, point = rich("arc")
     lin = problem.linearize(point)
     d = 1e-6  # m
+    columns = problem.equilibria.used_deviations
     for j in problem.used:
-        for k, column in enumerate(problem.equilibria.used_deviations):
+        for k, column in enumerate(columns):
             step = np.zeros_like(point.shapes.deviation)
             step[j, column] = d
-            ahead = residuals(problem, point, point.theta, step)[j]
-            behind = residuals(problem, point, point.theta, -step)[j]
-            exact = lin.by_deviation[j][:, k]
+            ahead = residuals(problem, point, point.theta, step)
+            behind = residuals(problem, point, point.theta, -step)
             # As above, with residuals of order ten that are good to 1e-11, over 2 d.
-            tolerance = 1e-5 * np.abs(exact).max()
-            np.testing.assert_allclose((ahead - behind) / (2 * d), exact, atol=tolerance)
+            tolerance = 1e-5 * np.abs(lin.by_deviation[j][:, k]).max()
+            for i, (one, other) in enumerate(zip(ahead, behind, strict=True)):
+                exact = lin.by_all[i][:, len(columns) * j + k]
+                np.testing.assert_allclose((one - other) / (2 * d), exact, atol=tolerance)
+                assert exact.any() == (i >= j)
+            np.testing.assert_array_equal(lin.by_deviation[j], own_part(lin.by_all[j], j, columns))
 
 
 def test_gradient_of_the_objective():
