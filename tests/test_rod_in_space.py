@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.guesses import same_sign
 from dlo_casadi.equilibrium.minima import descend
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -20,6 +19,7 @@ from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.node import Frame, same_sign
 
 LENGTH, EI, GJ = 0.8, 0.02, 0.015
 DOWN = (0.0, 0.0, -9.81)
@@ -225,6 +225,16 @@ def test_turns_twist_the_cable_either_way_alike():
     energies = [solved(m, pose((0.7, 0.0, 0.0), turns=turns)).energy for turns in (-1, 0, 1)]
     assert energies[0] == pytest.approx(energies[2], rel=1e-6)
     assert energies[1] < energies[2]
+
+
+def test_interpolated_frames_have_the_signs_of_their_neighbours():
+    """Beyond a clip quaternions may have the other sign: of such neighbours the mean is far off."""
+    angles, fine = np.linspace(0, 1, 5), np.linspace(0, 1, 17)
+    known = Rotation.from_rotvec(np.outer(angles, [0.5, 1.0, -0.8])).as_quat()
+    found = Frame.interpolated(fine, angles, known * np.array([1, 1, -1, -1, 1])[:, None])
+    assert ((found[1:] * found[:-1]).sum(axis=1) > 0.9).all()
+    turned = Rotation.from_rotvec(np.outer(fine, [0.5, 1.0, -0.8]))
+    assert (Rotation.from_quat(found).inv() * turned).magnitude().max() < 1e-12
 
 
 def test_derivatives_by_increments():

@@ -14,7 +14,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import Chain
-from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.node import Frame, same_sign
 
 Clamps = tuple[FloatArray | None, FloatArray | None]
 Turned = tuple[Rotation | None, Rotation | None]
@@ -382,13 +382,6 @@ def nearest_roll(roll: float, aimed: float) -> float:
     The larger of two that are equally near up to rounding.
     """
     return roll + 2 * np.pi * float(np.floor(aimed - roll / (2 * np.pi) + 0.5 + _ROUNDING))
-
-
-def same_sign(quaternions: FloatArray) -> FloatArray:
-    """Quaternions (k, 4) with signs such that neighbours have a positive product."""
-    flips = np.sign((quaternions[1:] * quaternions[:-1]).sum(axis=1))
-    signs = np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])
-    return quaternions * signs[:, None]
 
 
 # ---- along a measured line -----------------------------------------------------------------------

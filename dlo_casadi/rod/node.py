@@ -189,13 +189,16 @@ class Frame(Node):
 
     @staticmethod
     def interpolated(places: FloatArray, known: FloatArray, x: FloatArray) -> FloatArray:
-        """Spherical interpolation between nodes, constant beyond."""
+        """Spherical interpolation between nodes, constant beyond.
+
+        The nodes before and after a clip may carry quaternions of different signs.
+        """
+        x = same_sign(x)
         k = np.clip(np.searchsorted(known, places, side="right") - 1, 0, len(known) - 2)
         u = np.clip((places - known[k]) / (known[k + 1] - known[k]), 0.0, 1.0)
         first, last = x[..., k, :], x[..., k + 1, :]
         cosine = np.clip((first * last).sum(axis=-1), -1.0, 1.0)
-        angle = np.maximum(np.arccos(np.abs(cosine)), 1e-12)
-        last = last * np.where(cosine < 0, -1.0, 1.0)[..., None]
+        angle = np.maximum(np.arccos(cosine), 1e-12)
         weights = [np.sin((1 - u) * angle), np.sin(u * angle)]
         out = weights[0][..., None] * first + weights[1][..., None] * last
         return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
@@ -240,6 +243,13 @@ def quaternion_product(p: Any, q: Any) -> tuple[Any, Any, Any, Any]:
         pw * qz + px * qy - py * qx + pz * qw,
         pw * qw - px * qx - py * qy - pz * qz,
     )
+
+
+def same_sign(x: FloatArray) -> FloatArray:
+    """Quaternions (..., n, 4) with signs such that neighbours have a positive product."""
+    flips = np.where((x[..., 1:, :] * x[..., :-1, :]).sum(axis=-1) < 0, -1.0, 1.0)
+    signs = np.concatenate([np.ones_like(x[..., :1, 0]), np.cumprod(flips, axis=-1)], axis=-1)
+    return np.asarray(x * signs[..., None])
 
 
 def conjugate(q: Any) -> tuple[Any, Any, Any, Any]:

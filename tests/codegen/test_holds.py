@@ -79,7 +79,10 @@ def agree(shape, eq):
 
 def test_two_clips(two):
     solver, p, rest = two
-    agree(solver.solve(POSE), solve_equilibrium(solver.model, p, rest, POSE))
+    shape = solver.solve(POSE)
+    agree(shape, solve_equilibrium(solver.model, p, rest, POSE))
+    # Arcs took 94: a coarse mesh of them has no shape that reaches from clip to clip.
+    assert shape.iterations < 80
 
 
 def test_slopes_by_clips_and_ends_are_differences(two):
