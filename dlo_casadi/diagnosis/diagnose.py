@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
-from dlo_casadi.diagnosis.refits import Confirmed
+from dlo_casadi.diagnosis.refits import Confirmed, RelaxedStart, confirm_from_data
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
@@ -55,7 +55,6 @@ from dlo_casadi.thresholds import (
 )
 
 Verdict = Literal["complete", "effect_found", "unexplained"]
-# Of a candidate beside others that explain what the declared model misses by far.
 NOT_NEAR = "does not come near the measured shapes"
 
 
@@ -214,7 +213,7 @@ class Search:
         return Screen(current, listed).run(screening_degrees(current), self.executor)
 
     def closed(self) -> Diagnosis:
-        """What the search finds; effects that explain too little are withdrawn."""
+        """What the search finds, without effects that explain too little."""
         fit = self.declared
         # Where left-out poses are not even reached no effect can be followed: first the force.
         lost = self.loses_poses and fit.noise.source != "misfit"
@@ -268,9 +267,9 @@ class Search:
         for k in range(self.max_effects):
             self.step("search for a missing effect", k, self.max_effects)
             misfit = current.noise.source == "misfit"
-            tried: list[Confirmed | None] = []
+            tried, far = list[Confirmed | None](), list[str]()
             if misfit and force is None:
-                screened, tried = self._from_data(current)
+                screened, tried, far = self._from_data(current)
             else:
                 screened = self.first if k == 0 else self._screened(current)
             p_values = {x.candidate.name: sidak(x.p_value, len(screened)) for x in screened}
@@ -293,6 +292,7 @@ class Search:
                 why = partial(shortcoming, validation=validation, doubt=self.doubt)
                 other = (lambda _: NOT_NEAR) if explaining else why
                 lost = why_lost(tried, confirmed, misleading, chosen, other)
+                lost |= dict.fromkeys(far, NOT_NEAR)
             if chosen is None:
                 break
             winner, rivals = chosen
@@ -355,22 +355,24 @@ class Search:
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         return list(map_in_order(self.executor, partial(refits.confirm, current), worthy))
 
-    def _from_data(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None]]:
+    def _from_data(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None], list[str]]:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
         Beside a misfit scores tell nothing, and a refit leads where the declared model has gone.
-        Where no candidate explains the shapes from its first start, all are tried from others, too.
+        Other starts are tried where none explains the shapes. Last: who stays far from them.
         """
         near, softness = refits.from_data(current)
         listed = candidates_of(near, self.center, self.exclude)
         screened = refits.screened_from_data(near, softness, listed)
-        likely = [x for x in screened if x.score >= NEAR_LEADER * screened[0].score]
+        likely = [x for x in screened if x.score >= NEAR_LEADER * screened[0].score][:REFITTED]
+        begun = map_in_order(self.executor, partial(RelaxedStart.of, near), likely)
+        kept, far = refits.nearest(begun)
         for starts in (1, 3):
-            refit = partial(refits.confirm_from_data, current, near, starts=starts)
-            tried = list(map_in_order(self.executor, refit, likely[:REFITTED]))
+            refit = partial(confirm_from_data, current, near, starts=starts)
+            tried = list(map_in_order(self.executor, refit, kept))
             if explained_by(current, tried):
                 break
-        return screened, tried
+        return screened, tried, far
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.

@@ -159,6 +159,7 @@ def fit_from(
     begun: Values,
     softness: Sequence[float] = SOFTNESS[1:],
     fixed: BoolArray | None = None,
+    followed: Values | None = None,
 ) -> Fit | None:
     """The minimum that relaxed values lead to; None if some pose has no equilibrium there.
 
@@ -172,8 +173,10 @@ def fit_from(
         Through which the balance becomes strict.
     fixed : (size,) bool, optional
         Entries of theta that stay where they are until the shapes are equilibria.
+    followed : Values, optional
+        Where those begun have led through a larger softness; by default they are followed from.
     """
-    values = relaxed(problem, begun, softness, fixed)
+    values = relaxed(problem, begun if followed is None else followed, softness, fixed)
     point = problem.balanced(_anew(problem, begun, values), max_iterations=40)
     return None if point is None else descend(Fit(problem, point), tolerance=1e-2)
 

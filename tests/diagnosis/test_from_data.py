@@ -7,7 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
-from dlo_casadi.diagnosis.refits import confirm_from_data, from_data, screened_from_data
+from dlo_casadi.diagnosis.refits import (
+    RelaxedStart,
+    confirm_from_data,
+    from_data,
+    screened_from_data,
+)
 from dlo_casadi.effects import BendingAnisotropy, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, misfits
@@ -77,7 +82,7 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
     assert first.p_value < 1e-9
     assert first.score > 1.2 * second.score
 
-    fit = confirm_from_data(base, near, first).fit
+    fit = confirm_from_data(base, near, RelaxedStart.of(near, first)).fit
     assert fit.noise.std == NOISE
     assert fit.value("bending_anisotropy.ratio") == pytest.approx(RATIO, rel=0.03)
     assert fit.value("bending_anisotropy.angle") == pytest.approx(ANGLE, abs=0.03)
@@ -87,5 +92,5 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
 
 @pytest.mark.long
 def test_with_another_effect_the_misfit_stays(base, near, screened):
-    found = confirm_from_data(base, near, screened["stiffness_gradient"])
+    found = confirm_from_data(base, near, RelaxedStart.of(near, screened["stiffness_gradient"]))
     assert found is None or found.fit.noise.source == "misfit"
