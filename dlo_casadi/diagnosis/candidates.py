@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.effects import EFFECTS, Effect, Fitted, Load, PointLoad, Setup
+from dlo_casadi.effects import EFFECTS, Effect, Fitted, Load, Setup
 from dlo_casadi.effects.cable import CableData
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
@@ -55,14 +55,6 @@ class Candidate:
     def add_linear_to(self, model: CableModel) -> CableModel:
         """Return the model with this effect in the parameters that it is screened in."""
         return self.add_to(model) if self.nuisance else model.with_effect(self.effect.linear())
-
-    def contains(self, other: Candidate, cable: CableData) -> bool:
-        """Whether this is a load at one place that may be the other one."""
-        loads = isinstance(self.effect, PointLoad) and isinstance(other.effect, PointLoad)
-        own, others = (
-            {q.name for q in item.effect.linear().parameters(cable)} for item in (self, other)
-        )
-        return loads and own > others
 
     def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
         """Qualified parameters, within their bounds, from those that it is screened in."""

@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
-from dlo_casadi.diagnosis.refits import Confirmed, RelaxedStart, confirm_from_data
+from dlo_casadi.diagnosis.refits import Confirmed, confirm_from_data
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
@@ -365,8 +365,7 @@ class Search:
         listed = candidates_of(near, self.center, self.exclude)
         screened = refits.screened_from_data(near, softness, listed)
         likely = [x for x in screened if x.score >= NEAR_LEADER * screened[0].score][:REFITTED]
-        begun = map_in_order(self.executor, partial(RelaxedStart.of, near), likely)
-        kept, far = refits.nearest(begun)
+        kept, far = refits.nearest(near, likely, self.executor)
         for starts in (1, 3):
             refit = partial(confirm_from_data, current, near, starts=starts)
             tried = list(map_in_order(self.executor, refit, kept))

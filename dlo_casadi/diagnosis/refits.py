@@ -13,7 +13,8 @@ equilibrium, see `estimation.relaxation`. The imbalance tells which effect is mi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,6 +37,7 @@ from dlo_casadi.estimation.start import begin, fit_from
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.runtime.parallel import map_in_order
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -163,22 +165,32 @@ class RelaxedStart:
     left: float
 
     @classmethod
-    def of(cls, near: Fit, screened: Screened) -> RelaxedStart:
-        """From the relaxed shapes with the candidate not there yet."""
-        scan = screened.candidate.scans[0]
-        places = {name: value for name, value in screened.start.items() if name in scan}
-        problem, begun = _begun(near, screened.candidate, places)
+    def of(cls, near: Fit, screened: Screened, *, estimated: bool = False) -> RelaxedStart:
+        """From the relaxed shapes, the candidate not there yet or at its one-step estimate."""
+        first, scan = screened.start, screened.candidate.scans[0]
+        first = first if estimated else {k: v for k, v in first.items() if k in scan}
+        problem, begun = _begun(near, screened.candidate, first)
         values = relaxed(problem, begun, COMPARED)
         left = Relaxation(problem, COMPARED[-1]).objective(values)
         return cls(screened, problem, begun, values, left)
 
 
-def nearest(begun: Iterable[RelaxedStart]) -> tuple[list[RelaxedStart], list[str]]:
-    """Starts that leave little more than the one that leaves least; names of the others."""
-    begun = list(begun)
-    most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
-    far = [start.screened.candidate.name for start in begun if start.left > most]
-    return [start for start in begun if start.left <= most], far
+def nearest(
+    near: Fit, likely: Sequence[Screened], executor: Executor
+) -> tuple[list[RelaxedStart], list[str]]:
+    """Starts of the candidates that leave little more than the one that leaves least.
+
+    Last: names of the others, which do not come near from their one-step estimates either: an
+    anchor is nowhere while its tether has no stiffness.
+    """
+    far, kept = list(likely), list[RelaxedStart]()
+    for estimated in (False, True):
+        begin = partial(RelaxedStart.of, near, estimated=estimated)
+        begun = [*kept, *map_in_order(executor, begin, far)]
+        most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
+        kept = [start for start in begun if start.left <= most]
+        far = [start.screened for start in begun if start.left > most]
+    return kept, [item.candidate.name for item in far]
 
 
 def confirm_from_data(

@@ -174,16 +174,6 @@ class Unknowns:
         found = [self.names.index(name) if name in self.names else None for name in STIFFNESSES]
         return found[0], found[1]
 
-    def odd_ratio(self, theta: FloatArray) -> bool:
-        """Whether GJ over EI is more than two standard deviations from what is declared.
-
-        Where an effect is missing, a cable without torsion often fits shapes better than any.
-        """
-        bending, torsion = self._stiffnesses
-        if bending is None or torsion is None:
-            return False
-        return self.own_prior(theta, torsion) > 4.0
-
     def own_prior(self, theta: FloatArray, k: int) -> float:
         """What the prior of entry k itself adds to twice the objective."""
         gap = theta - self._nominal
