@@ -182,8 +182,9 @@ class Comparison(NamedTuple):
 
     @property
     def certain(self) -> bool:
-        """Whether it is clearly better, and no effect that is missing explains it."""
-        return self.better and self.own.rms > BEYOND_EFFECTS * self.length
+        """Whether it is clearly better and explains the shapes, which no missing effect does."""
+        own, other = self.own.rms / self.length, self.other.rms / self.length
+        return self.better and own > BEYOND_EFFECTS and other < UNEXPLAINED
 
     @property
     def shows_weight(self) -> bool:
