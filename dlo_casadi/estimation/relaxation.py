@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.estimation.problem import NO_INFORMATION, Normal, Problem, Values
 from dlo_casadi.model.assembly import Inputs, Tangents
 from dlo_casadi.model.functions import functions_of
@@ -76,14 +76,19 @@ class Relaxation:
         own = nodes + a.k + len(equilibria.used_deviations)
         return nodes, nodes + a.k, own, own + self.problem.unknowns.size
 
-    @cached_property
-    def _stiffness(self) -> IntArray:
-        """Of each node's rows the parameter that scales it: bending or torsional stiffness."""
+    def _stiffness(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Logarithms of the stiffnesses that scale the nodes' rows (n b,), and these by p.
+
+        Torsional, or bending as it is at one turn per length: where the section softens its
+        stiffness at rest may be anything.
+        """
         model = self.problem.unknowns.model
-        bending, torsion = model.stiffness_indices[0], model.stiffness_indices[-1]
-        node = model.node
-        kinds = [bending if name in node.curvatures else torsion for name in node.strains]
-        return np.tile(np.array(kinds), model.chain.n_nodes)
+        log, by_p = (np.array(x).ravel() for x in functions_of(model).bent_stiffness(p))
+        torsion = model.stiffness_indices[-1]
+        twists = np.eye(len(p))[torsion] / p[torsion]
+        bent = np.array([name in model.node.curvatures for name in model.node.strains])
+        rows = np.where(bent, log, np.log(p[torsion])), np.where(bent[:, None], by_p, twists)
+        return np.tile(rows[0], model.chain.n_nodes), np.tile(rows[1], (model.chain.n_nodes, 1))
 
     def _weights(self, p: FloatArray) -> FloatArray:
         """Weights (n b + k,) of the rows of F at these parameters."""
@@ -96,7 +101,7 @@ class Relaxation:
                 border.append(1 / force)
             else:  # a multiplier's is its condition
                 border.append(1 / END / (cable.length if kind == "distance" else 1.0))
-        moments = model.chain.h / p[self._stiffness]
+        moments = model.chain.h / np.exp(self._stiffness(p)[0])
         return np.concatenate([moments, border]) / self.softness
 
     # ---- evaluation --------------------------------------------------------------------------
@@ -180,8 +185,7 @@ class Relaxation:
         rows[:, :, :nodes] += tangent[:, :, :nodes]
         rows += tangent[:, :, nodes:] @ along.lam
         weights, left = self._weights(state[1]), force.rows[:, :, 0]
-        scaled = problem.unknowns.slopes(values.theta)[self._stiffness]
-        scaled = scaled / state[1][self._stiffness, None]
+        scaled = self._stiffness(state[1])[1] @ problem.unknowns.slopes(values.theta)
         rows[:, :nodes, own:] -= left[:, :nodes, None] * scaled
         rows, left = rows * weights[:, None], left * weights
         std, used = problem.deviation_std, equilibria.used_deviations

@@ -386,6 +386,13 @@ class Functions:
         return ca.Function("section_moment", [bend, self.terms.p], [ca.gradient(energy, bend)])
 
     @cached_property
+    def bent_stiffness(self) -> ca.Function:
+        """(p) -> logarithm of the bending stiffness M / k at one turn per length; gradient by p."""
+        p, bend = self.terms.p, self.model.cable.curvature_scale
+        stiffness = ca.log(self.section_moment(bend, p) / bend)
+        return ca.Function("bent_stiffness", [p], [stiffness, ca.gradient(stiffness, p)])
+
+    @cached_property
     def dead_load(self) -> ca.Function:
         """(p) -> sum of the dead loads (dimension,) [N], without those of single poses."""
         still = ca.SX.zeros(len(self.model.deviation_names))
