@@ -35,6 +35,13 @@ WORTH = 0.1
 # score the true effect had all in six cables simulated by this program; in four sessions of another
 # simulator (space_pull, space_taper, space_drift, space_flat) 1, 1, 0.86 and 0.71.
 NEAR_LEADER = 0.3
+# Probability of a score below which a candidate is refitted where a scatter from pose to pose was
+# estimated: that may hold the effect, and the refit is tested with what is left of the scatter. Of
+# a drift the probability was 0.026, and below 1e-6 with the scatter that it leaves.
+PLAUSIBLE = 0.1
+# Score of a candidate with fewer parameters than the chosen one, relative to that, from which on it
+# may be the larger of two effects that the chosen one stands for: of two the larger has half.
+LARGER_OF_TWO = 0.5
 # Factor by which an effect may raise the error of poses predicted from their ends alone; beyond it
 # the effect misleads. A judgement: a correct lumped mass raised it from 10.9 to 11.2 mm, all but
 # 1 mm of it from one pose on another equilibrium; a wrong effect raised it from 6 to 178 mm.

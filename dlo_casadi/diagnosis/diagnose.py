@@ -16,11 +16,13 @@ from dlo_casadi.diagnosis.refits import Confirmed, confirm_from_data
 from dlo_casadi.diagnosis.screening import Screen, Screened, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
+    Found,
     Ranked,
     as_complete,
     choose,
     explained_by,
     improving,
+    in_place_of,
     misleads,
     p_with_closed_noise,
     ranking,
@@ -45,8 +47,10 @@ from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import (
     BIC_APART,
     DIFFERENT,
+    LARGER_OF_TWO,
     LEFT,
     NEAR_LEADER,
+    PLAUSIBLE,
     REFITTED,
     SIGNIFICANCE,
     UNSEEN,
@@ -139,28 +143,6 @@ def diagnose(
 
 
 @dataclass(frozen=True)
-class Found:
-    """Where a search has ended.
-
-    Parameters
-    ----------
-    fit : Fit
-    added : tuple of AddedEffect
-    ranked : tuple of Ranked
-    validation : CrossValidation
-    structure : Structure
-    unexplained : bool
-    """
-
-    fit: Fit
-    added: tuple[AddedEffect, ...]
-    ranked: tuple[Ranked, ...]
-    validation: CrossValidation
-    structure: Structure
-    unexplained: bool
-
-
-@dataclass(frozen=True)
 class Search:
     """Search for effects that a declared model lacks: the arguments of `diagnose`."""
 
@@ -218,7 +200,7 @@ class Search:
         # Where left-out poses are not even reached no effect can be followed: first the force.
         lost = self.loses_poses and fit.noise.source != "misfit"
         force = estimate_unknown_force(fit, self.executor) if lost else None
-        found = self.run(force)
+        found = self.among_simpler(self.run(force))
         other = self.at_random(found)
         if other is not None:
             return replace(self, declared=other).closed()
@@ -232,11 +214,10 @@ class Search:
             if found.added or not fit.errors_known:
                 force = estimate_unknown_force(found.fit, self.executor)
         tried = {row.name for row in found.ranked}
-
-        def named(item: AddedEffect) -> AddedEffect:
-            rivals = [rival.candidate for rival in item.rivals]
-            return replace(item, equivalents=equivalents(found.fit, item.candidate, tried, rivals))
-
+        added = [
+            replace(x, equivalents=equivalents(found.fit, x.candidate, tried, x.rival_candidates))
+            for x in found.added
+        ]
         return Diagnosis(
             before=fit,
             after=found.fit,
@@ -244,7 +225,7 @@ class Search:
             validation_after=found.validation,
             structure_before=structure_of(fit, screening_degrees(fit)),
             structure_after=found.structure,
-            added=tuple(map(named, found.added)),
+            added=tuple(added),
             ranked=found.ranked,
             unexplained=found.unexplained,
             pull=force if found.unexplained else None,
@@ -301,9 +282,11 @@ class Search:
                 single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
                 p_value = sidak(single, len(screened))
             closed = winner.fit if explaining else as_complete(winner.fit)
-            if not (closed.errors_known or misfit):
+            scatters = current.problem.priors.pose_scatter.std > 0
+            if (scatters or not closed.errors_known) and not misfit:
                 again = p_with_closed_noise(current, closed, winner, len(screened))
-                p_value = max(p_value, again)
+                # A scatter from pose to pose may be nothing but the effect.
+                p_value = again if scatters else max(p_value, again)
             if p_value > self.significance:
                 if not added:
                     names = [item.candidate.name for item in (winner, *rivals)]
@@ -316,6 +299,24 @@ class Search:
         self.step("search for a missing effect", self.max_effects, self.max_effects)
         listed = tuple(replace(row, reason=lost.get(row.name, "")) for row in ranked)
         return self._ended(*self._pruned(current, added), listed)
+
+    def among_simpler(self, found: Found) -> Found:
+        """What is found, or effects of fewer parameters each that are likelier together.
+
+        An effect of many parameters may stand for two of one each.
+        """
+        if not found.added or self.declared.noise.source == "misfit":
+            return found
+        winner = found.added[0].candidate
+        scores = {item.candidate.name: item.score for item in self.first}
+        enough = LARGER_OF_TWO * scores[winner.name]
+        free = {item.candidate.name: len(item.candidate.frees) for item in self.first}
+        others = [name for name in scores if free[name] >= len(winner.frees)]
+        if not any(scores[name] >= enough for name in scores.keys() - others):
+            return found
+        other = replace(self, exclude=[*self.exclude, *others]).run()
+        likelier = other.fit.log_evidence >= found.fit.log_evidence
+        return in_place_of(found, other) if likelier and not other.unexplained else found
 
     def at_random(self, found: Found) -> Fit | None:
         """The declared model with random effects, if it misfits and they explain more."""
@@ -350,7 +351,9 @@ class Search:
         self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
     ) -> list[Confirmed | None]:
         """Refits of the significant candidates with the highest scores."""
-        significant = [x for x in screened if p_values[x.candidate.name] < self.significance]
+        scatters = current.problem.priors.pose_scatter.std > 0
+        most = PLAUSIBLE if scatters else self.significance
+        significant = [x for x in screened if p_values[x.candidate.name] < most]
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         return list(map_in_order(self.executor, partial(refits.confirm, current), worthy))
@@ -393,11 +396,11 @@ class Search:
         if not added and not fit.noise.known:
             fit = settle(fit)
         found = self._judged(fit, added, ranked)
-        if not (found.unexplained and added and self.finest):
-            return found
         # What effects leave may be the mesh's, which was fine enough for what they explain.
-        finer, _ = fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)
-        return found if finer is fit else self._judged(finer, added, ranked)
+        if found.unexplained and added and self.finest:
+            finer, _ = fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)
+            found = found if finer is fit else self._judged(finer, added, ranked)
+        return found
 
     def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
@@ -443,7 +446,5 @@ class Search:
             return True
         if 2 * alone.fit.point.objective >= 2 * force.fit.point.objective + extra:
             return False
-        p_alone, p_found = (
-            structure_of(x, noise_degrees(x)).p_value for x in (alone.fit, found.fit)
-        )
-        return p_alone > p_found
+        p = [structure_of(x, noise_degrees(x)).p_value for x in (alone.fit, found.fit)]
+        return p[0] > p[1]

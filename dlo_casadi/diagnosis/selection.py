@@ -9,6 +9,7 @@ from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
+from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.prediction import predicted_shapes
@@ -42,6 +43,11 @@ class AddedEffect:
     rivals: tuple[Confirmed, ...]
     equivalents: tuple[str, ...] = ()
 
+    @property
+    def rival_candidates(self) -> list[Candidate]:
+        """Candidates that could not be told apart from it."""
+        return [rival.candidate for rival in self.rivals]
+
 
 @dataclass(frozen=True)
 class Ranked:
@@ -68,6 +74,37 @@ def explained_by(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confir
     close = [item for item in refits if item.fit.noise.source != "misfit"]
     least = min((item.fit.log_evidence for item in close), default=0.0)
     return [replace(item, bic=2 * (item.fit.log_evidence - least)) for item in close]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a search has ended.
+
+    Parameters
+    ----------
+    fit : Fit
+    added : tuple of AddedEffect
+    ranked : tuple of Ranked
+    validation : CrossValidation
+    structure : Structure
+    unexplained : bool
+    """
+
+    fit: Fit
+    added: tuple[AddedEffect, ...]
+    ranked: tuple[Ranked, ...]
+    validation: CrossValidation
+    structure: Structure
+    unexplained: bool
+
+
+def in_place_of(found: Found, other: Found) -> Found:
+    """Other effects that are likelier together, with that as the reason against those found."""
+    reason = "less likely than " + " and ".join(item.candidate.name for item in other.added)
+    first = found.added[0]
+    chosen = {item.name for item in (first.candidate, *first.rival_candidates)}
+    rows = (replace(x, reason=reason) if x.name in chosen else x for x in found.ranked)
+    return replace(other, ranked=tuple(rows))
 
 
 def as_complete(fit: Fit) -> Fit:
