@@ -19,6 +19,7 @@ from dlo_casadi.config import read_yaml
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.guesses import guesses
 from dlo_casadi.equilibrium.minima import ipopt, run_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
@@ -140,7 +141,7 @@ def stated(model: CableModel) -> tuple[ca.Function, int]:
 
 
 def check_random(count: int) -> None:
-    """Energies of random cables beside IPOPT's from the same solution and from the free shape."""
+    """Energies of random cables beside IPOPT's from the solution, the free shape and arcs."""
     rng, found, began = np.random.default_rng(0), Counter(), time.process_time()
     worst = 0.0
     while found["cables"] < count:
@@ -162,7 +163,7 @@ def check_random(count: int) -> None:
             [np.zeros(equalities), np.full(solver.size1_out("g") - equalities, np.inf)]
         )
         free = replace(model, obstacles=())
-        starts = [solved(free, pose).x[:, 0]]
+        starts = [solved(free, pose).x[:, 0], *guesses(model, model.nominal, rest, pose)]
         if isinstance(eq, Equilibrium):
             starts.append(eq.x[:, 0])
             found["solved"] += 1

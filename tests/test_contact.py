@@ -9,7 +9,9 @@ from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.sides import beside_bars
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
@@ -20,6 +22,7 @@ LENGTH, WEIGHT, EI, RADIUS = 1.0, 1.0, 0.02, 0.003  # m, N, N m^2, m
 CABLE = CableData(LENGTH, WEIGHT / 9.81, 2 * RADIUS, EI)
 LOOM = replace(CABLE, torsional_stiffness=0.015)
 TABLE = Plane((0.0, -0.15), (0.0, 1.0), "table")
+BARS = {"left": (0.12, -0.22), "right": (0.4, -0.3)}
 IN_SPACE = (
     Plane((0.0, 0.0, -0.2), (0.1, 0.0, 0.995), "ramp"),
     Capsule((0.21, -0.3, -0.19), (0.25, 0.3, -0.17), 0.03, "bar"),
@@ -62,9 +65,9 @@ def test_tension_over_a_cylinder_follows_from_the_height():
     """T + M^2 / (2 EI) - w y is the same everywhere, without friction on the cylinder, too."""
     radius, pose = 0.1, HeldPose((-0.2, -0.25), (0.22, -0.15))
     cylinder = Capsule((0.0, 0.0), (0.0, 0.0), radius, "cylinder")
-    over = np.linspace(0.23 + 2.03, 0.23 - 2.03, 41)[:, None]  # an arc between the ends
+    over = np.linspace(0.23 + 2.03, 0.23 - 2.03, 81)[:, None]  # an arc between the ends
     soft = replace(CABLE, bending_stiffness=2e-3)
-    _, found = solved(soft, pose, cylinder, n=40, x_init=over)
+    _, found = solved(soft, pose, cylinder, n=80, x_init=over)
     ahead = np.concatenate([np.cos(found.x), np.sin(found.x)], axis=1)
     ends = found.end_force @ ahead[-1], -found.start_force @ ahead[0]
     from_center = np.linalg.norm(found.points, axis=1)
@@ -124,6 +127,21 @@ def test_derivatives_of_a_shape_that_touches():
         assert change.curve[..., k] == pytest.approx(by, abs=2e-3 * np.abs(by).max())
         read = (ends[0].readings - ends[1].readings) / (2 * step)
         assert change.readings[:, k] == pytest.approx(read, abs=5e-3 * np.abs(read).max())
+
+
+def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():
+    """Guesses on either side of bars lead to the minima that IPOPT finds, the lowest is chosen."""
+    left, right = (Capsule(c, c, 0.03, name) for name, c in BARS.items())
+    pose = HeldPose((0.0, 0.0), (0.6, 0.05))
+    model, found = solved(CABLE, pose, left, right, n=24)
+    free = solved(CABLE, pose, n=24)[1].x
+    energies, given = [], (model, model.nominal, np.zeros(model.chain.n_rests), pose)
+    for x in [free, *beside_bars(model, free, found.points)]:
+        minimum = by_ipopt(*given, x[:, 0])
+        if minimum is not None and minimum.stable:
+            energies.append(minimum.energy)
+    assert max(energies) - min(energies) > 0.01 * WEIGHT * LENGTH  # the sides differ
+    assert found.energy == pytest.approx(min(energies), abs=1e-8)
 
 
 def test_a_fixture_inside_of_an_obstacle():

@@ -53,7 +53,10 @@ FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
 RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
 # these that a given start skips, so that it stays on its side; maximum number of steps of each.
-SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-4), 2, 20
+SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
+# Share taken of a step that is hardly shorter than the one before: contacts that change to and fro
+# make steps of one size.
+SHORTER = 0.5
 # Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8
 # Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
@@ -98,7 +101,7 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
     wanted = assembly.model.n_multipliers
     now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
     balanced, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
-    shift, first = np.zeros(m), np.full(m, np.inf)
+    shift, first, last = np.zeros(m), np.full(m, np.inf), np.full(m, np.inf)
     active = np.arange(m)
     for iteration in range(max_iterations):
         here = now.subset(active)
@@ -115,7 +118,11 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
         factor, shift[active] = _convex(matrix, wanted, shift[active], assembly.turn_per_slip)
         step = factor.solve(Vector(-force.x, -force.y))
         size = assembly.size(step)
-        now.x[active], now.lam[active] = stepped(assembly, here, step, size)
+        to_and_fro = bool(assembly.model.surfaces) & (size > last[active] / 2)
+        shorter = np.where(to_and_fro, SHORTER, 1.0)
+        last[active] = size
+        taken = Vector(step.x * shorter[:, None, None, None], step.y * shorter[:, None, None])
+        now.x[active], now.lam[active] = stepped(assembly, here, taken, size * shorter)
         # A shift makes steps small even where forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
@@ -209,9 +216,12 @@ def ipopt(name: str, problem: dict[str, ca.SX], tolerance: float, iterations: in
 
 @lru_cache(maxsize=32)
 def _solver(model: CableModel, clamped: tuple[int, ...]) -> ca.Function:
-    problem, count = potential(model, clamped), model.chain.n_nodes
-    x = problem.coordinates
-    conditions = ca.vertcat(problem.conditions, x[1:count] - x[: count - 1])
+    free, count = replace(model, obstacles=()), model.chain.n_nodes
+    problem = potential(free, clamped)
+    x, start = problem.coordinates, problem.parameters[len(model.names) + model.chain.n_rests :][:2]
+    places = start + ca.cumsum(problem.by_segment[free.end_pull, : model.n - 1], 1)
+    gaps = [one.symbolic(places).T - model.cable.diameter / 2 for one in model.surfaces]
+    conditions = ca.vertcat(problem.conditions, x[1:count] - x[: count - 1], *gaps)
     stated = {"x": x, "p": problem.parameters, "f": problem.energy, "g": conditions}
     return ipopt("equilibrium", stated, 1e-11, IPOPT_ITERATIONS)
 
@@ -235,8 +245,9 @@ def by_ipopt(
     """Equilibrium of a planar cable that IPOPT reaches from one first guess; None if it does not.
 
     IPOPT minimises the potential under the end conditions and the bounds of the joints: the same
-    functions of segments as everywhere, stated as one problem of the whole pose. Newton's method on
-    the Lagrangian then converges to rounding.
+    functions of segments as everywhere, stated as one problem of the whole pose; that no node is
+    inside of an obstacle are inequalities. Newton's method on the Lagrangian then converges to
+    rounding.
 
     Parameters
     ----------
@@ -245,23 +256,32 @@ def by_ipopt(
     pose : HeldPose
     phi : (n_nodes,) [rad]
     """
-    count, conditions = model.chain.n_nodes, model.n_multipliers
+    count, touching = model.chain.n_nodes, model.n_contacts
+    conditions = model.n_multipliers - touching
     solver = _solver(model, clamped_nodes(model.chain, pose.clips))
     deviation = np.zeros(len(model.deviation_names))
     others = border_of(model, pose, phi[:, None])[~model.are_multipliers]
     inner = np.zeros(solver.size1_in("x0") - len(phi) - len(others))
     x0 = np.concatenate([phi, others, inner])
-    bounds = np.zeros(conditions + count - 1)
-    bounds[conditions:] = JOINT_BOUND
+    equal, bent, most = (
+        np.zeros(conditions),
+        np.full(count - 1, JOINT_BOUND),
+        np.full(touching, np.inf),
+    )
+    lower = np.concatenate([equal, -bent, np.zeros(touching)])
+    upper = np.concatenate([equal, bent, most])
     parameters = np.concatenate([p, rest, pose.vector, deviation])
-    out, stats = run_ipopt(solver, x0=x0, p=parameters, lbg=-bounds, ubg=bounds)
+    out, stats = run_ipopt(solver, x0=x0, p=parameters, lbg=lower, ubg=upper)
     multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))
     border = np.zeros(model.n_border)
-    border[model.are_multipliers] = multipliers[:conditions]
+    bounded, pressed = np.split(multipliers[conditions:], [count - 1])
+    border[model.are_multipliers] = np.concatenate([multipliers[:conditions], -pressed])
     border[~model.are_multipliers] = coordinates[count:][: np.sum(~model.are_multipliers)]
     start = Shapes(coordinates[None, :count, None], border[None], deviation[None])
     given = Inputs.of(p, rest, pose.vector[None])
-    return _balanced(model, start, multipliers[conditions:], given, stats["iter_count"])
+    if model.surfaces:
+        start = descend(assembly_of(model), start, given).shapes
+    return _balanced(model, start, bounded, given, stats["iter_count"])
 
 
 def _balanced(

@@ -15,6 +15,7 @@ from dlo_casadi.equilibrium.equilibrium import (
 )
 from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
+from dlo_casadi.equilibrium.sides import beside_bars, on_other_side
 from dlo_casadi.equilibrium.spans import (
     border_of,
     chords,
@@ -285,6 +286,10 @@ class _PoseSearch:
             of, likely = self._likely([poses[j] for j in free])
             if len(of):
                 found = self._descended(poses, np.array(free)[of], likely, near=True)
+        if free and self.model.surfaces:
+            of, beside = self._beside([poses[j] for j in free])
+            again = self._descended(poses, np.array(free)[of], beside, near=True)
+            found = [one + more for one, more in zip(found, again, strict=True)]
         left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
         if left:
             others = [poses[j] for j in left]
@@ -310,6 +315,20 @@ class _PoseSearch:
         x, border = zip(*(guess for guesses in rows for guess in guesses), strict=True)
         return of, Shapes.declared(np.array(x), np.array(border), len(model.clips))
 
+    def _beside(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
+        """Guesses beside obstacles, and the pose of each: see `sides`."""
+        model = self.model
+        search = replace(self, model=replace(model, obstacles=()))
+        of, first = self._first(poses, [None] * len(poses))
+        pairs = list(zip(of.tolist(), first.x, first.lam, strict=True))
+        for j, minima in enumerate(search.reached(poses, [None] * len(poses))):
+            lowest = min((eq for eq in minima if eq.stable), key=lambda eq: eq.energy, default=None)
+            if lowest is not None:
+                every = beside_bars(model, lowest.x, lowest.points[: len(lowest.x)])
+                pairs += [(j, x, border_of(model, poses[j], x)) for x in every]
+        rows, nodes, lam = zip(*pairs, strict=True)
+        return np.array(rows), Shapes.declared(np.array(nodes), np.array(lam), len(model.clips))
+
     def _descend(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool = False
     ) -> tuple[Inputs, Minima]:
@@ -333,9 +352,10 @@ class _PoseSearch:
             iterations=minima.iterations[kept],
         )
         out: list[list[Equilibrium]] = [[] for _ in poses]
+        untold = self.model.end == "free" and bool(self.model.surfaces)  # IPOPT knows none
         for k, j in enumerate(of.tolist()):
             eq = equilibria.pop(0) if kept[k] else None
-            if eq is None and not self.model.in_space and not self.model.surfaces:
+            if eq is None and not (self.model.in_space or untold):
                 eq = by_ipopt(self.model, self.p, self.rest, poses[j], shapes.x[k, :, 0])
             if eq is not None:
                 out[j].append(eq)
@@ -384,20 +404,6 @@ def _twists(model: CableModel, twist: FloatArray) -> FloatArray:
 def _holds(twist: FloatArray, turns: FloatArray | float) -> BoolArray:
     """Whether cables of these twists [turns] have shed none of the turns asked for."""
     return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
-
-
-def on_other_side(
-    model: CableModel, pose: HeldPose, x: FloatArray, others: FloatArray
-) -> BoolArray:
-    """Whether other shapes (m, n_nodes, coordinates) hang on the other side of a shape.
-
-    With a free end these turn the other way; between two clamps, where twists differ by full
-    turns, by more than half a turn. None does if the pose names its side or there are no two.
-    """
-    turn, turns = float(model.node.turning(x)), model.node.turning(others)
-    least = 0.0 if pose.end is None else np.pi
-    apart = (turns * turn < 0) & (np.abs(turns - turn) > least)
-    return np.asarray(apart & (model.tipped_by is not None and not pose.turns and not pose.branch))
 
 
 def continued(

@@ -21,7 +21,7 @@ Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002): primal-dual active sets a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -36,8 +36,12 @@ from dlo_casadi.rod.obstacles import Surface, surfaces_near
 # Depth [lengths] under a force as large as the cable's weight: it keeps apart contacts that depend
 # on each other.
 DEPTH = 1e-8
-# Gap [lengths] that counts as much as such a force in deciding whether a contact is active.
-BALANCED = 1e-2
+# Gap [lengths] that counts as much as such a force in deciding whether a contact is active: larger
+# than what the force bends segments.
+BALANCED = 1.0
+# Maximum number of evaluations of the gaps under forces that depend on them, and their change
+# [lengths] at which it ends.
+LOOKS, SAME_GAP = 8, 1e-12
 # Nodes so near to a surface [lengths] belong to the same contact as those beside them that press.
 CLOSE = 1e-4
 
@@ -112,16 +116,27 @@ class Touching:
         """Which nodes touch.
 
         `advances`: those of the segments (m, n, d) [m] under forces (m, n, n_lam). The forces on
-        obstacles bend the segments a little: the second of two looks counts.
+        obstacles bend the segments, and round surfaces turn these forces: gaps are found by
+        fixed-point iteration, first under all that push.
         """
         m, d = start.shape
-        count = model.n_contacts
-        nowhere = np.zeros((m, count, d)), np.zeros((m, count, d, d - 1)), np.ones((m, count))
+        count, sizes = model.n_contacts, border[:, model.n_lam :]
+        nowhere = (
+            np.zeros((m, count, d)),
+            np.zeros((m, count, d, d - 1)),
+            np.full((m, count), np.inf),
+        )
         found = cls(model, border, start, offsets, depth, *nowhere, np.zeros((m, count), bool))
-        for _ in range(2):
-            gap, normal, bends = found._near(advances(found.lam))
-            active = found.sizes * _per_force(model, BALANCED) > gap
-            found = cls(model, border, start, offsets, depth, normal, bends, gap, active)
+        for touching in (sizes > 0, None):
+            active = (
+                sizes * _per_force(model, BALANCED) > found.gap if touching is None else touching
+            )
+            for _ in range(LOOKS):
+                before, now = found.gap, replace(found, active=active)
+                gap, normal, bends = now._near(advances(now.lam))
+                found = replace(now, gap=gap, normal=normal, bends=bends)
+                if np.all(np.abs(gap - before) < SAME_GAP * model.cable.length):
+                    break
         return found
 
     @property

@@ -49,13 +49,15 @@ class PoseSymbols:
 class Potential:
     """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
 
-    The parameters stack p, rest curvature of the cells, pose, deviation.
+    The parameters stack p, rest curvature of the cells, pose, deviation. `by_segment` (n_lam,
+    n_segments): what each segment adds to the conditions, that on the end's place its advance [m].
     """
 
     coordinates: ca.SX
     parameters: ca.SX
     energy: ca.SX
     conditions: ca.SX
+    by_segment: ca.SX
 
 
 def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
@@ -78,13 +80,14 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
         energy += ca.sumsqr(given_way) / 2
         conditions[lagrangian.compliant] -= ca.sqrt(lagrangian.compliances(s.p)) * given_way
     given, zero = [energy, conditions[multipliers]], ca.SX.zeros(len(multipliers))
-    energy, conditions = ca.substitute(given, [s.lam[multipliers]], [zero])
+    given.append(reached)
+    energy, conditions, reached = ca.substitute(given, [s.lam[multipliers]], [zero])
     for node, frame in zip(clamped, _clip_frames(model, s), strict=True):
         # Nothing else depends on the own coordinates of a node that a clip holds.
         energy += ca.sumsqr(s.x[_rows(model, node)] - frame) / 2
     coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
     parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
-    return Potential(coordinates, parameters, energy, conditions)
+    return Potential(coordinates, parameters, energy, conditions, reached)
 
 
 def balance(model: CableModel, s: PoseSymbols) -> Any:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
@@ -44,6 +45,10 @@ class Plane:
         bends = np.zeros((*places.shape, len(n) - 1))
         return Surface(distance, np.broadcast_to(n, places.shape), bends)
 
+    def symbolic(self, places: Any) -> Any:
+        """Distances (1, n) [m] of CasADi's places (d, n)."""
+        return ca.DM(self.normal).T @ (places - ca.DM(self.point))
+
     @property
     def drawn(self) -> dict[str, Any]:
         """As plain data."""
@@ -77,6 +82,14 @@ class Capsule:
         bends = bends / np.sqrt(np.maximum(size, _ON_AXIS))[..., None]
         bends[..., -1] *= ~beside[..., None]
         return Surface(size[..., 0] - self.radius, normal, bends)
+
+    def symbolic(self, places: Any) -> Any:
+        """Distances (1, n) [m] of CasADi's places (d, n)."""
+        axis = ca.DM(self.b) - ca.DM(self.a)
+        gap = places - ca.DM(self.a)
+        share = axis.T @ gap / max(float(ca.sumsqr(axis)), _ON_AXIS)
+        gap = gap - axis @ ca.fmax(ca.fmin(share, 1.0), 0.0)
+        return ca.sqrt(ca.sum1(gap**2)) - self.radius
 
     @property
     def drawn(self) -> dict[str, Any]:

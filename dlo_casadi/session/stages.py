@@ -11,7 +11,7 @@ from dlo_casadi.cable.limits import LimitCheck, limit_checks
 from dlo_casadi.config import Limits
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import on_other_side
+from dlo_casadi.equilibrium.sides import on_other_side
 from dlo_casadi.equilibrium.spread import (
     Uncertainty,
     displacements,

@@ -1,0 +1,82 @@
+"""Sides on which a cable may hang or pass, across which its energy alone does not lead it.
+
+A cable passes each bar on one of two sides: where a cable without obstacles comes near a bar, first
+guesses push it to either side.
+"""
+
+from itertools import product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.equilibrium.guesses import smallest_turn
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import tangents
+from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.obstacles import Capsule
+
+# Distance of a bar [lengths] from a cable without obstacles beyond which it has one side alone.
+NEAR_BAR = 0.1
+# Maximum number of bars, the nearest ones, whose sides are combined.
+MOST_BARS = 3
+
+
+def beside_bars(model: CableModel, x: FloatArray, points: FloatArray) -> list[FloatArray]:
+    """Nodes x (n_nodes, coordinates), and the same pushed to all combinations of sides of bars.
+
+    Places beside a bar move across the cable by a Gaussian of the arc length as wide as the bar;
+    the nodes turn with the line through them.
+
+    Parameters
+    ----------
+    points : (n_nodes, dimension) [m]
+        Places of the nodes x.
+    """
+    s, ahead, found = model.chain.places, tangents(model.node, x), []
+    for bar in model.surfaces:
+        if not isinstance(bar, Capsule):
+            continue
+        near = bar.near(points)
+        i = int(near.distance[1:-1].argmin()) + 1
+        away = near.normal[i] - near.normal[i] @ ahead[i] * ahead[i]
+        size = float(np.linalg.norm(away))
+        if near.distance[i] > NEAR_BAR * model.chain.length or size < 1e-3:
+            continue
+        clear = bar.radius + model.cable.diameter / 2
+        wide = max(clear, 2 * model.chain.h)
+        bump = np.exp(-(((s - s[i]) / wide) ** 2) / 2)[:, None] * away / size
+        here = size * (near.distance[i] + bar.radius)
+        found.append((near.distance[i], [(side * clear - here) * bump for side in (1, -1)]))
+    nearest = sorted(found, key=lambda pair: float(pair[0]))[:MOST_BARS]
+    ways = product(*(pushes for _, pushes in nearest)) if nearest else ()
+    return [x, *(_turned(model, x, points, points + sum(way)) for way in ways)]
+
+
+def on_other_side(
+    model: CableModel, pose: HeldPose, x: FloatArray, others: FloatArray
+) -> BoolArray:
+    """Whether other shapes (m, n_nodes, coordinates) hang on the other side of a shape.
+
+    With a free end these turn the other way; between two clamps, where twists differ by full
+    turns, by more than half a turn. None does if the pose names its side or there are no two.
+    """
+    turn, turns = float(model.node.turning(x)), model.node.turning(others)
+    least = 0.0 if pose.end is None else np.pi
+    apart = (turns * turn < 0) & (np.abs(turns - turn) > least)
+    return np.asarray(apart & (model.tipped_by is not None and not pose.turns and not pose.branch))
+
+
+def _turned(model: CableModel, x: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:
+    """Nodes x turned as the line through their places turns; both ends stay."""
+    before, after = (np.gradient(points, axis=0) for points in (old, new))
+    out = x.copy()
+    if model.node is Frame:
+        units = [one / np.linalg.norm(one, axis=1, keepdims=True) for one in (before, after)]
+        turned = smallest_turn(units[0], units[1]) * Rotation.from_quat(x)
+        out[1:-1] = turned.as_quat()[1:-1]
+    else:
+        across = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+        out[1:-1, 0] += np.arctan2(across, (before * after).sum(axis=1))[1:-1]
+    return out
