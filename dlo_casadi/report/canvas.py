@@ -53,6 +53,7 @@ STYLES: dict[str, dict[str, Any]] = {
     "axis-z": {"color": "#3A3AD6", "lw": 1.2},
     "fixture start": {"color": BLACK, "marker": "s", "ms": 3, "markevery": [0]},
     "fixture end": {"color": BLACK, "marker": "o", "ms": 3, "markevery": [0]},
+    "fixture clip": {"color": BLACK, "marker": "D", "mfc": "white", "ms": 5, "markevery": [0]},
 }
 
 # Width [inch] of a chart: on a telephone its letters are still as large as that of a footnote.

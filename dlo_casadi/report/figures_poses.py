@@ -107,8 +107,11 @@ def _legend_of(
         handles += [
             canvas.line_of(f"clamp's {name}", **canvas.STYLES[f"axis-{name}"]) for name in "xyz"
         ]
+    if experiment.clips:
+        handles.append(canvas.dot("clip", "D", style.BLACK))
     if experiment.in_space or readings:
-        handles.append(canvas.line_of("force on the ends", color=style.FORCE))
+        where = "ends and clips" if experiment.in_space and experiment.clips else "the ends"
+        handles.append(canvas.line_of(f"force on {where}", color=style.FORCE))
     if readings:
         handles.append(canvas.line_of("force as read", color=style.BLACK, ls=":"))
     if any(pose.role == "held_out" for pose in poses):

@@ -197,7 +197,7 @@ def scenes_of(
             + [stage.shapes[pose.name].curve for stage in stages if pose.name in stage.shapes]
             for pose in poses
         ]
-        scenes = _rooms(config, drawn, [x for shape in last.values() for x in shape.forces])
+        scenes = _rooms(config, drawn, [x for shape in last.values() for x in _all_forces(shape)])
     else:
         pairs = [pair for shape in last.values() for _, *pair in _forces_read(shape)]
         board = Plane(length, _scale(_AT_END * length, [force for pair in pairs for force in pair]))
@@ -211,6 +211,11 @@ def scenes_of(
 def held_places(pose: Pose) -> FloatArray:
     """Where the ends of a pose are held (1 or 2, d) [m]."""
     return np.array([place for place in (pose.start, pose.end) if place is not None])
+
+
+def _all_forces(shape: PoseShape) -> list[FloatArray]:
+    """Forces (d,) [N] of the cable on its fixtures and clips."""
+    return [*shape.forces, *(np.array(clip["force"]) for clip in shape.clips)]
 
 
 def _rooms(
@@ -252,26 +257,36 @@ def _forces_read(shape: PoseShape) -> list[tuple[int, FloatArray, FloatArray]]:
     ]
 
 
+def _spot(scene: Scene, at: FloatArray, what: str) -> list[Mark]:
+    """Where a cable is held; a line of no length at all would not be drawn."""
+    spot = np.stack([at, at + 1e-4 * scene.length])
+    return [Mark(f"{kind} {what}", spot) for kind in ("fixture-casing", "fixture")]
+
+
 def around(
     scene: Scene, declared: Pose, measured: FloatArray, shape: PoseShape | None
 ) -> tuple[list[Mark], list[Mark]]:
-    """What stands behind a cable, and in front of it: ground and shadow; clamps and forces.
+    """What stands behind a cable, and in front of it: ground and shadow; clamps, clips and forces.
 
-    On a board only forces that were read, each after what a sensor would show of the predicted one.
+    On a board clips, and forces that were read, each after what a sensor would show of the
+    predicted one.
 
     Parameters
     ----------
     declared : Pose
-        How the ends are held.
+        How the ends are held, and where clips are.
     measured : (K, d) [m]
     shape : PoseShape or None
         Predicted; without it the measured points throw the shadow.
     """
     read = [] if shape is None else _forces_read(shape)
     line = scene.points(measured if shape is None else shape.curve)
+    between = [scene.points(np.array(clip.place))[0] for clip in declared.clips]
+    clips = [mark for at in between for mark in _spot(scene, at, "clip")]
     if isinstance(scene, Plane):
         pairs = [(k, (("force", model), ("force-read", known))) for k, known, model in read]
-        return [], [scene.force(line[k], force, kind) for k, pair in pairs for kind, force in pair]
+        arrows = [scene.force(line[k], force, kind) for k, pair in pairs for kind, force in pair]
+        return [], [*clips, *arrows]
     under, over = scene.ground(), []
     if len(line):
         under += scene.shadow(line)
@@ -286,10 +301,13 @@ def around(
         if shape is not None:
             over.append(scene.force(at, shape.forces[k]))
             over += [scene.force(at, known, "force-read") for j, known, _ in read if j == k]
-        # A line of no length at all would not be drawn.
-        spot = np.stack([at, at + 0.1])
-        over += [Mark(f"{kind} {side}", spot) for kind in ("fixture-casing", "fixture")]
-    return under, over
+        over += _spot(scene, at, side)
+    for k, (at, clip) in enumerate(zip(between, declared.clips, strict=True)):
+        if clip.orientation is not None:
+            over += scene.clamp(at, clip.orientation)
+        if shape is not None and shape.clips:
+            over.append(scene.force(at, np.array(shape.clips[k]["force"])))
+    return under, over + clips
 
 
 # ---- all poses of a session in one scene -------------------------------------------------------
