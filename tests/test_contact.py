@@ -144,6 +144,16 @@ def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():
     assert found.energy == pytest.approx(min(energies), abs=1e-8)
 
 
+def test_ipopt_lays_a_free_end_on_a_table():
+    pose = HeldPose((0.0, 0.0), start_heading=0.0)
+    model, found = solved(CABLE, pose, TABLE, n=24, start="clamped", end="free")
+    straight = np.zeros(model.chain.n_nodes)
+    minimum = by_ipopt(model, model.nominal, np.zeros(model.chain.n_rests), pose, straight)
+    assert found.contacts
+    assert minimum.contacts
+    assert minimum.energy == pytest.approx(found.energy, abs=1e-10)
+
+
 def test_a_fixture_inside_of_an_obstacle():
     with pytest.raises(
         EquilibriumError, match=r"end \(0.7000, -0.2000\) m is 0.0500 m inside table"

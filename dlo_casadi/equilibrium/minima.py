@@ -216,11 +216,13 @@ def ipopt(name: str, problem: dict[str, ca.SX], tolerance: float, iterations: in
 
 @lru_cache(maxsize=32)
 def _solver(model: CableModel, clamped: tuple[int, ...]) -> ca.Function:
-    free, count = replace(model, obstacles=()), model.chain.n_nodes
-    problem = potential(free, clamped)
+    problem, count, gaps = potential(model, clamped), model.chain.n_nodes, []
     x, start = problem.coordinates, problem.parameters[len(model.names) + model.chain.n_rests :][:2]
-    places = start + ca.cumsum(problem.by_segment[free.end_pull, : model.n - 1], 1)
-    gaps = [one.symbolic(places).T - model.cable.diameter / 2 for one in model.surfaces]
+    if model.surfaces:
+        touching = model.n_contacts // len(model.surfaces)
+        places = start + ca.cumsum(problem.by_segment[model.end_pull, :touching], 1)
+        clearance = model.cable.diameter / 2
+        gaps = [one.symbolic(places).T - clearance for one in model.surfaces]
     conditions = ca.vertcat(problem.conditions, x[1:count] - x[: count - 1], *gaps)
     stated = {"x": x, "p": problem.parameters, "f": problem.energy, "g": conditions}
     return ipopt("equilibrium", stated, 1e-11, IPOPT_ITERATIONS)
@@ -263,13 +265,11 @@ def by_ipopt(
     others = border_of(model, pose, phi[:, None])[~model.are_multipliers]
     inner = np.zeros(solver.size1_in("x0") - len(phi) - len(others))
     x0 = np.concatenate([phi, others, inner])
-    equal, bent, most = (
-        np.zeros(conditions),
-        np.full(count - 1, JOINT_BOUND),
-        np.full(touching, np.inf),
-    )
-    lower = np.concatenate([equal, -bent, np.zeros(touching)])
-    upper = np.concatenate([equal, bent, most])
+    rows, most = np.flatnonzero(model.are_multipliers)[:conditions], np.full(touching, np.inf)
+    held = np.where(np.isin(rows, model.no_pull), np.inf, 0.0)
+    bent = np.full(count - 1, JOINT_BOUND)
+    lower = np.concatenate([-held, -bent, np.zeros(touching)])
+    upper = np.concatenate([held, bent, most])
     parameters = np.concatenate([p, rest, pose.vector, deviation])
     out, stats = run_ipopt(solver, x0=x0, p=parameters, lbg=lower, ubg=upper)
     multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))

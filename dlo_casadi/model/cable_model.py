@@ -315,6 +315,11 @@ class CableModel:
         names = [f"free_end_{axis}" for axis in self.node.axes] if free else self._end_position
         return [self.border_names.index(name) for name in names]
 
+    @property
+    def no_pull(self) -> list[int]:
+        """Those of `end_pull` that are zero: of a free end."""
+        return self.end_pull if self.end == "free" else []
+
     @cached_property
     def border_kinds(self) -> dict[str, Literal["distance", "angle", "place"]]:
         """Unknowns beside the nodes by their names: of end conditions, springs, clips, contacts.

@@ -211,15 +211,10 @@ class Touching:
         """
         gaps = np.where(self.active, self._near(advances).distance, 0.0)
         y = np.concatenate([force.y, (-gaps - self.sizes * self.softness)[..., None]], axis=1)
-        y[:, self._no_pull] = 0.0
+        y[:, self.model.no_pull] = 0.0
         work = (self.beyond * advances).sum(axis=(1, 2))
         own = (self.felt * (gaps + self.felt * self.softness / 2)).sum(axis=1)
         return total - work - own, Vector(force.x, y)
-
-    @property
-    def _no_pull(self) -> list[int]:
-        """Rows of the border of a force at a free end."""
-        return self.model.end_pull if self.model.end == "free" else []
 
     def contacts(self) -> list[tuple[Contact, ...]]:
         """Stretches of neighbouring nodes that touch, for each of m poses."""
@@ -285,7 +280,7 @@ class Touching:
         own = np.concatenate([-self.softness, np.ones((len(border), inner))], axis=1)
         diagonal = np.arange(n_lam, k + inner)
         corner[:, diagonal, diagonal] += own
-        for row in self._no_pull:
+        for row in self.model.no_pull:
             border[..., row] = corner[:, row] = corner[:, :, row] = 0.0
             corner[:, row, row] = -1.0
         return BandMatrix(plain.diagonal, plain.upper, border, corner, inner)
@@ -316,7 +311,7 @@ class Touching:
         rows = np.repeat(offsets, _count(self.model), axis=1) * self.active[..., None]
         rows[:, self._used] -= np.einsum("masd,msdq->maq", self._normals, moved)
         y = np.concatenate([change.y, rows], axis=1)
-        y[:, self._no_pull] = 0.0
+        y[:, self.model.no_pull] = 0.0
         return Vector(change.x, y)
 
 

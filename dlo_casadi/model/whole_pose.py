@@ -20,7 +20,7 @@ from dlo_casadi.model.lagrangian import lagrangian_of
 class PoseSymbols:
     """Arguments of the expressions of a pose.
 
-    `x` (n_nodes coordinates,), `lam` (n_border,), `p` (n_parameters,), `rest` (n_rests,) [1/m],
+    `x` (n_nodes coordinates,), `lam` (n_lam,), `p` (n_parameters,), `rest` (n_rests,) [1/m],
     `pose` (n_pose,), `deviation` (n_deviations,).
     """
 
@@ -36,7 +36,7 @@ class PoseSymbols:
         """Fresh symbols."""
         sizes = {
             "x": model.chain.n_nodes * model.node.coordinates,
-            "lam": model.n_border,
+            "lam": model.n_lam,
             "p": len(model.parameters),
             "rest": model.chain.n_rests,
             "pose": model.n_pose,
@@ -73,7 +73,7 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     own, reached = functions.segment_potential(*_segment_arguments(model, s, clamped), inner)
     energy = sum(ca.horzsplit(own), start=energy)
     conditions = sum(ca.horzsplit(reached), start=gradient[2 * model.node.increment :])
-    multipliers = np.flatnonzero(model.are_multipliers).tolist()
+    multipliers = np.flatnonzero(model.are_multipliers[: model.n_lam]).tolist()
     places = np.flatnonzero(~model.are_multipliers).tolist()
     given_way = ca.SX.sym("given_way", len(lagrangian.compliant))
     if lagrangian.compliant:
