@@ -22,6 +22,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipKind, HeldClip
 from dlo_casadi.report.canvas import BLACK, BLUE, GREY, WIDTH, line_of, styled
 from dlo_casadi.report.scene import seen
+from dlo_casadi.rod.obstacles import Plane
 
 PICTURES = Path(__file__).parents[1] / "docs/pages/effects"
 LENGTH, ELEMENTS = 0.8, 40
@@ -40,10 +41,13 @@ class Shown:
     clamped: bool = False
     history: bool = False  # the third pose is the first one again
     clipped: bool = False  # a pinned clip holds the middle
+    touching: bool = False  # the cable lies on a table
 
 
 # End of the pose that leaves a set [m], and the floor's depth below the cable [m].
 TIGHT, FLOOR = (0.1, 0.06, 0.1), 0.1
+# Height of the table [m].
+TABLE = -0.17
 SIDES = np.array([-1.0, 1.0])
 STYLES = ({"color": GREY, "ls": "--", "lw": 1.4}, {"color": BLUE, "ls": "-", "lw": 2.2})
 
@@ -80,6 +84,7 @@ SHOWN = {
         {"dx": 0.04, "dy": 0.03}, {"dx": 0.04, "dy": 0.04, "dz": 0.03}, clipped=True
     ),
     "clip_slip": Shown({"ds": 0.04}, {"ds": 0.04}, clipped=True),
+    "obstacle_offset": Shown({}, {"offset": 0.06}, touching=True),
     "rest_curvature_drift": Shown({"rate": 0.6}, {"rate": 0.6}, history=True),
     "plastic_set": Shown(
         {"yield_curvature": 3, "share": 0.9}, {"yield_curvature": 3, "share": 0.9}, history=True
@@ -126,12 +131,17 @@ def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) 
     kinds: tuple[ClipKind, ...] = ("pinned",) if shown.clipped else ()
     setup = Setup(cable, held, held, gravity, center=(0.4, -0.1), camera=True, clips=kinds)
     effects = (dlo.EFFECTS[name].made_for(setup),) if values else ()
+    up = tuple(-g / 9.81 for g in gravity)
+    tables = (Plane(tuple(TABLE * x for x in up), up),) if shown.touching else ()
     options = {"start": held, "end": held, "gravity": gravity, "effects": effects, "clips": kinds}
+    options |= {"obstacles": tables}
     model = CableModel(cable, ELEMENTS, **options)
     p = model.nominal
     for key, value in values.items():
         p[model.names.index(f"{name}.{key}")] = value
     poses = poses_in_space() if spatial else poses_in_plane(shown.clamped)
+    if shown.touching:
+        poses = [replace(pose, end=(*pose.end[:-1], 0.0)) for pose in poses]
     if shown.clipped:
         poses = [replace(pose, clips=(middle_clip(pose),)) for pose in poses]
     if shown.history:

@@ -7,16 +7,19 @@ import pytest
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import CableData, ObstacleOffset
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import beside_bars
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Inputs, assembly_of
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.obstacles import Capsule, Plane
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 LENGTH, WEIGHT, EI, RADIUS = 1.0, 1.0, 0.02, 0.003  # m, N, N m^2, m
 CABLE = CableData(LENGTH, WEIGHT / 9.81, 2 * RADIUS, EI)
@@ -111,14 +114,15 @@ def test_the_tangent_is_the_derivative_of_the_balance(loom):
 
 
 def test_derivatives_of_a_shape_that_touches():
-    """By EI and the roll of the end, beside equilibria on either side."""
-    model, found = solved(LOOM, HELD_IN_SPACE, IN_SPACE[0], start="clamped", end="clamped")
+    """By EI, the roll of the end and the ramp's place, beside equilibria on either side."""
+    own = {"start": "clamped", "end": "clamped", "effects": (ObstacleOffset(),)}
+    model, found = solved(LOOM, HELD_IN_SPACE, IN_SPACE[0], **own)
     assert found.contacts
     p, rest, q = model.nominal, np.zeros(model.chain.n_rests), len(model.names)
     equilibria = BatchEquilibrium(model, [HELD_IN_SPACE])
     along = equilibria.directions(found.shapes, p, rest, np.eye(q), np.zeros((len(rest), q)))
     ((_, change),) = equilibria.observe(found.shapes, p, rest, along)
-    for k, step in ((0, 1e-5), (2, 1e-4)):
+    for k, step in ((0, 1e-5), (2, 1e-4), (3, 1e-5)):
         ends = []
         for h in (step, -step):
             there, _ = equilibria.solve(found.shapes, p + h * np.eye(q)[k], rest)
@@ -127,6 +131,49 @@ def test_derivatives_of_a_shape_that_touches():
         assert change.curve[..., k] == pytest.approx(by, abs=2e-3 * np.abs(by).max())
         read = (ends[0].readings - ends[1].readings) / (2 * step)
         assert change.readings[:, k] == pytest.approx(read, abs=5e-3 * np.abs(read).max())
+
+
+def test_an_obstacle_that_is_elsewhere():
+    """An offset is the same as an obstacle declared there; of a bar it is a larger radius."""
+    ramp, bar = IN_SPACE
+    size = np.linalg.norm(ramp.normal)
+    ramp = replace(ramp, normal=tuple(ramp.normal / size))
+    up = tuple(x + 0.01 * n for x, n in zip(ramp.point, ramp.normal, strict=True))
+    there = replace(ramp, point=up), replace(bar, radius=bar.radius - 0.004)
+    held = {"start": "clamped", "end": "clamped"}
+    _, same = solved(LOOM, HELD_IN_SPACE, *there, **held)
+    effects = (ObstacleOffset(), ObstacleOffset(obstacle=1))
+    model = CableModel(
+        LOOM, 20, n_rest=0, gravity=(0, 0, -9.81), obstacles=(ramp, bar), effects=effects, **held
+    )
+    assert model.names[-2:] == ("obstacle_offset.offset", "obstacle_offset_2.offset")
+    p = model.nominal + np.array([0, 0, 0, 0.01, -0.004])
+    found = solve_equilibrium(model, p, np.zeros(model.chain.n_rests), HELD_IN_SPACE)
+    assert found.energy == pytest.approx(same.energy, rel=1e-9)
+    assert found.points == pytest.approx(same.points, abs=1e-8)
+    too_high = replace(HELD_IN_SPACE, end=(0.7, 0.1, -0.268))
+    with pytest.raises(EquilibriumError, match=r"end .* is 0\.00\d\d m inside ramp"):
+        solve_equilibrium(model, p, np.zeros(model.chain.n_rests), too_high)
+
+
+def test_a_fit_finds_where_the_table_is():
+    """From shapes without noise; the table is 3 mm higher than declared, EI larger by half."""
+    table = Plane((0.0, -0.12), (0.0, 1.0), "table")
+    held = {"start": "clamped", "end": "clamped", "n_rest": 0}
+    cable = replace(CABLE, bending_stiffness=2e-3)
+    model = CableModel(cable, 20, obstacles=(table,), effects=(ObstacleOffset(),), **held)
+    poses = [HeldPose((0.0, 0.0), (x, 0.02), -1.0, 1.1) for x in (0.45, 0.55, 0.65)]
+    true = model.nominal * [1.5, 1.0] + [0.0, 0.003]
+    places = np.linspace(0.02, 0.98, 40)
+    shown = predict_poses(model, true, np.zeros(model.chain.n_rests), poses)
+    assert all(one.equilibrium.contacts for one in shown)
+    measured = [
+        MeasuredPose.of_points(pose, one.curve.at(places))
+        for pose, one in zip(poses, shown, strict=True)
+    ]
+    fit = fit_model(model, measured, Tolerances(), 1e-4)
+    # A point force of half the weight sinks in by 5e-5 lengths in a fit.
+    assert fit.p == pytest.approx(true, rel=2e-3, abs=5e-5)
 
 
 def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():

@@ -41,6 +41,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.element import Cell
+from dlo_casadi.rod.obstacles import Plane
 
 CABLE = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 # Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).
@@ -53,12 +54,13 @@ POSE_IN_SPACE = HeldPose(
     end_orientation=(-0.3, 0.1, 0.2, 0.9),
 ).vector
 GRAVITY = {"plane": (1.0, -9.7), "space": (1.0, 0.5, -9.7)}
-KINDS = {"section", "kinematics", "load", "boundary", "measurement", "state"}
+KINDS = {"section", "kinematics", "load", "boundary", "measurement", "state", "contact"}
 UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad", "rad/(N m)"}
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WHERE = (*(("plane", e) for e in ELEMENTS), *(("space", e) for e in ELEMENTS_IN_SPACE))
-CLIPPED = {"clip_offset", "clip_slip"}
+CLIPPED, TOUCHING = {"clip_offset", "clip_slip"}, {"obstacle_offset"}
+TABLES = {"plane": Plane((0.0, 0.3), (0.0, 1.0)), "space": Plane((0.0, 0.0, 0.3), (0.0, 0.0, 1.0))}
 CLIPS = {
     "plane": HeldClip("pinned", (0.3, -0.1), 0.37),
     "space": HeldClip("pinned", (0.3, 0, 0), 0.37),
@@ -68,7 +70,7 @@ CASES = [
     for where, element in WHERE
     for name, kind in sorted(EFFECTS.items())
     if {"plane": 2, "space": 3}[where] in kind.dimensions
-    and not (name in CLIPPED and element == "link")  # refused with clips
+    and not (name in CLIPPED | TOUCHING and element == "link")  # refused with clips and obstacles
 ]
 
 
@@ -84,7 +86,9 @@ def plain(name: str, where: str, element: str) -> CableModel:
     held = "pinned" if where == "plane" and not name.startswith("clamp_") else "clamped"
     cable = CABLE if where == "plane" else IN_SPACE
     clips = ("pinned",) if name in CLIPPED else ()
-    return CableModel(cable, 5, element, held, held, GRAVITY[where], clips=clips)
+    obstacles = (TABLES[where],) if name in TOUCHING else ()
+    between = {"clips": clips, "obstacles": obstacles}
+    return CableModel(cable, 5, element, held, held, GRAVITY[where], **between)
 
 
 @cache

@@ -28,6 +28,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.rod.obstacles import Plane
 
 FLAT = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 CABLE = replace(FLAT, torsional_stiffness=0.03)
@@ -67,6 +68,7 @@ PLANAR = {
     "end_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
     "clip_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
     "clip_slip": {"ds": 0.01},
+    "obstacle_offset": {"offset": 0.01},
     "rest_curvature_drift": {"rate": 0.3},
     "plastic_set": {"yield_curvature": 2.0, "share": 0.3},
 }
@@ -100,7 +102,9 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
     models, ps, rests = [], [], []
     for cable, g in ((FLAT, gravity), (CABLE, (*gravity, 0.0))):
         effect = EFFECTS[name].made_for(Setup(cable, "clamped", "clamped", g))
-        model = CableModel(cable, 10, "arc", "clamped", "clamped", g, (effect,), clips=("pinned",))
+        table = Plane((0.0, -0.12, 0.0)[: len(g)], (0.0, 1.0, 0.0)[: len(g)])
+        between = {"clips": ("pinned",), "obstacles": (table,) * (name == "obstacle_offset")}
+        model = CableModel(cable, 10, "arc", "clamped", "clamped", g, (effect,), **between)
         p = model.nominal.copy()
         for q in effect.parameters(cable):
             p[model.names.index(f"{name}.{q.name}")] = PLANAR[name][q.name]
@@ -322,7 +326,7 @@ ONLY = {
     "space": {"bending_anisotropy", "camera_frame", "clamp_rotation"},
 }
 FULL = {"curved": True, "n_poses": 3, "center": (0.0, 0.0), "camera": True, "readings": True}
-FULL["clips"] = ("pinned",)
+FULL |= {"clips": ("pinned",), "obstacles": 1}
 
 
 def applied(where):

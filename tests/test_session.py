@@ -68,7 +68,7 @@ IN_PLANE = {
         "tolerances": dict.fromkeys(
             (
                 *("length", "end", "heading", "rotation", "roll", "scale", "camera_rotation"),
-                *("camera_translation", "force_bias", "moment_bias", "clip", "slip"),
+                *("camera_translation", "force_bias", "moment_bias", "clip", "slip", "obstacle"),
             ),
             0.001,
         ),

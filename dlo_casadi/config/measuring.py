@@ -184,6 +184,8 @@ class DeclaredTolerances(ConfigSection):
     """Of a coordinate of a clip between the ends [m]."""
     slip: Positive = _STANDARD.slip
     """Of the arc length at which a clip holds the cable [m]."""
+    obstacle: Positive = _STANDARD.obstacle
+    """Of the place of an obstacle's surface, along its normal [m]."""
     scale: Positive = _STANDARD.scale
     """Of the scale of the measurement, relative."""
     camera_rotation: Positive = _STANDARD.camera_rotation

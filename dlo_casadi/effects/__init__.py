@@ -11,8 +11,10 @@ from dlo_casadi.effects.clamps import ClampCompliance as ClampCompliance
 from dlo_casadi.effects.clamps import ClampRotation as ClampRotation
 from dlo_casadi.effects.clips import ClipOffset as ClipOffset
 from dlo_casadi.effects.clips import ClipSlip as ClipSlip
+from dlo_casadi.effects.contact import ObstacleOffset as ObstacleOffset
 from dlo_casadi.effects.edge_bias import EdgeBias as EdgeBias
 from dlo_casadi.effects.effect import BoundaryEffect as BoundaryEffect
+from dlo_casadi.effects.effect import ContactEffect as ContactEffect
 from dlo_casadi.effects.effect import Effect as Effect
 from dlo_casadi.effects.effect import EndConditions as EndConditions
 from dlo_casadi.effects.effect import Fitted as Fitted
@@ -69,6 +71,7 @@ EFFECTS: dict[str, type[Effect]] = {
         EndOffset,
         ClipOffset,
         ClipSlip,
+        ObstacleOffset,
         RestCurvatureDrift,
         PlasticSet,
         ImageScale,

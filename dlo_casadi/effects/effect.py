@@ -1,4 +1,4 @@
-"""The contract of an effect and its six kinds.
+"""The contract of an effect and its seven kinds.
 
 An effect declares parameters and is of one kind. It sees the curve, never the solver's coordinates;
 it creates no symbol, keeps no state and calls no solver. It also says where it applies, which
@@ -318,6 +318,20 @@ class BoundaryEffect(Effect):
     def compliance(self, params: Params) -> tuple[ca.SX | float, ca.SX | float]:
         """Turn of the start and end clamp per moment on it [rad/(N m)]. Compliances add."""
         return 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class ContactEffect(Effect):
+    """Kind `contact`: where an obstacle is. Its one parameter is how far it is outwards [m].
+
+    Parameters
+    ----------
+    obstacle : int
+        Its number, 0 of the first.
+    """
+
+    kind: ClassVar[str] = "contact"
+    obstacle: int = 0
 
 
 class MeasurementEffect(Effect):

@@ -14,7 +14,7 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
-from dlo_casadi.equilibrium.minima import TOLERANCE, descend_to_contact, stepped
+from dlo_casadi.equilibrium.minima import TOLERANCE, damped, descend_to_contact, stepped
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
@@ -27,6 +27,10 @@ REACH = 1.5
 # be kept; otherwise it is evaluated again. Five gradients cost less than one matrix.
 CONTRACTION = 0.2
 NEAR = 0.1
+# Depth [lengths] of obstacles here, see `contact.DEPTH`: they are then as soft as the cable between
+# two of 80 nodes, so that contacts hardly depend on each other, and a cable that lies on a table
+# with all its weight sinks in by a millionth of its length.
+SOFT_DEPTH = 1e-4
 # Maximum number of iterations of a descent to a minimum: poses of a session in space took 7 to 23.
 DOWNHILL = 40
 
@@ -45,7 +49,7 @@ class BatchEquilibrium:
         self.model = model
         self.poses = tuple(poses)
         self.m = len(self.poses)
-        self.assembly = assembly_of(model)
+        self.assembly = assembly_of(model).softened(SOFT_DEPTH)
         self.node = self.assembly.node
         self._ends = np.array([pose.vector for pose in self.poses])
         self.used_deviations = [model.deviation_names.index(name) for name in model.deviations]
@@ -156,10 +160,12 @@ class BatchEquilibrium:
             size = self.assembly.size(step)
             if coupled:
                 size[:] = size.max()
-            now.x[active], now.lam[active] = stepped(self.assembly, here, step, size)
+            step, taken = damped(self.assembly, step, size, last[active])
+            now.x[active], now.lam[active] = stepped(self.assembly, here, step, taken)
             done = _settled(size, last[active], tolerance, fresh)
             stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
-            stale[active] |= size > NEAR
+            # A contact that begins or ends changes the matrix.
+            stale[active] |= (size > NEAR) | bool(self.model.surfaces)
             way = self.node.difference(shapes.x[active], now.x[active])
             lost = ~(np.abs(way).max(axis=(1, 2)) <= reach)
             converged[active[done & ~lost]] = True

@@ -36,6 +36,7 @@ from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes
+from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
 from dlo_casadi.runtime.executors import interrupts_held
@@ -54,9 +55,9 @@ RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
 # these that a given start skips, so that it stays on its side; maximum number of steps of each.
 SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
-# Share taken of a step that is hardly shorter than the one before: contacts that change to and fro
-# make steps of one size.
-SHORTER = 0.5
+# Share taken of a step that is hardly shorter than the one before, and their ratio from which on it
+# is: contacts that change to and fro make steps of one size; after half a step follows the other.
+SHORTER, SAME_SIZE = 0.5, 0.75
 # Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8
 # Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
@@ -118,11 +119,9 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
         factor, shift[active] = _convex(matrix, wanted, shift[active], assembly.turn_per_slip)
         step = factor.solve(Vector(-force.x, -force.y))
         size = assembly.size(step)
-        to_and_fro = bool(assembly.model.surfaces) & (size > last[active] / 2)
-        shorter = np.where(to_and_fro, SHORTER, 1.0)
+        taken, length = damped(assembly, step, size, last[active])
         last[active] = size
-        taken = Vector(step.x * shorter[:, None, None, None], step.y * shorter[:, None, None])
-        now.x[active], now.lam[active] = stepped(assembly, here, taken, size * shorter)
+        now.x[active], now.lam[active] = stepped(assembly, here, taken, length)
         # A shift makes steps small even where forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
@@ -145,7 +144,8 @@ def descend_to_contact(
     assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80, *, near: bool
 ) -> Minima:
     """As `descend`; obstacles are soft at first. `near`: whether shapes keep to their sides."""
-    for depth in SOFT[KEEPING_SIDE * near :] if assembly.model.surfaces else ():
+    softer = [x for x in SOFT[KEEPING_SIDE * near :] if x > assembly.depth]
+    for depth in softer if assembly.model.surfaces else ():
         shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
     return descend(assembly, shapes, given, max_iterations)
 
@@ -181,6 +181,16 @@ def _convex(
         shift[wrong] = np.minimum(larger, most[wrong])
         wrong = wrong[(shifted(wrong).negative != wanted) & (larger < most[wrong])]
     return shifted(everyone), shift
+
+
+def damped(
+    assembly: Assembly, step: Vector, size: FloatArray, last: FloatArray
+) -> tuple[Vector, FloatArray]:
+    """Steps of one column and their sizes (m,), shorter where contacts change to and fro."""
+    if not assembly.model.surfaces:
+        return step, size
+    share = np.where(size > SAME_SIZE * last, SHORTER, 1.0)
+    return Vector(step.x * share[:, None, None, None], step.y * share[:, None, None]), size * share
 
 
 def stepped(
@@ -221,8 +231,9 @@ def _solver(model: CableModel, clamped: tuple[int, ...]) -> ca.Function:
     if model.surfaces:
         touching = model.n_contacts // len(model.surfaces)
         places = start + ca.cumsum(problem.by_segment[model.end_pull, :touching], 1)
-        clearance = model.cable.diameter / 2
-        gaps = [one.symbolic(places).T - clearance for one in model.surfaces]
+        offsets = ca.DM(outwards(model)) @ problem.parameters[: len(model.names)]
+        clearance = offsets + model.cable.diameter / 2
+        gaps = [one.symbolic(places).T - clearance[k] for k, one in enumerate(model.surfaces)]
     conditions = ca.vertcat(problem.conditions, x[1:count] - x[: count - 1], *gaps)
     stated = {"x": x, "p": problem.parameters, "f": problem.energy, "g": conditions}
     return ipopt("equilibrium", stated, 1e-11, IPOPT_ITERATIONS)

@@ -27,6 +27,7 @@ from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes
+from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame, Heading
 
@@ -59,7 +60,7 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         return _no_equilibrium(pose, what, "see where these numbers come from.")
     if wrong := _wrong_clips(model, p, pose):
         return _no_equilibrium(pose, *wrong)
-    if wrong := _inside(model, pose):
+    if wrong := _inside(model, p, pose):
         return _no_equilibrium(pose, *wrong)
     if pose.end is None or model.extensible:
         return None
@@ -76,15 +77,15 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
     return _no_equilibrium(pose, what, "end in metres? cable.length?")
 
 
-def _inside(model: CableModel, pose: HeldPose) -> tuple[str, str] | None:
+def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
     """Why obstacles leave no equilibrium, and what to try: a fixture is inside of one."""
-    held = [("start", pose.start), ("end", pose.end)]
-    held += [(clip.name, clip.place) for clip in pose.clips]
+    held = [("start", pose.start), *((clip.name, clip.place) for clip in pose.clips)]
+    held += [("end", pose.end)] if pose.end is not None else []
     for name, place in held:
-        for obstacle in model.surfaces if place is not None else ():
-            depth = -float(obstacle.near(np.array(place)).distance)
+        for obstacle, offset in zip(model.surfaces, outwards(model) @ p, strict=True):
+            depth = offset - float(obstacle.near(np.array(place)).distance)
             if depth > 0:
-                at = ", ".join(f"{x:.4f}" for x in place or ())
+                at = ", ".join(f"{x:.4f}" for x in place)
                 what = f"no equilibrium: the {name} ({at}) m is {depth:.4f} m inside"
                 return f"{what} {obstacle.name}", "the obstacle's place, or its normal."
     return None
@@ -104,10 +105,8 @@ def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str,
         return f"no equilibrium: {what}", "a finer mesh (model.n)."
     held = holders(model, p, pose) if pose.clips and not model.extensible else []
     names = ["the start", *(clip.name for clip in pose.clips), "the end"]
-    apart, true_length = (
-        chords(held),
-        float(lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1]),
-    )
+    apart = chords(held)
+    true_length = float(lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1])
     for low, high, declared in fixed_stretches(held):
         length = declared * true_length / model.cable.length
         if sum(apart[low:high]) >= length:

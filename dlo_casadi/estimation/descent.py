@@ -24,6 +24,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.contact import forces_on_other_mesh
 
 # Longest step of a node along its derivative [rad]; beyond it the linearisation is poor.
 LONGEST_MOVE = 1.5
@@ -287,18 +288,19 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
             raise EstimationError(error.message) from error
         rows.append((found.x, found.multipliers, np.zeros(len(fit.model.deviation_names))))
     x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
-    model = problem.unknowns.model
-    shapes = with_border_of(Shapes(x, lam, deviation), fit.model, model)
-    return on_other_mesh(shapes, fit.model, model)
+    return on_other_mesh(Shapes(x, lam, deviation), fit.model, problem.unknowns.model)
 
 
 def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
-    """Nodes interpolated from one model's mesh to another's; contacts begin without forces."""
+    """Nodes and forces on obstacles interpolated from one model's mesh to another's."""
+    moved = with_border_of(shapes, model, other)
     if model.chain == other.chain:
-        return shapes
+        return moved
     coarse, fine = model.chain.places, other.chain.places
     x = other.chain.kind.node.interpolated(fine, coarse, shapes.x)
-    return with_border_of(replace(shapes, x=x), model, other)
+    if model.surfaces and model.surfaces == other.surfaces:
+        moved.lam[:, other.n_lam :] = forces_on_other_mesh(shapes.lam, model, other)
+    return replace(moved, x=x)
 
 
 def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:

@@ -18,7 +18,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
-from dlo_casadi.model.contact import DEPTH, Contact, Touching
+from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.mapped import Mapped
@@ -60,12 +60,12 @@ class Assembly:
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self._functions: dict[str, Mapped] = {}
-        self._depth = DEPTH
+        self.depth, self._outwards = DEPTH, outwards(model)
 
     def softened(self, depth: float) -> Assembly:
         """The same with softer obstacles, see `contact.DEPTH`."""
         other = copy(self)
-        other._depth = depth
+        other.depth = depth
         return other
 
     def __getstate__(self) -> dict[str, Any]:
@@ -128,16 +128,8 @@ class Assembly:
         def advances(lam: FloatArray) -> FloatArray:
             return self._under(lam, "segment_curve", shapes, given)[0][:, :, :d, 0]
 
-        start, offsets = given.poses[:, :d], self.offsets(given.p)
-        return Touching.of(self.model, shapes.lam, start, offsets, self._depth, advances)
-
-    def offsets(self, p: FloatArray) -> FloatArray:
-        """How far surfaces are outwards of the declared ones (m, surfaces) [m]."""
-        return np.zeros((len(p), len(self.model.surfaces)))
-
-    def offsets_along(self, p: FloatArray) -> FloatArray:
-        """Change (m, surfaces, q) [m] of `offsets` along parameters (m, n_parameters, q)."""
-        return np.zeros((len(p), len(self.model.surfaces), p.shape[2]))
+        start, offsets = given.poses[:, :d], given.p @ self._outwards.T
+        return Touching.of(self.model, shapes.lam, start, offsets, self.depth, advances)
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, of (m, n_nodes, k, ...)."""
@@ -257,7 +249,7 @@ class Assembly:
         total = self._added(changed, at_ends)
         if touching:
             moved = changed[:, :, self._pull]
-            total = touching.along(total, moved, self.offsets_along(along.p))
+            total = touching.along(total, moved, self._outwards @ along.p)
         for slip, (more, less) in self.slipped(given, along):
             change = self.imbalance(shapes, more) - self.imbalance(shapes, less)
             total = total + Vector(change.x * slip[:, None, None], change.y * slip[:, None])

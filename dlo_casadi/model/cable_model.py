@@ -431,6 +431,7 @@ class Tolerances:
     moment_bias: float = 2e-3
     clip: float = 2e-4
     slip: float = 5e-4
+    obstacle: float = 5e-4
 
     def deviation(self, model: CableModel) -> FloatArray:
         """Standard deviations of a model's `deviation_names`; infinite for unknown forces."""

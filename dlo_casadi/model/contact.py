@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.effects import ContactEffect
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
@@ -330,6 +331,25 @@ def _inwards(force: FloatArray, h: float) -> float:
     root = b * b - 4 * a * c
     x = -2 * c / (b + np.sqrt(root)) if root > 0 and b > 0 else 3 * h
     return float(np.clip(3 * h - x, -h, 2 * h))
+
+
+def outwards(model: CableModel) -> FloatArray:
+    """Moves (surfaces, n_parameters) [m] of the surfaces outwards, per unit of parameters."""
+    found = np.zeros((len(model.surfaces), len(model.parameters)))
+    for effect in model.effects:
+        if isinstance(effect, ContactEffect) and effect.obstacle < len(found):
+            (parameter,) = effect.parameters(model.cable)
+            column = model.names.index(f"{effect.label}.{parameter.name}")
+            found[effect.obstacle, column] = 1.0
+    return found
+
+
+def forces_on_other_mesh(lam: FloatArray, model: CableModel, other: CableModel) -> FloatArray:
+    """Sizes (m, K) [N] of the forces on obstacles at another mesh's nodes: as many per length."""
+    old, new = (one.chain.h * (np.arange(_count(one)) + 1) for one in (model, other))
+    sizes = np.maximum(lam[:, model.n_lam :], 0.0).reshape((-1, _count(model)))
+    there = [np.interp(new, old, row, 0.0, 0.0) for row in sizes]
+    return np.array(there).reshape((len(lam), -1)) * (other.chain.h / model.chain.h)
 
 
 def _count(model: CableModel) -> int:

@@ -173,9 +173,10 @@ def first_mesh(model: CableModel) -> int:
     """Number of elements on which stiffnesses and shapes are searched for.
 
     Cables bend sharply at saddles and eyelets: on 10 elements, of a cable in space through one of
-    each, the true parameters leave twice what they leave on 20.
+    each, the true parameters leave twice what they leave on 20. A stretch that lies on an obstacle
+    ends at nodes.
     """
-    more = sum(kind != "pinned" for kind in model.clips)
+    more = sum(kind != "pinned" for kind in model.clips) + 2 * bool(model.surfaces)
     return FIRST_MESH // len(model.node.curvatures) * (2 + more) // 2
 
 

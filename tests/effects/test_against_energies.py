@@ -507,8 +507,8 @@ def test_the_rest_shape_that_a_pose_leaves_behind(name, where):
 
 
 def test_every_effect_meets_its_formula():
-    of_clips = {"clip_offset", "clip_slip"}  # see tests/test_clips.py
-    assert {*MECHANICAL, *IMAGES, *STATES, "sensor_bias", *of_clips} == set(ALL)
+    others = {"clip_offset", "clip_slip", "obstacle_offset"}  # see tests/test_clips.py, _contact.py
+    assert {*MECHANICAL, *IMAGES, *STATES, "sensor_bias", *others} == set(ALL)
 
 
 # ---- section laws, whatever the element --------------------------------------------------------

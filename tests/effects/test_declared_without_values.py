@@ -14,6 +14,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import REACTIONS
+from dlo_casadi.rod.obstacles import Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 LENGTH, NOISE, N = 0.6, 3e-4, 5
@@ -52,6 +53,7 @@ STRONG = {
     "end_offset": {"dx": 0.04, "dy": -0.05, "dz": 0.03},
     "clip_offset": {"dx": 0.03, "dy": -0.02, "dz": 0.02},
     "clip_slip": {"ds": 0.03},
+    "obstacle_offset": {"offset": 0.03},
     "rest_curvature_drift": {"rate": 0.4},
     "plastic_set": {"yield_curvature": 2.0, "share": 0.6},
     "image_scale": {"factor": 1.1},
@@ -113,7 +115,10 @@ def test_a_fit_stays_finite(name, where, has):
         held_at = [HeldClip("pinned", place, 0.45 * LENGTH) for place in middles]
         poses = [replace(pose, clips=(x,)) for pose, x in zip(poses, held_at, strict=True)]
     n = 2 * N if clips else N  # each span needs its own
-    plain = CableModel(cable, n, "arc", held, held, gravity, n_rest=3, clips=clips)
+    up = (0.0,) * (len(gravity) - 1) + (1.0,)
+    table = (Plane(tuple(-0.1 * x for x in up), up),) if name == "obstacle_offset" else ()
+    between = {"clips": clips, "obstacles": table}
+    plain = CableModel(cable, n, "arc", held, held, gravity, n_rest=3, **between)
     model = plain.with_effect(effect)
     p = model.nominal.copy()
     if has:
