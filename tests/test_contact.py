@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_casadi.cable.held import among
 from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, ObstacleOffset
@@ -154,6 +155,20 @@ def test_an_obstacle_that_is_elsewhere():
     too_high = replace(HELD_IN_SPACE, end=(0.7, 0.1, -0.268))
     with pytest.raises(EquilibriumError, match=r"end .* is 0\.00\d\d m inside ramp"):
         solve_equilibrium(model, p, np.zeros(model.chain.n_rests), too_high)
+
+
+def test_an_offset_of_the_session_does_not_move_other_obstacles():
+    """A fitted cable among obstacles that are handed over: they are where they are declared."""
+    moved = CableModel(LOOM, 20, n_rest=0, gravity=(0, 0, -9.81), effects=(ObstacleOffset(),))
+    p = moved.nominal + np.eye(len(moved.names))[-1] * 0.01
+    found = among(moved, p, [{"kind": "plane", "point": [0, 0, -0.2], "normal": [0, 0, 1]}])
+    plain = CableModel(LOOM, 20, n_rest=0, gravity=(0, 0, -9.81), obstacles=found["model"].surfaces)
+    rest, pose = np.zeros(plain.chain.n_rests), HeldPose((0.0, 0.0, 0.0), (0.7, 0.1, 0.0))
+    one = solve_equilibrium(found["model"], found["p"], rest, pose)
+    other = solve_equilibrium(plain, plain.nominal, rest, pose)
+    assert one.contacts
+    assert one.energy == pytest.approx(other.energy, rel=1e-12)
+    assert found["p"][:-1] == pytest.approx(p[:-1], abs=0.0)
 
 
 def test_a_fit_finds_where_the_table_is():

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve, curves_of
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
-from dlo_casadi.cable.held import check_mesh, held_pose, held_surfaces, reaction_texts, side_texts
+from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
@@ -146,8 +146,8 @@ class FittedCable(CasadiCable):
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         pose = held_pose(self.model, self.metadata.fixtures, asked | {"clips": list(clips)})
         held = self.with_clips([clip.kind for clip in pose.clips])
-        if surfaces := held_surfaces(self.model, obstacles):
-            held = replace(held, model=replace(held.model, obstacles=surfaces))
+        if obstacles:
+            held = replace(held, **among(held.model, held.p, obstacles))
         return held._solved(pose)
 
     def _solved(self, pose: HeldPose) -> "Shape":

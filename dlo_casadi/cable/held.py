@@ -20,9 +20,8 @@ from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
-from dlo_casadi.model.contact import Contact
+from dlo_casadi.model.contact import Contact, outwards
 from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.rod.obstacles import Obstacle as Surface
 from dlo_casadi.show.text import millimetres, vector
 
 # Whether in space -> key of a clamp's direction, unit, the other dimension's key, words, a place.
@@ -114,10 +113,12 @@ def reaction_texts(
     return rows + clip_texts(pose.clips, found.clips) + contact_texts(found.contacts)
 
 
-def held_surfaces(
-    model: CableModel, obstacles: Sequence[Obstacle | Mapping[str, Any]]
-) -> tuple[Surface, ...]:
-    """Obstacles for the statics, checked as those of a session.
+def among(
+    model: CableModel, p: FloatArray, obstacles: Sequence[Obstacle | Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Model and parameters `p` of a cable among obstacles, checked as those of a session.
+
+    They are where they are declared: an `obstacle_offset` is of the session's own.
 
     Raises
     ------
@@ -127,7 +128,9 @@ def held_surfaces(
     listed = [x if isinstance(x, Obstacle) else Obstacle(**x) for x in obstacles]
     if wrong := [x.message for x in obstacle_problems(listed, model.node.dimension)]:
         raise DloError("; ".join(wrong))
-    return tuple(item.surface(k) for k, item in enumerate(listed, start=1))
+    surfaces = tuple(item.surface(k) for k, item in enumerate(listed, start=1))
+    model = replace(model, obstacles=surfaces)
+    return {"model": model, "p": np.where(outwards(model).any(axis=0), model.nominal, p)}
 
 
 def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, Any]) -> HeldPose:

@@ -55,8 +55,9 @@ RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
 # these that a given start skips, so that it stays on its side; maximum number of steps of each.
 SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
-# Share taken of a step that is hardly shorter than the one before, and their ratio from which on it
-# is: contacts that change to and fro make steps of one size; after half a step follows the other.
+# Contacts that change to and fro make steps of one size: of a step that is longer than SAME_SIZE
+# times the one before, the share SHORTER is taken. What is left of it is the next step, so that the
+# ratio has to be more than a half.
 SHORTER, SAME_SIZE = 0.5, 0.75
 # Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8

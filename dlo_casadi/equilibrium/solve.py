@@ -81,8 +81,9 @@ def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str]
     """Why obstacles leave no equilibrium, and what to try: a fixture is inside of one."""
     held = [("start", pose.start), *((clip.name, clip.place) for clip in pose.clips)]
     held += [("end", pose.end)] if pose.end is not None else []
+    offsets = outwards(model) @ p if model.surfaces else ()
     for name, place in held:
-        for obstacle, offset in zip(model.surfaces, outwards(model) @ p, strict=True):
+        for obstacle, offset in zip(model.surfaces, offsets, strict=True):
             depth = offset - float(obstacle.near(np.array(place)).distance)
             if depth > 0:
                 at = ", ".join(f"{x:.4f}" for x in place)
