@@ -79,7 +79,7 @@ def test_every_effect_of_the_cable_has_values():
     in_plane = {n: e for n, e in EFFECTS.items() if 2 in e.dimensions}
     of_the_cable = {n for n, e in in_plane.items() if not issubclass(e, MeasurementEffect)}
     refused = {n for n, e in EFFECTS.items() if issubclass(e, Load) and e.n_springs}
-    refused |= {"clip_offset", "clip_slip", "obstacle_offset"}  # of what is refused
+    refused |= {"clip_offset", "clip_slip", "obstacle_offset"}  # of clips and obstacles
     assert set(VALUES) == of_the_cable - refused
 
 
