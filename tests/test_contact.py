@@ -17,10 +17,12 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.start import begin
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.obstacles import Capsule, Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 
 LENGTH, WEIGHT, EI, RADIUS = 1.0, 1.0, 0.02, 0.003  # m, N, N m^2, m
 CABLE = CableData(LENGTH, WEIGHT / 9.81, 2 * RADIUS, EI)
@@ -189,6 +191,11 @@ def test_a_fit_finds_where_the_table_is():
     fit = fit_model(model, measured, Tolerances(), 1e-4)
     # A point force of half the weight sinks in by 5e-5 lengths in a fit.
     assert fit.p == pytest.approx(true, rel=2e-3, abs=5e-5)
+    # The relaxed start, from a stiffness more than three times too large.
+    stiff = fit.problem.unknowns.pack(model.nominal * [5.0, 1.0], np.zeros(0))
+    loose = replace(fit.problem, noise=NoiseModel(1e-3, source="declared"), weights=())
+    problem, begun = begin(loose, stiff)
+    assert problem.unknowns.p(begun.theta) == pytest.approx(true, rel=0.02, abs=1e-4)
 
 
 def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():

@@ -26,7 +26,8 @@ from scipy.optimize import lsq_linear
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.estimation.problem import NO_INFORMATION, Normal, Problem, Values
-from dlo_casadi.model.assembly import Inputs, Tangents
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
+from dlo_casadi.model.contact import gap_per_force
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.band import Vector
 
@@ -36,6 +37,10 @@ SOFTNESS = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 # Error of an end condition that weighs as much as a unit of the balance, in lengths or [rad]. With
 # 1e-5 instead, whatever the softness, steps were refused because the conditions are curved.
 END = 1 / 30
+# Gap [lengths] that counts as much as a force of the weight in whether a node touches: with 0.01 and
+# 0.03 three fits of cables on planes reach the noise, with 0.3 one does not. Rounding of the corner
+# between both [lengths].
+AT_A_DISTANCE, SHARP = 0.03, 1e-9
 # Longest step of a node [rad]; largest change of the logarithm of a stiffness in one step.
 LONGEST, LARGEST = 0.7, 1.0
 # First and smallest damping of the nodes [1/rad]; share of it for the unknowns of the fit.
@@ -44,6 +49,21 @@ FIRST_DAMPING, LEAST_DAMPING, OF_UNKNOWNS = 1.0, 0.1, 0.01
 REFUSED = 6
 # Maximum number of iterations at each softness; relative decrease below which they end.
 STEPS, CONVERGED = 20, 5e-3
+
+
+@dataclass(frozen=True)
+class _Linearized:
+    """Rows of a Gauss-Newton step by a pose's own unknowns, theta, and last their target.
+
+    Parameters
+    ----------
+    poses : list of (n_j, own + size + 1)
+        Of each pose; the balance of forces first, its rows in the order of the unknowns.
+    prior : (size, size + 1)
+    """
+
+    poses: list[FloatArray]
+    prior: FloatArray
 
 
 @dataclass(frozen=True)
@@ -104,13 +124,49 @@ class Relaxation:
         moments = model.chain.h / np.exp(self._stiffness(p)[0])
         return np.concatenate([moments, border]) / self.softness
 
+    # ---- contact -----------------------------------------------------------------------------
+
+    @cached_property
+    def _assembly(self) -> Assembly:
+        """In which forces of obstacles are felt wherever they are."""
+        return self.problem.equilibria.assembly.felt_everywhere()
+
+    @cached_property
+    def _contacts(self) -> slice:
+        """Rows of the conditions of contacts."""
+        nodes, border = self._counts[:2]
+        return slice(nodes + self.problem.unknowns.model.n_lam, border)
+
+    def _complementarity(
+        self, left: FloatArray, shapes: Shapes
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What gaps g >= 0 and forces f >= 0 leave of f g = 0: (m, K) [m].
+
+            sqrt(g^2 + (c f)^2) - g - c f
+
+        It has a slope where neither holds, so that a force may grow at a distance. Its derivatives
+        along -g and f follow. `left`: the rows of all conditions, those of contacts -g.
+
+        References
+        ----------
+        Fischer, Optimization 24 (1992).
+        """
+        model = self.problem.unknowns.model
+        per_force, gap = gap_per_force(model, AT_A_DISTANCE), -left[:, self._contacts]
+        force = per_force * shapes.lam[:, model.n_lam :]
+        root = np.sqrt(gap**2 + force**2 + (SHARP * model.cable.length) ** 2)
+        return root - gap - force, 1 - gap / root, per_force * (force / root - 1)
+
     # ---- evaluation --------------------------------------------------------------------------
 
     def objectives(self, values: Values) -> tuple[FloatArray, float]:
         """Twice the objective: what each pose (m,) has in it, and the prior."""
         problem = self.problem
         shapes, p, _ = state = problem.state(values)
-        left = problem.equilibria.imbalance(*state).rows[:, :, 0] * self._weights(p)
+        given = problem.equilibria.given(*state)
+        left = self._assembly.imbalance(shapes, given).rows[:, :, 0]
+        left[:, self._contacts] = self._complementarity(left, shapes)[0]
+        left *= self._weights(p)
         own = shapes.deviation[:, problem.equilibria.used_deviations] / problem.deviation_std
         each = (left**2).sum(axis=1) + (own**2).sum(axis=1)
         seen = problem.observed(values)
@@ -127,7 +183,7 @@ class Relaxation:
 
     def normal(self, values: Values) -> Normal:
         """Gauss-Newton normal equations of theta, all of the poses' own unknowns eliminated."""
-        rows = self._reduced(values, 0.0).shared
+        rows = self._reduced(self._linearized(values), 0.0).shared
         return Normal(rows[:, :-1].T @ rows[:, :-1], -rows[:, :-1].T @ rows[:, -1], [])
 
     def _along(self, values: Values, given: Inputs) -> Tangents:
@@ -168,41 +224,58 @@ class Relaxation:
         slope = unknowns.slopes(values.theta)[bending] / unknowns.p(values.theta)[bending]
         return np.concatenate([np.zeros(self._counts[2]), slope])
 
-    def _reduced(self, values: Values, damping: float, fixed: BoolArray | None = None) -> _Reduced:
-        """Orthogonal elimination of the poses' own unknowns."""
+    def _linearized(self, values: Values) -> _Linearized:
+        """Derivatives and residuals of all that the objective holds."""
         problem = self.problem
         equilibria, size = problem.equilibria, problem.unknowns.size
         nodes, border, own, _ = self._counts
-        free = np.ones(size, dtype=bool) if fixed is None else ~fixed
-        kept = np.concatenate([np.ones(own, dtype=bool), free])
         state = problem.state(values)
         given = equilibria.given(*state)
         along = self._along(values, given)
-        _, force, matrix = equilibria.assembly.balance(values.shapes, given)
+        _, force, matrix = self._assembly.balance(values.shapes, given)
         still = replace(along, x=np.zeros_like(along.x), lam=np.zeros_like(along.lam))
-        rows = equilibria.assembly.imbalance_by(values.shapes, given, still).rows
+        rows = self._assembly.imbalance_by(values.shapes, given, still).rows
         tangent = matrix.dense()
         rows[:, :, :nodes] += tangent[:, :, :nodes]
         rows += tangent[:, :, nodes:] @ along.lam
         weights, left = self._weights(state[1]), force.rows[:, :, 0]
+        at = self._contacts
+        left[:, at], by_gap, by_size = self._complementarity(left, values.shapes)
+        rows[:, at] *= by_gap[..., None]
+        rows[:, at] += by_size[..., None] * along.lam[:, at.start - nodes :]
         scaled = self._stiffness(state[1])[1] @ problem.unknowns.slopes(values.theta)
         rows[:, :nodes, own:] -= left[:, :nodes, None] * scaled
         rows, left = rows * weights[:, None], left * weights
         std, used = problem.deviation_std, equilibria.used_deviations
         prior = np.eye(len(std), own + size, border) / std[:, None]
-        damped = np.eye(border, own + size) * max(damping, NO_INFORMATION)
-        damped[nodes:] *= NO_INFORMATION
         data = dict(zip(problem.used, self._data(values, along), strict=True))
-        triangles, shared = [], []
+        stacked = []
         for j in range(equilibria.m):
             parts = [(rows[j], left[j]), (prior, values.shapes.deviation[j, used] / std)]
-            parts += [(damped, np.zeros(border))] + ([data[j]] if j in data else [])
-            stacked = np.concatenate([np.column_stack([a[:, kept], -e]) for a, e in parts])
+            parts += [data[j]] if j in data else []
+            stacked.append(np.concatenate([np.column_stack([a, -e]) for a, e in parts]))
+        root, gap = self._prior, values.theta - problem.mean
+        return _Linearized(stacked, np.column_stack([root, -root @ gap]))
+
+    def _reduced(
+        self,
+        linearized: _Linearized,
+        damping: float,
+        fixed: BoolArray | None = None,
+    ) -> _Reduced:
+        """Orthogonal elimination of the poses' own unknowns."""
+        nodes, border, own, q = self._counts
+        free = np.ones(q - own, dtype=bool) if fixed is None else ~fixed
+        kept = np.concatenate([np.ones(own, dtype=bool), free, [True]])
+        damped = np.eye(border, q + 1) * max(damping, NO_INFORMATION)
+        damped[nodes:] *= NO_INFORMATION
+        triangles, shared = [], []
+        for rows in linearized.poses:
+            stacked = np.concatenate([rows, damped])[:, kept]
             triangle: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
             triangles.append(triangle[:own])
             shared.append(triangle[own:, own:])
-        root, gap = self._prior, values.theta - problem.mean
-        shared.append(np.column_stack([root[:, free], -root @ gap]))
+        shared.append(linearized.prior[:, np.append(free, True)])
         more = OF_UNKNOWNS * damping * np.eye(int(free.sum()))
         shared.append(np.column_stack([more, np.zeros(len(more))]))
         left_over: FloatArray = np.asarray(np.linalg.qr(np.concatenate(shared), mode="r"))
@@ -233,9 +306,10 @@ class Relaxation:
         damping, least = FIRST_DAMPING, self.objective(values)
         for _ in range(steps):
             found, reached = values, np.inf
+            linearized = self._linearized(values)
             for _ in range(REFUSED):
                 try:
-                    found = self._stepped(values, damping, fixed)
+                    found = self._stepped(values, linearized, damping, fixed)
                     reached = self.objective(found)
                 except np.linalg.LinAlgError:
                     reached = np.inf
@@ -250,13 +324,14 @@ class Relaxation:
                 break
         return values
 
-    def _stepped(self, values: Values, damping: float, fixed: BoolArray | None) -> Values:
+    def _stepped(
+        self, values: Values, linearized: _Linearized, damping: float, fixed: BoolArray | None
+    ) -> Values:
         """Values after a damped step within reach."""
-        problem = self.problem
+        problem, reduced = self.problem, self._reduced(linearized, damping, fixed)
         unknowns, equilibria = problem.unknowns, problem.equilibria
         nodes, border, own, _ = self._counts
         free = np.ones(unknowns.size, dtype=bool) if fixed is None else ~fixed
-        reduced = self._reduced(values, damping, fixed)
         lower, upper = unknowns.reach(values.theta, LARGEST)
         step = np.zeros(unknowns.size)
         lower, upper = lower - values.theta, upper - values.theta

@@ -60,12 +60,18 @@ class Assembly:
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self._functions: dict[str, Mapped] = {}
-        self.depth, self._outwards = DEPTH, outwards(model)
+        self.depth, self.everywhere, self._outwards = DEPTH, False, outwards(model)
 
     def softened(self, depth: float) -> Assembly:
         """The same with softer obstacles, see `contact.DEPTH`."""
         other = copy(self)
         other.depth = depth
+        return other
+
+    def felt_everywhere(self) -> Assembly:
+        """The same where forces of obstacles are felt whatever the gaps."""
+        other = copy(self)
+        other.everywhere = True
         return other
 
     def __getstate__(self) -> dict[str, Any]:
@@ -129,7 +135,8 @@ class Assembly:
             return self._under(lam, "segment_curve", shapes, given)[0][:, :, :d, 0]
 
         start, offsets = given.poses[:, :d], given.p @ self._outwards.T
-        return Touching.of(self.model, shapes.lam, start, offsets, self.depth, advances)
+        soft = self.depth, self.everywhere
+        return Touching.of(self.model, shapes.lam, start, offsets, *soft, advances)
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, of (m, n_nodes, k, ...)."""

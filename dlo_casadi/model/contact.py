@@ -112,13 +112,15 @@ class Touching:
         start: FloatArray,
         offsets: FloatArray,
         depth: float,
+        everywhere: bool,
         advances: Callable[[FloatArray], FloatArray],
     ) -> Touching:
         """Which nodes touch.
 
         `advances`: those of the segments (m, n, d) [m] under forces (m, n, n_lam). The forces on
         obstacles bend the segments, and round surfaces turn these forces: gaps are found by
-        fixed-point iteration, first under all that push.
+        fixed-point iteration, first under all that push. `everywhere`: forces are felt whatever the
+        gaps.
         """
         m, d = start.shape
         count, sizes = model.n_contacts, border[:, model.n_lam :]
@@ -128,9 +130,9 @@ class Touching:
             np.full((m, count), np.inf),
         )
         found = cls(model, border, start, offsets, depth, *nowhere, np.zeros((m, count), bool))
-        for touching in (sizes > 0, None):
+        for touching in (np.ones_like(sizes, dtype=bool),) if everywhere else (sizes > 0, None):
             active = (
-                sizes * _per_force(model, BALANCED) > found.gap if touching is None else touching
+                sizes * gap_per_force(model, BALANCED) > found.gap if touching is None else touching
             )
             for _ in range(LOOKS):
                 before, now = found.gap, replace(found, active=active)
@@ -192,7 +194,7 @@ class Touching:
     @property
     def softness(self) -> FloatArray:
         """Gap per force (m, K) [m/N] of active contacts, and of others the row's own scale."""
-        depth, balanced = (_per_force(self.model, size) for size in (self.depth, BALANCED))
+        depth, balanced = (gap_per_force(self.model, size) for size in (self.depth, BALANCED))
         return np.where(self.active, depth, balanced)
 
     def _near(self, advances: FloatArray) -> Surface:
@@ -357,8 +359,8 @@ def _count(model: CableModel) -> int:
     return model.n_contacts // len(model.surfaces)
 
 
-def _per_force(model: CableModel, gap: float) -> float:
-    """A gap [m/N] in lengths for a force as large as the cable's weight and bending forces."""
+def gap_per_force(model: CableModel, gap: float) -> float:
+    """A gap in lengths for a force as large as the cable's weight and bending forces, [m/N]."""
     cable = model.cable
     weight = cable.mass * float(np.linalg.norm(model.gravity))
     return gap * cable.length / (weight + cable.bending_stiffness / cable.length**2)
