@@ -37,7 +37,7 @@ SOFTNESS = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 # Error of an end condition that weighs as much as a unit of the balance, in lengths or [rad]. With
 # 1e-5 instead, whatever the softness, steps were refused because the conditions are curved.
 END = 1 / 30
-# Gap [lengths] that counts as much as a force of the weight in whether a node touches: with 0.01 and
+# Gap [lengths] that counts as much as a force of the weight in whether a node touches: with 0.01 or
 # 0.03 three fits of cables on planes reach the noise, with 0.3 one does not. Rounding of the corner
 # between both [lengths].
 AT_A_DISTANCE, SHARP = 0.03, 1e-9
