@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -245,8 +245,9 @@ class SearchSettings:
 
     @classmethod
     def of(cls, model: CableModel) -> SearchSettings:
-        """How it is done for a model."""
-        return IN_SPACE if model.in_space else IN_PLANE
+        """How it is done for a model; beside obstacles a prediction takes seconds a pose."""
+        found = IN_SPACE if model.in_space else IN_PLANE
+        return replace(found, decades=1, predicts=False) if model.surfaces else found
 
 
 # other_minima: of 26 sessions in the plane 16 left less; no second search led elsewhere there.

@@ -10,8 +10,11 @@ import cv2
 import numpy as np
 
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
+from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.session import run_session
+from dlo_casadi.session.fitting import declared_model
+from dlo_casadi.session.measure import measured_poses, read_inputs
 
 BENCH = Path(__file__).resolve().parents[2] / "tests" / "data" / "bench"
 CONFIG = "session.yaml"
@@ -65,6 +68,73 @@ def centerline_session(name: str, poses: int, **model: Any) -> Session:
         head, *lines = (BENCH / name / pose["file"]).read_text().splitlines()
         files[pose["file"]] = ("\n".join([head, *lines[::_THINNED]]) + "\n").encode()
     return Session(document, files)
+
+
+def obstructed_session(folder: Path, in_space: bool) -> Session:
+    """Two poses of a cable through a clip and over obstacles, with limits; shapes as predicted."""
+
+    def place(x: float, height: float) -> list[float]:
+        return [x, 0.0, height] if in_space else [x, height]
+
+    # Quarter turns about the y axis: out of the ground, and into it.
+    up, down = ([0.0, 0.5**0.5 * sign, 0.0, 0.5**0.5] for sign in (-1.0, 1.0))
+    directions = (
+        ({"start_orientation": up, "end_orientation": down, "turns": 0}) if in_space else {}
+    )
+    poses = [
+        {
+            "file": f"pose_0{k + 1}.csv",
+            "start": place(0.0, 0.0),
+            "end": place(end, 0.02),
+            **directions,
+            "clips": [
+                {"name": "first", "kind": "pinned", "at": 0.12, "place": place(0.07, 0.09)},
+                {"kind": "eyelet", "place": place(0.2, 0.09)},
+            ],
+            "role": "fit",
+        }
+        for k, end in enumerate((0.27, 0.3))
+    ]
+    kind = "clamped" if in_space else "pinned"
+    plane = {"kind": "plane", "point": place(0.0, -0.05), "normal": place(0.0, 1.0)}
+    bar = {"kind": "capsule", "a": place(0.3, 0.15), "b": place(0.4, 0.2), "radius": 0.01}
+    document = {
+        "cable": {
+            "name": "obstructed",
+            "length": 0.45,
+            "mass": 0.03,
+            "diameter": 0.005,
+            "bending_stiffness": 0.01,
+            **({"torsional_stiffness": 0.008} if in_space else {}),
+        },
+        "experiment": {
+            "gravity": place(0.0, -9.81),
+            "boundary": {"start": kind, "end": kind},
+            "measurement": {"kind": "centerlines", "std": 3.0e-4},
+            "tolerances": {"clip": 1e-3, "slip": 1e-3, "obstacle": 5e-4},
+            "obstacles": [{"name": "table", **plane}, {"name": "bar", **bar}],
+            "poses": poses,
+        },
+        "model": {"n": _MESH},
+        "estimation": {"plausibility": False},
+        "diagnosis": {"enabled": False},
+        "limits": {"bend_radius": 0.02, "force": 8.0},
+    }
+    header = "x_m,y_m,z_m" if in_space else "x_m,y_m"
+    straight = np.array([place(x, 0.0) for x in (0.1, 0.2)])
+    files = {pose["file"]: _lines(header, straight) for pose in poses}
+    config = load_config(Session(document, files).write(folder))
+    model = declared_model(config).model
+    held = [item.pose for item in measured_poses(config, read_inputs(config, lambda *_: None))]
+    shapes = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), held)
+    shown = [found.curve.at(np.linspace(0.02, 0.43, 12)) for found in shapes]
+    files = {name: _lines(header, points) for name, points in zip(files, shown, strict=True)}
+    return Session(document, files)
+
+
+def _lines(header: str, points: np.ndarray) -> bytes:
+    rows = (",".join(f"{x:.6f}" for x in point) for point in points)
+    return ("\n".join([header, *rows]) + "\n").encode()
 
 
 def photograph_session(with_board: bool) -> Session:
@@ -142,6 +212,11 @@ def make_bases(folder: Path) -> Bases:
     pinned = centerline_session("short_clean", 3, effects=effects)
     held = centerline_session("held_headings", 3, effects=["stiff_section"])
     free = centerline_session("overhang", 2, effects=["end_spring", "rest_curvature_drift"])
+    obstructed = []
+    for in_space in (False, True):
+        place = folder / f"obstructed_{in_space}"
+        place.mkdir()
+        obstructed.append(obstructed_session(place, in_space))
     small = (
         centerline_session("short_clean", 2, effects=effects[:1]),
         centerline_session("overhang", 2, element="arc"),
@@ -156,7 +231,7 @@ def make_bases(folder: Path) -> Bases:
         (place / "parameters.yaml").write_text(parameters_text(outcome), encoding="utf-8")
         parameters.append(read_yaml(place / "parameters.yaml"))
     return Bases(
-        (pinned, held, free),
+        (pinned, held, free, *obstructed),
         (photograph_session(False), photograph_session(True)),
         small,
         tuple(parameters),
