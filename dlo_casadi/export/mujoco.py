@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.export.relax import Relaxed, relax
+from dlo_casadi.export.common import Relaxed, relax
 from dlo_casadi.export.rod import Fixture, Rod
 
 # Time step [s], and damping of a joint over its stiffness [s], which nobody has measured.
@@ -174,7 +174,6 @@ def settle(text: str, rod: Rod) -> Relaxed:
     data = mj.MjData(model)
     mj.mj_resetDataKeyframe(model, data, 0)
     links = [model.body(f"cable_{k}").id for k in range(len(rod.masses))]
-    before = 0.0
 
     def advance(many: int) -> FloatArray:
         if many:
@@ -183,15 +182,13 @@ def settle(text: str, rod: Rod) -> Relaxed:
         ahead = data.xmat[links[-1]].reshape(3, 3)[:, 0]
         return np.vstack([data.xpos[links], data.xpos[links[-1]] + rod.h * ahead])
 
-    def halt() -> None:
-        nonlocal before
+    def energy() -> float:
         mj.mj_energyVel(model, data)
-        now = float(data.energy[1])
-        if now < before:
-            data.qvel[:] = 0.0
-            now = 0.0
-        before = now
+        return float(data.energy[1])
 
-    nodes, seconds = relax(advance, halt, model.opt.timestep, "MuJoCo")
+    def halt() -> None:
+        data.qvel[:] = 0.0
+
+    nodes, seconds = relax(advance, energy, halt, model.opt.timestep, "MuJoCo")
     on_cable = data.efc_force[data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY][:3]
     return Relaxed(nodes, -on_cable if len(on_cable) else np.zeros(3), seconds)

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.export.relax import Relaxed, relax
+from dlo_casadi.export.common import Relaxed, array, head_of_python, relax
 from dlo_casadi.export.rod import Rod
-from dlo_casadi.export.text import array, head_of_python
 
 # Moduli [Pa] of the softest cable in Newton's example cable_twist: 100 N m/rad each 0.1 m, r 20 mm.
 DEFAULT = (8e7, 4e7)
@@ -84,6 +83,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     """The rod as a Python file: `add_cable(builder)`, `make_model()`."""
     masses, stiff = rod.link_masses, rod.inextensible(STIFF)
     rest_nodes, rest_frames = rod.unloaded
+    step, inertia = rod.explicit(masses, stiff, _COURANT)
     sides = [(rod.start, 0, -1), (rod.end, -1, 1)]
     pinned = [(end, side) for fixture, end, side in sides if fixture.kind == "pinned"]
     numbers = [
@@ -92,8 +92,8 @@ def write(rod: Rod, head: Sequence[str]) -> str:
         ("GRAVITY", array(rod.gravity), "[m/s^2]"),
         ("EA", f"{min(rod.axial, stiff):.9g}", "[N]"),
         ("GA", f"{stiff:.9g}", "[N], so stiff that shear does not matter"),
-        ("INERTIA", f"{_inertia(rod):.9g}", "of a link [kg m^2], raised for STEP"),
-        ("STEP", f"{time_step(rod):.6g}", "time step [s]: not larger, see above"),
+        ("INERTIA", f"{inertia:.9g}", "of a link [kg m^2], raised for STEP"),
+        ("STEP", f"{step:.6g}", "time step [s]: not larger, see above"),
         ("ITERATIONS", f"{ITERATIONS}", "of the solver in a step, or more"),
         ("CLAMPED", str([end for f, end, _ in sides if f.kind == "clamped"]), ""),
         ("PINNED", str(pinned), "node, and side of its link"),
@@ -107,20 +107,6 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     ]
     libraries = ["newton", "numpy as np", "warp as wp"]
     return head_of_python(head, libraries, numbers) + _BODY
-
-
-def time_step(rod: Rod) -> float:
-    """Time step [s] at which a cable rests where it should."""
-    stiff = rod.inextensible(STIFF)
-    return float(_COURANT * np.sqrt(rod.link_masses[1:-1].min() * rod.h / stiff))
-
-
-def _inertia(rod: Rod) -> float:
-    """As of a link about its end, and slow enough for the step in bending, twist and shear."""
-    fastest = rod.inextensible(STIFF) * rod.h
-    fastest += 4 * max(float(rod.bending.max()), float(rod.torsion.max())) / rod.h
-    slow = fastest * (time_step(rod) / _COURANT) ** 2 / 4
-    return float(max(rod.link_masses.mean() * rod.h**2 / 3, slow))
 
 
 def settle(text: str, rod: Rod) -> Relaxed:
@@ -148,10 +134,11 @@ def settled(model: Any, rod: Rod, name: str) -> Relaxed:
     import newton
     import warp as wp
 
-    step = time_step(rod)
+    stiff = rod.inextensible(STIFF)
+    step, _ = rod.explicit(rod.link_masses, stiff, _COURANT)
     solver = newton.solvers.SolverVBD(model, iterations=ITERATIONS)
     states, control = [model.state(), model.state()], model.control()
-    count, before = len(rod.masses), 0.0
+    count = len(rod.masses)
 
     def two_steps() -> None:
         for one, next_one in (states, states[::-1]):
@@ -169,19 +156,14 @@ def settled(model: Any, rod: Rod, name: str) -> Relaxed:
         ends = x[:, :3] + half
         return np.vstack([x[0, :3] - half[0], ends])
 
-    def halt() -> None:
-        nonlocal before
-        now = float((states[0].body_qd.numpy()[:, :3] ** 2).sum())
-        if now < before:
-            states[0].body_qd.zero_()
-            now = 0.0
-        before = now
+    def energy() -> float:
+        return float((states[0].body_qd.numpy()[:, :3] ** 2).sum())
 
-    nodes, seconds = relax(advance, halt, step, name, _REST_SPEED)
+    halt = states[0].body_qd.zero_
+    nodes, seconds = relax(advance, energy, halt, step, name, _REST_SPEED)
     x = states[0].body_q.numpy()[count - 2 : count].astype(float)
     along = Rotation.from_quat(x[:, 3:]).apply([0.0, 0.0, 1.0])
     gap = x[1, :3] - x[0, :3] - rod.h / 2 * along.sum(axis=0)
-    stiff = rod.inextensible(STIFF)
     stretch = gap @ along[0] * along[0]
     pull = (stiff * (gap - stretch) + min(rod.axial, stiff) * stretch) / rod.h
     weight = rod.link_masses[-1] * rod.gravity

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.export.relax import Relaxed, relax
+from dlo_casadi.export.common import Relaxed, array, head_of_python, relax
 from dlo_casadi.export.rod import Fixture, Rod
-from dlo_casadi.export.text import array, head_of_python
 
 # Young's modulus and shear modulus [Pa] of PyElastica's first examples (Timoshenko beam).
 DEFAULT = (1e6, 1e4)
@@ -77,19 +76,15 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     masses = rod.lumps_at(rod.s)
     masses[1:] += rod.masses / 2
     masses[:-1] += rod.masses / 2
-    stiff, stiffest = rod.inextensible(_STIFF), float(rod.bending.max())
-    axial = min(rod.axial, stiff)
-    step = _COURANT * rod.h * np.sqrt(masses[1:-1].min() / rod.h / max(axial, stiff))
-    # As of a link about its end, and slow enough for the step in bending, twist and shear.
-    fastest = stiff * rod.h + 4 * max(stiffest, float(rod.torsion.max())) / rod.h
-    inertia = max(masses.mean() * rod.h**2 / 3, fastest * (step / _COURANT) ** 2 / 4)
+    stiff = rod.inextensible(_STIFF)
+    step, inertia = rod.explicit(masses, stiff, _COURANT)
     held = [_held(rod.start, 0, 1), _held(rod.end, -1, -2)]
     about = [rod.bending[:, 0, 0], rod.bending[:, 0, 1], rod.bending[:, 1, 1], rod.torsion]
     numbers = [
         ("H", f"{rod.h:.12g}", "length of an element [m]"),
         ("RADIUS", f"{rod.radius:.9g}", "[m]"),
         ("GRAVITY", array(rod.gravity), "[m/s^2]"),
-        ("EA", f"{axial:.9g}", "[N]"),
+        ("EA", f"{min(rod.axial, stiff):.9g}", "[N]"),
         ("GA", f"{stiff:.9g}", "[N], so stiff that shear does not matter"),
         ("INERTIA", f"{inertia:.9g}", "of an element [kg m^2], raised until STEP is stable"),
         ("STEP", f"{step:.6g}", "time step [s]"),
@@ -125,7 +120,7 @@ def settle(text: str, rod: Rod) -> Relaxed:
     simulator, cable = Simulator(), made["make_rod"]()
     made["hold"](simulator, cable)
     simulator.finalize()
-    stepper, time, before, step = ea.PositionVerlet(), 0.0, 0.0, made["STEP"]
+    stepper, time, step = ea.PositionVerlet(), 0.0, made["STEP"]
 
     def advance(many: int) -> FloatArray:
         nonlocal time
@@ -133,14 +128,13 @@ def settle(text: str, rod: Rod) -> Relaxed:
             time = stepper.step(simulator, time, step)
         return np.array(cable.position_collection.T)
 
-    def halt() -> None:
-        nonlocal before
-        now = float((cable.mass * cable.velocity_collection**2).sum())
-        if now < before:
-            cable.velocity_collection[:] = cable.omega_collection[:] = now = 0.0
-        before = now
+    def energy() -> float:
+        return float((cable.mass * cable.velocity_collection**2).sum())
 
-    nodes, seconds = relax(advance, halt, step, "PyElastica")
+    def halt() -> None:
+        cable.velocity_collection[:] = cable.omega_collection[:] = 0.0
+
+    nodes, seconds = relax(advance, energy, halt, step, "PyElastica")
     at_end = [k for k in made["HELD_NODES"] if k < 0]
     weight = np.outer(made["GRAVITY"], cable.mass[at_end])
     return Relaxed(nodes, (cable.internal_forces[:, at_end] + weight).sum(axis=1), seconds)

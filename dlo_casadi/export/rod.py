@@ -236,6 +236,19 @@ class Rod:
         buckling = 4 * np.pi**2 * self.bending.max() / (self.h * len(self.masses)) ** 2
         return float(factor * (weight + buckling))
 
+    def explicit(self, masses: FloatArray, stiff: float, courant: float) -> tuple[float, float]:
+        """Time step [s] for a stiffness EA [N] along it, and the inertia [kg m^2] of a link.
+
+        The step is `courant` times the largest that an explicit solver can take with the inner ones
+        of these masses [kg]. The inertia is that of a link about its end, or larger, so that the
+        step serves in bending, twist and shear, too.
+        """
+        largest = float(np.sqrt(masses[1:-1].min() * self.h / stiff))
+        fastest = stiff * self.h
+        fastest += 4 * max(float(self.bending.max()), float(self.torsion.max())) / self.h
+        inertia = max(float(masses.mean()) * self.h**2 / 3, fastest * largest**2 / 4)
+        return courant * largest, inertia
+
     def lumps_at(self, s: FloatArray) -> FloatArray:
         """Compact masses [kg] carried by points at arc lengths s, each by its two neighbours."""
         out = np.zeros(len(s))

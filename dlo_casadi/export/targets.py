@@ -9,7 +9,7 @@ import numpy as np
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
-from dlo_casadi.export.relax import Relaxed
+from dlo_casadi.export.common import Relaxed
 from dlo_casadi.export.rod import Feature, Rod
 
 # Text by which a written file is recognised.

@@ -10,9 +10,8 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.export import newton
-from dlo_casadi.export.relax import Relaxed
+from dlo_casadi.export.common import Relaxed, rounded
 from dlo_casadi.export.rod import Fixture, Rod
-from dlo_casadi.export.text import rounded
 
 # What the proposal assumes of a material that says nothing: E = 1 MPa, Poisson's ratio 0.3 [Pa].
 DEFAULT = (1e6, 1e6 / 2.6)

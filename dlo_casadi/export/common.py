@@ -1,6 +1,6 @@
-"""How a simulator comes to rest: the same rule for all of them."""
+"""What all simulators share: numbers in the text of their files, and how a cable comes to rest."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,29 @@ from dlo_casadi.errors import EquilibriumError
 REST_SPEED, INTERVAL = 2e-5, 0.02
 # Simulated time [s] after which it has failed.
 PATIENCE = 60.0
+
+
+def rounded(values: FloatArray) -> list:
+    """Numbers as lists, to 12 digits."""
+    plain: list = np.vectorize(lambda x: float(f"{x:.12g}"))(values).tolist()
+    return plain
+
+
+def array(values: FloatArray) -> str:
+    """An array in Python, one row a line."""
+    rows = ",\n    ".join(map(str, rounded(values)))
+    return f"np.array([\n    {rows},\n])"
+
+
+def head_of_python(
+    head: Sequence[str], imports: Sequence[str], numbers: Sequence[tuple[str, str, str]]
+) -> str:
+    """Comments, imports, and numbers: name, value, meaning."""
+    lines = [f"# {line}".rstrip() for line in head]
+    lines += ["", *(f"import {name}" for name in imports), ""]
+    for name, value, meaning in numbers:
+        lines += [f"# {meaning}"] * bool(meaning) + [f"{name} = {value}"]
+    return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +58,7 @@ class Relaxed:
 
 def relax(
     advance: Callable[[int], FloatArray],
+    energy: Callable[[], float],
     halt: Callable[[], None],
     step: float,
     name: str,
@@ -49,8 +73,10 @@ def relax(
     ----------
     advance : callable
         Makes so many steps, and returns the nodes.
+    energy : callable
+        The kinetic energy, in any unit.
     halt : callable
-        Sets all velocities to zero if the kinetic energy is smaller than at the last call.
+        Sets all velocities to zero.
     step : float [s]
     speed : float [m/s]
         Below it a node is at rest; larger for a simulator of single precision.
@@ -61,7 +87,7 @@ def relax(
         If it does not come to rest, or its numbers become infinite.
     """
     many = max(1, round(INTERVAL / step))
-    nodes, still, time = advance(0), 0, 0.0
+    nodes, still, time, last = advance(0), 0, 0.0, 0.0
     while still < 2:
         before, nodes = nodes, advance(many)
         time += many * step
@@ -72,5 +98,9 @@ def relax(
                 f"{fastest:.2g} m/s.\n  Try: fewer segments, or a pose nearer to the cable's."
             )
         still = still + 1 if fastest < speed else 0
-        halt()
+        moving = energy()
+        if moving < last:
+            halt()
+            moving = 0.0
+        last = moving
     return nodes, time
