@@ -11,6 +11,7 @@ from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.export.files import losses, samples_of, write_rods
+from dlo_casadi.export.mujoco import principal
 from dlo_casadi.export.rod import Held, Rod
 from dlo_casadi.export.targets import TARGETS, target_of
 from dlo_casadi.model.cable_model import CableModel
@@ -77,7 +78,7 @@ def test_the_rod_lies_on_the_curve(case):
 def test_what_effects_are_to_a_rod():
     rod = Rod.of(CASES["mass"](), 20)
     assert rod.lumps == pytest.approx(np.array([[MASS, PLACE]]))
-    stiffness, axes = Rod.of(CASES["flat"](), 20).principal()
+    stiffness, axes = principal(Rod.of(CASES["flat"](), 20))
     assert stiffness == pytest.approx(np.tile([0.011, 0.015, 0.045], (19, 1)))
     assert np.abs(axes.as_matrix()[:, 2, 1] / axes.as_matrix()[:, 1, 1]) == pytest.approx(
         np.tan(0.4)

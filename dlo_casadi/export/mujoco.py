@@ -72,7 +72,7 @@ def _gripper(side: str, fixture: Fixture) -> str:
 
 
 def _bodies(rod: Rod) -> list[str]:
-    stiffness, axes = rod.principal()
+    stiffness, axes = principal(rod)
     stiffness[1::2] = stiffness[1::2, ::-1]
     rest = _in_axes(rod.rest_turns, axes)
     place, frame = rod.start.offset
@@ -99,6 +99,19 @@ def _bodies(rod: Rod) -> list[str]:
                     f'mass="{carried:.9g}" contype="0" conaffinity="1"/>'
                 )
     return [f"    {line}" for line in lines]
+
+
+def principal(rod: Rod) -> tuple[FloatArray, Rotation]:
+    """Stiffnesses (n - 1, 3) [N m^2] about the principal axes of each joint, and those axes.
+
+    First GJ about x, then the two of bending. The axes (n - 1,) are in the material frame; of
+    an isotropic section they are that frame.
+    """
+    values, vectors = np.linalg.eigh(rod.bending)
+    round_ = np.ptp(values, axis=1) < 1e-9 * values[:, 1]
+    angle = np.where(round_, 0.0, np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
+    axes = Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 0.0])
+    return np.column_stack([rod.torsion, values]), axes
 
 
 def _pin(rod: Rod) -> str:
@@ -155,7 +168,7 @@ solimp="0.9999 0.9999 0.001"/>
 
 def _angles(rod: Rod) -> FloatArray:
     """Positions of all joints in the pose."""
-    angles = _in_axes(rod.turns, rod.principal()[1])
+    angles = _in_axes(rod.turns, principal(rod)[1])
     if not rod.in_space:
         angles = rod.turns.as_rotvec()[:, 2]
     first = rod.frames[0]

@@ -213,18 +213,6 @@ class Rod:
             rest=np.zeros((count, 3)),
         )
 
-    def principal(self) -> tuple[FloatArray, Rotation]:
-        """Stiffnesses (n - 1, 3) [N m^2] about the principal axes of each joint, and those axes.
-
-        First GJ about x, then the two of bending. The axes (n - 1,) are in the material frame; of
-        an isotropic section they are that frame.
-        """
-        values, vectors = np.linalg.eigh(self.bending)
-        round_ = np.ptp(values, axis=1) < 1e-9 * values[:, 1]
-        angle = np.where(round_, 0.0, np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
-        axes = Rotation.from_rotvec(angle[:, None] * [1.0, 0.0, 0.0])
-        return np.column_stack([self.torsion, values]), axes
-
     @property
     def mean_bending(self) -> FloatArray:
         """EI (n - 1,) [N m^2] of the joints: the mean about all axes of a section."""
