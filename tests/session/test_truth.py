@@ -20,8 +20,18 @@ TRUTH = ROOT / "tests" / "data" / "bench_truth"
 true_effects = runpy.run_path(str(ROOT / "scripts" / "check_bench.py"))["true_effects"]
 # Photographs are fitted in tests/diagnosis/test_bench_sessions.py, a tether is on nobody's list,
 # and of 77 N m^2 gravity shows nothing.
-NAMES = ["clamped", "held_askew", "held_headings", "long", "thin", "two_effects"]
-LONG = ["drift", "overhang", "short_clean", "softening", "splice", "stretch", "taper"]
+NAMES = ["clamped", "held_askew", "thin", "two_effects"]
+LONG = [
+    "drift",
+    "held_headings",
+    "long",
+    "overhang",
+    "short_clean",
+    "softening",
+    "splice",
+    "stretch",
+    "taper",
+]
 # Elements; on the splice, a tenth of the cable, two are too few: its end is 3.3 deviations off.
 MESH, FINER = 24, {"splice": 40}
 # Somebody who declares an effect knows it to a tenth.
