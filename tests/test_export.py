@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, OutputError
-from dlo_casadi.export.files import losses, samples_of, write_rods
 from dlo_casadi.export.mujoco import principal
 from dlo_casadi.export.rod import Held, Rod
-from dlo_casadi.export.targets import TARGETS, target_of
+from dlo_casadi.export.targets import TARGETS, losses, samples_of, target_of, write_rods
 from dlo_casadi.model.cable_model import CableModel
 
 SPACE = CableData(0.6, 0.03, 0.004, 0.015, "loom <&>", torsional_stiffness=0.011)

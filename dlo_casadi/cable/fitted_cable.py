@@ -32,9 +32,8 @@ from dlo_casadi.equilibrium.spread import (
 )
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError, counted
-from dlo_casadi.export.files import samples_of, write_rods
 from dlo_casadi.export.rod import Held
-from dlo_casadi.export.targets import target_of
+from dlo_casadi.export.targets import samples_of, target_of, write_rods
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.model.contact import Contact
 from dlo_casadi.rod.node import Heading

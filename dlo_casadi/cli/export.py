@@ -10,9 +10,8 @@ from dlo_casadi.cli.fitted import DRAWN, HELD, POSE
 from dlo_casadi.cli.options import PARAMETERS, Page, command, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.errors import DloError
-from dlo_casadi.export.files import losses
 from dlo_casadi.export.rod import Rod
-from dlo_casadi.export.targets import TARGETS, require, target_of
+from dlo_casadi.export.targets import TARGETS, losses, require, target_of
 
 # `--check` without a session.
 _NEAR = Path()

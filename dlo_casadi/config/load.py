@@ -8,10 +8,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from dlo_casadi.config.clips import clip_problems, clips_differ, too_short
+from dlo_casadi.config.between import clip_problems, clips_differ, obstacle_problems, too_short
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.measuring import DeclaredTolerances
-from dlo_casadi.config.obstacles import obstacle_problems
 from dlo_casadi.config.options import DeclaredEffect
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose

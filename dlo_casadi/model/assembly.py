@@ -21,8 +21,8 @@ from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
-from dlo_casadi.model.mapped import Mapped
 from dlo_casadi.model.stacked import Inputs as Inputs
+from dlo_casadi.model.stacked import Mapped
 from dlo_casadi.model.stacked import Shapes as Shapes
 from dlo_casadi.model.stacked import Tangents as Tangents
 from dlo_casadi.rod.band import BandMatrix, Vector

@@ -6,9 +6,8 @@ from pathlib import Path
 
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings.bags import read_bag
-from dlo_casadi.recordings.c3d import read_c3d
 from dlo_casadi.recordings.clouds import CloudView, read_cloud
-from dlo_casadi.recordings.mocap_csv import read_mocap_csv
+from dlo_casadi.recordings.mocap import read_c3d, read_mocap_csv
 from dlo_casadi.recordings.recording import Recording, together
 
 WHOLE = CloudView()  # all points of clouds in metres

@@ -17,7 +17,7 @@ from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from dlo_casadi.estimation.stiffness import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report import canvas, words
-from dlo_casadi.report.figures_limits import limits_figure
+from dlo_casadi.report.figures_poses import limits_figure
 from dlo_casadi.report.scene import Mark, Scene, next_marks, pull_marks, scene_of
 from dlo_casadi.report.words import NOISE_ALONE, compared, directions
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
