@@ -35,7 +35,7 @@ from dlo_casadi.config import (
 )
 from dlo_casadi.config.problems import Arguments
 from dlo_casadi.config.values import plain
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, library
 from dlo_casadi.report.documents import fitted_cable
 from dlo_casadi.report.figures_poses import outcome_figure
 from dlo_casadi.report.tables import estimates_of, outcome_html, outcome_text, summary_text
@@ -112,12 +112,7 @@ class Result(Outcome):
         DloError
             If pandas is not installed.
         """
-        try:
-            from pandas import DataFrame
-        except ImportError:
-            raise DloError(
-                "pandas is not installed.\n  Try: pip install pandas, or `params`."
-            ) from None
+        pandas = library("pandas", "pandas", "to_dataframe")
         rows = [
             {
                 "value": x.value,
@@ -128,7 +123,7 @@ class Result(Outcome):
             }
             for x in self.params.values()
         ]
-        return DataFrame(rows, index=list(self.params))
+        return pandas.DataFrame(rows, index=list(self.params))
 
     def write(self, folder: str | Path) -> Path:
         """Write report, parameters, centre-lines and figures, as `dlo fit` does.
@@ -283,10 +278,7 @@ class Session(Config):
             )
         if not isinstance(diagnosis, bool | None):
             raise DloError(f"diagnosis is True, False or None, found {diagnosis!r}")
-        session = self
-        if diagnosis is not None:
-            options = self.diagnosis.model_copy(update={"enabled": diagnosis})
-            session = self.model_copy(update={"diagnosis": options})
+        session = self if diagnosis is None else self.changed(diagnosis={"enabled": diagnosis})
         return _as(Result, run_session(session, progress, executor))
 
 

@@ -1,5 +1,6 @@
 """Errors that the package raises: what happened, with numbers, and what to try."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,17 @@ class EquilibriumError(DloError):
         super().__init__(message if pose is None else f"{pose}: {message}")
         self.pose = pose
         self.p_des = p_des
+
+
+def library(name: str, extra: str, user: str) -> Any:
+    """An optional library; without it a DloError names its `user` and the extra that has it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise DloError(
+            f"{user}: {name.partition('.')[0]} is not installed.\n"
+            f"  Try: pip install 'dlo-casadi[{extra}]'"
+        ) from None
 
 
 class EstimationError(DloError):

@@ -261,7 +261,7 @@ def shown_by(found: Simulated) -> list[str]:
     if not found.hidden:
         return []
     session = found.session
-    measured = measured_poses(session, read_inputs(session, lambda *_: None))
+    measured = measured_poses(session, read_inputs(session))
     declared, readings = declared_model(session), declared_setup(session).readings
     base = declared.model.with_mesh(SEARCH_MESH // (4 if declared.model.in_space else 2))
 

@@ -46,7 +46,7 @@ def main() -> None:
         parser.error(f"no {', '.join(sorted(lost))}: try {', '.join(WIRES)}")
     for name in names:
         config = load_config(ROOT / "configs" / f"{name}.yaml")
-        measured = measured_poses(config, read_inputs(config, lambda *_: None))
+        measured = measured_poses(config, read_inputs(config))
         table, inside = [], []
         for k in range(len(measured)):
             poses = tuple(

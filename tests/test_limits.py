@@ -137,7 +137,7 @@ def fitted(tmp_path_factory):
     """A folder of results of a quick fit, and a list of poses."""
     folder = tmp_path_factory.mktemp("fitted")
     config = load_config(BENCH / "session.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     declared = declared_model(config)
     fit = fit_model(declared.model.with_mesh(10), measured[:3], declared.tolerances, 3e-4)
     document = fit_dict(fit) | {"fixtures": shared_fixtures(config), "model_hash": "test"}

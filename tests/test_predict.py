@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 def results(path, folder, n=20):
     """A folder of results of a quick fit that holds parameters.yaml alone."""
     config = load_config(path)
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
     fit = fit_model(model, measured[:4], declared.tolerances, 3e-4)

@@ -39,10 +39,7 @@ def check(chosen: argparse.Namespace) -> int:
     dlo check rope.yaml --json
     """
     with Watch(quiet=chosen.quiet) as watch:
-        config = measure.calibrated(
-            chosen.config, lambda name, k, m: watch.step(f"calibrate {name}".strip(), k, m)
-        )
-        inputs = measure.read_inputs(config, lambda name, k, m: watch.step(f"read {name}", k, m))
+        config, inputs = measure.read_session(chosen.config, watch.step)
         pictures = [] if chosen.show is None else _show(config, chosen.show, watch)
         watch.step("compare with what is declared", 0, 1)
         result = check_dict(config, inputs, find_suspicions(config, inputs))
@@ -97,9 +94,7 @@ def calibrate(chosen: argparse.Namespace) -> None:
     dlo calibrate rope.yaml --json
     """
     with Watch(quiet=chosen.quiet) as watch:
-        found = measure.calibrate_session(
-            chosen.config, lambda name, k, m: watch.step(f"read {name}", k, m)
-        )
+        found = measure.calibrate_session(chosen.config, watch.step)
     page, names = Page(chosen), ("fx", "fy", "cx", "cy")
     matrix, lens = found.camera.matrix.tolist(), found.camera.distortion.tolist()
     page.data(

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from dlo_casadi.cli.guard import BAD_INPUT, OK
 from dlo_casadi.cli.options import CONFIG, SCHEDULER, Page, command, jobs, option
-from dlo_casadi.config import Config
 from dlo_casadi.errors import counted
 from dlo_casadi.io.files import make_folder
 from dlo_casadi.runtime.executors import ended_first
@@ -52,7 +51,7 @@ def fit(chosen: argparse.Namespace) -> None:
     """
     chosen.output = chosen.output or Path("results") / chosen.config.name
     if chosen.no_diagnosis:
-        chosen.config = _with_diagnosis(chosen.config, False)
+        chosen.config = chosen.config.changed(diagnosis={"enabled": False})
     _fit_and_show(chosen)
 
 
@@ -69,14 +68,8 @@ def diagnose(chosen: argparse.Namespace) -> None:
     dlo diagnose rope.yaml --output results/rope     writes the results of a fit, too
     dlo diagnose rope.yaml --quiet --json            effects, candidates, verdict and next pose
     """
-    chosen.config = _with_diagnosis(chosen.config, True)
+    chosen.config = chosen.config.changed(diagnosis={"enabled": True})
     _fit_and_show(chosen, DIAGNOSIS)
-
-
-def _with_diagnosis(config: Config, enabled: bool) -> Config:
-    return config.model_copy(
-        update={"diagnosis": config.diagnosis.model_copy(update={"enabled": enabled})}
-    )
 
 
 def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:

@@ -135,7 +135,7 @@ def _mistakes(session: Imported, folder: Path) -> list[str]:
     write_file(stand_in, text)
     try:
         config = load_config(stand_in)
-        inputs = measure.read_inputs(config, lambda *_: None)
+        inputs = measure.read_inputs(config)
         return [item.message for item in find_suspicions(config, inputs, fits=False)]
     finally:
         stand_in.unlink()

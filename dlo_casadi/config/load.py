@@ -95,8 +95,7 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
     skipped = [pose for pose in poses if pose.name in reasons]
-    experiment = config.experiment.model_copy(update={"poses": reachable})
-    return config.model_copy(update={"experiment": experiment}).noted(
+    return config.changed(experiment={"poses": reachable}).noted(
         warnings=tuple(warnings),
         skipped=tuple(SkippedPose(pose.name, reasons[pose.name], pose.role) for pose in skipped),
     )

@@ -9,7 +9,7 @@ import inspect
 import math
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple, TypeAlias
+from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from pydantic import (
@@ -196,6 +196,12 @@ class ConfigSection(BaseModel):
                 f"{name} of a {kind} cannot be set.\n  Try: another {kind}, made with it"
             )
         super().__setattr__(name, value)
+
+    def changed(self, **values: Any) -> Self:
+        """The same with other values, unchecked; of a section inside, mappings of its own."""
+        inner = {name: getattr(self, name) for name, x in values.items() if isinstance(x, dict)}
+        changed = {name: section.changed(**values[name]) for name, section in inner.items()}
+        return self.model_copy(update=values | changed)
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:

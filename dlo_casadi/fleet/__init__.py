@@ -2,20 +2,9 @@
 
 from typing import Any
 
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import library
 
 
-def parquet_library() -> tuple[Any, Any]:
-    """The library that writes Parquet.
-
-    Raises
-    ------
-    DloError
-        If it is not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise DloError("tables need pyarrow.\n  Try: pip install 'dlo-casadi[table]'") from None
-    return pyarrow, pyarrow.parquet
+def parquet_library() -> tuple[Any, ...]:
+    """The library that writes Parquet, and its module for that; DloError without it."""
+    return tuple(library(name, "table", "tables") for name in ("pyarrow", "pyarrow.parquet"))

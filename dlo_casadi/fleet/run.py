@@ -195,8 +195,7 @@ def fit_one(job: Job) -> Row:
 def _fitted(job: Job, begin: float) -> Row:
     config = load_config(job.session.path)
     if not job.options.diagnosis:
-        diagnosis = config.diagnosis.model_copy(update={"enabled": False})
-        config = config.model_copy(update={"diagnosis": diagnosis})
+        config = config.changed(diagnosis={"enabled": False})
     if job.options.reports:
         # It imports the drawing libraries; without figures a worker starts in half the time.
         from dlo_casadi.report.writer import ResultsFolder

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.errors import MeasurementError
-from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream, library
+from dlo_casadi.errors import MeasurementError, library
+from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream
 
 _NANO = 1e-9
 # Types of a message's numpy fields by their numbers in sensor_msgs/PointField.
@@ -35,8 +35,8 @@ def read_bag(path: Path) -> Recording:
     MeasurementError
         If the bag is damaged, or holds none of these.
     """
-    anyreader = library("rosbags.highlevel")
-    typesys = library("rosbags.typesys")
+    anyreader = library("rosbags.highlevel", "recordings", "reading this file")
+    typesys = library("rosbags.typesys", "recordings", "reading this file")
     rows: dict[tuple[Kind, str], Rows] = defaultdict(list)
     frames: dict[tuple[Kind, str], str] = {}
     links: Links = {}

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.problems import show
-from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.recordings.recording import Kind, Recording, Stream, factor, library
+from dlo_casadi.errors import MeasurementError, counted, library
+from dlo_casadi.recordings.recording import Kind, Recording, Stream, factor
 
 # Sections of a Vicon file that hold places; others (devices, model outputs) are passed over.
 _SECTIONS: dict[str, Kind] = {"Trajectories": "marker", "Objects": "body", "Segments": "body"}
@@ -191,7 +191,7 @@ def read_c3d(path: Path) -> Recording:
     ----------
     The C3D file format, www.c3d.org: POINT:Y_SCREEN is the axis that points up on a screen.
     """
-    ezc3d = library("ezc3d")
+    ezc3d = library("ezc3d", "recordings", "reading this file")
     try:
         content = ezc3d.c3d(str(path))
     except (OSError, RuntimeError, ValueError) as error:

@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.errors import DloError, MeasurementError
+from dlo_casadi.errors import MeasurementError
 
 Kind = Literal["marker", "body", "wrench"]
 
@@ -131,17 +130,6 @@ def together(recordings: Sequence[Recording]) -> Recording:
         tuple(cloud for item in recordings for cloud in item.clouds),
         tuple(dict.fromkeys(text for item in recordings for text in item.assumptions)),
     )
-
-
-def library(name: str) -> Any:
-    """An optional library, or a DloError that says how to install it."""
-    try:
-        return import_module(name)
-    except ImportError:
-        raise DloError(
-            f"reading this file takes {name.split('.')[0]}, which is not installed.\n"
-            "  Try: pip install 'dlo-casadi[recordings]'"
-        ) from None
 
 
 def factor(unit: str, name: str) -> float:

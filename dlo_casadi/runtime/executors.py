@@ -28,7 +28,7 @@ from weakref import WeakSet
 
 from threadpoolctl import threadpool_limits
 
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, library
 
 # Longest time until a scheduler answers, and until it has a worker [s].
 PATIENCE = 30.0
@@ -129,11 +129,7 @@ class Cluster(Executor):
     """The workers of a Dask scheduler, see `open_executor`."""
 
     def __init__(self, address: str, logs: Path | None) -> None:
-        try:
-            import distributed
-        except ImportError:
-            message = "--scheduler needs Dask.\n  Try: pip install 'dlo-casadi[dask]'"
-            raise DloError(message) from None
+        distributed = library("distributed", "dask", "--scheduler")
         self.losses, self.logs = distributed.KilledWorker, logs
         try:
             self._client = distributed.Client(

@@ -73,8 +73,7 @@ class ReadSession:
 
     def with_experiment(self, **values: object) -> Self:
         """Return the session with other values in its configuration's `experiment`."""
-        experiment = self.config.experiment.model_copy(update=values)
-        return replace(self, config=self.config.model_copy(update={"experiment": experiment}))
+        return replace(self, config=self.config.changed(experiment=values))
 
 
 class Hypothesis(NamedTuple, Generic[T]):

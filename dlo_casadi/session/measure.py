@@ -23,26 +23,35 @@ READERS = 2
 MOST_POINTS = 240
 
 
-def read_inputs(config: Config, step: Callable[[str, int, int], None]) -> tuple[PoseInput, ...]:
+Step = Callable[[str, int, int], None]
+"""Told what is done, how much of it is done, and how much there is."""
+
+
+def nobody(*_: object) -> None:
+    """A `Step` that tells nobody."""
+
+
+def read_session(config: Config, step: Step = nobody) -> tuple[Config, tuple[PoseInput, ...]]:
+    """The configuration with its camera, and all poses; see `calibrated` and `read_inputs`."""
+    config = calibrated(config, step)
+    return config, read_inputs(config, step)
+
+
+def read_inputs(config: Config, step: Step = nobody) -> tuple[PoseInput, ...]:
     """Read all poses; one that cannot be read keeps its name and says why.
 
     Several at a time: OpenCV and NumPy leave the interpreter to others for half of the work.
-
-    Parameters
-    ----------
-    step : callable
-        Called with the pose's file name, how many are done and how many there are.
     """
     poses, inputs = config.experiment.poses, []
     threads = ThreadPoolExecutor(READERS)
     try:
         found = threads.map(lambda pose: _read(config, pose), poses)
         for k, pose in enumerate(poses):
-            step(pose.shown_by, k, len(poses))
+            step(f"read {pose.shown_by}", k, len(poses))
             inputs.append(next(found))
     finally:
         threads.shutdown(cancel_futures=True)
-    step("", len(poses), len(poses))
+    step("read ", len(poses), len(poses))
     return tuple(inputs)
 
 
@@ -318,13 +327,8 @@ def needs_camera(config: Config) -> str:
     return "with a standoff from the board" if measurement.board.standoff else ""
 
 
-def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
+def calibrated(config: Config, step: Step = nobody) -> Config:
     """Return the configuration with the camera that its photographs show, where it needs one.
-
-    Parameters
-    ----------
-    step : callable
-        Called with the photograph's name, how many are read and how many there are.
 
     Raises
     ------
@@ -345,14 +349,12 @@ def calibrated(config: Config, step: Callable[[str, int, int], None]) -> Config:
         ) from None
     own = {key: getattr(found.camera, key).tolist() for key in DeclaredCamera.model_fields}
     camera = DeclaredCamera.model_validate(own)
-    measurement = config.experiment.measurement.model_copy(update={"camera": camera})
-    experiment = config.experiment.model_copy(update={"measurement": measurement})
-    return config.model_copy(update={"experiment": experiment}).noted(
+    return config.changed(experiment={"measurement": {"camera": camera}}).noted(
         warnings=(*config.warnings, f"no camera is declared: {summary(found)}", *found.advice)
     )
 
 
-def calibrate_session(config: Config, step: Callable[[str, int, int], None]) -> vision.Calibration:
+def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration:
     """Calibrate the camera from all photographs of a session, see `vision.calibrate_camera`.
 
     Raises
@@ -374,13 +376,13 @@ def calibrate_session(config: Config, step: Callable[[str, int, int], None]) -> 
     }
     images = {}
     for k, (name, path) in enumerate(paths.items()):
-        step(name, k, len(paths))
+        step(f"calibrate {name}", k, len(paths))
         try:
             images[name] = vision.read_image(path)
         except MeasurementError:  # told of once its pose is read
             continue
     found = vision.calibrate_camera(images, board_of(measurement))
-    step("", len(paths), len(paths))
+    step("calibrate", len(paths), len(paths))
     return found
 
 

@@ -1,7 +1,7 @@
 """An exported cable relaxed in its simulator, beside our prediction and what was measured."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.export.rod import ROUND, Rod
 from dlo_casadi.export.targets import Target, require
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.measure import calibrated, measured_poses, read_inputs
+from dlo_casadi.session.measure import Step, measured_poses, read_session
 
 # Whose stiffness a simulator is given, in the order of tables.
 CASES = ("default", "first guess", "identified")
@@ -103,7 +103,7 @@ def round_trip(
     config: Config,
     target: Target,
     segments: int | None,
-    step: Callable[[str, int, int], None],
+    step: Step,
     poses: int | None = None,
 ) -> Iterator[Relaxation]:
     """Relax a cable in every held-out pose; in every pose if none was held out.
@@ -116,9 +116,8 @@ def round_trip(
         If the target is not installed.
     """
     require(target)
-    quiet: Callable[[str, int, int], None] = lambda *_: None  # noqa: E731
-    config = calibrated(config, quiet)
-    measured = measured_poses(config, read_inputs(config, quiet))
+    config, inputs = read_session(config)
+    measured = measured_poses(config, inputs)
     declared = config.experiment.poses
     predictions = predict_poses(cable.model, cable.p, cable.rest, [item.pose for item in measured])
     order = sorted(range(len(measured)), key=lambda j: not measured[j].held_out)

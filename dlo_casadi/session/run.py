@@ -1,11 +1,9 @@
 """One session of measurements from configuration to outcome."""
 
-import platform
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from importlib.metadata import version
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,11 +24,11 @@ from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.runtime.executors import InProcess, one_thread
+from dlo_casadi.runtime.executors import InProcess, one_thread, software
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
-from dlo_casadi.session.measure import calibrated, measured_poses, read_inputs
+from dlo_casadi.session.measure import measured_poses, read_session
 from dlo_casadi.session.outcome import (
     Discretization,
     MeasurementSummary,
@@ -106,9 +104,8 @@ def run_session(
     progress = progress or Silent()
     clock = Clock()
     executor = executor or InProcess()
-    begin(executor, versions)  # another process starts, and imports what fits, meanwhile
-    config = calibrated(config, lambda name, k, m: progress.step(f"calibrate {name}".strip(), k, m))
-    inputs = read_inputs(config, lambda name, k, m: progress.step(f"read {name}", k, m))
+    begin(executor, software)  # another process starts, and imports what fits, meanwhile
+    config, inputs = read_session(config, progress.step)
     try:
         with one_thread():
             return fit_session(config, inputs, clock, progress, executor)
@@ -185,7 +182,7 @@ def fit_session(
             timing=clock.total(),
             fit=fit,
             warnings=tuple(warnings),
-            versions=versions(),
+            versions=software(),
             limits=checked_limits(config.limits, fit, [item.pose for item in measured]),
             **found,
         )
@@ -308,12 +305,6 @@ def _confirmed(fit: Fit, confirming: Callable[[], fitting.Minimum], clock: Clock
     found = confirming()
     clock.add("batch", found.seconds)
     return fitting.confirmed(fit, found)
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computed the results."""
-    packages = ("dlo-casadi", "casadi", "numpy", "scipy", "opencv-contrib-python-headless")
-    return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
 def _center(inputs: Sequence[PoseInput]) -> tuple[float, float] | None:

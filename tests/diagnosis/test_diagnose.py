@@ -31,7 +31,7 @@ BENCH = Path(__file__).resolve().parents[1] / "data" / "bench"
 def session():
     """Declared model and measured poses of a clamped, free cable that softens."""
     config = load_config(BENCH / "overhang" / "session.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     return declared_model(config), measured
 
 
@@ -98,7 +98,7 @@ def test_without_the_cause_nothing_false_is_claimed(fit):
 )
 def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
     config = load_config(BENCH / name / "session.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     declared = declared_model(config)
     model = declared.model.with_mesh(20)
     start = fit_of((declared, measured), std=config.experiment.measurement.std)
@@ -119,7 +119,7 @@ def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypa
     monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: None)
     tried = {"stiffness_gradient", "gravity_tilt"}
     config = load_config(BENCH / "stretch" / "session.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     fit = fit_of((declared_model(config), measured), std=config.experiment.measurement.std)
     found = diagnose(fit, exclude=tuple(set(EFFECTS) - tried))
     assert found.verdict == "unexplained"

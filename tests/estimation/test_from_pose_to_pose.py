@@ -69,7 +69,7 @@ def test_displacements_are_those_of_shapes_solved_anew(case):
 def test_turned_clamps_are_named_and_leave_the_stiffness_alone():
     found = simulated(generator_of(7, 1), 2, 0, "clamp_angle")
     session = found.session
-    measured = measured_poses(session, read_inputs(session, lambda *_: None))
+    measured = measured_poses(session, read_inputs(session))
     fit, _ = fit_declared(session, declared_model(session), measured)
     own = fit.problem.priors.pose_scatter
     assert own.source == "clamp_angle"

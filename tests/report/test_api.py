@@ -133,7 +133,7 @@ def test_parameters_are_a_table_of_pandas(result, monkeypatch):
         "N m^2",
     )
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(dlo.DloError, match=r"pandas is not installed.\n  Try: pip install pandas"):
+    with pytest.raises(dlo.DloError, match=r"pandas is not installed.\n  Try: pip install"):
         result.to_dataframe()
 
 

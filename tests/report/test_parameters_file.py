@@ -33,7 +33,7 @@ def file(outcome, tmp_path_factory):
 def fitted(name, *effects, n=10):
     """A quick fit of a bench session with more effects than declared."""
     config = load_config(BENCH / name / "session.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))[:8]
+    measured = measured_poses(config, read_inputs(config))[:8]
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
     for effect in effects:
@@ -43,7 +43,7 @@ def fitted(name, *effects, n=10):
 
 def test_a_cable_in_space_is_rebuilt_exactly(outcome, tmp_path):
     config = load_config(CONFIGS / "markers_in_space.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     declared = declared_model(config)
     model = declared.model.with_mesh(8)
     fit = fit_model(model, measured[:3], declared.tolerances, 3e-4)

@@ -32,7 +32,7 @@ def test_a_missing_camera_is_found_in_the_photographs(session, capsys):
     """To half a percent, as the command prints it; the command's text can be pasted."""
     config = load_config(session)
     assert needs_camera(config)
-    found = calibrated(config, lambda *_: None)
+    found = calibrated(config)
     assert not needs_camera(found)
     camera = found.experiment.measurement.camera
     assert camera.matrix[0][0] == pytest.approx(FOCAL, rel=5e-3)
@@ -58,7 +58,7 @@ def test_photographs_from_one_direction_are_no_calibration():
         r"camera is missing.* focal length is known to .* % only, .* within \d+ degrees.* Try: .*"
     )
     with pytest.raises(MeasurementError, match=said + "30 to 90 degrees apart, or .*camera"):
-        calibrated(config.model_copy(update={"experiment": bare}), lambda *_: None)
+        calibrated(config.model_copy(update={"experiment": bare}))
 
 
 def test_too_few_photographs(session):
@@ -66,7 +66,7 @@ def test_too_few_photographs(session):
     poses = config.experiment.poses
     few = config.experiment.model_copy(update={"poses": (poses[1],)})
     with pytest.raises(MeasurementError, match=r"camera is missing.* needs 3 photographs .* are 2"):
-        calibrated(config.model_copy(update={"experiment": few}), lambda *_: None)
+        calibrated(config.model_copy(update={"experiment": few}))
 
 
 def test_a_session_without_photographs(capsys):

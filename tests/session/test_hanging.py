@@ -53,7 +53,7 @@ def curved(tmp_path_factory):
     for name, shape in zip(names, predict_poses(model, p, rest, poses), strict=True):
         points = shape.curve.at(np.linspace(0.01, 0.99, 40) * LENGTH)
         write_points(folder / name, points + NOISE * rng.standard_normal(points.shape))
-    return config, read_inputs(config, lambda *_: None)
+    return config, read_inputs(config)
 
 
 def under(config, gravity):
@@ -131,14 +131,14 @@ def test_a_loop_of_which_only_the_ends_were_measured_is_no_mistake(tmp_path):
     }
     (tmp_path / "loop.yaml").write_text(dump_yaml(data))
     config = load_config(tmp_path / "loop.yaml")
-    assert plausibility.find_suspicions(config, read_inputs(config, lambda *_: None)) == ()
+    assert plausibility.find_suspicions(config, read_inputs(config)) == ()
 
 
 @pytest.mark.long
 def test_gravity_upwards_is_named_of_a_wire_that_does_not_repeat():
     """Its trials differ by a hundredth of its length, whichever way gravity points."""
     config = load_config(CONFIGS / "black_wire.yaml")
-    inputs = read_inputs(config, lambda *_: None)
+    inputs = read_inputs(config)
     (found,) = plausibility.find_suspicions(under(config, (0.0, 9.81)), inputs)
     assert "the lines show no weight" in found.message
     assert not found.certain

@@ -47,7 +47,7 @@ def session(folder, change=lambda pose, k: None, turn=TURN, apart=5):
     path = folder / "arcs.yaml"
     path.write_text(dump_yaml(data))
     config = load_config(path)
-    return config, read_inputs(config, lambda *_: None)
+    return config, read_inputs(config)
 
 
 @pytest.mark.parametrize("turn", [TURN, -5.0, 13.0])

@@ -47,7 +47,7 @@ def summary_text(outcome):
 
 def left_out(config):
     """What a fit says of the poses that it leaves out."""
-    inputs, odd = without_implausible(config, read_inputs(config, lambda *_: None))
+    inputs, odd = without_implausible(config, read_inputs(config))
     assert not odd
     return reading_warnings(inputs, config.skipped), inputs
 
@@ -58,7 +58,7 @@ def test_an_end_out_of_reach_is_told(session):
 
     config = session(change)
     assert "pose_02" not in [pose.name for pose in config.experiment.poses]
-    assert reading_warnings(read_inputs(config, lambda *_: None), config.skipped) == [
+    assert reading_warnings(read_inputs(config), config.skipped) == [
         "pose_02 is left out: end (0.6, 0.1) m is 0.6083 m from the start; the cable is 0.55 m "
         "long. Are end and cable.length in metres?"
     ]
@@ -69,7 +69,7 @@ def test_a_missing_file_is_told_once(session):
         poses[1]["file"] = "nothing.csv"
 
     config = session(change)
-    (line,) = reading_warnings(read_inputs(config, lambda *_: None), config.skipped)
+    (line,) = reading_warnings(read_inputs(config), config.skipped)
     assert line.startswith("nothing is left out: ")
     assert "nothing.csv does not exist" in line
 

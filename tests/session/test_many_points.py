@@ -54,7 +54,7 @@ def fit_of(config, measured):
 def test_many_points_tell_what_all_of_them_do(tmp_path, marked):
     """The standard deviation of EI is that of a fit of every point; errors are those of points."""
     config, all_points = session(tmp_path, MANY // 2, marked, STD)
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     assert max(len(item.points) for item in measured) <= MOST_POINTS
     fit = fit_of(config, measured)
     every = fit_of(
@@ -84,7 +84,7 @@ def test_an_interval_is_the_narrower_the_more_points(tmp_path):
         folder = tmp_path / str(count)
         folder.mkdir()
         config, _ = session(folder, count, True, None)
-        fit = fit_of(config, measured_poses(config, read_inputs(config, lambda *_: None)))
+        fit = fit_of(config, measured_poses(config, read_inputs(config)))
         assert fit.noise.std == pytest.approx(STD, rel=0.1)  # of one point, not of a mean
         found = profile_interval(fit)
         assert found.low < 1.3 * CABLE["bending_stiffness"] < found.high

@@ -42,7 +42,7 @@ def config(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def inputs(config):
-    return read_inputs(config, lambda *_: None)
+    return read_inputs(config)
 
 
 def test_a_session_of_views_one_view_and_markers(config, inputs):
@@ -102,7 +102,7 @@ def test_a_camera_of_another_picture_size_is_told(config):
     camera = DeclaredCamera(matrix=((540.0, 0.0, 321.0), (0.0, 540.0, 237.0), (0.0, 0.0, 1.0)))
     measurement = config.experiment.measurement.model_copy(update={"camera": camera})
     experiment = config.experiment.model_copy(update={"poses": (only,), "measurement": measurement})
-    (item,) = read_inputs(config.model_copy(update={"experiment": experiment}), lambda *_: None)
+    (item,) = read_inputs(config.model_copy(update={"experiment": experiment}))
     assert "pose_01_b: camera.matrix, with its principal point at (321, 237)" in item.problem
     assert "is not that of this picture of 1280 x 960 px" in item.problem
     assert not item.readable

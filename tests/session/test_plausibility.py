@@ -218,4 +218,4 @@ def test_no_session_of_the_repository_looks_like_a_mistake(path):
         config = config.model_copy(
             update={"experiment": config.experiment.model_copy(update={"poses": poses})}
         )
-    assert find_suspicions(config, read_inputs(config, lambda *_: None)) == ()
+    assert find_suspicions(config, read_inputs(config)) == ()

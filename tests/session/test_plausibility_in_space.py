@@ -22,7 +22,7 @@ AWAY = np.array([0.3, 0.1, -0.2])
 def session(request):
     """Markers of the repository, and lines through them that nobody has arc lengths of."""
     config = load_config(ROOT / "configs/markers_in_space.yaml")
-    inputs = read_inputs(config, lambda *_: None)
+    inputs = read_inputs(config)
     if request.param == "lines":
         length = config.cable.length
         ends = [(pose.start, pose.end) for pose in config.experiment.poses]
@@ -172,7 +172,7 @@ def test_the_load_over_the_stiffness_is_that_of_the_cable(session):
 
 def markers():
     config = load_config(ROOT / "configs/markers_in_space.yaml")
-    return config, read_inputs(config, lambda *_: None)
+    return config, read_inputs(config)
 
 
 def test_markers_counted_from_the_end():

@@ -134,7 +134,7 @@ def test_axes_of_another_world(read):
 def test_a_session_whose_readings_have_the_other_sign():
     """Forces of a straight cable of the declared stiffness, a guess, are near enough to tell."""
     config = load_config(ROOT / "tests/data/bench/short_clean/session.yaml")
-    inputs = read_inputs(config, lambda *_: None)
+    inputs = read_inputs(config)
     model = straight(declared_model(config).model).with_mesh(10)
     declared = config.experiment.poses
     found = predict_poses(

@@ -15,7 +15,7 @@ BENCH = Path(__file__).parents[1] / "data" / "bench"
 @pytest.fixture(scope="module")
 def session():
     config = load_config(BENCH / "short_clean" / "session.yaml")
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     few = [item for item in measured if not item.held_out][:3]
     return config.estimation, declared_model(config).model, few
 

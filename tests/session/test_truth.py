@@ -58,7 +58,7 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
     config = config.model_copy(
         update={"model": config.model.model_copy(update={"effects": effects})}
     )
-    measured = measured_poses(config, read_inputs(config, lambda *_: None))
+    measured = measured_poses(config, read_inputs(config))
     declared = declared_model(config)
     fit = fit_model(
         declared.model.with_mesh(FINER.get(name, MESH)),
