@@ -1,8 +1,8 @@
-"""Contact against others: python scripts/check_contact.py [--count 200] [--fixtures FOLDER].
+"""Contact against others: python scripts/check_contact.py [--count 200] [--space 20] ...
 
 Closed forms: a heavy beam laid on a table, a cable over a cylinder. Random cables in the plane
-against IPOPT with inequalities on the same energy. With a folder
-of sessions, what their fits say beside the truth next to it.
+against IPOPT with inequalities on the same energy, in space against random starts. With a folder
+of sessions (--fixtures), what their fits say beside the truth next to it.
 """
 
 import argparse
@@ -13,13 +13,14 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
 from dlo_casadi.config import read_yaml
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.guesses import guesses
+from dlo_casadi.equilibrium.guesses import guessed_frames, guesses
 from dlo_casadi.equilibrium.minima import ipopt, run_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
@@ -186,6 +187,70 @@ def check_random(count: int) -> None:
     )
 
 
+def random_in_space(rng: np.random.Generator) -> tuple[CableModel, HeldPose]:
+    """A cable between two clamps, with one to three obstacles near where it hung without them."""
+    mass, stiffness = 10 ** rng.uniform(-1.7, -0.5), 10 ** rng.uniform(-2.2, -1.2)
+    cable = CableData(1.0, mass, 0.008, stiffness, 0.6 * stiffness)
+    free = CableModel(
+        cable, 24, start="clamped", end="clamped", gravity=(0.0, 0.0, -9.81), n_rest=0
+    )
+    turns = Rotation.from_rotvec(rng.normal(0, 0.4, (2, 3))).as_quat()
+    end = (rng.uniform(0.5, 0.85), *rng.normal(0, 0.1, 2))
+    frames = dict(zip(("start_orientation", "end_orientation"), turns.tolist(), strict=True))
+    pose = HeldPose((0.0, 0.0, 0.0), end, **frames)
+    hung = solved(free, pose)
+    obstacles: list[Obstacle] = []
+    lowest, highest = hung.points[:, 2].min(), min(0.0, end[2])
+    for k in range(rng.integers(1, 4)):
+        if k == 0 and rng.random() < 0.6:
+            level = lowest + rng.uniform(0.05, 0.7) * (highest - lowest) - 0.006
+            normal = np.array([*rng.normal(0, 0.1, 2), 1.0])
+            normal /= np.linalg.norm(normal)
+            obstacles.append(Plane((0.0, 0.0, float(level)), tuple(normal), "table"))
+            continue
+        place = hung.points[rng.integers(5, 20)] + rng.normal(0, 0.03, 3)
+        along = 0.2 * Rotation.random(random_state=rng).apply([1.0, 0.0, 0.0])
+        radius = float(rng.uniform(0.02, 0.06))
+        obstacles.append(Capsule(tuple(place - along), tuple(place + along), radius, f"bar {k}"))
+    return replace(free, obstacles=tuple(obstacles)), pose
+
+
+def check_space(count: int) -> None:
+    """Energies of random cables in space beside the lowest from random starts.
+
+    Starts are first guesses, each turned by random smooth rotations along it.
+    """
+    rng, found, began = np.random.default_rng(0), Counter(), time.process_time()
+    spent = 0.0
+    while found["cables"] < count:
+        try:
+            model, pose = random_in_space(rng)
+        except dlo.DloError:
+            continue
+        ends = np.array([pose.start, pose.end])
+        if any(one.near(ends).distance.min() < 0.004 for one in model.obstacles):
+            continue
+        found["cables"] += 1
+        rest, p = np.zeros(model.chain.n_rests), model.nominal
+        before = time.process_time()
+        (eq,) = solve_equilibria(model, p, rest, [pose])
+        spent += time.process_time() - before
+        waves = np.sin(np.pi * np.outer(model.chain.places / model.cable.length, [1, 2, 3]))
+        starts = [
+            model.node.moved(x, waves @ rng.normal(0, 0.6, (3, 3)))
+            for x in 3 * guessed_frames(model, p, rest, pose)
+        ]
+        others = solve_equilibria(model, p, rest, [pose] * len(starts), starts)
+        energies = [x.energy for x in others if isinstance(x, Equilibrium) and x.stable]
+        found["from random starts"] += bool(energies)
+        if isinstance(eq, Equilibrium):
+            found["solved"] += 1
+            found["touching"] += bool(eq.contacts)
+            lower = min(energies, default=np.inf) < eq.energy - 1e-6 * (abs(eq.energy) + 1e-3)
+            found["lower from random starts"] += lower
+    print(f"space: {dict(found)}, {time.process_time() - began:.0f} s, {spent:.0f} s of them ours")
+
+
 def check_fixtures(folder: Path) -> None:
     """Fits of sessions beside their truth."""
     for name in ("table", "ramp", "table_hidden"):
@@ -198,11 +263,14 @@ def check_fixtures(folder: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--space", type=int, default=0, help="random cables in space")
     parser.add_argument("--fixtures", type=Path)
     chosen = parser.parse_args()
     check_beam()
     check_cylinder()
     if chosen.count:
         check_random(chosen.count)
+    if chosen.space:
+        check_space(chosen.space)
     if chosen.fixtures:
         check_fixtures(chosen.fixtures)

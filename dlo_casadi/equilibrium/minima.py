@@ -21,6 +21,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.equilibrium import (
@@ -55,6 +56,9 @@ RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
 # these that a given start skips, so that it stays on its side; maximum number of steps of each.
 SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
+# How often the way from one depth to the next is halved where contacts change to and fro. Beyond
+# the depth by which the cable bends between two nodes they change no more.
+HALVINGS = 4
 # Contacts that change to and fro make steps of one size: of a step that is longer than SAME_SIZE
 # times the one before, the share SHORTER is taken. What is left of it is the next step, so that the
 # ratio has to be more than a half.
@@ -87,6 +91,18 @@ class Minima:
     converged: BoolArray
     energy: FloatArray
     iterations: IntArray
+
+    @property
+    def parts(self) -> tuple[NDArray[Any], ...]:
+        """Its arrays."""
+        return (
+            self.shapes.x,
+            self.shapes.lam,
+            self.balanced,
+            self.converged,
+            self.energy,
+            self.iterations,
+        )
 
 
 def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
@@ -145,10 +161,41 @@ def descend_to_contact(
     assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80, *, near: bool
 ) -> Minima:
     """As `descend`; obstacles are soft at first. `near`: whether shapes keep to their sides."""
-    softer = [x for x in SOFT[KEEPING_SIDE * near :] if x > assembly.depth]
-    for depth in softer if assembly.model.surfaces else ():
+    if not assembly.model.surfaces:
+        return descend(assembly, shapes, given, max_iterations)
+    depths = [x for x in SOFT[KEEPING_SIDE * near :] if x > assembly.depth]
+    for depth in depths:
         shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
-    return descend(assembly, shapes, given, max_iterations)
+    return _hardened(assembly, depths[-1], shapes, given, max_iterations, HALVINGS)
+
+
+def _hardened(
+    assembly: Assembly,
+    softer: float,
+    shapes: Shapes,
+    given: Inputs,
+    max_iterations: int,
+    halvings: int,
+) -> Minima:
+    """Minima from shapes in obstacles of a larger depth, `softer`.
+
+    Where contacts change so much that this finds none, half of the way, of the logarithm of the
+    depth, comes first.
+    """
+    found = descend(assembly, shapes, given, max_iterations)
+    lost = np.flatnonzero(~found.balanced)
+    if not len(lost) or not halvings:
+        return found
+    between, few = float(np.sqrt(softer * assembly.depth)), (STEPS_WHILE_SOFT, halvings - 1)
+    half = _hardened(
+        assembly.softened(between), softer, shapes.subset(lost), given.subset(lost), *few
+    )
+    lost, near = lost[half.balanced], half.shapes.subset(half.balanced)
+    if len(lost):
+        other = _hardened(assembly, between, near, given.subset(lost), *few)
+        for mine, theirs in zip(found.parts, other.parts, strict=True):
+            mine[lost] = theirs
+    return found
 
 
 def _convex(

@@ -15,20 +15,12 @@ from dlo_casadi.equilibrium.equilibrium import (
 )
 from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
+from dlo_casadi.equilibrium.reach import no_equilibrium, out_of_reach
 from dlo_casadi.equilibrium.sides import beside_bars, on_other_side
-from dlo_casadi.equilibrium.spans import (
-    border_of,
-    chords,
-    first_guesses,
-    fixed_stretches,
-    holders,
-)
+from dlo_casadi.equilibrium.spans import border_of, first_guesses
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import clamped_nodes
-from dlo_casadi.model.contact import outwards
-from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame, Heading
 
 # Largest move of an end in one step [lengths, rad], so that shapes are followed up to a fold.
@@ -41,82 +33,6 @@ WAYS_ROUND = (0.5, -0.5)
 # Largest difference [turns] of a twist from the one asked for before turns count as shed. Of 7,500
 # random problems with up to four turns 1,369 differ by more than 1.35, 7 by 1.15 to 1.35.
 MOST_SHED = 1.3
-
-
-def _no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
-    return EquilibriumError(f"{what}.\n  Try: {hint}", pose.name, pose.end)
-
-
-def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
-    """Why a pose has no equilibrium: its end is missing or too far, or a number is not finite."""
-    if pose.end is None and model.end != "free":
-        what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
-        return _no_equilibrium(pose, what, "Pose(start, end).")
-    if not np.all(np.isfinite(pose.vector)):
-        what = (
-            f"no equilibrium: a number of the pose is not finite: start {pose.start} m, end "
-            f"{pose.end} m, headings {pose.start_heading} and {pose.end_heading} rad"
-        )
-        return _no_equilibrium(pose, what, "see where these numbers come from.")
-    if wrong := _wrong_clips(model, p, pose):
-        return _no_equilibrium(pose, *wrong)
-    if wrong := _inside(model, p, pose):
-        return _no_equilibrium(pose, *wrong)
-    if pose.end is None or model.extensible:
-        return None
-    ends, true_length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
-    start, end = np.array(ends).ravel()[: 2 * model.node.dimension].reshape(2, -1)
-    distance, length = float(np.linalg.norm(end - start)), float(true_length)
-    if distance < length:
-        return None
-    where = ", ".join(f"{x:.4f}" for x in pose.end)
-    what = (
-        f"no equilibrium: the end ({where}) m is {distance:.4f} m "
-        f"from the start, the cable is {length:.4f} m long"
-    )
-    return _no_equilibrium(pose, what, "end in metres? cable.length?")
-
-
-def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
-    """Why obstacles leave no equilibrium, and what to try: a fixture is inside of one."""
-    held = [("start", pose.start), *((clip.name, clip.place) for clip in pose.clips)]
-    held += [("end", pose.end)] if pose.end is not None else []
-    offsets = outwards(model) @ p if model.surfaces else ()
-    for name, place in held:
-        for obstacle, offset in zip(model.surfaces, offsets, strict=True):
-            depth = offset - float(obstacle.near(np.array(place)).distance)
-            if depth > 0:
-                at = ", ".join(f"{x:.4f}" for x in place)
-                what = f"no equilibrium: the {name} ({at}) m is {depth:.4f} m inside"
-                return f"{what} {obstacle.name}", "the obstacle's place, or its normal."
-    return None
-
-
-def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
-    """Why clips leave no equilibrium, and what to try: other kinds, no room on the mesh or cable.
-
-    Eyelets are taken to be anywhere between the clips beside them.
-    """
-    if tuple(clip.kind for clip in pose.clips) != model.clips:
-        own, others = (", ".join(x) or "none" for x in ([c.kind for c in pose.clips], model.clips))
-        return f"no equilibrium: the pose has the clips {own}, the model {others}", "the same."
-    nodes = clamped_nodes(model.chain, pose.clips)
-    if len(set(nodes)) < len(nodes):
-        what = f"clamped clips are nearer to each other than an element, {model.chain.h:.4g} m"
-        return f"no equilibrium: {what}", "a finer mesh (model.n)."
-    held = holders(model, p, pose) if pose.clips and not model.extensible else []
-    names = ["the start", *(clip.name for clip in pose.clips), "the end"]
-    apart = chords(held)
-    true_length = float(lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1])
-    for low, high, declared in fixed_stretches(held):
-        length = declared * true_length / model.cable.length
-        if sum(apart[low:high]) >= length:
-            what = (
-                f"no equilibrium: {names[low]} and {names[high]} are {sum(apart[low:high]):.4f} m "
-                f"apart, with {length:.4f} m of cable between them"
-            )
-            return what, "places and arc lengths in metres, in the order along the cable?"
-    return None
 
 
 def solve_equilibrium(
@@ -237,7 +153,7 @@ def _chosen(
                 f"the cable does not hold {pose.turns:g} turns of twist with {where}: it loops "
                 f"until {left:.2g} are left"
             )
-            return _no_equilibrium(pose, what, "fewer turns, or the end farther from the start.")
+            return no_equilibrium(pose, what, "fewer turns, or the end farther from the start.")
         found = kept
     if not found:
         hint = "a finer mesh (model.n), or check the stiffness and the headings."
@@ -248,7 +164,7 @@ def _chosen(
                 "stiffnesses and orientations."
             )
         what = f"no equilibrium found from its first guesses with {where}"
-        return _no_equilibrium(pose, what, hint)
+        return no_equilibrium(pose, what, hint)
     if named is not None and (model.start, model.end) == ("pinned", "pinned"):
         for eq in found:
             if eq.stable and eq.turns(named):
@@ -265,7 +181,7 @@ def _chosen(
         f"one, of {lowest.energy:.4g} J, turns by {lowest.turn:+.3g} rad from start to end "
         f"({there})"
     )
-    return _no_equilibrium(pose, what, "the other branch, or none.")
+    return no_equilibrium(pose, what, "the other branch, or none.")
 
 
 @dataclass(frozen=True)
@@ -286,10 +202,9 @@ class _PoseSearch:
             of, likely = self._likely([poses[j] for j in free])
             if len(of):
                 found = self._descended(poses, np.array(free)[of], likely, near=True)
-        if free and self.model.surfaces:
+        elif free and self.model.surfaces:
             of, beside = self._beside([poses[j] for j in free])
-            again = self._descended(poses, np.array(free)[of], beside, near=True)
-            found = [one + more for one, more in zip(found, again, strict=True)]
+            found = self._descended(poses, np.array(free)[of], beside, near=True)
         left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
         if left:
             others = [poses[j] for j in left]
@@ -316,16 +231,20 @@ class _PoseSearch:
         return of, Shapes.declared(np.array(x), np.array(border), len(model.clips))
 
     def _beside(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
-        """Guesses beside obstacles, and the pose of each: see `sides`."""
-        model = self.model
+        """Guesses beside obstacles, and the pose of each: first ones, and without obstacles.
+
+        All minima without obstacles are lifted out of them; of the lowest, see `sides`.
+        """
+        model, none = self.model, [None] * len(poses)
         search = replace(self, model=replace(model, obstacles=()))
-        of, first = self._first(poses, [None] * len(poses))
+        of, first = self._first(poses, none)
         pairs = list(zip(of.tolist(), first.x, first.lam, strict=True))
-        for j, minima in enumerate(search.reached(poses, [None] * len(poses))):
-            lowest = min((eq for eq in minima if eq.stable), key=lambda eq: eq.energy, default=None)
-            if lowest is not None:
-                every = beside_bars(model, lowest.x, lowest.points[: len(lowest.x)])
-                pairs += [(j, x, border_of(model, poses[j], x)) for x in every]
+        for j, minima in enumerate(search.reached(poses, none)):
+            stable = sorted((eq for eq in minima if eq.stable), key=lambda eq: eq.energy)
+            for k, i in enumerate(_distinct(model, [eq.x for eq in stable])):
+                x, points = stable[i].x, stable[i].points
+                every = [x] if k else beside_bars(model, x, points[: len(x)])
+                pairs += [(j, one, border_of(model, poses[j], one)) for one in every]
         rows, nodes, lam = zip(*pairs, strict=True)
         return np.array(rows), Shapes.declared(np.array(nodes), np.array(lam), len(model.clips))
 
@@ -365,8 +284,11 @@ class _PoseSearch:
         """The lowest distinct minima of a coarse mesh on the model's mesh, and the pose of each."""
         model, coarse = self.model, self.model.coarse
         search = _PoseSearch(coarse, self.p, coarse_rest(model, coarse, self.rest))
-        of, shapes = search._first(poses, [None] * len(poses))
-        given, found = search._descend(poses, of, shapes)
+        touching = bool(model.surfaces)
+        of, shapes = (
+            search._beside(poses) if touching else search._first(poses, [None] * len(poses))
+        )
+        given, found = search._descend(poses, of, shapes, near=touching)
         strains = assembly_of(coarse).strain(found.shapes, given)
         twists = _twists(coarse, strains[:, : coarse.chain.n_cells])
         usable = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
@@ -374,11 +296,7 @@ class _PoseSearch:
         for j, pose in enumerate(poses):
             rows = np.flatnonzero((of == j) & usable)
             rows = rows[np.argsort(found.energy[rows], kind="stable")]
-            mine: list[int] = []
-            for k in rows:
-                differs = all(not model.node.same(x[k], x[other], NEARBY) for other in mine)
-                if differs and len(mine) < FEW:
-                    mine.append(int(k))
+            mine = [int(rows[k]) for k in _distinct(model, x[rows])[:FEW]]
             if mine:
                 there = rows[on_other_side(model, pose, x[mine[0]], x[rows])]
                 mine += [int(k) for k in there[:1] if k not in mine]
@@ -387,6 +305,15 @@ class _PoseSearch:
         lam = np.zeros((len(kept), model.n_border))
         lam[:, : model.n_lam] = found.shapes.lam[kept, : model.n_lam]
         return of[kept], Shapes.declared(nodes, lam, len(model.clips))
+
+
+def _distinct(model: CableModel, shapes: Sequence[FloatArray] | FloatArray) -> list[int]:
+    """Indices of shapes (n_nodes, coordinates) that differ from all before them."""
+    found: list[int] = []
+    for k, x in enumerate(shapes):
+        if all(not model.node.same(x, shapes[other], NEARBY) for other in found):
+            found.append(k)
+    return found
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:

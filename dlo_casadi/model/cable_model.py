@@ -24,7 +24,7 @@ from dlo_casadi.model.rest_curvature import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
 from dlo_casadi.rod.ends import EndConditions, deviation_names
 from dlo_casadi.rod.node import Node
-from dlo_casadi.rod.obstacles import Obstacle
+from dlo_casadi.rod.obstacles import Capsule, Obstacle
 
 StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
@@ -269,8 +269,12 @@ class CableModel:
 
     @property
     def coarse(self) -> Self:
-        """The same model on a coarse mesh."""
-        return self.with_mesh(max(COARSE_MESH, COARSE_SPAN * (len(self.clips) + 1)))
+        """The same model on a coarse mesh, its elements no longer than a bar is thick."""
+        count = max(COARSE_MESH, COARSE_SPAN * (len(self.clips) + 1))
+        if self.surfaces:
+            thin = min((x.radius for x in self.surfaces if isinstance(x, Capsule)), default=np.inf)
+            count = max(2 * count, int(self.cable.length / (2 * thin + self.cable.diameter)))
+        return self.with_mesh(count)
 
     @cached_property
     def n_conditions(self) -> int:
