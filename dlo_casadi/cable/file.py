@@ -74,10 +74,17 @@ def _wrong_effect(row: Mapping[str, Any]) -> list[ConfigProblem]:
     for key, value in row.items():
         if key not in ("name", *defaults):
             problems.append(ConfigProblem((key,), f"{name} knows {', '.join(defaults)}"))
-        elif key != "name" and _form(value) != _form(defaults[key]):
+        elif key != "name" and not _alike(value, defaults[key]):
             text = f"something like {defaults[key]!r} belongs here, found {show(value)}"
             problems.append(ConfigProblem((key,), text))
     return problems
+
+
+def _alike(value: Any, default: Any) -> bool:
+    """Whether a value is of a default's form; where that is empty, any list of whole numbers."""
+    if default == ():
+        return isinstance(value, list) and all(type(item) is int for item in value)
+    return bool(_form(value) == _form(default))
 
 
 def _form(value: Any) -> Any:

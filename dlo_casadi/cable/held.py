@@ -11,7 +11,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
-from dlo_casadi.config.between import Obstacle, clip_problems, obstacle_problems
+from dlo_casadi.config.supports import Obstacle, clip_problems, obstacle_problems
 from dlo_casadi.config.values import MESH
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose

@@ -13,7 +13,7 @@ from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
 from dlo_casadi.config import read_yaml
-from dlo_casadi.config.between import KINDS
+from dlo_casadi.config.supports import KINDS
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from dlo_casadi.cli.options import Page, command, one_of, option
-from dlo_casadi.config.between import KINDS
+from dlo_casadi.config.supports import KINDS
 from dlo_casadi.config.template import schema_text, template
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file

@@ -4,7 +4,7 @@ The only package that imports yaml and pydantic. All units are SI. Every problem
 reported at once, each with its line.
 """
 
-from dlo_casadi.config.between import Clip, Obstacle
+from dlo_casadi.config.supports import Clip, Obstacle
 from dlo_casadi.config.document import dump_yaml, read_yaml
 from dlo_casadi.config.load import (
     any_photographs,

@@ -7,6 +7,7 @@ from typing import Any, Literal, Protocol
 from dlo_casadi.config.problems import ConfigProblem
 from dlo_casadi.config.values import (
     ConfigSection,
+    Force,
     Name,
     NonNegative,
     Number,
@@ -41,6 +42,8 @@ class Clip(ConfigSection):
     cable."""
     roll: Literal["held", "free"] = "held"
     """In space: whether a clamped clip holds the roll of the cable about its axis."""
+    clip_force: Force | None = None
+    """Force [N] that the cable exerts on the clip, where it was measured, as start_force."""
 
     def held(self, number: int) -> HeldClip:
         """The same for the statics; `number` names it where it has no name."""
@@ -85,6 +88,8 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
             yield f"{called}: {other} is of a cable in {'a plane' if space else 'space'}", k
         if clip.kind != "clamped" and getattr(clip, wanted) is not None:
             yield f"{called}: {wanted} is of a clamped clip, it is {clip.kind}", k
+        if clip.clip_force is not None and len(clip.clip_force) != axes:
+            yield f"{called}: clip_force: {'[fx, fy, fz]' if space else '[fx, fy]'} belongs here", k
         if clip.roll == "free" and not (space and clip.kind == "clamped"):
             yield f"{called}: roll: free is of a clamped clip in space", k
         if (clip.at is None) != (clip.kind == "eyelet"):

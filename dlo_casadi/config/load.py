@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from dlo_casadi.config.between import clip_problems, clips_differ, obstacle_problems, too_short
+from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.measuring import DeclaredTolerances
 from dlo_casadi.config.options import DeclaredEffect

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from dlo_casadi.config.between import Clip, Obstacle
+from dlo_casadi.config.supports import Clip, Obstacle
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.measuring import Centerlines, DeclaredTolerances, Images
 from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, Limits, ModelOptions
@@ -38,7 +38,7 @@ from dlo_casadi.config.values import (
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import counted, well_formed
 from dlo_casadi.model.clips import ClipKind
-from dlo_casadi.rod.ends import REACTIONS
+from dlo_casadi.rod.ends import REACTIONS, clip_force
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 
 # Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
@@ -207,8 +207,9 @@ class Pose(ConfigSection):
 
     @property
     def readings(self) -> dict[str, tuple[float, ...]]:
-        """Forces and moments on the fixtures that were measured, by their keys."""
+        """Forces and moments that were measured, by names of `ends.reaction_rows`."""
         found = {name: getattr(self, name) for name in REACTIONS}
+        found |= {clip_force(k): clip.clip_force for k, clip in enumerate(self.clips, start=1)}
         return {name: value for name, value in found.items() if value is not None}
 
     @property

@@ -351,7 +351,7 @@ class MeasurementEffect(Effect):
         return point
 
     def feel(self, reactions: Mapping[str, ca.SX], params: Params) -> dict[str, ca.SX]:
-        """Measured from true forces and moments on the fixtures, by `ends.REACTIONS`."""
+        """Measured from true forces and moments on the fixtures, by `ends.reaction_rows`."""
         return dict(reactions)
 
 

@@ -28,7 +28,7 @@ class Setup:
     camera : bool
         Whether the place of the camera is known.
     readings : tuple of str
-        Which forces and moments on the fixtures were measured, of `ends.REACTIONS`.
+        Which forces and moments on the fixtures were measured, of `ends.reaction_rows`.
     tolerances : mapping
         Standard deviations of declared values, by the names of `tolerances` in a configuration.
     directions : (float, float) [rad]

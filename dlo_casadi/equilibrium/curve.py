@@ -229,7 +229,8 @@ def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:
 class Observed:
     """Predicted measurements of one pose: its curve, and `readings` (n_reactions,) [N, N m].
 
-    Readings are the forces and moments on the fixtures as sensors measure them, `ends.REACTIONS`.
+    Readings are the forces and moments on the fixtures as sensors measure them, see
+    `ends.reaction_rows`.
     """
 
     curve: NodeCurve

@@ -331,7 +331,7 @@ class Assembly:
         return CurveSlopes(self, shapes, given, even, by_moving, by_others, by_station, by_p)
 
     def reactions(self, shapes: Shapes, given: Inputs) -> FloatArray:
-        """Forces and moments (m, n_reactions) of the cable on its fixtures, `ends.REACTIONS`."""
+        """Forces and moments (m, n_reactions) of the cable on its fixtures, `reaction_rows`."""
         found, touching = (
             self._call_ends("reactions", shapes, given)[0][..., 0],
             self.touching(shapes, given),

@@ -304,11 +304,12 @@ class Functions:
 
     @cached_property
     def _reactions(self) -> ca.SX:
-        """Forces [N] and moments [N m] of the cable on its fixtures, see `ends.REACTIONS`.
+        """Forces [N] and moments [N m] of the cable on its fixtures, see `ends.reaction_rows`.
 
-        Forces are minus the gradient of the Lagrangian by the ends' places at fixed nodes and
-        multipliers. Moments, about the world's axes, are the gradient of the holders' part of it
-        (multipliers of clamps, springs of pins) by rotations of the first and last node.
+        Forces on ends are minus the gradient of the Lagrangian by the ends' places at fixed nodes
+        and multipliers; those on clips are multipliers. Moments, about the world's axes, are the
+        gradient of the holders' part of it (multipliers of clamps, springs of pins) by rotations
+        of the first and last node.
         """
         node, x, delta = self.node, self.terms.x, self.terms.delta
         places = -ca.gradient(self.terms.ends_lagrangian, self.terms.pose)[: 2 * node.dimension]
@@ -321,17 +322,18 @@ class Functions:
             strict=True,
         )
         here = [row for force, own, turn in pairs for row in (force, node.to_world(own, turn))]
-        return ca.substitute(ca.vertcat(*here), x, ca.vertcat(*self.terms.moved))
+        clips = (self.terms.lam[rows] for rows in self.model.pulls[self.model.n_springs :])
+        return ca.substitute(ca.vertcat(*here, *clips), x, ca.vertcat(*self.terms.moved))
 
     @cached_property
     def reactions(self) -> ca.Function:
-        """As `at_ends` -> `ends.REACTIONS` in one column [N, N m]."""
+        """As `at_ends` -> `ends.reaction_rows` in one column [N, N m]."""
         return self._of_ends("reactions", self._reactions)
 
     @cached_property
     def _readings(self) -> ca.SX:
         """The same as measured by sensors."""
-        rows, of = self._reactions, reaction_rows(self.node)
+        rows, of = self._reactions, reaction_rows(self.node, len(self.model.clips))
         for effect, local in self.terms.effects_of(MeasurementEffect):
             parts = effect.feel({name: rows[at] for name, at in of.items()}, local)
             rows = ca.vertcat(*(parts[name] for name in of))

@@ -169,7 +169,7 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 
 def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
-    """Wrench measurements (n_reactions,) [N, N m] of sensors, see `ends.REACTIONS`."""
+    """Wrench measurements (n_reactions,) [N, N m] of sensors, see `ends.reaction_rows`."""
     return functions_of(model).readings(*_end_arguments(model, s))
 
 

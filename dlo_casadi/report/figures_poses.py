@@ -114,7 +114,7 @@ def _legend_of(
     if experiment.clips:
         handles.append(canvas.dot("clip", "D", style.BLACK))
     if experiment.in_space or readings:
-        where = "ends and clips" if experiment.in_space and experiment.clips else "the ends"
+        where = "ends and clips" if experiment.clips else "the ends"
         handles.append(canvas.line_of(f"force on {where}", color=style.FORCE))
     if readings:
         handles.append(canvas.line_of("force as read", color=style.BLACK, ls=":"))

@@ -342,7 +342,7 @@ def _readings(measurement: MeasurementSummary, shape: PoseShape) -> list[tuple[s
     """Each reading by its name: how far from the predicted one, in units and in its noise."""
     facts = []
     for name, (known, model) in shape.readings.items():
-        std, unit = measurement.std_of(name.split("_")[1])
+        std, unit = measurement.std_of(name.split("_")[-1])
         off, size = float(np.linalg.norm(known - model)), float(np.linalg.norm(known))
         text = f"{size:.3g} {unit}, off by {off:.2g} {unit} ({off / std:.1f} std)"
         facts.append((name.replace("_", " "), text))

@@ -199,7 +199,7 @@ def scenes_of(
         ]
         scenes = _rooms(config, drawn, [x for shape in last.values() for x in _all_forces(shape)])
     else:
-        pairs = [pair for shape in last.values() for _, *pair in _forces_read(shape)]
+        pairs = [pair for shape in last.values() for pair in _forces_read(shape).values()]
         board = Plane(length, _scale(_AT_END * length, [force for pair in pairs for force in pair]))
         scenes = [board] * len(poses)
     return scenes, [
@@ -248,13 +248,10 @@ def _scale(longest: float, forces: Iterable[FloatArray]) -> float:
 # ---- what stands around one pose ---------------------------------------------------------------
 
 
-def _forces_read(shape: PoseShape) -> list[tuple[int, FloatArray, FloatArray]]:
-    """At each end of which the force was read: its place in the curve, the force, the predicted."""
-    return [
-        (k, *shape.readings[f"{side}_force"])
-        for k, side in ((0, "start"), (-1, "end"))
-        if f"{side}_force" in shape.readings
-    ]
+def _forces_read(shape: PoseShape) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Forces that were read and the predicted ones by their holders: start, end, clip_1, ..."""
+    forces = (name for name in shape.readings if name.endswith("_force"))
+    return {name.removesuffix("_force"): shape.readings[name] for name in forces}
 
 
 def _spot(scene: Scene, at: FloatArray, what: str) -> list[Mark]:
@@ -279,13 +276,18 @@ def around(
     shape : PoseShape or None
         Predicted; without it the measured points throw the shadow.
     """
-    read = [] if shape is None else _forces_read(shape)
+    read = {} if shape is None else _forces_read(shape)
     line = scene.points(measured if shape is None else shape.curve)
     between = [scene.points(np.array(clip.place))[0] for clip in declared.clips]
     clips = [mark for at in between for mark in _spot(scene, at, "clip")]
     if isinstance(scene, Plane):
-        pairs = [(k, (("force", model), ("force-read", known))) for k, known, model in read]
-        arrows = [scene.force(line[k], force, kind) for k, pair in pairs for kind, force in pair]
+        holders = {f"clip_{k}": at for k, at in enumerate(between, start=1)}
+        holders |= {"start": line[0], "end": line[-1]} if read else {}
+        arrows = [
+            scene.force(holders[side], force, kind)
+            for side, (known, model) in read.items()
+            for kind, force in (("force", model), ("force-read", known))
+        ]
         return [], [*clips, *arrows]
     under, over = scene.ground(), []
     if len(line):
@@ -300,13 +302,16 @@ def around(
             over += scene.clamp(at, orientation)
         if shape is not None:
             over.append(scene.force(at, shape.forces[k]))
-            over += [scene.force(at, known, "force-read") for j, known, _ in read if j == k]
+        if side in read:
+            over.append(scene.force(at, read[side][0], "force-read"))
         over += _spot(scene, at, side)
     for k, (at, clip) in enumerate(zip(between, declared.clips, strict=True)):
         if clip.orientation is not None:
             over += scene.clamp(at, clip.orientation)
         if shape is not None and shape.clips:
             over.append(scene.force(at, np.array(shape.clips[k]["force"])))
+        if f"clip_{k + 1}" in read:
+            over.append(scene.force(at, read[f"clip_{k + 1}"][0], "force-read"))
     return under, over + clips
 
 

@@ -96,9 +96,9 @@ def nuisance_rows(outcome: Outcome) -> list[Row]:
 def fixed_rows(outcome: Outcome) -> list[Row]:
     """What was declared and kept."""
     cable, fit = outcome.config.cable, outcome.fit
-    kept = {"length": f"{cable.length:g} m", MASS: f"{cable.mass:g} kg"}
-    if MASS in outcome.stages[-1].parameters:
-        del kept[MASS]
+    kept = {"length": f"{cable.length:g} m"}
+    if MASS not in outcome.stages[-1].parameters:
+        kept[MASS] = f"{cable.mass:g} kg"
     kept["gravity"] = text.vector(outcome.config.experiment.gravity, "g", "m/s^2")
     for q, free in zip(fit.model.parameters, fit.problem.unknowns.free, strict=True):
         if not free:

@@ -7,14 +7,24 @@ import casadi as ca
 
 from dlo_casadi.rod.node import Node, quaternion_product
 
-# Forces and moments of the cable on its fixtures, in the order of `Assembly.reactions`.
+# Forces and moments of the cable on its ends' fixtures, in the order of `Assembly.reactions`.
 REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
 
 
-def reaction_rows(node: type[Node]) -> dict[str, slice]:
-    """Where each of REACTIONS stands in their vector: forces (dimension,), moments (increment,)."""
-    edges = pairwise(accumulate([node.dimension, node.increment] * 2, initial=0))
-    return {name: slice(*both) for name, both in zip(REACTIONS, edges, strict=True)}
+def clip_force(number: int) -> str:
+    """Name of the force of the cable on a clip; `number` is 1 of the first one from the start."""
+    return f"clip_{number}_force"
+
+
+def reaction_rows(node: type[Node], clips: int = 0) -> dict[str, slice]:
+    """Where REACTIONS and the forces on clips stand in the vector of `Assembly.reactions`.
+
+    Forces (dimension,) [N], moments (increment,) [N m].
+    """
+    names = (*REACTIONS, *map(clip_force, range(1, clips + 1)))
+    sizes = [node.increment if name.endswith("moment") else node.dimension for name in names]
+    edges = pairwise(accumulate(sizes, initial=0))
+    return {name: slice(*both) for name, both in zip(names, edges, strict=True)}
 
 
 def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:

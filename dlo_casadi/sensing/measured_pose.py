@@ -57,14 +57,16 @@ class MeasuredPose:
         return cls(pose, (line_or_markers(points, weight, s),), held_out)
 
     def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
-        """The same pose with wrench measurements at its fixtures, by names of `ends.REACTIONS`.
+        """The same pose with wrench measurements by names of `ends.reaction_rows`.
 
         An unreadable pose stays so.
         """
         if not readings or not self.readable:
             return self
         known = {name: np.array(value, dtype=float) for name, value in readings.items()}
-        return replace(self, sensors=(*self.sensors, Wrench(known, self.pose.node)))
+        return replace(
+            self, sensors=(*self.sensors, Wrench(known, self.pose.node, len(self.pose.clips)))
+        )
 
     @property
     def readable(self) -> bool:
@@ -123,7 +125,7 @@ class MeasuredPose:
 
     @property
     def reactions(self) -> tuple[str, ...]:
-        """Which forces and moments on the fixtures were measured, of `ends.REACTIONS`."""
+        """Which forces and moments on the fixtures were measured, of `ends.reaction_rows`."""
         return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.measured)
 
     def readings_beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:

@@ -262,19 +262,23 @@ class Wrench(_Known):
     ----------
     measured : dict
         Forces (dimension,) [N] and moments (increment,) [N m] of the cable on its fixtures, in
-        world axes, moments about the fixture; by names of `ends.REACTIONS`.
+        world axes, moments about the fixture; by names of `ends.reaction_rows`.
     node : type of Node
+    clips : int
+        Number of clips of the pose.
     """
 
     measured: dict[str, FloatArray]
     node: type[Node]
+    clips: int = 0
     per_point = 0
     points, weight, s = np.zeros((0, 1)), np.zeros(0), np.zeros(0)
 
     @property
     def _rows(self) -> dict[str, slice]:
         """Slices of the measured components in the model's `readings`."""
-        return {name: at for name, at in reaction_rows(self.node).items() if name in self.measured}
+        every = reaction_rows(self.node, self.clips)
+        return {name: at for name, at in every.items() if name in self.measured}
 
     def beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Measured and predicted values by name."""
@@ -284,7 +288,7 @@ class Wrench(_Known):
     def kinds(self) -> NDArray[np.str_]:
         """Kind of each residual (R,): a force or a moment."""
         return np.concatenate(
-            [np.full(at.stop - at.start, name.split("_")[1]) for name, at in self._rows.items()]
+            [np.full(at.stop - at.start, name.split("_")[-1]) for name, at in self._rows.items()]
         )
 
     def weighing(self, weight: FloatArray) -> Self:

@@ -344,7 +344,7 @@ def _about_elsewhere(one: ComparedReading, forces: FloatArray) -> Iterator[Hypot
 
 def _other_unit(name: str, scale: float, scales: Mapping[str, float]) -> Iterator[Suspicion]:
     """A scale that no mass explains; of moments, beside that of forces on the same cable."""
-    kind = name.split("_")[1]
+    kind = name.split("_")[-1]
     forces = [known for other, known in scales.items() if other.endswith("force")]
     beside = float(np.median(forces)) if forces and kind == "moment" else 1.0
     if 1 / READ_SCALE < scale / beside < READ_SCALE:

@@ -249,15 +249,15 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
     if fit is None:
         return ()
     seen = fit.problem.observed(fit.point)
-    rows = reaction_rows(fit.model.node)
+    rows = reaction_rows(fit.model.node, len(fit.model.clips))
     compared = []
     for name, at in rows.items():
-        side, kind = name.split("_")
+        side, _, kind = name.rpartition("_")
         poses = [session.declared[item.name] for item in shown]
         own = [k for k, pose in enumerate(poses) if name in pose.readings]
         if not own:
             continue
-        held = getattr(fit.model, side) == "clamped"
+        held = getattr(fit.model, side, "clip") == "clamped"
         forces = np.array([seen[k].readings[rows[f"{side}_force"]] for k in own])
         compared.append(
             ComparedReading(

@@ -323,7 +323,7 @@ def _summary(
 ) -> MeasurementSummary:
     readable = [item for item in measured if item.readable]
     readings = [name for item in readable for name in item.reactions]
-    kinds, points = {name.split("_")[1] for name in readings}, fit.noise.of_points
+    kinds, points = {name.split("_")[-1] for name in readings}, fit.noise.of_points
     noise = points.readings
     return MeasurementSummary(
         kind=config.experiment.measurement.kind,

@@ -270,7 +270,7 @@ def _reading_errors(
     squares: dict[str, list[float]] = {"force": [], "moment": []}
     for name in names:
         for reading, (known, model) in shapes[name].readings.items():
-            squares[reading.split("_")[1]].append(float(((known - model) ** 2).sum()))
+            squares[reading.split("_")[-1]].append(float(((known - model) ** 2).sum()))
     return ReadingErrors(*(float(np.sqrt(np.mean(x))) if x else None for x in squares.values()))
 
 

@@ -5,14 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import dlo_casadi as dlo
 from dlo_casadi.effects import CableData, SensorBias, Setup, StartSpring
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import ConfigError, MeasurementError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Inputs, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import REACTIONS, reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
@@ -106,11 +109,22 @@ def test_a_spring_at_a_pin_holds_a_moment():
     np.testing.assert_allclose(found[[2, 5]], [0.05 * (eq.phi[0] - 0.4), 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize("space", [False, True])
-def test_derivatives_of_readings(space):
-    """Along moved nodes, multipliers, parameters (bias among them) and deviations."""
+def clipped(space: bool) -> tuple[CableModel, HeldPose]:
+    """The same through a saddle and an eyelet."""
     model, pose = clamped(space)
-    setup = Setup(model.cable, gravity=model.gravity, readings=REACTIONS)
+    at = np.array([[0.17, 0.05, 0.06], [0.35, 0.2, 0.07]])[:, : len(pose.start)]
+    turn = {"orientation": (0.1, 0.0, 0.2, np.sqrt(0.95))} if space else {"heading": 0.5}
+    clips = HeldClip("clamped", tuple(at[0]), 0.25, **turn), HeldClip("eyelet", tuple(at[1]))
+    return replace(model, clips=("clamped", "eyelet")), replace(pose, clips=clips)
+
+
+@pytest.mark.parametrize("held", [clamped, clipped])
+@pytest.mark.parametrize("space", [False, True])
+def test_derivatives_of_readings(space, held):
+    """Along moved nodes, multipliers, parameters (bias among them) and deviations."""
+    model, pose = held(space)
+    names = tuple(reaction_rows(model.node, len(model.clips)))
+    setup = Setup(model.cable, gravity=model.gravity, readings=names, clips=model.clips)
     model = model.with_effect(SensorBias.made_for(setup))
     rest, assembly = np.full(model.chain.n_rests, 0.5), assembly_of(model)
     shapes = solve_equilibrium(model, model.nominal, rest, pose).shapes
@@ -133,6 +147,20 @@ def test_derivatives_of_readings(space):
 
     # Central differences of numbers of order one: 1e-10 of curvature, 1e-16 / 1e-5 of rounding.
     np.testing.assert_allclose(slope, (at(1e-5) - at(-1e-5)) / 2e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_readings_of_clips_are_the_forces_on_them(space):
+    model, pose = clipped(space)
+    rest = np.full(model.chain.n_rests, 0.5)
+    eq = solve_equilibrium(model, model.nominal, rest, pose)
+    found = assembly_of(model).reactions(
+        eq.shapes, Inputs.of(model.nominal, rest, pose.vector[None])
+    )
+    rows = reaction_rows(model.node, 2)
+    for k, load in enumerate(eq.clips, start=1):
+        np.testing.assert_array_equal(found[0, rows[f"clip_{k}_force"]], load.force)
+        assert np.linalg.norm(load.force) > 0.1
 
 
 def test_readings_are_residuals_beside_points():
@@ -189,3 +217,56 @@ def test_noise_and_bias_of_readings_are_estimated():
     assert fit.value("bending_stiffness") == pytest.approx(
         0.04, abs=3 * fit.std("bending_stiffness")
     )
+
+
+def through_a_clip(read=lambda force: force):
+    """Five poses, in three the force on the clip with 10 mN of noise, off by 30 mN; no mass."""
+    rng, s = np.random.default_rng(0), np.linspace(0.05, 0.75, 25)
+    cable = CableData(0.8, 0.15, 0.01, 0.03)
+    model = CableModel(cable, 20, n_rest=0, start="clamped", end="clamped", clips=("pinned",))
+    poses = []
+    for k in range(5):
+        end, turn = rng.uniform([0.5, -0.15], [0.65, 0.15]), rng.uniform(-0.4, 0.4, 2)
+        place = tuple(0.5 * end + rng.uniform([-0.03, -0.1], [0.03, -0.02]))
+        pose = HeldPose((0, 0), tuple(end), *turn, clips=(HeldClip("pinned", place, 0.4),))
+        (known,) = predict_poses(model, model.nominal, np.zeros(20), [pose])
+        force = known.seen.readings[-2:] + 0.03 + rng.normal(0, 0.01, 2)
+        clip = {"kind": "pinned", "at": 0.4, "place": place}
+        clip |= {"clip_force": read(force.tolist())} if k < 3 else {}
+        held = {"start_heading": turn[0], "end_heading": turn[1], "clips": [clip]}
+        points = known.curve.at(s) + rng.normal(0, 3e-4, (25, 2))
+        poses.append(dlo.Pose((0, 0), end, points=points, at=s, **held))
+    prior = {"bending_stiffness": 0.3, "rest_shape": "straight"}
+    return dlo.Session(
+        dlo.Cable(length=0.8, mass=None, diameter=0.01, **prior),
+        poses,
+        gravity=(0, -9.81),
+        boundary=("clamped", "clamped"),
+        std=3e-4,
+        force_std=0.01,
+        tolerances={"force_bias": 0.05},
+        model={"n": 20},
+    )
+
+
+def test_a_sensor_at_a_clip_makes_stiffness_absolute_where_the_mass_is_unknown(tmp_path):
+    result = through_a_clip().fit(diagnosis=False)
+    for name, true in (("bending_stiffness", 0.03), ("mass", 0.15)):
+        found = result.params[name]
+        assert found.value == pytest.approx(true, abs=3 * found.std)
+        assert found.std < 0.05 * true
+    bias = result.params["sensor_bias.clip_1_force_x"]
+    assert (bias.value, bias.unit) == (pytest.approx(0.03, abs=3 * bias.std), "N")
+    # Both components together; three readings give the size of noise to 1/sqrt(12) at best.
+    assert result.stages[-1].readings_fit.force == pytest.approx(0.01 * np.sqrt(2), rel=0.6)
+    result.write(tmp_path)
+    assert dlo.load(tmp_path).model.effects == result.cable.model.effects
+
+
+def test_wrong_readings_of_clips_are_told():
+    with pytest.raises(ConfigError, match="shapes tell stiffness over weight alone"):
+        through_a_clip(lambda force: None)
+    with pytest.raises(ConfigError, match=r"clip_1: clip_force: \[fx, fy\] belongs here"):
+        through_a_clip(lambda force: [*force, 0.0])
+    with pytest.raises(MeasurementError, match=r"clip_1_force is .* with the other sign"):
+        through_a_clip(lambda force: [-x for x in force]).fit()
