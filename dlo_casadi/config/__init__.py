@@ -4,7 +4,6 @@ The only package that imports yaml and pydantic. All units are SI. Every problem
 reported at once, each with its line.
 """
 
-from dlo_casadi.config.supports import Clip, Obstacle
 from dlo_casadi.config.document import dump_yaml, read_yaml
 from dlo_casadi.config.load import (
     any_photographs,
@@ -17,3 +16,4 @@ from dlo_casadi.config.load import (
 from dlo_casadi.config.measuring import Centerlines, DeclaredCamera, DeclaredTolerances, Images
 from dlo_casadi.config.options import DeclaredEffect, EstimationOptions, Limits
 from dlo_casadi.config.sections import Cable, Config, Pose, SkippedPose
+from dlo_casadi.config.supports import Clip, Obstacle

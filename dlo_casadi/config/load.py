@@ -8,12 +8,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.measuring import DeclaredTolerances
 from dlo_casadi.config.options import DeclaredEffect
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
+from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short
 from dlo_casadi.config.values import Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.errors import ConfigError, counted
