@@ -130,14 +130,18 @@ class Touching:
             np.full((m, count), np.inf),
         )
         found = cls(model, border, start, offsets, depth, *nowhere, np.zeros((m, count), bool))
+        felt = None
         for touching in (np.ones_like(sizes, dtype=bool),) if everywhere else (sizes > 0, None):
             active = (
                 sizes * gap_per_force(model, BALANCED) > found.gap if touching is None else touching
             )
             for _ in range(LOOKS):
-                before, now = found.gap, replace(found, active=active)
-                gap, normal, bends = now._near(advances(now.lam))
-                found = replace(now, gap=gap, normal=normal, bends=bends)
+                before, found = found.gap, replace(found, active=active)
+                if felt is not None and np.array_equal(found.lam, felt):
+                    break
+                felt = found.lam
+                gap, normal, bends = found._near(advances(felt))
+                found = replace(found, gap=gap, normal=normal, bends=bends)
                 if np.all(np.abs(gap - before) < SAME_GAP * model.cable.length):
                     break
         return found
