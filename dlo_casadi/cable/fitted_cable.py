@@ -445,5 +445,5 @@ class Shape:
     @property
     def _side(self) -> str:
         """What tells the side on which the cable hangs, as in a configuration."""
-        branch = f"branch: {self.pose.branch}"
-        return f"turns: {self.pose.turns:g}" if self.cable.model.in_space else branch
+        branch, turns = self.pose.branch, self.pose.turns
+        return f"branch: {branch}" if branch else f"turns: {turns:g}"

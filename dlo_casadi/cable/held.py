@@ -12,7 +12,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.config.supports import Obstacle, clip_problems, obstacle_problems
-from dlo_casadi.config.values import MESH
+from dlo_casadi.config.values import AXES, MESH
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
@@ -23,11 +23,6 @@ from dlo_casadi.model.contact import Contact, outwards
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.show.text import millimetres, vector
 
-# Whether in space -> key of a clamp's direction, unit, the other dimension's key, words, a place.
-_DIRECTIONS = {
-    False: ("heading", " [rad]", "orientation", "two numbers of gravity", "[x, y]"),
-    True: ("orientation", " [qx, qy, qz, qw]", "heading", "three numbers of gravity", "[x, y, z]"),
-}
 # Distances [m] between a fixture and the cable that a table shows.
 _SHOWN = 5e-6
 
@@ -148,7 +143,8 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
         If the ends are not held as the cable's boundary asks, or are no finite numbers.
     """
     name, spatial, branch = repr(model.cable.name), model.in_space, asked["branch"]
-    kind, unit, other, gravity, place = _DIRECTIONS[spatial]
+    own, other = AXES[model.node.dimension], AXES[5 - model.node.dimension]
+    kind, gravity = own.direction, f"{own.gravity} of gravity"
     given = {key: value for key, value in asked.items() if value is not None}
     if branch not in (None, *get_args(Branch)):
         raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
@@ -159,21 +155,20 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     if model.end != "free" and "end" not in given:
         raise DloError(
             f"the end of {name} is {model.end}: where is it?\n"
-            f"  Try: end={place} [m], of the command --end {' '.join(model.node.axes).upper()}."
+            f"  Try: end={own.place} [m], of the command --end {' '.join(model.node.axes).upper()}."
         )
     given.setdefault("start", shared.get("start") or (0.0,) * model.node.dimension)
     for side, held in (("start", model.start), ("end", model.end)):
         key = f"{side}_{kind}"
-        if f"{side}_{other}" in given:
-            where = "space" if spatial else "a plane"
-            text = f"{side}_{other}: {name} is in {where} ({gravity})"
-            raise DloError(f"{text}.\n  Try: {key}{unit}")
+        if (strange := f"{side}_{other.direction}") in given:
+            text = f"{strange}: {name} is in {own.where} ({gravity})"
+            raise DloError(f"{text}.\n  Try: {key} {own.unit}")
         if held != "clamped" and key in given:
             raise DloError(f"the {side} of {name} is {held}: {key} has no meaning")
         if held == "clamped" and given.setdefault(key, shared.get(key)) is None:
             raise DloError(
                 f"the {side} of {name} is clamped, and its {kind} differed from pose to pose: "
-                f"give {key}{unit}"
+                f"give {key} {own.unit}"
             )
     posed = Pose(**given)
     length, axes = model.cable.length, model.node.dimension
@@ -182,7 +177,7 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     pose = posed.held
     for key, at in (("start", pose.start), ("end", pose.end)):
         if at is not None and len(at) != model.node.dimension:
-            raise DloError(f"{key}: {place} belongs here ({gravity}), found {at}")
+            raise DloError(f"{key}: {own.place} belongs here ({gravity}), found {at}")
     if pose.turns and not (spatial and model.start == model.end == "clamped"):
         raise DloError(f"{name} has no turns: it is not in space and clamped at both ends")
     return replace(pose, name=model.cable.name or "cable")

@@ -14,7 +14,7 @@ from dlo_casadi.config.options import DeclaredEffect
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
 from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short
-from dlo_casadi.config.values import Range
+from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
@@ -190,10 +190,9 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
     if experiment.measurement.kind == "centerlines" and endings & _IMAGE_ENDINGS:
         yield "a photograph is not a CSV; measurement kind: images?", None
     if pose.points is not None:
+        own = AXES[len(experiment.gravity)]
         if len(pose.points[0]) != len(experiment.gravity):
-            axes = "[[x, y, z], ...]" if experiment.in_space else "[[x, y], ...]"
-            gravity = "three numbers" if experiment.in_space else "two numbers"
-            yield f"points: {axes} belong here ({gravity} of gravity)", "points"
+            yield f"points: [{own.place}, ...] belong here ({own.gravity} of gravity)", "points"
         if experiment.measurement.kind == "images" and not experiment.in_space:
             yield "points are not a photograph; measurement kind: centerlines?", "points"
     if len(pose.files) > 1 and not experiment.in_space:
@@ -218,37 +217,31 @@ def _weightless(config: Config) -> Iterator[ConfigProblem]:
 
 def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
     """What is wrong with the ends of a pose, in the plane or in space, and the key."""
-    held, space = experiment.boundary, experiment.in_space
-    axes = "[x, y, z]" if space else "[x, y]"
-    numbers = "three numbers of gravity: the cable is in space" if space else "two of gravity"
+    held, space, d = experiment.boundary, experiment.in_space, len(experiment.gravity)
+    own, other = AXES[d], AXES[5 - d]
+    numbers = f"{own.gravity} of gravity: the cable is in {own.where}"
     for key, most in _LARGEST_HEADINGS.items():
-        place, how, one = getattr(pose, key), getattr(held, key), "an" if key == "end" else "a"
-        orientation, heading = getattr(pose, f"{key}_orientation"), getattr(pose, f"{key}_heading")
-        if place is not None and len(place) != len(experiment.gravity):
-            yield f"{key}: {axes} belongs here ({numbers})", key
-        if orientation is not None and not space:
-            text = "is for a cable in space; gravity has two numbers. Try: "
-            yield f"{key}_orientation {text}{key}_heading", f"{key}_orientation"
-        if heading is not None and space:
-            text = "is for a cable in a plane; gravity has three numbers. Try: "
-            yield f"{key}_heading {text}{key}_orientation", f"{key}_heading"
-        if heading is not None and how == "clamped" and abs(heading) > most:
-            text = f"{heading:g} rad: in degrees? then {math.radians(heading):.4g}"
-            yield f"{key}_heading: {text}", f"{key}_heading"
+        place, how, heading = getattr(pose, key), getattr(held, key), f"{key}_heading"
+        if place is not None and len(place) != d:
+            yield f"{key}: {own.place} belongs here ({numbers})", key
+        if getattr(pose, strange := f"{key}_{other.direction}") is not None:
+            text = f"is for a cable in {other.where}; gravity has {own.gravity}"
+            yield f"{strange} {text}. Try: {key}_{own.direction}", strange
+        angle = getattr(pose, heading) or 0.0
+        if how == "clamped" and abs(angle) > most:
+            yield f"{heading}: {angle:g} rad: in degrees? then {math.radians(angle):.4g}", heading
         for kind, count, what in (
-            ("force", len(experiment.gravity), "[fx, fy, fz]" if space else "[fx, fy]"),
-            ("moment", 3 if space else 1, "[mx, my, mz]" if space else "one number"),
+            ("force", d, own.force),
+            ("moment", 2 * d - 3, "[mx, my, mz]" if space else "one number"),
         ):
             reading = getattr(pose, f"{key}_{kind}")
             if reading is not None and len(reading) != count:
                 yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
-        if how == "clamped" and space and orientation is None:
-            yield f"a clamped {key} needs {one} {key}_orientation [qx, qy, qz, qw]", None
-        if how == "clamped" and not space and heading is None:
-            how = " [rad]" if key == "start" else " [rad], continuous along the cable"
-            yield f"a clamped {key} needs {one} {key}_heading{how}", None
+        if how == "clamped" and getattr(pose, f"{key}_{own.direction}") is None:
+            one = "an" if key == "end" else "a"
+            yield f"a clamped {key} needs {one} {key}_{own.direction} {own.unit}", None
     if held.end != "free" and pose.end is None:
-        yield f"a {held.end} end needs its position: end: {axes}", None
+        yield f"a {held.end} end needs its position: end: {own.place}", None
     if held.end == "free":
         for key in ("end", "end_heading", "end_orientation", "end_force", "end_moment"):
             if getattr(pose, key) is not None:

@@ -6,6 +6,7 @@ from typing import Any, Literal, Protocol
 
 from dlo_casadi.config.problems import ConfigProblem
 from dlo_casadi.config.values import (
+    AXES,
     ConfigSection,
     Force,
     Name,
@@ -75,22 +76,20 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
 
     `axes`: 2 in a plane, 3 in space.
     """
-    last = 0.0
+    last, own, other = 0.0, AXES[axes], AXES[5 - axes]
     for k, (clip, held) in enumerate(zip(pose.clips, pose.held.clips, strict=True)):
-        called, space = held.name, axes == 3
+        called, clamped = held.name, clip.kind == "clamped"
         if len(clip.place) != axes:
-            yield f"{called}: place: {'[x, y, z]' if space else '[x, y]'} belongs here", k
-        wanted, other = ("orientation", "heading") if space else ("heading", "orientation")
-        if clip.kind == "clamped" and getattr(clip, wanted) is None:
-            unit = "[qx, qy, qz, qw]" if space else "[rad], continuous along the cable"
-            yield f"{called}: a clamped clip needs its {wanted} {unit}", k
-        if getattr(clip, other) is not None:
-            yield f"{called}: {other} is of a cable in {'a plane' if space else 'space'}", k
-        if clip.kind != "clamped" and getattr(clip, wanted) is not None:
-            yield f"{called}: {wanted} is of a clamped clip, it is {clip.kind}", k
+            yield f"{called}: place: {own.place} belongs here", k
+        if clamped and getattr(clip, own.direction) is None:
+            yield f"{called}: a clamped clip needs its {own.direction} {own.unit}", k
+        if getattr(clip, other.direction) is not None:
+            yield f"{called}: {other.direction} is of a cable in {other.where}", k
+        if not clamped and getattr(clip, own.direction) is not None:
+            yield f"{called}: {own.direction} is of a clamped clip, it is {clip.kind}", k
         if clip.clip_force is not None and len(clip.clip_force) != axes:
-            yield f"{called}: clip_force: {'[fx, fy, fz]' if space else '[fx, fy]'} belongs here", k
-        if clip.roll == "free" and not (space and clip.kind == "clamped"):
+            yield f"{called}: clip_force: {own.force} belongs here", k
+        if clip.roll == "free" and not (clamped and own is AXES[3]):
             yield f"{called}: roll: free is of a clamped clip in space", k
         if (clip.at is None) != (clip.kind == "eyelet"):
             how = "no at: the cable slides through" if clip.at is not None else "at [m]"
@@ -200,7 +199,6 @@ def _wrong(item: Obstacle, axes: int) -> Iterator[str]:
         if value is not None and key not in wanted:
             yield f"a {item.kind} has no {key}, it has {', '.join(wanted)}"
         elif value is not None and key != "radius" and len(value) != axes:
-            place = "[x, y, z]" if axes == 3 else "[x, y]"
-            yield f"{key}: {place} belongs here, found {list(value)}"
+            yield f"{key}: {AXES[axes].place} belongs here, found {list(value)}"
     if item.normal is not None and not any(item.normal):
         yield "the normal of a plane is not zero"

@@ -136,6 +136,25 @@ def implausible_quaternion(values: Sequence[float]) -> str:
     return "" if abs(size - 1) <= _UNIT else f"{belongs}, its length is {size:.4g}"
 
 
+class Axes(NamedTuple):
+    """What a session says of a cable in a plane or in space: `direction` is that of a clamp."""
+
+    where: str
+    gravity: str
+    place: str
+    force: str
+    direction: str
+    unit: str
+
+
+# By the numbers of gravity.
+_TURNED, _FRAME = "[rad], continuous along the cable", "[qx, qy, qz, qw]"
+AXES = {
+    2: Axes("a plane", "two numbers", "[x, y]", "[fx, fy]", "heading", _TURNED),
+    3: Axes("space", "three numbers", "[x, y, z]", "[fx, fy, fz]", "orientation", _FRAME),
+}
+
+
 # ---- types -------------------------------------------------------------------------------------
 
 

@@ -18,6 +18,7 @@ from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.file import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.config import Config, dump_yaml
+from dlo_casadi.config.values import AXES
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.errors import DloError, well_formed
 from dlo_casadi.estimation.result import Fit, uncertainty_of
@@ -346,7 +347,7 @@ def _effect_row(effect: Effect) -> dict[str, Any]:
 def shared_fixtures(config: Config) -> dict[str, Any]:
     """What all poses share of their start and of the directions of clamps."""
     shared: dict[str, Any] = {}
-    direction = "orientation" if config.experiment.in_space else "heading"
+    direction = AXES[len(config.experiment.gravity)].direction
     for key in ("start", f"start_{direction}", f"end_{direction}"):
         values = {getattr(pose, key) for pose in config.experiment.poses}
         shared[key] = finite(values.pop()) if len(values) == 1 else None

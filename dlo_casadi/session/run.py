@@ -28,7 +28,7 @@ from dlo_casadi.runtime.executors import InProcess, one_thread, software
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
-from dlo_casadi.session.measure import measured_poses, read_session
+from dlo_casadi.session.measure import Step, measured_poses, nobody, read_session
 from dlo_casadi.session.outcome import (
     Discretization,
     MeasurementSummary,
@@ -47,13 +47,6 @@ class Progress(Protocol):
 
     def step(self, name: str, done: int, total: int) -> None:
         """`done` of `total` parts of the named work are finished."""
-
-
-class Silent:
-    """Progress that nobody watches."""
-
-    def step(self, name: str, done: int, total: int) -> None:
-        """Ignore."""
 
 
 TIMED = ("vision", "algorithm1", "batch", "diagnosis")
@@ -101,14 +94,14 @@ def run_session(
     EstimationError
         If no model of the declared cable comes near the measured shapes.
     """
-    progress = progress or Silent()
+    step = nobody if progress is None else progress.step
     clock = Clock()
     executor = executor or InProcess()
     begin(executor, software)  # another process starts, and imports what fits, meanwhile
-    config, inputs = read_session(config, progress.step)
+    config, inputs = read_session(config, step)
     try:
         with one_thread():
-            return fit_session(config, inputs, clock, progress, executor)
+            return fit_session(config, inputs, clock, step, executor)
     except DloError as error:
         error.poses = inputs  # for whoever tells what had been read
         raise
@@ -118,7 +111,7 @@ def fit_session(
     config: Config,
     inputs: Sequence[PoseInput],
     clock: Clock,
-    progress: Progress,
+    step: Step,
     executor: Executor,
 ) -> Outcome:
     """Fit and report a session whose poses have been read; raises as `run_session` does."""
@@ -130,7 +123,7 @@ def fit_session(
     pixels = [item.pixel for item in inputs if item.pixel is not None]
     declared = fitting.declared_model(config, center, float(np.median(pixels)) if pixels else None)
 
-    progress.step("fit the declared model", 0, 1)
+    step("fit the declared model", 0, 1)
     n, refined = config.model.n or fitting.first_mesh(declared.model), None
     if config.estimation.robust:
         fit, _ = fitting.fit_declared(config, declared, measured)
@@ -138,9 +131,9 @@ def fit_session(
     compared = begin(executor, fitting.simpler_fits, config.estimation, declared.model, measured, n)
     fit, error = fitting.fit_declared(config, declared, measured, refined)
     confirming = begin(executor, fitting.minimum_by_ipopt, fit)
-    progress.step("fit the declared model", 1, 1)
+    step("fit the declared model", 1, 1)
 
-    progress.step("compare with simpler fits", 0, 1)
+    step("compare with simpler fits", 0, 1)
     reported = _parameters_of({item.name for item in config.model.effects}, fit.model)
 
     def staged(fit: Fit) -> Stage:
@@ -164,12 +157,12 @@ def fit_session(
                 fit, error = fine_enough(near, near.model.n)
         fit = as_measured(fit)
     stages = [*stages, own if fit is best else staged(fit)]
-    progress.step("compare with simpler fits", 1, 1)
+    step("compare with simpler fits", 1, 1)
     clock.lap("fit")
     found: dict[str, Any] = {}
     if config.diagnosis.enabled:
         fit, error, found = close_the_loop(
-            config, fit, stages, measured, reported, center, clock, progress, executor
+            config, fit, stages, measured, reported, center, clock, step, executor
         )
     return judged(
         Outcome(
@@ -226,7 +219,7 @@ def close_the_loop(
     reported: Sequence[str],
     center: tuple[float, float] | None,
     clock: Clock,
-    progress: Progress,
+    step: Step,
     executor: Executor,
 ) -> tuple[Fit, float, dict[str, Any]]:
     """Diagnose the declared model's residual and add what is missing.
@@ -256,7 +249,7 @@ def close_the_loop(
         exclude=options.exclude,
         significance=options.significance,
         max_effects=options.max_effects,
-        step=progress.step,
+        step=step,
         executor=executor,
         finest=None if kept_mesh else SEARCH_MESH,
     )
