@@ -45,7 +45,8 @@ def session(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(session):
-    assert main(["fit", str(session), "--output", str(session.parent / CAFE), "--quiet"]) == 0
+    command = ["fit", str(session), "--output", str(session.parent / CAFE), "--quiet"]
+    assert main([*command, "--jobs", "1"]) == 0
     return session.parent / CAFE
 
 
@@ -91,7 +92,9 @@ def test_a_failed_fit_with_such_a_name_leaves_its_page(session, tmp_path, capsys
     for pose in data["experiment"]["poses"]:
         (tmp_path / pose["file"]).write_text("x_m,y_m\n0,0\n")
     config.write_text(dump_yaml(data))
-    assert main(["fit", str(config), "--output", str(tmp_path / "out"), "--quiet"]) == 2
+    assert (
+        main(["fit", str(config), "--output", str(tmp_path / "out"), "--quiet", "--jobs", "1"]) == 2
+    )
     assert f"{READABLE}_pose_01" in (tmp_path / "out" / "failed.html").read_text()
     assert "Traceback" not in capsys.readouterr().err
 
