@@ -17,7 +17,7 @@ Value = TypeVar("Value")
 
 
 class Named(dict[str, Value]):
-    """Values by name; asked for another name it raises a DloError with all that there are."""
+    """Values by name; for an unknown name a DloError lists the known ones."""
 
     def __missing__(self, name: str) -> Value:
         raise DloError(f"nothing is called {name!r}; there are {', '.join(self)}")

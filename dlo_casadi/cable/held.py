@@ -62,7 +62,7 @@ def side_texts(
 
 
 def check_mesh(n: object, element: object) -> None:
-    """Raise DloError if there is no mesh of so many elements of that kind; None is the fit's."""
+    """Raise DloError if there is no mesh of `n` elements of that kind; None is the fit's."""
     if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
         raise DloError(f"n: a whole number, {MESH}, found {n!r}")
     if element not in (None, *ELEMENTS):

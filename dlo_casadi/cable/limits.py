@@ -27,7 +27,7 @@ from dlo_casadi.thresholds import SAFE
 
 Kind = TypeVar("Kind", bound=ConfigSection)
 Verdict = Literal["pass", "risk", "fail"]
-# Smallest probability that is told as a number.
+# Smallest probability that is written as a number.
 SHOWN = 1e-3
 UNITS = {"bend_radius": "m", "force": "N", "moment": "N m", "twist": "1/m"}
 

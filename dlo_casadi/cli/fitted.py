@@ -41,7 +41,7 @@ LIMITS = (
         help="of other fixtures than the session's: end, length [m], heading, rotation, roll [rad]",
     ),
 )
-# What `dlo predict` hands on.
+# Arguments of `FittedCable.solve` among the options.
 HELD = (
     *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
     *("turns", "branch"),
@@ -256,7 +256,7 @@ def shape_table(chosen: argparse.Namespace) -> None:
 
 
 def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
-    """The poses, if all that is not in the list is given or the same in the session's poses."""
+    """The poses; what a list does not contain is given, or the same in all poses of the session."""
     model, shared = cable.model, cable.metadata.fixtures
     x, y = chosen.start or shared.get("start") or (0.0, 0.0)
     fixed = {"start_x": float(x), "start_y": float(y)}

@@ -60,7 +60,7 @@ def guarded(work: Callable[[], int]) -> int:
         if signals.received:  # an import that was interrupted may end as any error
             return _interrupted()
         if isinstance(error, OSError) and error.errno in _LOST:
-            sys.stdout = None  # what is left in it would be tried again at exit
+            sys.stdout = None  # its unwritten rest would be tried again at exit
             if error.errno == errno.EPIPE:
                 return OK  # the reader has gone, as `head` does; nothing is left to be said
             print(f"OutputError: the output cannot be written: {error.strerror}", file=sys.stderr)

@@ -11,9 +11,9 @@ import yaml
 from dlo_casadi.config.problems import Place, Source, did_you_mean, show
 from dlo_casadi.errors import ConfigError
 
-# A file of so many bytes takes PyYAML some five seconds; a session of a thousand poses has 80,000.
+# Largest file [bytes]; PyYAML reads it in five seconds. A session of a thousand poses has 80,000.
 _LARGEST = 500_000
-# Values in a file of that size take two characters each at least: aliases may not make more.
+# Largest number of values with aliases written out: as many as the largest file can hold itself.
 _MOST_VALUES = _LARGEST // 2
 # Levels of lists and mappings; a configuration has seven.
 _DEEPEST = 30

@@ -96,8 +96,8 @@ class DiagnosisOptions(ConfigSection):
     """Largest number of effects that are added."""
 
 
-# Largest bend radius and clearance that are asked of a cable, in lengths of it: three turn the
-# whole cable by 20 degrees at most; in millimetres a limit is hundreds.
+# Largest bend radius and clearance of a limit, in lengths of the cable. At a radius of three the
+# whole cable turns by 20 degrees; a limit in millimetres would be hundreds of lengths.
 _LARGEST = 3.0
 # A full turn in a tenth of a millimetre.
 _TWIST = Range(0.0, 1.0e5, "1/m")

@@ -158,7 +158,7 @@ class Source:
 
 
 class Arguments(Source):
-    """Arguments of a call: a place is told by the argument's name alone."""
+    """Arguments of a call: a place is named by its argument alone."""
 
     hidden = ("experiment", "measurement")
     top = "the arguments"

@@ -52,7 +52,7 @@ class Range(NamedTuple):
 
 # Nothing shorter than a millimetre is held in two fixtures; 100 m hang between two masts.
 LENGTH = Range(1.0e-3, 100.0, "m")
-# Rounding to three digits moves the length of a quaternion by so much at most.
+# Largest change of a quaternion's length by rounding to three digits.
 _UNIT = 2.0e-3
 # Carbon fibres have 5e-6 m; the upper limit is the length itself.
 _THINNEST = 1.0e-6
@@ -71,7 +71,7 @@ _POSSIBLE_DENSITIES = Range(1.2, 2.0e5, "kg/m^3")
 STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
 # The largest centrifuge for models of soil reaches some 1e3 times the Earth's 9.81 m/s^2.
 GRAVITY = Range(0.0, 1.0e4, "m/s^2")
-# A frame whose origin is farther away is that of a map; of 1e3 m, doubles resolve 1e-13 m.
+# Only frames of maps have an origin farther away; at 1e3 m doubles resolve 1e-13 m.
 COORDINATE = Range(-1.0e3, 1.0e3, "m")
 # The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; taut it pulls more. A moment: a metre's arm.
 FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
@@ -115,7 +115,7 @@ def implausible_sizes(length: float, mass: float, diameter: float) -> list[Confi
     elif mass < _LIGHTEST:
         text = f"no cable is lighter than {_LIGHTEST:g} kg; to leave its weight out, write "
         wrong.append(("mass", f"{mass:g} kg: {text}gravity: [0, 0]"))
-    apparent = math.nan if wrong else density(diameter)  # told of sizes that are sound alone
+    apparent = math.nan if wrong else density(diameter)  # of possible sizes alone
     if apparent > _POSSIBLE_DENSITIES.most:
         hint = meant(mass / 1e3, apparent / 1e3 in _DENSITIES)
         text = f"{mass:g} kg make it {apparent / 1e3:.3g} times as dense as water (osmium, the "
@@ -176,7 +176,7 @@ def plain(value: Any) -> Any:
 
 
 class _Long(int):
-    """A list of so many items, where only that is told."""
+    """A long list, shown by the number of its items alone."""
 
     def __repr__(self) -> str:
         return f"<{counted(int(self), 'item')}>"
@@ -293,7 +293,7 @@ def stacked(names: Sequence[str]) -> BeforeValidator:
 
 
 def _listed(belongs: str, schema: Any, *counts: int) -> BeforeValidator:
-    """A list of one of these counts of numbers; the schema of editors tells it by its types."""
+    """A list with one of these numbers of items; `schema` is what editors are told of it."""
 
     def check(value: object) -> object:
         if not isinstance(value, list | tuple) or len(value) not in counts:

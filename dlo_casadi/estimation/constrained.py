@@ -35,7 +35,7 @@ BELOW_HIGH_END = 0.975
 # Search for the interval's ends within this factor of the estimate, threefold at most at a time.
 LARGEST_LOG_STEP = float(np.log(1e4))
 FARTHEST_AIM, MOST_REFITS = 3.0, 12
-# A last aim that moves by this share of itself: what is left of it is of second order.
+# Relative change of a crossing below which the search ends: the remaining error is of second order.
 SAME_CROSSING = 0.03
 # How far a measured equilibrium is to lie below the predicted one, in standard deviations of their
 # gap, and how closely that is met. Of nine simulated sessions of one pose eight predicted another
@@ -335,7 +335,7 @@ def _gaps(fit: Fit) -> list[EnergyGap]:
 
 
 def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:
-    """The fit where it is told that all gaps are below zero, to first order."""
+    """The fit with all gaps below zero as further measurements, to first order."""
     problem, told = fit.problem, []
     for gap in gaps:
         row = gap.slope / (KEPT * gap.std)

@@ -31,7 +31,7 @@ LONGEST_MOVE = 1.5
 # A step that lowers the objective by less has converged: one standard deviation of one parameter is
 # a decrease of 1/2.
 CONVERGED = 1e-4
-# A descent has stalled where so many steps together gain no more than the last one may.
+# Number of steps after which a descent has stalled if they gain less than one converged step may.
 STALLED = 4
 # Uphill steps allowed before backtracking; largest rise of the objective allowed.
 WATCHED, WORSE = 2, 3.0

@@ -43,7 +43,7 @@ FIRST_REST_TURNS = 0.05
 # turns of 0.06 rad, taken to first order, left 1.25.
 EXPLAINED = 1.5
 FINEST_MESH = 160
-# The search for missing effects, a hundred refits, runs on at most so many elements.
+# Largest number of elements in the search for missing effects, which takes a hundred refits.
 SEARCH_MESH = 80
 
 

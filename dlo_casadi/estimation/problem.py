@@ -222,7 +222,7 @@ class Problem:
 
     @cached_property
     def _prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and precision of the prior of theta, with what else is told of it."""
+        """Mean and precision of the prior of theta, further measurements of it included."""
         mean, precision = self.unknowns.prior(self.priors.roughness_std)
         told = self.priors.told
         if told:

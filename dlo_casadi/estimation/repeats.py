@@ -43,8 +43,8 @@ from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE, SIGNIFICANCE
 
 # Of the length: beside a fixture all repeats are where it holds them.
 _BESIDE_FIXTURES = 0.02
-# Ends so near [lengths], and clamps [rad], hold a pose in the same way: whatever the cable, its
-# shape moves by no more than about that share of its length.
+# Largest difference of ends [lengths] and clamps [rad] of two poses that are held in the same way:
+# the shape of any cable then moves by about this share of its length at most.
 NEARLY = 1e-3
 # Of the mean of repeats, a polyline.
 _NODES = 201
@@ -54,7 +54,7 @@ RANGES = (0.25, 1.0)
 # by chance. At 0.5 % the scatter of 3 of 17 simulated cables that do not repeat was taken as none,
 # for decreases of 3.5 to 5.9; the stiffness of one of them was two standard deviations off.
 TELLING = float(chdtri(1, 0.1))
-# Poses that are used at most, evenly picked.
+# Maximum number of poses used, evenly spaced.
 MOST_POSES = 40
 # Smallest and largest size in units of the first guess that are looked at.
 _LOWEST, _HIGHEST = np.log(1e-4), np.log(1e2)
@@ -315,7 +315,7 @@ class RestLikelihood:
         squares = np.einsum("jmq,mq->j", moved, pull)
         seen = np.einsum("mpq,jmq->jp", hidden, moved)
         bend = np.einsum("jmq,mqk,imk->ji", moved, inside, moved, optimize=True) - seen @ seen.T
-        # P V P = P tells what belongs to the noise from what belongs to all random parts.
+        # P V P = P separates the part of the noise from that of all random parts.
         by_noise = 2 * (self.free - traces[0] - quadratic + squares[0])
         information = bend.copy()
         information[0] = information[:, 0] = 2 * (squares - bend[0])
@@ -360,7 +360,7 @@ class RestLikelihood:
 
 @dataclass(frozen=True)
 class ScatterEstimate:
-    """What a session tells of a cable that does not repeat.
+    """What a session shows of a cable that does not repeat.
 
     Parameters
     ----------

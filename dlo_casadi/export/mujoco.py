@@ -14,7 +14,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.export.common import Relaxed, relax
 from dlo_casadi.export.rod import Fixture, Rod
 
-# Time step [s], and damping of a joint over its stiffness [s], which nobody has measured.
+# Time step [s]; damping of a joint over its stiffness [s], not measured.
 STEP, DAMPING = 0.002, 0.03
 # Moduli [Pa] in bending and twist of the cable that comes with MuJoCo 3 (model/plugin/elasticity).
 DEFAULT = (4e6, 1e7)

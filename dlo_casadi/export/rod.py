@@ -204,7 +204,7 @@ class Rod:
         )
 
     def with_stiffness(self, bending: float, torsion: float) -> Self:
-        """A straight cable of uniform stiffness [N m^2] in its place: what nobody has measured."""
+        """A straight cable of uniform stiffness [N m^2] in its place, as if unmeasured."""
         count = len(self.torsion)
         return replace(
             self,
@@ -219,7 +219,7 @@ class Rod:
         return np.trace(self.bending, axis1=1, axis2=2) / 2
 
     def inextensible(self, factor: float) -> float:
-        """EA [N] of so many times weight and buckling load: a strain of about 1 / factor."""
+        """EA [N] as a multiple of weight and buckling load: the strain is about 1 / factor."""
         weight = (self.masses.sum() + self.lumps[:, 0].sum()) * np.linalg.norm(self.gravity)
         buckling = 4 * np.pi**2 * self.bending.max() / (self.h * len(self.masses)) ** 2
         return float(factor * (weight + buckling))

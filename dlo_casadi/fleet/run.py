@@ -153,7 +153,7 @@ def fit_fleet(
 
 @dataclass(frozen=True)
 class Job:
-    """One session to fit, with all that a worker needs."""
+    """One session to fit, complete for a worker."""
 
     session: SessionFile
     digest: str  # of what decides the results

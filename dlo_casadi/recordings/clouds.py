@@ -29,7 +29,7 @@ class CloudView:
     box: Sequence[float] = ()
     """x, y, z of two corners [m] between which the cable is; everywhere when empty."""
     units: str = "m"
-    """Unit of the files, which do not tell it."""
+    """Unit of the files, which do not contain it."""
 
     def of(self, cloud: Cloud) -> Cloud:
         """The cloud without what is not the cable.

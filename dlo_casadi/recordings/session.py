@@ -46,7 +46,7 @@ class Wishes:
     hold: float = 0.5
     """Shortest still stretch that is a pose [s]."""
     held_out: int = 4
-    """Every so many poses one is held out; 0 for none."""
+    """One in this many poses is held out; 0 for none."""
     known: Mapping[str, float] = field(default_factory=dict)
     """Keys and values of the section `cable`."""
 
@@ -146,7 +146,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             for line, here in zip(lines, seen.T, strict=True)
         ]
     readings = _readings(recording, stills, wishes, remarks)
-    whole = {"length": length} if start and end else {}  # beyond the last marker nobody knows it
+    whole = {"length": length} if start and end else {}  # beyond the last marker it is unknown
     known = {**whole, **wishes.known}
     if "mass" in known and "bending_stiffness" not in known:
         known["bending_stiffness"] = _guess(known["mass"], length)

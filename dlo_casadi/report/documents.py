@@ -262,7 +262,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
 
 
 def _scatter(repeats: Repeatability) -> dict[str, Any] | None:
-    """What differs from pose to pose, and what is not told from it."""
+    """What differs from pose to pose, and what cannot be distinguished from it."""
     found = repeats.scatter
     if not found.std:
         return None

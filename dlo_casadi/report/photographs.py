@@ -113,7 +113,7 @@ def _draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome
         canvas = FigureCanvasAgg(drawing)
         canvas.draw()
         over = Image.fromarray(np.asarray(canvas.buffer_rgba()))
-    # Matplotlib takes longer to draw a photograph than all that lies over it.
+    # Matplotlib draws a photograph more slowly than all the lines over it.
     page = Image.new("RGB", over.size, "white")
     page.paste(part, ((whole - width) // 2, 0))
     page.paste(over, mask=over)

@@ -240,7 +240,7 @@ def _rooms(
 
 
 def _scale(longest: float, forces: Iterable[FloatArray]) -> float:
-    """Length of a newton with which the largest of all forces is drawn as long as told."""
+    """Length of a newton with which the largest of all forces is drawn with the `longest` arrow."""
     largest = max((float(np.linalg.norm(force)) for force in forces), default=0.0)
     return longest / largest if largest > 0 else 0.0
 

@@ -36,7 +36,7 @@ DEPENDENCES = {
     "span_z": "the distance of the ends",
     "position_z": "the place in the {plane}",
 }
-# Nobody measures a pose more often.
+# Largest number of repeats that is proposed.
 MOST_REPEATS = 20
 
 
@@ -112,7 +112,7 @@ def predicted_share(outcome: Outcome, stage: Stage) -> str:
 
 
 def mesh_text(outcome: Outcome) -> str:
-    """Elements of the model, and the error of so many."""
+    """Elements of the model, and the error of this mesh."""
     mesh = outcome.discretization
     return f"{counted(mesh.n, mesh.element)}, mesh error {millimetres(mesh.error)}"
 

@@ -137,7 +137,7 @@ class BandMatrix:
         return BandMatrix(diagonal, upper, border, corner, internal)
 
     def _widened(self, internal: int) -> BandMatrix:
-        """The same matrices with so many internal unknowns, the new ones without effect."""
+        """The same matrices with `internal` internal unknowns, the new ones without effect."""
         more = internal - self.internal
         if not more:
             return self

@@ -32,7 +32,7 @@ from dlo_casadi.errors import DloError, library
 
 # Longest time until a scheduler answers, and until it has a worker [s].
 PATIENCE = 30.0
-# Longest time until a process that is told to end has ended [s]: one that is just starting takes 1.
+# Longest time in which a terminated process ends [s]: one that is just starting takes 1.
 LAST_WORDS = 2.0
 # Environment variables that BLAS, OpenMP and OpenCV read when they are loaded.
 THREADS = dict.fromkeys(

@@ -142,7 +142,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> Profile
     variance = float(gram[0, 0] - cross @ explained) / count
     gradient = np.zeros(len(kept[0][-1]))
     for white, left, own, slopes in kept if len(gradient) else ():
-        # What is projected out, as an orthonormal basis, and last what is left of the residuals.
+        # Orthonormal basis of the directions that are projected out; last column: residuals.
         basis = np.column_stack([left[:, 1:] @ root, own, left[:, 0] - left[:, 1:] @ explained])
         weighed = white.T @ basis.reshape((len(white), -1))
         products = (weighed * (slopes @ weighed)).reshape((len(slopes), len(basis), -1)).sum(axis=1)

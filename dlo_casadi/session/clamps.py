@@ -35,7 +35,7 @@ from dlo_casadi.thresholds import (
 _TURN = 6.3
 # Of the length: pieces of which the direction is taken, and the part at an end that is used.
 _STEP, _PART = 0.02, 0.1
-# Between two pieces a line must turn by less, or nobody knows which way round [rad].
+# Largest turn between two pieces of a line [rad]; beyond it the way round is unknown.
 _TELLING = np.pi / 2
 
 

@@ -38,7 +38,7 @@ from dlo_casadi.thresholds import (
 )
 
 UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
-# A rotation so near to exchanged axes is told by their names [rad].
+# Angle [rad] within which a rotation is described as exchanged axes.
 _NAMED = 0.3
 # Fits of a frame, each followed by a new choice of which end of a line is which.
 _FITS_OF_FRAME = 4
@@ -324,6 +324,6 @@ def stretched(session: ReadSession) -> tuple[Suspicion, ...]:
     return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())
 
 
-# Of these only the first one that finds anything is told; and those that are told beside others.
+# Alternatives, of which the first that finds anything is reported; and questions of their own.
 ENDS = (wrong_units, counted_from_the_end, wrong_frame, out_of_step, single_poses)
 POINTS = (repeated, stretched)

@@ -275,7 +275,7 @@ def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, Float
 
 
 def spread(count: int, most: int) -> IntArray:
-    """Indices of at most so many of `count`, evenly picked, both ends among them."""
+    """Indices of at most `most` of `count` items, evenly spaced, both ends included."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 
 

@@ -28,7 +28,7 @@ Step = Callable[[str, int, int], None]
 
 
 def nobody(*_: object) -> None:
-    """A `Step` that tells nobody."""
+    """A `Step` that reports to nobody."""
 
 
 def read_session(config: Config, step: Step = nobody) -> tuple[Config, tuple[PoseInput, ...]]:
@@ -152,7 +152,7 @@ def _kept(points: np.ndarray) -> slice:
 
 
 def _read_views(config: Config, pose: Pose) -> PoseInput:
-    """Photographs of a cable in space; those that cannot be used are told of."""
+    """Photographs of a cable in space; messages name those that cannot be used."""
     images, problems = {}, []
     for name, path in pose.photographs.items():
         try:
@@ -379,7 +379,7 @@ def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration
         step(f"calibrate {name}", k, len(paths))
         try:
             images[name] = vision.read_image(path)
-        except MeasurementError:  # told of once its pose is read
+        except MeasurementError:  # reported when its pose is read
             continue
     found = vision.calibrate_camera(images, board_of(measurement))
     step("calibrate", len(paths), len(paths))

@@ -403,7 +403,7 @@ class Outcome:
 
     @property
     def either_side(self) -> dict[str, EitherSide]:
-        """Held-out poses by name of which the side is to be told, as the last stage sees them."""
+        """Held-out poses by name whose side has to be reported, as the last stage predicts them."""
         shapes = self.stages[-1].shapes.items()
         return {name: found for name, x in shapes if (found := x.either_side) and found.told}
 

@@ -54,8 +54,8 @@ NEVERTHELESS = (
 _POSES, _POINTS, _MESH, _REST = 8, 24, 12, 4
 # Poses that tell whether ends are exchanged: a misfit of a twentieth of the length shows in two.
 _FEW = 2
-# Stiffness over weight is known if its relative standard deviation is below this: units are told
-# where forces are five times off.
+# Largest relative standard deviation of a known stiffness over weight: wrong units, a factor of
+# five or more, are recognised then.
 _SIZED = 0.5
 # What is exchanged -> the keys of a pose.
 _EXCHANGED = {
@@ -204,7 +204,7 @@ def compare(
 ) -> Comparison | None:
     """Fit the declared session, and each hypothesis until one explains all; the best one.
 
-    Of so many poses at most. None where there is no hypothesis, or the declared session explains
+    Of `most` poses at most. None where there is no hypothesis, or the declared session explains
     its shapes and weight.
     """
     length = session.config.cable.length
@@ -220,7 +220,7 @@ def compare(
 
 
 def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
-    """Quick fit of so many poses at most, evenly picked, whatever their role."""
+    """Quick fit of at most `most` poses, evenly spaced, fitted and held-out ones."""
     measured, length = [], session.config.cable.length
     for k in spread(len(session.read), most):
         item = session.read[k]
@@ -422,8 +422,9 @@ def _angle(pull: FloatArray | None, way: FloatArray) -> float:
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-# Each takes a session and tells what it finds. Of alternatives the first that finds anything is the
-# only one. What a group finds certain is the last; poses that it doubts are left out of the next.
+# Functions from a session to what they find, in groups. Of alternatives only the first that finds
+# anything counts. A group that finds anything certain is the last one; poses that it doubts are
+# left out of the next.
 Question = Callable[[ReadSession], tuple[Suspicion, ...]]
 QUESTIONS: tuple[tuple[tuple[Question, ...], ...], ...] = (
     (ENDS,),

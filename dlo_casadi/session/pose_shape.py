@@ -57,7 +57,7 @@ class EitherSide:
 
     @property
     def told(self) -> bool:
-        """Whether the pose was measured on the other side, or nobody knows the lower one."""
+        """Whether the pose was measured on the other side, or the lower one is uncertain."""
         near = self.tipping is not None and self.tipping.either
         return near or self.other.rmse < self.predicted.rmse
 

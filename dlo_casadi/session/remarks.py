@@ -114,7 +114,7 @@ def _cure(chosen_by: str | None) -> str:
 
 
 def weight_warning(weight: HiddenWeight, expected: float) -> str:
-    """What a weight that nobody has declared would do, and what would tell.
+    """What an undeclared weight would do, and which measurement would reveal it.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
 
 
 def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> tuple[str, ...]:
-    """Why the numbers of the last stage do not hold, whatever its residual looks like.
+    """Why the numbers of the last stage do not hold, even if its residual looks like noise.
 
     Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
     times what noise, fixtures, parameters and the cable's scatter let expect. A held-out pose that
@@ -311,7 +311,7 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
 
 
 def _own(scatter: PoseScatter, fit: Fit) -> str:
-    """What each pose has of its own, with its size, and what is not told from it."""
+    """What differs in each pose, with its size, and what cannot be distinguished from it."""
     each = [
         f"{one.words} of {one.std:.2g} {one.unit(fit.model)}" for one in (scatter, *scatter.rivals)
     ]

@@ -66,7 +66,7 @@ class Clock:
         self._last = now
 
     def add(self, name: str, seconds: float) -> None:
-        """Add the time [s] that a named part has taken beside others; only some are told."""
+        """Add the time [s] of a part that ran beside others, if it is one of `TIMED`."""
         if name in self.parts:
             self.parts[name] += seconds
 
@@ -103,7 +103,7 @@ def run_session(
         with one_thread():
             return fit_session(config, inputs, clock, step, executor)
     except DloError as error:
-        error.poses = inputs  # for whoever tells what had been read
+        error.poses = inputs  # for the page of the failure, which shows what had been read
         raise
 
 

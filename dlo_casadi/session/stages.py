@@ -158,7 +158,7 @@ class _Model:
     def _told(
         self, item: MeasuredPose, known: Prediction, other: MeasuredBranch | None, shape: PoseShape
     ) -> PoseShape:
-        """A predicted pose with all that the uncertainty tells of it and of its next repeat."""
+        """A predicted pose with its uncertainty, and with that of its next repeat."""
         if self.uncertainty is None:
             return shape
         places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)

@@ -1,1 +1,1 @@
-"""How numbers and figures look, whatever they are of."""
+"""How numbers and figures look, the same everywhere."""
