@@ -129,9 +129,8 @@ def fit_many(chosen: argparse.Namespace) -> int:
     dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast
     """
     from dlo_casadi.cli.watch import Counter
-    from dlo_casadi.fleet.discover import find_sessions
     from dlo_casadi.fleet.overview import judge
-    from dlo_casadi.fleet.run import Options, fit_fleet
+    from dlo_casadi.fleet.run import Options, find_sessions, fit_fleet
 
     base, sessions = find_sessions(chosen.where)
     output = chosen.output or Path("results") / f"fleet-{base.name}"

@@ -16,8 +16,7 @@ from dlo_casadi.config import read_yaml
 from dlo_casadi.config.supports import KINDS
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
-from dlo_casadi.fleet.shape_poses import COLUMNS, Grid, PoseList
-from dlo_casadi.fleet.shape_table import Plan
+from dlo_casadi.fleet.shape_table import COLUMNS, Grid, Plan, PoseList
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 

@@ -3,8 +3,7 @@
 import pytest
 from tiny_sessions import QUICK, without_times, write_fleet
 
-from dlo_casadi.fleet.discover import find_sessions
-from dlo_casadi.fleet.run import fit_fleet
+from dlo_casadi.fleet.run import find_sessions, fit_fleet
 from dlo_casadi.runtime.executors import InProcess
 
 

@@ -15,8 +15,7 @@ from tasks import draw, kill_once, root, threads
 from tiny_sessions import QUICK, without_times
 
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.fleet.discover import find_sessions
-from dlo_casadi.fleet.run import fit_fleet
+from dlo_casadi.fleet.run import find_sessions, fit_fleet
 from dlo_casadi.runtime import executors
 from dlo_casadi.runtime.parallel import map_as_completed, map_in_order, open_executor
 

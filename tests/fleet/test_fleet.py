@@ -19,10 +19,9 @@ from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import fit, main
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.discover import digest_of, find_sessions
 from dlo_casadi.fleet.overview import judge, overview_html, robust_z
 from dlo_casadi.fleet.rows import COLUMNS, empty_row, row_of
-from dlo_casadi.fleet.run import fit_fleet
+from dlo_casadi.fleet.run import digest_of, find_sessions, fit_fleet
 from dlo_casadi.io.files import only_run
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor

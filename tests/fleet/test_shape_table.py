@@ -21,8 +21,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet import shape_table as shape_table_module
-from dlo_casadi.fleet.shape_poses import Grid, PoseList
-from dlo_casadi.fleet.shape_table import Plan, shape_table
+from dlo_casadi.fleet.shape_table import Grid, Plan, PoseList, shape_table
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.runtime.executors import InProcess
