@@ -3,6 +3,7 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
@@ -13,10 +14,10 @@ from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
 from dlo_casadi.config import read_yaml
-from dlo_casadi.config.supports import KINDS
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_table import COLUMNS, Grid, Plan, PoseList
+from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 
@@ -290,7 +291,9 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
     PARAMETERS,
     option("--output", type=Path, required=True, help="folder for the C files"),
     option("--prefix", default="dlo", help="begins all public names (dlo)"),
-    option("--clips", nargs="+", default=(), choices=KINDS, help="what holds it between"),
+    option(
+        "--clips", nargs="+", default=(), choices=get_args(ClipKind), help="what holds it between"
+    ),
     *MESH,
     json="print files and hash as JSON",
 )

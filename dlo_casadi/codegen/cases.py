@@ -1,6 +1,7 @@
 """Differences between the solvers of a cable in a plane and in space."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
@@ -56,12 +57,67 @@ class Case:
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
-        return kernels_of(bare, p, rest, self.inline, held=self.holds > 0)
+        if not self.holds:
+            return kernels_of(bare, p, rest, self.inline)
+        if not bare.chain.kind.smooth:
+            raise DloError(
+                "no solver can be generated for a cable of links with a tether\n"
+                "  Try: another element, --element quadratic"
+            )
+        # Before a clip there is a force also in a cable whose end is free.
+        bare = replace(bare, end="pinned") if bare.end == "free" else bare
+        return kernels_of(
+            bare, p, rest, self.inline, "clamped" if model.clamped_between else "pinned"
+        )
 
     @property
     def holds(self) -> int:
         """Number of clips and tethers that hold the cable between its ends."""
         return len(self.model.clips) + len(self.tethers)
+
+    @property
+    def eyelet_rows(self) -> list[int]:
+        """Of each holder the row of its arc length in the border; 0 of those that do not slide."""
+        first, rows = self.model.node.dimension * (1 + self.holds), [0] * self.holds
+        for k, clip in enumerate(self.model.sliding):
+            rows[clip] = first + k
+        return rows
+
+    @property
+    def border(self) -> int:
+        """Number of unknowns of the border: forces, then arc lengths."""
+        return self.model.node.dimension * (1 + self.holds) + len(self.model.sliding)
+
+    @property
+    def holding(self) -> list[float]:
+        """Declared length [m]; of each clip what is true minus declared, and each tether."""
+        length = self.model.cable.length
+        places, at = (
+            np.array(x)
+            for x in functions_of(self.model).true_clips(self.p, np.zeros(self.model.n_pose))
+        )
+        clips: list[FloatArray] = [
+            np.array([s / length, *place, 0.0])
+            for s, place in zip(at.ravel(), places.T, strict=True)
+        ]
+        return [length, *(float(x) for row in (*clips, *self.tethers) for x in row)]
+
+    @property
+    def example_clips(self) -> str:
+        """Clips of the pose of example.c, evenly along its chord."""
+        model, shares = self.model, np.linspace(0.0, 1.0, len(self.model.clips) + 2)[1:-1]
+        rows = [
+            [s, *(s * np.array([0.6, 0.1, 0.1]))[: model.node.dimension]]
+            for s in shares * self.length
+        ]
+        frame = model.node.identity if model.clamped_between else ()
+        clips = [
+            f"{{{row[0]:.4g}, {{{', '.join(f'{x:.4g}' for x in row[1:])}}}"
+            + _initializer(frame)
+            + "}"
+            for row in rows
+        ]
+        return f",\n                           {{{', '.join(clips)}}}" if clips else ""
 
     @cached_property
     def tethers(self) -> list[FloatArray]:
@@ -118,12 +174,21 @@ class Case:
         return np.array(functions_of(self.model).dead_load(self.p)).ravel()
 
 
+def _initializer(frame: Sequence[float]) -> str:
+    """C text behind the place of a clip: its direction, of those that have one."""
+    if not len(frame):
+        return ""
+    return f", {frame[0]:g}" if len(frame) == 1 else f", {{{', '.join(f'{x:g}' for x in frame)}}}"
+
+
 class _PlaneCase(Case):
     """A cable in a plane."""
 
     name, try_steps = "plane", 13
     # Doubles of a workspace per node, as in the template: arrays, border, two-point segments.
     doubles = 12 + 2 + 2 * 15
+    # Of a segment that is held inside.
+    held_doubles = 15 + 2 + 2 + 2 + 4 + 3 + 8
 
     @property
     def numbers(self) -> list[float]:
@@ -139,6 +204,7 @@ class _PlaneCase(Case):
             *(chain.places / model.cable.length),
             *resting_headings(chain, self.rest),
             *(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)),
+            *(self.holding if self.holds else ()),
         ]
 
     @property
@@ -156,8 +222,15 @@ class _PlaneCase(Case):
         # From each first guess there is one free descent, and one guided by springs in 15 stages; a
         # descent takes 100 steps, and 6 more off saddles. The template checks the number.
         guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
+        held = 0
+        if self.holds:
+            held = 2 * self.held_doubles * self.holds + (5 + 15) * chain.n_segments
+            held += (self.border - 2) * count + 2 * self.held_doubles
+        if spans := len(model.clips) and len(model.clips) + 1:
+            guesses = (2**spans if spans <= 4 else spans + 2) * (3 if model.sliding else 1)
         return {
-            "WORKSPACE": self.doubles * (count + 1),
+            "WORKSPACE": self.doubles * (count + 1) + held,
+            "EXAMPLE_CLIPS": self.example_clips,
             "ELEMENTS": chain.n_segments,
             "FIRST": chain.layout.advancing[0],
             "LOW": model.start == "clamped" and not gives[0],
@@ -176,9 +249,9 @@ class _SpaceCase(Case):
 
     name, try_steps = "space", 12
     # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
-    doubles, coarse_shapes = 4 + 4 + 4 + 3 + 6 + 9 + 9 + 58, 8
+    doubles = 4 + 4 + 4 + 3 + 6 + 9 + 58
     # Of a segment that is held inside.
-    held_doubles = 58 + 3 + 9 + 9 + 9 + 6 + 13
+    held_doubles = 58 + 3 + 9 + 9 + 9 + 6 + 14
     # Fewest arcs of the coarse mesh, and number of fine elements in each. Of 3,000 random clamped
     # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
     # guesses on the fine mesh.
@@ -199,7 +272,8 @@ class _SpaceCase(Case):
         least = max(self.least_coarse, self.coarse_span * spans)
         count = min(model.n, max(least, round(model.n / self.coarsening)))
         itself = count == model.n and model.element == self.coarse_element
-        return 0 if model.end == "free" or itself else count
+        hangs = self.model.end == "free" and not self.model.clips
+        return 0 if hangs or itself else count
 
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
@@ -246,40 +320,21 @@ class _SpaceCase(Case):
         return [*first, *self.load, *self.clamps, *bends.T.ravel(), *self.holding]
 
     @property
-    def example_clips(self) -> str:
-        """Clips of the pose of example.c, evenly along its chord."""
-        shares = np.linspace(0.0, 1.0, len(self.model.clips) + 2)[1:-1] * self.length
-        places = [f"{{{s:.4g}, {{{0.6 * s:.4g}, {0.1 * s:.4g}, {0.1 * s:.4g}}}}}" for s in shares]
-        return f",\n                           {{{', '.join(places)}}}" if places else ""
-
-    @property
-    def holding(self) -> list[float]:
-        """Declared length [m]; of each clip what is true minus declared, and each tether."""
-        length = self.model.cable.length
-        places, at = (
-            np.array(x)
-            for x in functions_of(self.model).true_clips(self.p, np.zeros(self.model.n_pose))
-        )
-        clips: list[FloatArray] = [
-            np.array([s / length, *place, 0.0])
-            for s, place in zip(at.ravel(), places.T, strict=True)
-        ]
-        return [length, *(float(x) for row in (*clips, *self.tethers) for x in row)]
-
-    @property
     def values(self) -> dict[str, int | str]:
         n, coarse = self.model.n, self.coarse_elements
         # From each first guess there is a descent on the coarse mesh, from its minimum one on the
         # fine mesh, and if all fail, one on the fine mesh from the first guess; a descent takes 80
         # steps. The template checks the number.
-        guesses = 3 if self.model.end == "free" else 8
+        hangs = self.model.end == "free" and not self.model.clips
+        guesses = 3 if hangs else 8 * (3 if self.model.sliding else 1)
+        held = self.held_doubles * self.holds + (11 + 58) * n if self.holds else 0
         return {
-            "WORKSPACE": (self.doubles + 9 * self.holds) * (n + 2)
-            + 4 * self.coarse_shapes * (coarse + 1)
-            + self.held_doubles * self.holds,
+            "WORKSPACE": (self.doubles + 3 * self.border) * (n + 2)
+            + 4 * guesses * (coarse + 1)
+            + held,
             "EXAMPLE_CLIPS": self.example_clips,
             "COARSE": coarse,
-            "SHAPES": self.coarse_shapes,
+            "SHAPES": guesses,
             "FIRST": 0,
             "GIVES_START": 0,
             "GIVES_END": 0,

@@ -17,9 +17,12 @@ from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import CLAMPS
 
 # Maximum number of steps between two poses of a path, as in the templates.
 FINEST = 4096
+# What a clamp between the ends lets the cable do, as in the templates.
+_CLAMP_KINDS = {"clamped": 1, "swivel": 2}
 # Text by which a generated file is recognised, in all templates.
 MARK = "written by dlo-casadi"
 # Keywords of C99, C11 and C++, and names that every program defines.
@@ -107,7 +110,8 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
     """Values of the templates' marks for any cable."""
     model, node, kind = case.model, case.model.node, case.model.chain.kind
     effects = comment(", ".join(effect.name for effect in model.effects)) or "none"
-    held = f"start {model.start}, end {model.end}"
+    ends = f"start {model.start}, end {model.end}"
+    held = [*model.clips, *["pinned"] * len(case.tethers)]
     table, text = case.table, KernelText.of(case.meshes)
     values = case.values
     return values | {
@@ -115,7 +119,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
         "FILE": f"{prefix}_solver",
         "TITLE": comment(model.cable.name),
         "VERSION": __version__,
-        "MODEL": f"{counted(model.n, model.element)}, {held}, effects: {effects}",
+        "MODEL": f"{counted(model.n, model.element)}, {ends}, effects: {effects}",
         "HASH": digest,
         "DIMENSION": node.dimension,
         "COORDINATES": node.coordinates,
@@ -139,8 +143,15 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
         "KERNELS": text.functions,
         "LOOPS": text.loops,
         "HELD": text.holders,
+        "EVEN": text.even,
+        "ROW": 2 + 3 * len(node.strains),
         "HOLDS": case.holds,
         "CLIPS": len(model.clips),
+        "CLIP_KINDS": ", ".join(model.clips),
+        "CLAMPS": sum(kind in CLAMPS for kind in model.clips),
+        "CLAMP_KINDS": ", ".join(str(_CLAMP_KINDS.get(kind, 0)) for kind in held),
+        "EYELETS": len(model.sliding),
+        "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
         "TRY_STEPS": case.try_steps,
         "PATH_STEPS": int(values["STEPS"]) + case.try_steps * (2 * FINEST + 13),
     }
@@ -187,22 +198,6 @@ def fill(text: str, values: dict[str, str], prefix: str) -> str:
     return marked(text, values)
 
 
-def _cannot_hold(model: CableModel) -> str:
-    """Why the C solver cannot hold a cable between its ends; empty if it can, or need not."""
-    if model.surfaces:
-        return f"the C solver has no contact, this cable {counted(len(model.surfaces), 'obstacle')}"
-    if not model.clips:
-        return ""
-    if not model.in_space or model.end == "free":
-        how = "with a free end" if model.in_space else "in a plane"
-        return f"the C solver has clips of cables in space with both ends held, not {how}"
-    if others := sorted(set(model.clips) - {"pinned"}):
-        return (
-            f"the C solver has pinned clips alone, and this cable has {' and '.join(others)} ones"
-        )
-    return ""
-
-
 def generate(
     model: CableModel,
     p: FloatArray,
@@ -233,20 +228,17 @@ def generate(
         If the prefix is not a C identifier or an effect cannot be generated.
     """
     check_prefix(prefix)
-    if wrong := _cannot_hold(model):
-        raise DloError(f"{wrong}.\n  Try: solve(...) of Python, which knows them.")
+    if model.surfaces:
+        count = counted(len(model.surfaces), "obstacle")
+        raise DloError(
+            f"the C solver has no contact, this cable {count}.\n"
+            "  Try: solve(...) of Python, which knows them."
+        )
     p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
     if len(p) != len(model.parameters) or len(rest) != model.chain.n_rests:
         raise DloError(
             f"p has {len(p)} and rest {len(rest)} entries; the model has "
             f"{len(model.parameters)} parameters and {model.chain.n_rests} rest curvatures"
-        )
-    if model.shape_dependent_loads and not model.in_space:
-        loads = " and ".join(model.shape_dependent_loads)
-        raise DloError(
-            f"no solver can be generated for a cable with {loads}: the force depends on the shape, "
-            "and the generated solver of a plane knows dead loads only.\n"
-            "  Try: dlo predict, or dlo_casadi.predict, which know it."
         )
     digest = solver_hash(model, p, rest)
     case = case_of(model, p, rest, inline)
@@ -255,7 +247,8 @@ def generate(
         for mark, value in _values(case, prefix, digest).items()
     }
     own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
-    sources = ("common", case.name, "newton", *own, "shape", "clearance", "interface", "casadi")
+    sources = ("common", case.name, "newton", own[0], "between", *own[1:], "shape")
+    sources += ("clearance", "interface", "casadi")
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),

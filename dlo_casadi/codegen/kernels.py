@@ -14,6 +14,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
@@ -49,12 +50,13 @@ class Kernel:
     """Segments first <= j < last of one kind, which differ only by a row of numbers each.
 
     `members` are (first, last), `rows` (last - first, k) the numbers of each segment; `derive`
-    makes the function.
+    makes the function. Where nodes move along the cable a pose has the rows, see `row_of` in C.
     """
 
     members: tuple[int, int]
     rows: FloatArray
     derive: Callable[[], ca.Function]
+    moved: bool = False
 
     @cached_property
     def function(self) -> ca.Function:
@@ -65,19 +67,16 @@ class Kernel:
         """Statement that calls it for all its segments, whose rows begin at `table_at`."""
         (first, last), width = self.members, self.rows.shape[1]
         row = f"table + {table_at} + (j - {first}) * {width}" if width else "table"
+        row = "row_of(w, j)" if self.moved else row
         state = self.function.numel_in(0) // 2
         return f"""\
     FOR_SEGMENTS({first}, {last})
         {name}(x + {state} * j, FORCE, {row}, table,
         {" " * len(name)} segment + SEGMENT * j);"""
 
-    def at_holder(self, name: str, table_at: int) -> str:
+    def at_holder(self, name: str) -> str:
         """Statement that calls it for segment j, in which something holds the cable."""
-        width, state = self.rows.shape[1], self.function.numel_in(0) // 2
-        return f"""\
-    copy(row, table + {table_at} + j * {width}, {width});
-    row[{width}] = share;
-    {name}(x + {state} * j, lam, row, table, out);"""
+        return f"    {name}(x + {self.function.numel_in(0) // 2} * j, lam, row, table, out);"
 
     def text(self, name: str) -> str:
         """The function in C."""
@@ -137,12 +136,14 @@ class KernelText:
     """C text of the kernels of all meshes.
 
     `functions`, `loops` that call them for the segments, `holders` for one that holds the cable;
-    `size`: length of their table. With two meshes the second one is called if `w->coarse` is set.
+    `even`: where in their table the rows of the latter begin, `size`: its length. With two meshes
+    the second one is called if `w->coarse` is set.
     """
 
     functions: str
     loops: str
     holders: str
+    even: str
     size: int
 
     @classmethod
@@ -151,6 +152,7 @@ class KernelText:
         functions: list[str] = []
         loops: list[str] = []
         holders: list[str] = []
+        even: list[str] = []
         at = 0
         for name, kernels in meshes.items():
             statements, at = [], at + len(kernels.shared)
@@ -160,14 +162,16 @@ class KernelText:
                 at += kernel.rows.size
             if kernels.holder is not None:
                 functions.append(kernels.holder.text(f"{name}_held"))
-                holders.append(kernels.holder.at_holder(f"{name}_held", at))
+                holders.append(kernels.holder.at_holder(f"{name}_held"))
+                even.append(str(at))
                 at += kernels.holder.rows.size
             if kernels.ends is not None:
                 functions.append(_ends_text(kernels.ends))
             loops.append("\n".join(statements))
         text = "\n".join(functions)
         helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
-        return cls("\n".join([*helpers, text]), _by_mesh(loops), _by_mesh(holders), at)
+        rows = f"w->coarse ? {even[1]} : {even[0]}" if len(even) > 1 else "".join(even)
+        return cls("\n".join([*helpers, text]), _by_mesh(loops), _by_mesh(holders), rows, at)
 
 
 def _by_mesh(statements: list[str]) -> str:
@@ -188,18 +192,30 @@ def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
 
 
 def kernels_of(
-    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True, held: bool = False
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True, *held: ClipKind
 ) -> Kernels:
     """Kernels of a model at given parameters; `inline` as in `generate`.
 
-    The model has neither clips nor tethers; `held`: whether the solver has.
+    The model has neither clips nor tethers. `held`: a kind of clip that holds the cable inside of
+    one segment; if it is clamped, nodes are moved along the cable.
     """
-    places = model.chain.layout.segments
+    model, bare = replace(model, clips=held), model
+    places, moved = model.chain.layout.segments, model.clamped_between
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
-    kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
+    shared = np.zeros(0) if inline else np.asarray(p, float)
+    rows = np.insert(own, 1, places[:, 1], axis=1)
+    whole = (0, len(own))
+    held_by = partial(_told, model, parameters, rows.shape[1], inside=True)
+    holder = Kernel(whole, rows, held_by, moved) if held else None
+    if moved:
+        plain = partial(_told, model, parameters, rows.shape[1])
+        return Kernels(
+            (Kernel(whole, own[:, :0], plain, moved),), _ends(bare, parameters), shared, holder
+        )
+    kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
     # A point force acts on all of a segment, on none of it, or at a place inside it.
-    shares = np.array([np.array(lagrangian_of(model).shares(p, place)).ravel() for place in places])
+    shares = np.array([np.array(lagrangian_of(bare).shares(p, place)).ravel() for place in places])
     inside = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * inside
     told = (
@@ -207,51 +223,51 @@ def kernels_of(
     )
     edges = [0, *(np.flatnonzero(np.any(np.diff(told, axis=0), axis=1)) + 1), len(own)]
     segments = tuple(
-        _kernel(model, parameters, places[first], own[first:last], (first, last), inline)
+        _kernel(bare, parameters, places[first], own[first:last], (first, last), inline)
         for first, last in pairwise(edges)
     )
-    shared = np.zeros(0) if inline else np.asarray(p, float)
-    holder = _holder(model, parameters, places[0], own) if held else None
-    return Kernels(segments, _ends(model, parameters), shared, holder)
+    return Kernels(segments, _ends(bare, parameters), shared, holder)
 
 
-def _holder(model: CableModel, p: ca.SX, first: FloatArray, own: FloatArray) -> Kernel:
-    """Kernel of any segment, with a holder at the share `row[-1]` of it."""
-    held = replace(model, clips=("pinned",))
-    row = ca.SX.sym("row", own.shape[1] + 1)
-    start, share = row[0], row[-1]
-    place = ca.vertcat(start, first[1], start, *first[3:], start + share * model.chain.h)
-    still = ca.SX.zeros(len(held.deviation_names))
-    shares = ca.vertcat(lagrangian_of(model).shares(p, place[: len(first)]), share)
-    numbers = SegmentNumbers(p, row[1:-1], place, still, shares)
-    return Kernel((0, len(own)), own, partial(_told_held, held, numbers, row))
+def _told(model: CableModel, p: ca.SX, width: int, *, inside: bool = False) -> ca.Function:
+    """(x, lam, row, p) -> `_in_order` of a segment of a cable with one clip.
 
-
-def _told_held(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function:
-    """As `_told` for a segment that is held inside: lam are the force beyond and that inside.
-
-    After what `_told` has: derivatives by the force inside, first, then with the first node, the
-    last node, the force beyond and itself; and derivatives by the place on the cable [1/m]: of the
-    Lagrangian, of its gradient by the first node, the last node, the force beyond and that inside.
+    The row (width,) has its start and length [m] and rest strains inside. `inside`: the clip holds
+    it at the share `row[width]`, and lam are the force beyond and that of the clip. Then there are,
+    after the other results, the derivatives by the force inside, first, then with the first node,
+    the last node, the force beyond and itself; and derivatives by the place on the cable [1/m]: of
+    the Lagrangian, of its gradient by the first node, the last node, the force beyond and that
+    inside; and the second one of the Lagrangian.
     """
-    d = model.node.dimension
-    x, lam = ca.SX.sym("x", 2 * model.node.coordinates), ca.SX.sym("lam", 2 * d)
-    found = lagrangian_of(model).in_frame(x, ca.reshape(lam, d, 2), numbers).derivatives()
-    found = found.about(found.turn, found.turn)
-    inside = found.lam_lam[:d, d:], found.lam_lam[d:, d:]
-    more = [found.by_lam[d:], *(_rows(part[:, d:]) for part in found.mixed)]
-    more += [_rows(inside[0]), _triangle(inside[1])]
-    slopes = ca.vertcat(found.value, *found.slopes, found.by_lam)
-    by_place = ca.jacobian(slopes, row[-1]) / model.chain.h
-    plain = replace(
+    d, terms = model.node.dimension, lagrangian_of(model)
+    row, lam, own = (ca.SX.sym("i", size) for size in (width + inside, d, d))
+    x = ca.SX.sym("x", 2 * model.node.coordinates)
+    start, length, share = row[0], row[1], row[width] if inside else ca.SX(0)
+    length = length if model.clamped_between else ca.SX(model.chain.h)
+    advancing = model.chain.layout.segments[0, 4]
+    place = ca.vertcat(start, length, start, length, advancing, start + share * length)
+    still = ca.SX.zeros(len(model.deviation_names))
+    shares = ca.vertcat(*ca.vertsplit(terms.shares(p, place))[:-1], share)
+    numbers = SegmentNumbers(p, row[2:width], place, still, shares)
+    found = _derivatives(model, x, ca.vertcat(lam, own), numbers)
+    beyond = replace(
         found,
         by_lam=found.by_lam[:d],
         mixed=(found.mixed[0][:, :d], found.mixed[1][:, :d]),
         lam_lam=found.lam_lam[:d, :d],
     )
-    arguments = [x, lam, row, _symbols(numbers.p)]
-    outputs = [ca.densify(ca.vertcat(*_in_order(plain), *more, by_place))]
-    return ca.Function("kernel", arguments, ca.cse(outputs))
+    outputs = _in_order(beyond)
+    if inside:
+        outputs += [found.by_lam[d:], *(_rows(part[:, d:]) for part in found.mixed)]
+        outputs += [_rows(found.lam_lam[:d, d:]), _triangle(found.lam_lam[d:, d:])]
+        slopes = ca.vertcat(found.value, *found.slopes, found.by_lam)
+        by_place = ca.jacobian(slopes, share) / length
+        outputs += [by_place, ca.jacobian(by_place[0], share) / length]
+    else:
+        outputs = ca.substitute(outputs, [own], [ca.SX.zeros(d)])
+    told = ca.cse([ca.densify(ca.vertcat(*outputs))])
+    forces = ca.vertcat(lam, own) if inside else lam
+    return ca.Function("kernel", [x, forces, row, _symbols(p)], told)
 
 
 def _kernel(
@@ -277,49 +293,62 @@ def _kernel(
         ca.SX.zeros(len(model.deviation_names)),
         lagrangian_of(model).shares(p, ca.DM(first) if inline else place),
     )
-    return Kernel(members, own[:, ~alike], partial(_told, model, numbers, row))
+    return Kernel(members, own[:, ~alike], partial(_plain, model, numbers, row))
 
 
-def _told(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function:
-    """(x, lam, row, p) -> a segment's Lagrangian and its derivatives in one vector.
-
-    x are the states of both nodes, lam [N] is the force on the end's holder, also with a free end:
-    the derivative by it is the advance. In order: value; by lam: advance [m]; in space the rotation
-    vector from node to node [rad]; gradient by the first, last node; Hessian by first-first,
-    first-last, last-last, first-lam, last-lam, lam-lam: row by row, of symmetric blocks the upper
-    triangle column by column.
-    """
+def _plain(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Function:
+    """(x, lam, row, p) -> a segment's Lagrangian and its derivatives in one vector."""
     x, lam = ca.SX.sym("x", 2 * model.node.coordinates), ca.SX.sym("lam", model.node.dimension)
-    derive = {1: _of_headings, 3: _of_frames}[model.node.increment]
-    found = derive(model, x, lam, numbers)
+    found = _in_order(_derivatives(model, x, lam, numbers))
     arguments = [x, lam, row, _symbols(numbers.p)]
     return ca.Function("kernel", arguments, ca.cse([ca.densify(ca.vertcat(*found))]))
 
 
-def _of_headings(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
-    position = ca.SX.zeros(0) if model.end == "free" else lam
-    multipliers = ca.vertcat(position, ca.SX.zeros(2))[: model.n_conditions]
+def _derivatives(
+    model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers
+) -> SegmentDerivatives:
+    """Derivatives of a segment's Lagrangian, in space by increments about the world's axes.
+
+    x are the states of both nodes, lam the force on the end's holder, also with a free end, then
+    that of a clip [N].
+    """
+    if model.node.increment > 1:
+        forces = ca.reshape(lam, 3, lam.numel() // 3)
+        found = lagrangian_of(model).in_frame(x, forces, numbers).derivatives()
+        return found.about(found.turn, found.turn)
+    # At a free end lam is zero, but the derivative by it is still the advance.
+    free = model.end == "free"
+    multipliers = ca.SX.zeros(model.n_lam)
+    for rows, own in zip((model.end_pull, *model.pulls), ca.vertsplit(lam, 2), strict=True):
+        multipliers[rows] = own[: len(rows)]
     arguments = [x, multipliers, numbers.p, numbers.rest, numbers.place, numbers.deviation]
     both: Any = functions_of(model).segment_by_share(
         *arguments, numbers.shares
     )  # CasADi's stubs: one result
     value, advance = both
-    if model.end == "free":
-        # lam is zero at a free end, but the derivative by it is still the advance.
+    if free:
         value += ca.dot(lam, advance)
     hessian, gradient = ca.hessian(value, ca.vertcat(x, lam))
-    bends, borders = _triangle(hessian[:2, :2]), _rows(hessian[:2, 2:])
-    return [value, gradient[2:], gradient[:2], bends, borders, _triangle(hessian[2:, 2:])]
-
-
-def _of_frames(model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers) -> list[ca.SX]:
-    """Derivatives are by increments about the world's axes."""
-    found = lagrangian_of(model).in_frame(x, lam, numbers).derivatives()
-    return _in_order(found.about(found.turn, found.turn))
+    nodes, forces = hessian[:2, :2], hessian[:2, 2:]
+    return SegmentDerivatives(
+        value,
+        turn=ca.SX(0, 0),
+        phi=ca.SX(0, 1),
+        slopes=(gradient[0], gradient[1]),
+        by_lam=gradient[2:],
+        bends=(nodes[0, 0], nodes[0, 1], nodes[1, 1]),
+        mixed=(forces[0, :], forces[1, :]),
+        lam_lam=hessian[2:, 2:],
+    )
 
 
 def _in_order(found: SegmentDerivatives) -> list[ca.SX]:
-    """Derivatives in space in the order of `_told`."""
+    """Derivatives of a segment in the order of the C text.
+
+    Value; by lam: advance [m]; in space the rotation vector from node to node [rad]; gradient by
+    the first, last node; Hessian by first-first, first-last, last-last, first-lam, last-lam,
+    lam-lam: row by row, of symmetric blocks the upper triangle column by column.
+    """
     (first, between, last), mixed = found.bends, found.mixed
     bends = [_triangle(first), _rows(between), _triangle(last)]
     borders = [*map(_rows, mixed), _triangle(found.lam_lam)]

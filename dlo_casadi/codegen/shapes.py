@@ -12,6 +12,7 @@ from dlo_casadi.equilibrium.implicit import pose_size
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import EndConditions
 
 Place = tuple[float, ...]
@@ -74,6 +75,12 @@ class CompiledShape:
         Of the cable on each clip, then on each tether.
     clip_grip : (n_clips + n_tethers,) [N]
         Their parts along the cable, forward: what a clip holds against slipping.
+    clip_at : (n_clips + n_tethers,) [m]
+        Arc lengths at which they hold the cable.
+    clip_moments : (n_clips + n_tethers, increment) [N m]
+        With clamped clips, of the cable on them, in space about the world's axes.
+    places : (n + 1,)
+        With clamped clips, arc lengths over length of points and nodes: one is moved to each.
     """
 
     points: FloatArray
@@ -91,6 +98,9 @@ class CompiledShape:
     status: str
     clip_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
     clip_grip: FloatArray = field(default_factory=lambda: np.zeros(0))
+    clip_at: FloatArray = field(default_factory=lambda: np.zeros(0))
+    clip_moments: FloatArray = field(default_factory=lambda: np.zeros(0))
+    places: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -111,7 +121,8 @@ class Slope:
 
     In a plane by end x, y [m], start heading, end heading [rad], k = 4. In space by start x, y, z
     [m], the rotation of the start about the world's axes x, y, z [rad], and the same of the end,
-    k = 12, then of each clip its arc length and its place x, y, z [m].
+    k = 12. Then of each clip by its arc length and its place [m] and, if any is clamped, its
+    heading, or rotation about the world's axes [rad].
 
     Parameters
     ----------
@@ -121,7 +132,10 @@ class Slope:
     end_force : (dimension, k)
     moments : (2, increment, k)
     min_bend_radius : (k,)
-    clip_forces : (n_clips + n_tethers, dimension, k)
+    clip_forces, clip_at, clip_moments, places : (..., k)
+        Of those of CompiledShape.
+    energy_by_at : (n_clips,) [N]
+        Derivatives of the energy by the clips' arc lengths.
     """
 
     points: FloatArray
@@ -130,6 +144,10 @@ class Slope:
     moments: FloatArray
     min_bend_radius: FloatArray
     clip_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    clip_at: FloatArray = field(default_factory=lambda: np.zeros(0))
+    clip_moments: FloatArray = field(default_factory=lambda: np.zeros(0))
+    places: FloatArray = field(default_factory=lambda: np.zeros(0))
+    energy_by_at: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -207,16 +225,21 @@ def records_of(model: CableModel) -> Records:
     """Layouts of the structures of a model's solver."""
     node, n, nodes = model.node, model.n + 1, model.chain.n_nodes
     d, turn = node.dimension, node.increment
-    k, holds = 2 * turn + (2 * d if model.in_space else d), len(model.clips) + model.n_springs
-    k += (1 + d) * len(model.clips)
+    clips, holds = len(model.clips), len(model.clips) + model.n_springs
+    clamps, turns = model.clamped_between, turn * model.clamped_between
+    k = 2 * turn + (2 * d if model.in_space else d) + (1 + d + turns) * clips
     forces: dict[str, tuple[int, ...]] = {"start_force": (d,), "end_force": (d,)}
-    forces |= {"clip_forces": (holds, d), "clip_grip": (holds,)} if holds else {}
-    forces |= {"moments": (2, turn)}
+    forces |= {"clip_forces": (holds, d), "clip_grip": (holds,), "clip_at": (holds,)}
+    forces |= {
+        "clip_moments": (holds * clamps, turn),
+        "places": (n * clamps,),
+        "moments": (2, turn),
+    }
     scalars = ("energy", "min_bend_radius", "max_twist", "end_error", "imbalance")
     slope: dict[str, tuple[int, ...]] = {"points": (n, d, k), "rotations": (nodes, turn, k)}
-    slope["end_force"] = (d, k)
-    slope |= {"clip_forces": (holds, d, k)} if holds else {}
-    slope |= {"moments": (2, turn, k), "min_bend_radius": (k,)}
+    slope |= {"end_force": (d, k), "clip_forces": (holds, d, k), "clip_at": (holds, k)}
+    slope |= {"clip_moments": (holds * clamps, turn, k), "places": (n * clamps, k)}
+    slope |= {"energy_by_at": (clips,), "moments": (2, turn, k), "min_bend_radius": (k,)}
     gap = {"distance": (), "place": (), "point": (d,), "normal": (d,), "gradient": (k,)}
     return Records(
         _record(
@@ -232,7 +255,7 @@ def records_of(model: CableModel) -> Records:
 
 
 def _floats(shapes: dict[str, tuple[int, ...]]) -> list[Any]:
-    return [(name, float, shape) for name, shape in shapes.items()]
+    return [(name, float, shape) for name, shape in shapes.items() if 0 not in shape]
 
 
 def _record(*fields: list[Any]) -> np.dtype[Any]:
@@ -295,9 +318,17 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     if kinds != model.clips:
         own, others = (", ".join(x) or "none" for x in (kinds, model.clips))
         raise DloError(f"{said}the pose has the clips {own}, the solver {others}")
-    clips = [[clip.at or 0.0, *clip.place] for clip in pose.clips]
+    clips = [
+        [clip.at or 0.0, *clip.place, *(_frame(clip, model) if model.clamped_between else ())]
+        for clip in pose.clips
+    ]
     ends = EndConditions.size(model.node) + int(model.in_space)
     return np.concatenate([numbers[:ends], *clips])
+
+
+def _frame(clip: HeldClip, model: CableModel) -> FloatArray:
+    """Frame (coordinates,) of a clip as dlo_clip has it; any where the cable may turn."""
+    return np.array(model.node.identity) if clip.frame is None else clip.frame
 
 
 def no_equilibrium(status: str, pose: AnyPose, length: float) -> str:

@@ -42,7 +42,8 @@ LEAST_FRAME = 1e-6
 
 def pose_size(model: CableModel) -> int:
     """Size of dlo_pose in the C header: both ends, in space `turns`, then the clips."""
-    clips = (1 + model.node.dimension) * len(model.clips)
+    frame = model.node.coordinates * model.clamped_between
+    clips = (1 + model.node.dimension + frame) * len(model.clips)
     return EndConditions.size(model.node) + int(model.in_space) + clips
 
 

@@ -262,12 +262,6 @@ class CableModel:
         return twists and not held and all(law.isotropic for law in laws)
 
     @property
-    def shape_dependent_loads(self) -> tuple[str, ...]:
-        """Names of effects whose forces depend on the shape."""
-        loads = [effect for effect in self.effects if isinstance(effect, Load)]
-        return tuple(load.name for load in loads if not load.dead)
-
-    @property
     def coarse(self) -> Self:
         """The same model on a coarse mesh, its elements no longer than a bar is thick."""
         count = max(COARSE_MESH, COARSE_SPAN * (len(self.clips) + 1))

@@ -39,18 +39,28 @@ static void draw_pose(dlo_pose *pose, unsigned long *state)
             pose->end_orientation[k] = uniform(state) - 0.5;
         }
         pose->turns = floor(3.0 * uniform(state)) - 1.0;
-#if DLO_CLIPS
-        for (k = 0; k < 3 * DLO_CLIPS; ++k) {
-            dlo_clip *const clip = pose->clips + k / 3;
-            const double share = (k / 3 + 0.8 + 0.4 * uniform(state)) / (DLO_CLIPS + 1);
-            clip->at = share * DLO_LENGTH;
-            clip->place[k % 3] = share * pose->end[k % 3] + 0.1 * DLO_LENGTH * uniform(state);
-        }
-#endif
     }
 #else
     pose->start_heading = 3.0 * uniform(state) - 1.5;
     pose->end_heading = 3.0 * uniform(state) - 1.5;
+#endif
+#if DLO_CLIPS
+    {
+        int h, k;
+        for (h = 0; h < DLO_CLIPS; ++h) {
+            dlo_clip *const clip = pose->clips + h;
+            const double share = (h + 0.8 + 0.4 * uniform(state)) / (DLO_CLIPS + 1);
+            clip->at = share * DLO_LENGTH;
+            for (k = 0; k < DLO_DIMENSION; ++k)
+                clip->place[k] = share * pose->end[k] + 0.1 * DLO_LENGTH * uniform(state);
+#if DLO_SADDLES && DLO_DIMENSION == 3
+            for (k = 0; k < 4; ++k)
+                clip->orientation[k] = uniform(state) - 0.5;
+#elif DLO_SADDLES
+            clip->heading = 3.0 * uniform(state) - 1.5;
+#endif
+        }
+    }
 #endif
 }
 
