@@ -1,4 +1,4 @@
-"""Types of arrays, and the cross product of a few vectors."""
+"""Types of arrays, and a little geometry of many vectors at once."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,3 +12,19 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross product along the last axis (..., 3); on a few vectors faster than `numpy.cross`."""
     ahead, behind = [1, 2, 0], [2, 0, 1]
     return np.asarray(a[..., ahead] * b[..., behind] - a[..., behind] * b[..., ahead])
+
+
+def unit(vectors: FloatArray) -> NDArray[np.float64]:
+    """Vectors (..., d) over their lengths; zero where they are."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
+
+
+def chord_lengths(points: FloatArray) -> NDArray[np.float64]:
+    """Lengths (K,) along a polyline from its first point to each of its points (K, d)."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def length_of(points: FloatArray) -> float:
+    """Length of a polyline through points (K, d)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -58,13 +58,11 @@ class CableCurve(NodeCurve):
         In a plane the second column is to the left. In space the roll about the tangent is
         interpolated between the nodes, whose states are `x` (N, coordinates) at `places` (N,) [m].
         """
-        tangents = self.at(s, 1)
-        tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+        tangents = unit(self.at(s, 1))
         if self.d == 2:
             return np.stack([tangents, tangents[:, ::-1] * (-1.0, 1.0)], axis=2)
         y = Rotation.from_quat(Frame.interpolated(s, places, x)).apply([0.0, 1.0, 0.0])
-        y -= (y * tangents).sum(axis=1, keepdims=True) * tangents
-        y /= np.linalg.norm(y, axis=1, keepdims=True)
+        y = unit(y - (y * tangents).sum(axis=1, keepdims=True) * tangents)
         return np.stack([tangents, y, np.cross(tangents, y)], axis=2)
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc, chdtri
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, SMOOTHNESS, PoseScatter
@@ -91,11 +91,10 @@ def _gaps(
     for group in _groups(measured, length):
         curves = np.array([_line(item, grid, length) for item in group])
         mean = curves.mean(axis=0)
-        slopes = np.gradient(mean, axis=0)
         # From the mean of the others it is m / (m - 1) times as far as from the mean of all.
         gaps = (curves - mean) * len(group) / (len(group) - 1)
         # Beyond the points of a line its end stands still.
-        yield gaps, slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-300)
+        yield gaps, unit(np.gradient(mean, axis=0))
 
 
 def different_poses(measured: Sequence[MeasuredPose], length: float) -> int:

@@ -8,7 +8,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import make_lsq_spline
 from scipy.optimize import minimize_scalar
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, stacked
@@ -174,8 +174,7 @@ def measured_moment_curve(
             f"a moment curve needs at least {LEAST_POINTS} points, got {len(points)}"
         )
     if s is None:
-        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        s = np.concatenate([[0.0], np.cumsum(steps)])
+        s = chord_lengths(points)
         s *= length / s[-1]  # chords of noisy points add up to more than the cable
     parts = min(MOST_PARTS, len(points) // 2 - DEGREE)
     knots = np.pad(np.linspace(s[0], s[-1], max(parts, 1) + 1), DEGREE, mode="edge")

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.effects import (
     BoundaryEffect,
     Effect,
@@ -380,7 +380,7 @@ def _segments(
     held = [k for k, side in ((0, start), (-1, end)) if side.kind == "clamped"]
     for k in held:
         ways[k] = (start, end)[k].cable_frame.apply([1.0, 0.0, 0.0])
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = unit(ways)
     if 0 in held:
         first = first - h / 2 * ways[0]
     if -1 in held:
@@ -388,8 +388,7 @@ def _segments(
     free = np.setdiff1d(np.arange(len(ways)), np.array(held, dtype=int) % len(ways))
     for _ in range(_CLOSING if end.kind != "free" else 0):
         gap = (last - first) / h - ways.sum(axis=0)
-        ways[free] += gap / len(free)
-        ways[free] /= np.linalg.norm(ways[free], axis=1, keepdims=True)
+        ways[free] = unit(ways[free] + gap / len(free))
     nodes = np.vstack([first, first + h * np.cumsum(ways, axis=0)])
     # The smallest rotations that align the frames with the segments.
     before = frames.apply([1.0, 0.0, 0.0])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from dlo_casadi.arrays import chord_lengths, length_of
 from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import write_file
@@ -82,7 +83,7 @@ class MeasuredPoints:
             points = points[np.concatenate(([True], step > _SAME_POINT))]
         if len(points) == 1:
             raise MeasurementError("holds one point only; a pose takes two or more", pose=name)
-        along = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+        along = length_of(points)
         if along > _LONGEST:
             raise MeasurementError(
                 f"the centre-line is {along:.4g} m long: are the points in metres? If "
@@ -103,8 +104,7 @@ class MeasuredPoints:
         if along is None:
             # Lengths of chords that are longer than the noise, on which they must not depend.
             ends = np.linspace(0, every[-1], min(most, len(every))).astype(int)
-            chords = np.linalg.norm(np.diff(self.points[ends], axis=0), axis=1)
-            along = np.interp(every, ends, np.concatenate([[0.0], np.cumsum(chords)]))
+            along = np.interp(every, ends, chord_lengths(self.points[ends]))
         share = (along - along[0]) / (along[-1] - along[0])
         stretch = np.minimum(most * share, most - 1).astype(int)
         _, first, count = np.unique(stretch, return_index=True, return_counts=True)

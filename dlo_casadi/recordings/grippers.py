@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings.recording import Recording
 from dlo_casadi.recordings.stills import Still
@@ -33,9 +33,8 @@ def find_gripper(
     """The body, or the three markers, that hold an end; None where the recording has no body."""
     if name.count(",") == 2:
         o, x, y = (_means(stills, f"marker {part.strip()}", recording) for part in name.split(","))
-        first = (x - o) / np.linalg.norm(x - o, axis=1, keepdims=True)
-        third = np.cross(first, y - o)
-        third /= np.linalg.norm(third, axis=1, keepdims=True)
+        first = unit(x - o)
+        third = unit(np.cross(first, y - o))
         frames = np.stack([first, np.cross(third, first), third], axis=2)
         return Gripper(o + frames @ np.array(offset or np.zeros(3)), frames)
     bodies = recording.of("body")
@@ -95,7 +94,7 @@ def along_cable(
 
 def _aimed(gripper: Gripper, ways: FloatArray, side: str, remarks: list[str]) -> Gripper:
     """The gripper with that of its axes as x that points most along the ways (P, 3)."""
-    ways = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    ways = unit(ways)
     cosines = np.mean(np.einsum("pij,pi->pj", gripper.frames, ways), axis=0)
     k = int(np.argmax(np.abs(cosines)))
     sign = float(np.sign(cosines[k]))

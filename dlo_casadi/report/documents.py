@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, length_of
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.file import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.cable.fitted_cable import FittedCable
@@ -202,7 +202,7 @@ def _checked(config: Config, item: PoseInput) -> dict[str, Any]:
     declared = {pose.name: pose for pose in config.experiment.poses}[item.name]
     length, away = None, []
     if len(item.points):
-        length = float(np.linalg.norm(np.diff(item.points, axis=0), axis=1).sum())
+        length = length_of(item.points)
         ends = ((item.points[0], declared.start), (item.points[-1], declared.end))
         away = [float(np.linalg.norm(x - place)) for x, place in ends if place is not None]
     return {

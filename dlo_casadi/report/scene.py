@@ -12,7 +12,7 @@ from math import cos, radians, sin
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
@@ -353,7 +353,7 @@ def pull_marks(outcome: Outcome, scene: Scene) -> list[Mark]:
             continue
         start, *end = held_places(declared[name])
         points = np.concatenate([[start], measured[name], *([place] for place in end)])
-        places = np.cumsum([0.0, *np.hypot.reduce(np.diff(points, axis=0), axis=1)])
+        places = chord_lengths(points)
         if end:
             places *= outcome.config.cable.length / places[-1]
         part = scene.points(np.column_stack([np.interp(pulled, places, x) for x in points.T]))

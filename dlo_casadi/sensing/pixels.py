@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, chord_lengths, unit
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Sensor
@@ -132,7 +132,7 @@ class Pixels(Sensor):
     def _compared(self, curve: NodeCurve, places: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (K,) [m] and their derivatives (K, 3) by the curve's points."""
         position, tangent = curve.frame(places, 1)
-        tangent = tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
+        tangent = unit(tangent)
         away, by = compare_pixels(self.viewpoint, self.pixels, position, tangent, self.diameter)
         return self.size * away, self.size * by
 
@@ -182,8 +182,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     """
     curve = view.seen
     every = max(1, int(np.ceil(curve.correlation / curve.spacing)))
-    steps = np.linalg.norm(np.diff(curve.pixels, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
+    along = chord_lengths(curve.pixels)
     sure = curve.whole & (curve.std < _UNSURE * np.median(curve.std))
     sure &= _across(view) > _STEEP
     foreign = np.concatenate([[0.0], along[~sure], along[-1:]])
@@ -195,8 +194,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
         return None
     size, pixels, points = _size(view), curve.pixels[kept], view.places[kept]
     tangent = np.gradient(pixels, axis=0)
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal = unit(np.column_stack([-tangent[:, 1], tangent[:, 0]]))
     viewpoint = curve.viewpoint
     by_shift = np.einsum("ki,kij->kj", normal, viewpoint.project(points)[1])
     by_shift = by_shift @ viewpoint.rotation.T

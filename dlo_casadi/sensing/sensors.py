@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, chord_lengths, unit
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange, across, chord_places
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.rod.ends import reaction_rows
@@ -195,15 +195,12 @@ class Centerline(_Points):
     @cached_property
     def _line(self) -> tuple[FloatArray, FloatArray]:
         """Unit tangents (K, 3) of the measured line, smoothed, and its normals (K, 2, 3)."""
-        steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
-        s = np.concatenate([[0.0], np.cumsum(steps)])
+        s = chord_lengths(self.points)
         ahead, behind = (
             np.stack([np.interp(s + way * s[-1], s, column) for column in self.points.T], axis=1)
             for way in (_CHORD / 2, -_CHORD / 2)
         )
-        t = (ahead - behind) / np.maximum(
-            np.linalg.norm(ahead - behind, axis=1, keepdims=True), 1e-300
-        )
+        t = unit(ahead - behind)
         return t, across(t)
 
     def nearest(self, curve: NodeCurve) -> FloatArray:

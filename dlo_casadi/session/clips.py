@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config import Pose
 from dlo_casadi.model.clips import CLAMPS, HeldClip, tangents
 from dlo_casadi.session.hypotheses import ReadSession, Suspicion
@@ -46,8 +46,8 @@ def wrong_clips(session: ReadSession) -> tuple[Suspicion, ...]:
 def _passed(pose: Pose, item: PoseInput, place: tuple[float, ...], length: float) -> _Passed:
     """The point of a measured line that is nearest to a place."""
     line = pose.held.joined(item.points)
-    chords = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    s = np.concatenate([[0.0], chords.cumsum()])
+    s = chord_lengths(line)
+    chords = np.diff(s)
     if item.s is not None:
         s = np.concatenate([[0.0], item.s, [] if pose.end is None else [length]])
     elif pose.end is not None:

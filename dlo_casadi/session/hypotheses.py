@@ -9,7 +9,7 @@ from typing import Any, Generic, NamedTuple, Self, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, chord_lengths, unit
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
@@ -338,11 +338,9 @@ def _equations(points: FloatArray, s: FloatArray | None) -> list[tuple[FloatArra
     if len(points) < 5:
         return []
     steps = np.diff(s)
-    t = np.diff(points, axis=0) / steps[:, None]
-    t /= np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
+    t = unit(np.diff(points, axis=0) / steps[:, None])
     bend = np.cross(t[:-1], t[1:]) / ((steps[1:] + steps[:-1]) / 2)[:, None]
-    middle = t[:-1] + t[1:]
-    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-300)
+    middle = unit(t[:-1] + t[1:])
     across = np.eye(3) - middle[:, :, None] * middle[:, None, :]
     r, s = points - points[0], s - s[0]
     swept = np.cumsum((r[1:] + r[:-1]) / 2 * steps[:, None], axis=0)[:-1]
@@ -362,8 +360,7 @@ def _cross(vectors: FloatArray) -> FloatArray:
 
 def _sparse(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means of the points of pieces of a line, and their places along it."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    s = np.concatenate([[0.0], np.cumsum(steps)])
+    s = chord_lengths(points)
     piece = np.minimum((s / max(s[-1], 1e-300) * _PIECES).astype(int), _PIECES - 1)
     kept = [piece == k for k in np.unique(piece)]
     return (

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.io.files import write_file
 
 # Colours that the colour-blind can tell apart, each at least 4.5 to 1 against white.
@@ -84,7 +84,6 @@ def arrow(root: FloatArray, shaft: FloatArray) -> FloatArray:
 
 def band_outline(curve: FloatArray, half_width: FloatArray) -> FloatArray:
     """Outline (2 M, 2) [m] of a band of half widths (M,) [m] about a planar curve (M, 2)."""
-    tangent = np.gradient(curve, axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-300)
+    tangent = unit(np.gradient(curve, axis=0))
     side = half_width[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     return np.concatenate([curve + side, (curve - side)[::-1]])

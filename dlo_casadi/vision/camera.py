@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.errors import VisionError
 
 Array = NDArray[np.float64]
@@ -271,8 +271,7 @@ def project_outline(
     # d(pixel)/d(ray) = p_z d(pixel)/d(p_xy), and a step in the ray's plane changes no depth
     by_ray = p[:, 2, None, None] * (slopes @ viewpoint.rotation.T)[:, :, :2]
     step = np.einsum("kij,kj->ki", by_ray, across)
-    along = np.einsum("kij,kj->ki", slopes, np.asarray(tangents, float).reshape(-1, 3))
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    along = unit(np.einsum("kij,kj->ki", slopes, np.asarray(tangents, float).reshape(-1, 3)))
     normals = np.column_stack([-along[:, 1], along[:, 0]])
     return pixels + off[:, None] * step, normals, slopes
 

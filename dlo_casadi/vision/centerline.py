@@ -7,6 +7,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.ndimage import binary_dilation, gaussian_filter1d, label
 
+from dlo_casadi.arrays import chord_lengths, length_of
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, View
 from dlo_casadi.vision.chain import Workings, find_cable
@@ -14,11 +15,9 @@ from dlo_casadi.vision.profiles import (
     Crossings,
     EdgeShape,
     cable_direction,
-    chord_length,
     edge_shape,
     find_edges,
     fit_curve,
-    length_of,
     local_directions,
     normals,
     sample_profiles,
@@ -117,7 +116,7 @@ def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BS
     """
     diameter = expected.diameter
     points = np.vstack(strands)
-    t = chord_length(points)
+    t = chord_lengths(points)
     keep = np.concatenate([[True], np.diff(t) > 0])
     points, t = points[keep], t[keep]
     curve = fit_curve(t, points, np.ones(len(t)), 2 * diameter, diameter)
@@ -131,7 +130,7 @@ def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BS
     before = line[0] + np.arange(-ahead[0], -0.5 * step, step)[:, None] * forwards[0]
     beyond = line[-1] + np.arange(step, ahead[1], step)[:, None] * forwards[1]
     line = np.vstack([before, line, beyond])
-    t = chord_length(line)
+    t = chord_lengths(line)
     return fit_curve(t, line, np.ones(len(t)), 2 * diameter, 0.5 * diameter), t
 
 

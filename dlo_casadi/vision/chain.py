@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from dlo_casadi.arrays import length_of, unit
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, Flags, View
-from dlo_casadi.vision.profiles import length_of
 from dlo_casadi.vision.workplane import (
     Contrast,
     ExpectedLine,
@@ -222,9 +222,6 @@ def _links(ways: list[Array], diameter: float, scene: Scene) -> tuple[Array, Arr
         """Angle [rad] of unit vectors (..., d), in any dimension."""
         a, b = np.broadcast_arrays(a, b)
         return 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
-
-    def unit(a: Array) -> Array:
-        return a / np.maximum(np.linalg.norm(a, axis=-1, keepdims=True), 1e-300)
 
     across = np.array([way[0] for way in ways])[None] - np.array([way[-1] for way in ways])[:, None]
     gap = np.linalg.norm(across, axis=2)

@@ -10,11 +10,11 @@ from scipy.interpolate import BSpline
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, chord_lengths, length_of, unit
 from dlo_casadi.errors import VisionError, counted
 from dlo_casadi.vision.camera import Array, Flags
 from dlo_casadi.vision.chain import Strand, order_strands
-from dlo_casadi.vision.profiles import chord_length, fit_curve, length_of
+from dlo_casadi.vision.profiles import fit_curve
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
 _ALIKE = 40.0  # distance in CIE Lab within which a colour is that of the cable
@@ -87,7 +87,7 @@ def line_in_cloud(points: FloatArray, cable: KnownCable, camera: FloatArray | No
             "length and diameter in metres; clouds and grippers in one frame."
         )
     line = np.vstack(chain.strands)
-    t = chord_length(line)
+    t = chord_lengths(line)
     kept = np.concatenate([[True], np.diff(t) > 0])
     curve = fit_curve(t[kept], line[kept], np.ones(int(kept.sum())), _KNOT * diameter, diameter)
     for _ in range(_ROUNDS):
@@ -150,13 +150,11 @@ def _refitted(
     near = np.asarray(away < _REACH * diameter)
     near &= (nearest > 0) & (nearest < len(fine) - 1)  # those beyond the ends are not beside it
     points, t = points[near], fine[nearest[near]]
-    tangent = curve(t, 1)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = unit(curve(t, 1))
     t = t + ((points - curve(t)) * tangent).sum(axis=1)
     if camera is not None:
         sight = points - camera
-        sight -= (sight * tangent).sum(axis=1, keepdims=True) * tangent
-        sight /= np.maximum(np.linalg.norm(sight, axis=1, keepdims=True), 1e-12)
+        sight = unit(sight - (sight * tangent).sum(axis=1, keepdims=True) * tangent)
         across = ((points - curve(t)) * np.cross(tangent, sight)).sum(axis=1)
         points = points + np.sqrt(np.maximum(0.25 * diameter**2 - across**2, 0.0))[:, None] * sight
     order = np.argsort(t)

@@ -6,11 +6,12 @@ import numpy as np
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
+from dlo_casadi.arrays import chord_lengths
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, CameraPose, Flags, Indices, Picture
 from dlo_casadi.vision.centerline import FINE, measure_line
 from dlo_casadi.vision.chain import Workings
-from dlo_casadi.vision.profiles import chord_length, normals
+from dlo_casadi.vision.profiles import normals
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
 _NEAREST = 0.2  # m: smallest distance from which a cable is photographed
@@ -167,7 +168,7 @@ def loops_either_way(curve: ImageCurve) -> list[ImageCurve]:
     the loop between them may have either order.
     """
     apart = np.linalg.norm(curve.pixels[:, None] - curve.pixels[None], axis=2)
-    t = chord_length(curve.pixels)
+    t = chord_lengths(curve.pixels)
     meets = (apart < curve.width) & (t[None] - t[:, None] > _APART * curve.width)
     labels, count = label(meets, np.ones((3, 3)))
     ways = [curve]

@@ -10,6 +10,7 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.sparse import csr_array, diags_array
 
+from dlo_casadi.arrays import unit
 from dlo_casadi.vision.camera import Array, Flags, View
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
@@ -29,19 +30,7 @@ DEGREE = 3  # of all splines
 
 def normals(steps: Array) -> Array:
     """Unit vectors (K, 2) to the left of steps (K, 2)."""
-    sizes = np.maximum(np.linalg.norm(steps, axis=1, keepdims=True), 1e-12)
-    return steps[:, ::-1] * [-1.0, 1.0] / sizes
-
-
-def chord_length(points: Array) -> Array:
-    """Distance travelled (K,) [m] along points (K, d) [m]."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def length_of(points: Array) -> float:
-    """Length [m] of a polygon through points (K, d) [m]."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    return unit(steps)[:, ::-1] * [-1.0, 1.0]
 
 
 def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: float) -> BSpline:

@@ -8,16 +8,15 @@ from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import find_objects, label
 
+from dlo_casadi.arrays import chord_lengths, length_of, unit
 from dlo_casadi.vision.camera import Array, Picture, compare_pixels
 from dlo_casadi.vision.centerline import FINE
 from dlo_casadi.vision.image_curve import ImageCurve, other_stretches, places_along
 from dlo_casadi.vision.profiles import (
     DEGREE,
     EdgeShape,
-    chord_length,
     find_edges,
     fit_curve,
-    length_of,
     normals,
     sample_profiles,
 )
@@ -59,8 +58,7 @@ class SpaceCurve:
 
     def tangent(self, t: Array) -> Array:
         """Give the unit tangents (K, 3)."""
-        slope = np.asarray(BSpline(self.knots, self.coefficients, DEGREE)(t, 1))
-        return slope / np.linalg.norm(slope, axis=1, keepdims=True)
+        return unit(np.asarray(BSpline(self.knots, self.coefficients, DEGREE)(t, 1)))
 
     @property
     def length(self) -> float:
@@ -74,7 +72,7 @@ class SpaceCurve:
 
     def evenly(self) -> "SpaceCurve":
         """Give the same curve with t proportional to its arc length."""
-        s = chord_length(self.position(_FINE))
+        s = chord_lengths(self.position(_FINE))
         at = np.interp(_FINE * s[-1], s, _FINE)
         even = np.linalg.lstsq(self.design(_FINE), self.position(at), rcond=None)[0]
         return SpaceCurve(np.asarray(even, float))
@@ -243,7 +241,7 @@ def measure_shared_outlines(
     shared = []
     for curve in curves:
         pixels = curve.viewpoint.to_pixels(fit.curve.position(_FINE))
-        beside = other_stretches(pixels, chord_length(pixels), curve.width)
+        beside = other_stretches(pixels, chord_lengths(pixels), curve.width)
         shared.append(bool(np.isfinite(beside).any()))
     if not any(shared):
         return fit, curves
@@ -281,7 +279,7 @@ def see_beside(
     view = viewpoint.facing(distance)
     pixel = 1.0 / view.scale
     at, flat = viewpoint.in_camera(curve), viewpoint.flattened(curve, distance)
-    t = chord_length(flat)
+    t = chord_lengths(flat)
     beside = other_stretches(flat, t, seen.width * pixel)
     hidden = np.isfinite(beside)
     depth = float(np.median(at[~hidden, 2])) if not hidden.all() else distance

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dlo_casadi.arrays import chord_lengths
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
 from dlo_casadi.vision.camera import Array, Camera, Indices, Picture
@@ -20,7 +21,6 @@ from dlo_casadi.vision.image_curve import (
     see_cable,
     triangulate,
 )
-from dlo_casadi.vision.profiles import chord_length
 from dlo_casadi.vision.space_curve import (
     CurveFit,
     first_curve,
@@ -233,7 +233,7 @@ def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agree
     for one, other, first, second, share, _ in _pairs(curves):
         if share <= _AGREE:
             continue
-        along = chord_length(one.pixels)[first] + chord_length(other.pixels)[second]
+        along = chord_lengths(one.pixels)[first] + chord_lengths(other.pixels)[second]
         guess = first_curve(triangulate(one, other, first, second), along, spans)
         fit = fit_curve_to_images(seen, guess)
         away = fit.curve.away_from(cable.fixtures)
@@ -263,7 +263,7 @@ def _guessed(curve: ImageCurve, cable: KnownCable) -> Array:
     """Places (K, 3) [m] of pixels, with depth linear along the line from fixture to fixture."""
     viewpoint = curve.viewpoint
     depths = viewpoint.in_camera(cable.fixtures)[:, 2]
-    along = chord_length(curve.pixels)
+    along = chord_lengths(curve.pixels)
     depth = np.interp(along / along[-1], np.linspace(0.0, 1.0, len(depths)), depths)
     at = np.column_stack([viewpoint.rays(curve.pixels), np.ones(len(depth))]) * depth[:, None]
     return np.asarray((at - viewpoint.translation) @ viewpoint.rotation)

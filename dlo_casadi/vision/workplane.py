@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dlo_casadi.arrays import unit
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, View
 
@@ -218,7 +219,7 @@ def candidate_maps(contrast: Contrast, area_px: float) -> Iterator[NDArray[np.fl
     weight = strength[strong].astype(float)
     total = weight.sum()
     while weight.sum() > 0.1 * total > 0.0:
-        units = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        units = unit(vectors)
         direction = units[np.argmax(weight)]
         for _ in range(5):
             mean = (weight * (units @ direction > 0.8)) @ units
