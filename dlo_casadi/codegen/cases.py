@@ -119,6 +119,20 @@ class Case:
         ]
         return f",\n                           {{{', '.join(clips)}}}" if clips else ""
 
+    @property
+    def compliances(self) -> list[float]:
+        """Turn of the start and end clamp per moment on it [rad/(N m)]."""
+        turns = np.array(self.lagrangian.compliances(self.p)).ravel()
+        found = zip(self.lagrangian.compliant, turns, strict=True)
+        named = {self.model.condition_names[k]: float(c) for k, c in found}
+        turn = self.model.node.turns[0]
+        return [named.get(f"{side}_{turn}", 0.0) for side in ("start", "end")]
+
+    @property
+    def stiffnesses(self) -> list[float]:
+        """Of the start and end clamp [N m/rad], 0 of rigid ones."""
+        return [1 / c if c > 0 else 0.0 for c in self.compliances]
+
     @cached_property
     def tethers(self) -> list[FloatArray]:
         """Of each tether arc length over length, anchor [m] and inverse stiffness [m/N] (d + 2,).
@@ -200,20 +214,12 @@ class _PlaneCase(Case):
             float(np.arctan2(gravity[1], gravity[0])) if any(gravity) else 0.0,
             *self.load,
             *np.array(offsets).ravel()[2:],
-            *(1 / c if c > 0 else 0.0 for c in self.compliances),
+            *self.stiffnesses,
             *(chain.places / model.cable.length),
             *resting_headings(chain, self.rest),
             *(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)),
             *(self.holding if self.holds else ()),
         ]
-
-    @property
-    def compliances(self) -> list[float]:
-        """Turn of the start and end clamp per moment on it [rad/(N m)]."""
-        turns = np.array(self.lagrangian.compliances(self.p)).ravel()
-        found = zip(self.lagrangian.compliant, turns, strict=True)
-        named = {self.model.condition_names[k]: float(c) for k, c in found}
-        return [named.get(f"{side}_heading", 0.0) for side in ("start", "end")]
 
     @property
     def values(self) -> dict[str, int | str]:
@@ -278,12 +284,6 @@ class _SpaceCase(Case):
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
         found = super().meshes
-        if found["kernel"].ends is not None or self.lagrangian.compliant:
-            raise DloError(
-                "no solver can be generated for a cable in space whose ends are held by springs, "
-                "or by clamps that give way\n"
-                "  Try: dlo predict, or dlo_casadi.predict, which know them."
-            )
         if not self.coarse_elements:
             return found
         coarse = self.model.with_mesh(self.coarse_elements, self.coarse_element)
@@ -317,7 +317,8 @@ class _SpaceCase(Case):
         bends = chain.curvatures(self.rest) * np.diff(chain.cells, axis=1).ravel()
         length = self.length
         first = [length, length / model.n, *model.gravity]
-        return [*first, *self.load, *self.clamps, *bends.T.ravel(), *self.holding]
+        clamps = [*self.clamps, *self.stiffnesses]
+        return [*first, *self.load, *clamps, *bends.T.ravel(), *self.holding]
 
     @property
     def values(self) -> dict[str, int | str]:
@@ -336,8 +337,8 @@ class _SpaceCase(Case):
             "COARSE": coarse,
             "SHAPES": guesses,
             "FIRST": 0,
-            "GIVES_START": 0,
-            "GIVES_END": 0,
+            "GIVES_START": self.compliances[0] > 0,
+            "GIVES_END": self.compliances[1] > 0,
             # Elimination and solution: about 500 operations a node.
             "OPERATIONS": self.meshes["kernel"].operations + 500 * (n + 1),
             "STEPS": (1 + 3 * guesses) * 80,

@@ -9,7 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.codegen import CompiledSolver, generate
-from dlo_casadi.effects import AxialStretch, CableData, ClipOffset, ClipSlip, Tether
+from dlo_casadi.effects import (
+    AxialStretch,
+    CableData,
+    ClampCompliance,
+    ClipOffset,
+    ClipSlip,
+    Tether,
+)
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.symbolic import CasadiCable
@@ -289,10 +296,37 @@ def test_a_tether_to_a_cable_with_a_free_end(stiffness):
     agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
-@pytest.mark.parametrize("element", ["quadratic", "arc"])
-def test_a_tether_in_a_plane(element):
+@pytest.mark.parametrize("clips", [(), CLIPS[:1]])
+def test_clamps_in_space_that_give_way(clips):
+    """Their moments are minus the energy's derivative by turns of the clamps."""
+    model = loom(len(clips), (ClampCompliance(),))
+    values = {"clamp_compliance.start": 8.0, "clamp_compliance.end": 0.5}
+    solver, p, rest = compiled(model, values)
+    pose = replace(POSE, clips=clips)
+    shape = solver.solve(pose)
+    agree(shape, solve_equilibrium(model, p, rest, pose))
+    slope, step = solver.sensitivity(shape, pose), 1e-5
+    for side, column in (("start", 3), ("end", 9)):
+        frame = Rotation.from_quat(getattr(pose, f"{side}_orientation"))
+        for axis, unit in enumerate(np.eye(3)):
+            turned = [
+                tuple((Rotation.from_rotvec(h * unit) * frame).as_quat()) for h in (step, -step)
+            ]
+            ways = [replace(pose, **{f"{side}_orientation": q}) for q in turned]
+            ahead, back = (solver.solve(way, warm=shape) for way in ways)
+            own = shape.moments[int(side == "end")][axis]
+            assert -own == pytest.approx((ahead.energy - back.energy) / (2 * step), abs=1e-8)
+            for name in ("points", "end_force", "moments"):
+                change = (getattr(ahead, name) - getattr(back, name)) / (2 * step)
+                found = getattr(slope, name)[..., column + axis]
+                assert found == pytest.approx(change, abs=1e-7), (side, axis, name)
+
+
+@pytest.mark.parametrize(("element", "position"), [("quadratic", 0.02), ("arc", 0.7)])
+def test_a_tether_in_a_plane(element, position):
     model, pose = flat(effects=(Tether(),), element=element)
     values = {name: x for name, x in TETHER.items() if not name.endswith("_z")}
+    values["tether.position"] = position
     solver, p, rest = compiled(model, values)
     agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
