@@ -178,3 +178,6 @@ FIRST_ORDER = 0.02
 # Relative change of the least bend radius on half the element size below which the mesh resolves
 # it: of second order, what is left is a third of it.
 RESOLVED = 0.01
+# Distance between the lowest places of two shapes at which they may rest on the same table: so many
+# standard deviations of a point, and lengths of the cable.
+RESTING_NOISE, RESTING_APART = 3.0, 3e-3

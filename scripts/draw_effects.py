@@ -42,6 +42,7 @@ class Shown:
     history: bool = False  # the third pose is the first one again
     clipped: bool = False  # a pinned clip holds the middle
     touching: bool = False  # the cable lies on a table
+    level: bool = False  # all ends are at one height
 
 
 # End of the pose that leaves a set [m], and the floor's depth below the cable [m].
@@ -85,6 +86,7 @@ SHOWN = {
     ),
     "clip_slip": Shown({"ds": 0.04}, {"ds": 0.04}, clipped=True),
     "obstacle_offset": Shown({}, {"offset": 0.06}, touching=True),
+    "contact_plane": Shown({}, {"height": -0.17}, level=True),
     "rest_curvature_drift": Shown({"rate": 0.6}, {"rate": 0.6}, history=True),
     "plastic_set": Shown(
         {"yield_curvature": 3, "share": 0.9}, {"yield_curvature": 3, "share": 0.9}, history=True
@@ -140,7 +142,7 @@ def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) 
     for key, value in values.items():
         p[model.names.index(f"{name}.{key}")] = value
     poses = poses_in_space() if spatial else poses_in_plane(shown.clamped)
-    if shown.touching:
+    if shown.touching or shown.level:
         poses = [replace(pose, end=(*pose.end[:-1], 0.0)) for pose in poses]
     if shown.clipped:
         poses = [replace(pose, clips=(middle_clip(pose),)) for pose in poses]

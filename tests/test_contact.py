@@ -8,7 +8,9 @@ import pytest
 from dlo_casadi.cable.held import among
 from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import CableData, ObstacleOffset
+from dlo_casadi.diagnosis.candidates import candidates_of
+from dlo_casadi.diagnosis.refits import scored_by_refit
+from dlo_casadi.effects import CableData, ContactPlane, ObstacleOffset
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -196,6 +198,42 @@ def test_a_fit_finds_where_the_table_is():
     loose = replace(fit.problem, noise=NoiseModel(1e-3, source="declared"), weights=())
     problem, begun = begin(loose, stiff)
     assert problem.unknowns.p(begun.theta) == pytest.approx(true, rel=0.02, abs=1e-4)
+
+
+def test_a_plane_that_is_not_declared():
+    """The effect is a level plane; it is told by the height that shapes have in common."""
+    cable = replace(CABLE, bending_stiffness=2e-3)
+    held = {"start": "clamped", "end": "clamped"}
+    plane = ContactPlane(level=0.05)
+    model = CableModel(cable, 20, n_rest=0, effects=(plane,), **held)
+    low, high = (np.array([2e-3, x]) for x in (-1.9, -0.17))
+    poses = [HeldPose((0.0, 0.05), (x, 0.02), -1.0, 1.1) for x in (0.45, 0.55, 0.65)]
+    places, rng = np.linspace(0.02, 0.98, 40), np.random.default_rng(0)
+    fits = []
+    for p in (high, low):
+        shown = predict_poses(model, p, np.zeros(model.chain.n_rests), poses)
+        assert any(one.equilibrium.contacts for one in shown) is (p is high)
+        seen = [one.curve.at(places) for one in shown]
+        points = [one + rng.normal(scale=3e-4, size=one.shape) for one in seen]
+        measured = [MeasuredPose.of_points(*pair) for pair in zip(poses, points, strict=True)]
+        fits.append(fit_model(model.without_effect("contact_plane"), measured, Tolerances(), 3e-4))
+    table = Plane((0.0, -0.12), (0.0, 1.0), "table")
+    _, same = solved(cable, poses[0], table, **held)
+    found = solve_equilibrium(model, high, np.zeros(model.chain.n_rests), poses[0])
+    assert found.energy == pytest.approx(same.energy, rel=1e-9)
+    _, free = solved(cable, poses[0], **held)
+    hanging = solve_equilibrium(model, low, np.zeros(model.chain.n_rests), poses[0])
+    assert hanging.energy == pytest.approx(free.energy, rel=1e-9)
+    touched, clean = (candidates_of(fit, None, ()) for fit in fits)
+    assert "contact_plane" not in [item.name for item in clean]
+    (candidate,) = (item for item in touched if item.name == "contact_plane")
+    assert candidate.effect == plane
+    scored = scored_by_refit(fits[0], candidate, np.inf)
+    assert scored.p_value < 1e-9
+    fit = scored.fit
+    for name, true in (("contact_plane.height", -0.17), ("bending_stiffness", 2e-3)):
+        assert fit.value(name) == pytest.approx(true, abs=3 * fit.std(name))
+    assert fit.residual_rms < 4e-4 < fits[0].residual_rms
 
 
 def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():

@@ -59,7 +59,8 @@ UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad", "ra
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WHERE = (*(("plane", e) for e in ELEMENTS), *(("space", e) for e in ELEMENTS_IN_SPACE))
-CLIPPED, TOUCHING = {"clip_offset", "clip_slip"}, {"obstacle_offset"}
+CLIPPED, TOUCHING = {"clip_offset", "clip_slip"}, {"obstacle_offset", "contact_plane"}
+OPTIONS = {"contact_plane": {"level": 0.3}}
 TABLES = {"plane": Plane((0.0, 0.3), (0.0, 1.0)), "space": Plane((0.0, 0.0, 0.3), (0.0, 0.0, 1.0))}
 CLIPS = {
     "plane": HeldClip("pinned", (0.3, -0.1), 0.37),
@@ -93,7 +94,7 @@ def plain(name: str, where: str, element: str) -> CableModel:
 
 @cache
 def with_effect(name: str, where: str, element: str) -> CableModel:
-    return plain(name, where, element).with_effect(EFFECTS[name]())
+    return plain(name, where, element).with_effect(EFFECTS[name](**OPTIONS.get(name, {})))
 
 
 def own_indices(model: CableModel) -> list[int]:
@@ -110,6 +111,7 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
     for i in own_indices(model):
         q = model.parameters[i]
         moved = q.nominal + q.scale * rng.uniform(0.3, 0.8)
+        moved = moved if model.effects[-1].gradual else q.upper
         p[i] = np.clip(moved, q.lower, q.upper)
     return p
 
@@ -190,7 +192,7 @@ def test_no_effect_at_nominal_values(case):
     """Balance, Hessian, measured curve and state are those of the model without the effect."""
     model, bare = with_effect(*case), plain(*case)
     with_it, without = outputs(model, model.nominal), outputs(bare, bare.nominal)
-    if model.n_springs:
+    if model.n_border > bare.n_border:
         with_it["gradient"] = with_it["gradient"][:, : without["gradient"].shape[1]]
         with_it = {what: with_it[what] for what in ("Lagrangian", "gradient", "curve")}
     for what, block in with_it.items():

@@ -69,6 +69,7 @@ PLANAR = {
     "clip_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
     "clip_slip": {"ds": 0.01},
     "obstacle_offset": {"offset": 0.01},
+    "contact_plane": {"height": -0.12},
     "rest_curvature_drift": {"rate": 0.3},
     "plastic_set": {"yield_curvature": 2.0, "share": 0.3},
 }

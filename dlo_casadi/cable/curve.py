@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray, unit
+from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -70,6 +71,11 @@ def curves_of(
     model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
 ) -> tuple[CableCurve, CableCurve]:
     """The cable itself in a pose, and as the session's camera measures it."""
-    models = (model.without_camera(p), (model, p))
+    models = (without_camera(model, p), (model, p))
     true, seen = (CableCurve.at_rest(*one, rest, pose, eq) for one in models)
     return true, seen
+
+
+def without_camera(model: CableModel, p: FloatArray) -> tuple[CableModel, FloatArray]:
+    """The model without the effects of the camera, and its part of `p`."""
+    return model.without_kind(MeasurementEffect, p)

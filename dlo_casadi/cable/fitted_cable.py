@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.curve import CableCurve, curves_of
+from dlo_casadi.cable.curve import CableCurve, curves_of, without_camera
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
 from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
@@ -288,7 +288,7 @@ class Shape:
     @property
     def held(self) -> Held:
         """What an export is cut from."""
-        model, p = self.cable.model.without_camera(self.cable.p)
+        model, p = without_camera(self.cable.model, self.cable.p)
         return Held(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
 
     @property

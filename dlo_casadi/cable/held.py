@@ -124,7 +124,8 @@ def among(
         raise DloError("; ".join(wrong))
     surfaces = tuple(item.surface(k) for k, item in enumerate(listed, start=1))
     model = replace(model, obstacles=surfaces)
-    return {"model": model, "p": np.where(outwards(model).any(axis=0), model.nominal, p)}
+    moved = outwards(model)[: len(surfaces)]
+    return {"model": model, "p": np.where(moved.any(axis=0), model.nominal, p)}
 
 
 def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, Any]) -> HeldPose:

@@ -16,6 +16,7 @@ from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedP
 from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short
 from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
+from dlo_casadi.effects.setup import height_of
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
 
@@ -394,6 +395,7 @@ def declared_setup(config: Config) -> Setup:
         tolerances=experiment.tolerances.model_dump(),
         clips=experiment.clips,
         obstacles=len(experiment.obstacles),
+        level=float(height_of(experiment.poses[0].start, experiment.gravity)),
     )
 
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from dlo_casadi.effects import EFFECTS, Effect, Fitted, Load, Setup
 from dlo_casadi.effects.cable import CableData
+from dlo_casadi.effects.setup import height_of
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
-from dlo_casadi.thresholds import ALIKE
+from dlo_casadi.thresholds import ALIKE, RESTING_APART, RESTING_NOISE
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,29 @@ def candidates_of(
         readings=tuple({name for item in problem.history for name in item.reactions}),
         directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
         largest_bend=float(problem.equilibria.bends(shapes, fit.p, fit.rest).max()),
+        level=float(height_of(problem.history[0].pose.start, fit.model.gravity)),
+        resting=resting_height(fit),
     )
     return candidates(fit.model, setup, exclude)
+
+
+def resting_height(fit: Fit) -> float | None:
+    """The lowest height [m] that shapes of several poses have in common, if there is one.
+
+    What lies on a table is at the same height in all poses, and nothing is below it. Fixtures are
+    where they are held.
+    """
+    model, problem = fit.model, fit.problem
+    if not (any(model.gravity) and model.chain.kind.smooth):
+        return None
+    places = np.linspace(0.0, model.cable.length, 201)
+    seen = problem.observed(fit.point)
+    heights = height_of([seen[j].curve.at(places) for j in problem.used], model.gravity)
+    lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
+    hanging = lowest[(inside > 0) & (inside < len(places) - 1)]
+    apart = max(RESTING_NOISE * fit.noise.of_points.std, RESTING_APART * model.cable.length)
+    shared = hanging[hanging < lowest.min() + apart]
+    return float(shared.mean()) if len(shared) > 1 else None
 
 
 def equivalents(

@@ -13,7 +13,7 @@ from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
 from dlo_casadi.diagnosis.refits import Confirmed, confirm_from_data
-from dlo_casadi.diagnosis.screening import Screen, Screened, survival
+from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
     Found,
@@ -190,9 +190,7 @@ class Search:
     def _screened(self, current: Fit) -> list[Screened]:
         """Score tests of all `candidates_of` a fit, best first."""
         listed = candidates_of(current, self.center, self.exclude)
-        if not listed:
-            return []
-        return Screen(current, listed).run(screening_degrees(current), self.executor)
+        return refits.scored(current, listed, screening_degrees(current), self.executor)
 
     def closed(self) -> Diagnosis:
         """What the search finds, without effects that explain too little."""
@@ -339,7 +337,7 @@ class Search:
                 continue
             screened = self._screened(smaller)
             single = {item.candidate.name: item.p_value for item in screened}
-            p_value = sidak(single[effect.candidate.name], len(screened))
+            p_value = sidak(single.get(effect.candidate.name, 0.0), len(screened))
             price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
             gain = 2 * (smaller.point.objective - fit.point.objective)
             if gain < price or p_value > self.significance:

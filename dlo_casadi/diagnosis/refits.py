@@ -22,14 +22,20 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened
+from dlo_casadi.diagnosis.screening import (
+    RelaxedScreen,
+    Screen,
+    Screened,
+    in_order,
+    survival,
+)
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import carried_shapes, descend, refit
-from dlo_casadi.estimation.fit import misfits
+from dlo_casadi.estimation.fit import FIRST_STD, misfits
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed, with_springs_in_place
 from dlo_casadi.estimation.result import Fit
@@ -38,6 +44,7 @@ from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.sensing.noise import NoiseModel
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -55,8 +62,9 @@ SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 COMPARED, NEAR_LEAST = SOFTNESS[:4], 3.0
 # Largest sum of squares per residual at which a start counts as having reached the noise.
 REACHED = 1.5
-# Gauss-Newton steps of one refit, and of one from forces that scatter from pose to pose.
-MOST_STEPS, STEPS_FROM_FORCES = 25, 60
+# Gauss-Newton steps of one refit, of one from forces that scatter from pose to pose, and of one
+# that is a candidate's score.
+MOST_STEPS, STEPS_FROM_FORCES, SHORT = 25, 60, 5
 
 
 @dataclass(frozen=True)
@@ -98,10 +106,12 @@ class Confirmed:
 def from_data(base: Fit) -> tuple[Fit, float]:
     """A base that lacks something, relaxed at the measured shapes; no equilibrium.
 
-    At its known noise, from nominal parameters: those of the base fit what it lacks. Its softness
-    [rad] is the least of SCORED at which the shapes are still those measured.
+    At its known noise, or that of the shapes alone, and from nominal parameters: those of the base
+    fit what it lacks. Its softness [rad] is the least of SCORED at which the shapes are still those
+    measured.
     """
-    model, known = base.model, base.noise.before or base.noise
+    model, alone = base.model, replace(NoiseModel(FIRST_STD), readings=base.noise.readings)
+    known: NoiseModel = base.noise.before or alone
     p = np.where(base.problem.unknowns.free, model.nominal, base.p)
     problem = replace(_from_data(base, model), noise=known, weights=None)
     start = problem.unknowns.pack(p, np.zeros(model.n_coefficients))
@@ -126,12 +136,58 @@ def _from_data(base: Fit, model: CableModel) -> Problem:
 
 def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) -> list[Screened]:
     """Score tests in a relaxed model, best first."""
-    return RelaxedScreen(near, listed, softness).run(np.inf) if listed else []
+    gradual = [x for x in listed if x.effect.gradual]
+    found = RelaxedScreen(near, gradual, softness).run(np.inf) if gradual else []
+    found += [scored_from_data(near, softness, x) for x in listed if not x.effect.gradual]
+    return in_order(found)
+
+
+def scored(
+    base: Fit, listed: Sequence[Candidate], noise_dof: float, executor: Executor
+) -> list[Screened]:
+    """Score tests of candidates, best first; see `Screen.run`."""
+    gradual = [x for x in listed if x.effect.gradual]
+    found = Screen(base, gradual).run(noise_dof, executor) if gradual else []
+    others = (x for x in listed if not x.effect.gradual)
+    return in_order([*found, *(scored_by_refit(base, x, noise_dof) for x in others)])
+
+
+def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screened:
+    """Test of a candidate that has no derivative where it vanishes: what a refit gains.
+
+    It starts from the base, and from the measured shapes, where it also ends: the base's noise may
+    hold what it lacks.
+    """
+    start = dict(candidate.scans[0])
+    fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
+    near, _ = from_data(base)
+    for other in candidates_of(near, None, ()):
+        if other.name == candidate.name:
+            begun = RelaxedStart.of(near, Screened(other, 0.0, 1.0, dict(other.scans[0])))
+            fit = _fit_from_data(near, begun, 3)
+            fits += [fit and fit.reweighed(base.noise, base.problem.priors)]
+    best = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
+    if best is None:
+        return Screened(candidate, 0.0, 1.0, start)
+    gain = max(2 * (base.point.objective - best.point.objective), 0.0)
+    start = {name: best.value(name) for name in candidate.frees}
+    return Screened(candidate, gain, survival(gain, len(start), noise_dof), start, best)
+
+
+def scored_from_data(near: Fit, softness: float, candidate: Candidate) -> Screened:
+    """The same in a relaxed model, at the measured shapes."""
+    problem, begun = _begun(near, candidate, candidate.scans[0])
+    values = Relaxation(problem, softness).solve(begun, steps=SHORT)
+    before = Relaxation(near.problem, softness).objective(near.point)
+    gain = max(before - Relaxation(problem, softness).objective(values), 0.0)
+    p = dict(zip(problem.unknowns.model.names, problem.unknowns.p(values.theta), strict=True))
+    start = {name: float(p[name]) for name in candidate.frees}
+    return Screened(candidate, gain, survival(gain, len(start), np.inf), start)
 
 
 def confirm(base: Fit, screened: Screened) -> Confirmed | None:
     """Refit with a candidate added; None if no equilibria can be followed to it."""
-    return Confirmed.of(screened, base, refit_with(base, screened))
+    return Confirmed.of(screened, base, screened.fit or refit_with(base, screened))
 
 
 def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirmed | None:

@@ -17,7 +17,7 @@ function theorem, exact from CasADi.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -55,12 +55,20 @@ class Screened:
         Corrected for the places scanned, not for the number of candidates.
     start : dict
         One-step estimate of the candidate's parameters.
+    fit : Fit, optional
+        The refit that is the test of one that has no derivative where it vanishes.
     """
 
     candidate: Candidate
     score: float
     p_value: float
     start: dict[str, float]
+    fit: Fit | None = None
+
+
+def in_order(screened: Iterable[Screened]) -> list[Screened]:
+    """Score tests, best first."""
+    return sorted(screened, key=lambda item: item.p_value - 1e-9 * item.score)
 
 
 def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
@@ -216,7 +224,7 @@ class Screen:
                 known = best.get(candidate.name)
                 if known is None or tried.score > known.score:
                     best[candidate.name] = tried
-        return sorted(best.values(), key=lambda item: item.p_value - 1e-9 * item.score)
+        return in_order(best.values())
 
     def _score(self, candidate: Candidate, normal: AtScan, noise_dof: float) -> Screened:
         hessian, gradient, names = normal.hessian, normal.gradient, normal.names

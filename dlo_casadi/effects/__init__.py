@@ -11,6 +11,7 @@ from dlo_casadi.effects.clamps import ClampCompliance as ClampCompliance
 from dlo_casadi.effects.clamps import ClampRotation as ClampRotation
 from dlo_casadi.effects.clips import ClipOffset as ClipOffset
 from dlo_casadi.effects.clips import ClipSlip as ClipSlip
+from dlo_casadi.effects.contact import ContactPlane as ContactPlane
 from dlo_casadi.effects.contact import ObstacleOffset as ObstacleOffset
 from dlo_casadi.effects.edge_bias import EdgeBias as EdgeBias
 from dlo_casadi.effects.effect import BoundaryEffect as BoundaryEffect
@@ -72,6 +73,7 @@ EFFECTS: dict[str, type[Effect]] = {
         ClipOffset,
         ClipSlip,
         ObstacleOffset,
+        ContactPlane,
         RestCurvatureDrift,
         PlasticSet,
         ImageScale,

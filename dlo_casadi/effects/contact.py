@@ -1,11 +1,14 @@
-"""Obstacles that are not quite where they are declared."""
+"""Obstacles that are not quite where they are declared, or not declared at all."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
+import numpy as np
+
 from dlo_casadi.effects.cable import CableData, Parameter
-from dlo_casadi.effects.effect import ContactEffect
+from dlo_casadi.effects.effect import ContactEffect, Scan
 from dlo_casadi.effects.setup import Setup
+from dlo_casadi.rod.obstacles import Obstacle, Plane
 
 
 @dataclass(frozen=True)
@@ -44,3 +47,54 @@ class ObstacleOffset(ContactEffect):
     def each_for(cls, setup: Setup) -> tuple[Self, ...]:
         """One for each obstacle."""
         return tuple(cls(obstacle=k) for k in range(setup.obstacles))
+
+
+@dataclass(frozen=True)
+class ContactPlane(ContactEffect):
+    """A level plane below the cable that is not declared: a table on which it rests.
+
+        g = (r - r_start) . up - height - diameter / 2 >= 0
+
+    of all places r of the cable, the same plane in all poses, without friction. There is no
+    derivative where nothing touches: a fit has to begin where something does.
+
+    Parameters
+    ----------
+    height : scalar [m]
+        Along the vertical, from the start fixture of the first pose; negative. Vanishes where
+        nothing touches.
+    """
+
+    name = "contact_plane"
+    gradual = False
+    level: float = 0.0
+
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
+        """Declare the height."""
+        lowest = -2 * cable.length
+        return (Parameter("height", "m", lowest, 0.01 * cable.length, lowest, 0.0),)
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """Where there is a vertical."""
+        return super().applies(setup) and any(setup.gravity)
+
+    @classmethod
+    def made_for(cls, setup: Setup) -> Self:
+        """With the start fixture where it is."""
+        return cls(level=setup.level)
+
+    @classmethod
+    def each_for(cls, setup: Setup) -> tuple[Self, ...]:
+        """One where several shapes have the same lowest place."""
+        return () if setup.resting is None else (cls.made_for(setup),)
+
+    def scans(self, setup: Setup) -> tuple[Scan, ...]:
+        """Try the plane at the lowest place of several shapes."""
+        height = (setup.resting or 0.0) - setup.cable.diameter / 2 - self.level
+        return ({"height": min(height, 0.0)},)
+
+    def surface(self, gravity: tuple[float, ...]) -> Obstacle:
+        """The level plane through the start fixture of the first pose."""
+        up = -np.array(gravity) / np.linalg.norm(gravity)
+        return Plane(tuple((self.level * up).tolist()), tuple(up.tolist()), self.label)

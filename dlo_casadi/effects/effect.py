@@ -19,6 +19,7 @@ from dlo_casadi.effects.setup import Setup
 from dlo_casadi.errors import counted
 from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.ends import EndConditions
+from dlo_casadi.rod.obstacles import Obstacle
 from dlo_casadi.thresholds import NEAR_END
 
 Params = Mapping[str, ca.SX]
@@ -107,6 +108,8 @@ class Effect:
     shown: ClassVar[bool] = True
     # Whether the effect applies in the plane (2), in space (3).
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
+    # Whether derivatives where the effect vanishes tell of it.
+    gradual: ClassVar[bool] = True
 
     # Parameters that do not depend on the cable, see `parameters`.
     declared: ClassVar[tuple[Parameter, ...]] = ()
@@ -327,11 +330,15 @@ class ContactEffect(Effect):
     Parameters
     ----------
     obstacle : int
-        Its number, 0 of the first.
+        Its number, 0 of the first, among those declared or, with a `surface`, among the effects'.
     """
 
     kind: ClassVar[str] = "contact"
     obstacle: int = 0
+
+    def surface(self, gravity: tuple[float, ...]) -> Obstacle | None:
+        """The effect's own obstacle, at the parameter's zero; None of one that is declared."""
+        return None
 
 
 class MeasurementEffect(Effect):

@@ -2,8 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from dlo_casadi.effects.cable import CableData
+
+
+def height_of(places: ArrayLike, gravity: ArrayLike) -> Any:
+    """Heights (...) [m] of places (..., d) along the vertical from the origin; 0 without one."""
+    size = float(np.linalg.norm(gravity))
+    return -np.array(places) @ np.array(gravity) / size if size else 0.0 * np.array(places)[..., 0]
 
 
 @dataclass(frozen=True)
@@ -39,6 +49,10 @@ class Setup:
         Kinds of the clips between the ends.
     obstacles : int
         Number of obstacles that the cable may touch.
+    level : float [m]
+        Height of the first pose's start fixture, along the vertical from the origin.
+    resting : float, optional [m]
+        Lowest height that several shapes have in common; absent where none do.
     """
 
     cable: CableData
@@ -56,3 +70,5 @@ class Setup:
     largest_bend: float | None = None
     clips: tuple[str, ...] = ()
     obstacles: int = 0
+    level: float = 0.0
+    resting: float | None = None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.effects import ContactEffect
 from dlo_casadi.equilibrium.equilibrium import (
     JOINT_BOUND,
     NEARBY,
@@ -236,7 +237,8 @@ class _PoseSearch:
         All minima without obstacles are lifted out of them; of the lowest, see `sides`.
         """
         model, none = self.model, [None] * len(poses)
-        search = replace(self, model=replace(model, obstacles=()))
+        alone, p = replace(model, obstacles=()).without_kind(ContactEffect, self.p)
+        search = _PoseSearch(alone, p, self.rest)
         of, first = self._first(poses, none)
         pairs = list(zip(of.tolist(), first.x, first.lam, strict=True))
         for j, minima in enumerate(search.reached(poses, none)):

@@ -10,10 +10,10 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects import (
     CableData,
+    ContactEffect,
     Effect,
     Kinematics,
     Load,
-    MeasurementEffect,
     SectionLaw,
     StateEffect,
 )
@@ -105,7 +105,7 @@ class CableModel:
                 f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
                 "give both, in a plane neither"
             )
-        if (self.clips or self.obstacles) and not self.chain.kind.smooth:
+        if (self.clips or self.surfaces) and not self.chain.kind.smooth:
             what = "clips" if self.clips else "obstacles"
             raise DloError(f"{what} need a smooth element, found {self.element!r}; try 'quadratic'")
         labels = [effect.label for effect in self.effects]
@@ -218,9 +218,9 @@ class CableModel:
         priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
         return replace(self, effects=kept, priors=priors)
 
-    def without_camera(self, p: FloatArray) -> tuple[Self, FloatArray]:
-        """The model without the effects of the camera, and its part of `p`."""
-        effects = tuple(x for x in self.effects if not isinstance(x, MeasurementEffect))
+    def without_kind(self, kind: type[Effect], p: FloatArray) -> tuple[Self, FloatArray]:
+        """The model without the effects of a kind, and its part of `p`."""
+        effects = tuple(x for x in self.effects if not isinstance(x, kind))
         if effects == self.effects:
             return self, p
         plain = replace(self, effects=effects, priors={})
@@ -285,10 +285,11 @@ class CableModel:
         """Number of unknowns of the whole pose: `border_names`."""
         return len(self.border_names)
 
-    @property
+    @cached_property
     def surfaces(self) -> tuple[Obstacle, ...]:
-        """All that the cable may touch."""
-        return self.obstacles
+        """All that the cable may touch: what is declared, then what effects add."""
+        own = (x.surface(self.gravity) for x in self.effects if isinstance(x, ContactEffect))
+        return (*self.obstacles, *(one for one in own if one is not None))
 
     @property
     def n_contacts(self) -> int:

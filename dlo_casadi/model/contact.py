@@ -342,11 +342,15 @@ def _inwards(force: FloatArray, h: float) -> float:
 def outwards(model: CableModel) -> FloatArray:
     """Moves (surfaces, n_parameters) [m] of the surfaces outwards, per unit of parameters."""
     found = np.zeros((len(model.surfaces), len(model.parameters)))
+    declared = len(model.obstacles)
     for effect in model.effects:
-        if isinstance(effect, ContactEffect) and effect.obstacle < len(found):
+        if not isinstance(effect, ContactEffect):
+            continue
+        own = effect.surface(model.gravity) is not None
+        if own or effect.obstacle < declared:
             (parameter,) = effect.parameters(model.cable)
             column = model.names.index(f"{effect.label}.{parameter.name}")
-            found[effect.obstacle, column] = 1.0
+            found[effect.obstacle + own * declared, column] = 1.0
     return found
 
 

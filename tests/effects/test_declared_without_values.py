@@ -54,6 +54,7 @@ STRONG = {
     "clip_offset": {"dx": 0.03, "dy": -0.02, "dz": 0.02},
     "clip_slip": {"ds": 0.03},
     "obstacle_offset": {"offset": 0.03},
+    "contact_plane": {"height": -0.1},
     "rest_curvature_drift": {"rate": 0.4},
     "plastic_set": {"yield_curvature": 2.0, "share": 0.6},
     "image_scale": {"factor": 1.1},
