@@ -91,6 +91,7 @@ IN_PLANE = {
                         "at": 0.2,
                         "place": [0.18, 0.01],
                         "heading": 0.0,
+                        "clip_force": [0.1, -0.2],
                     }
                 ],
                 **HELD,
