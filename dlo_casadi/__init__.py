@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from dlo_casadi.cable.file import load as load
     from dlo_casadi.cable.fitted_cable import FittedCable as FittedCable
     from dlo_casadi.cable.fitted_cable import Shape as Shape
+    from dlo_casadi.cable.placing import Placing as Placing
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
     from dlo_casadi.config import Clip as Clip
@@ -35,6 +36,7 @@ _PUBLIC = {
     "cable.estimate": "Covariance Estimate",
     "cable.file": "load",
     "cable.fitted_cable": "FittedCable Shape",
+    "cable.placing": "Placing",
     "codegen": "CompiledSolver",
     "config": "Cable Clip Obstacle Pose",
     "effects": "EFFECTS",

@@ -105,3 +105,17 @@ def test_an_effect_of_ones_own_is_found(simulated, tmp_path, monkeypatch):
     assert effect.name == "balloon"
     for name, true in (("lift", script.LIFT), ("position", script.PLACE)):
         assert abs(effect.parameters[name].value - true) < 3 * effect.parameters[name].std
+
+
+def test_clips_of_a_door_keep_limits_at_openings_between_those_they_were_placed_for(
+    simulated, tmp_path, monkeypatch
+):
+    script = example("place_clips")
+    monkeypatch.setattr(script, "OPENINGS", np.array([-0.3, 0.6, 1.5]))  # quicker
+    placing = script.main(tmp_path / "picture.png")
+    assert placing.margin > 0.1
+    cable = script.fitted()
+    for pose in script.opened(np.array([0.1, 1.0])):
+        for check in cable.solve(**pose, clips=placing.clips).check(script.LIMITS):
+            assert check.verdict == "pass"
+    assert (tmp_path / "picture.png").stat().st_size > 10_000

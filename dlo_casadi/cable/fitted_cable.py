@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.curve import CableCurve, curves_of, without_camera
-from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
 from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
+from dlo_casadi.cable.known_cable import KnownCable
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
@@ -30,8 +30,7 @@ from dlo_casadi.equilibrium.spread import (
     spread_across,
     tipping_of,
 )
-from dlo_casadi.equilibrium.symbolic import CasadiCable
-from dlo_casadi.errors import DloError, EquilibriumError, counted
+from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.rod import Held
 from dlo_casadi.export.targets import samples_of, target_of, write_rods
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
@@ -44,7 +43,7 @@ _POINTS = 101
 
 
 @dataclass(frozen=True, eq=False)
-class FittedCable(CasadiCable):
+class FittedCable(KnownCable):
     """A fitted cable: its model with the fitted values, and what is known of their errors.
 
     From `Result.cable`, or `dlo_casadi.load` of a folder of results. Its `function` and `equations`
@@ -60,33 +59,6 @@ class FittedCable(CasadiCable):
         then k_y, then k_z.
     metadata : Metadata
     """
-
-    metadata: Metadata
-
-    def __repr__(self) -> str:
-        mesh = counted(self.model.n, f"{self.model.element} element")
-        rows = (f"  {name}: {x}" for name, x in self.params.items() if not x.fixed)
-        return "\n".join([f"<FittedCable {self.name!r}: {self.length:g} m, {mesh}>", *rows])
-
-    @property
-    def name(self) -> str:
-        """What the cable is called."""
-        return self.model.cable.name
-
-    @property
-    def params(self) -> dict[str, Estimate]:
-        """All parameters of the model by name, as they were estimated."""
-        return Named(self.metadata.params)
-
-    @property
-    def covariance(self) -> Covariance:
-        """Covariance of all fitted parameters by their names."""
-        return self.metadata.covariance
-
-    @property
-    def length(self) -> float:
-        """Length [m] as declared."""
-        return self.model.cable.length
 
     def solve(
         self,

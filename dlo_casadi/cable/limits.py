@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Metadata
@@ -33,29 +33,18 @@ UNITS = {"bend_radius": "m", "force": "N", "moment": "N m", "twist": "1/m"}
 
 
 @dataclass(frozen=True, eq=False)
-class LimitCheck:
-    """One quantity of one pose beside its limit.
+class LimitUse:
+    """How much of a limit the predicted shape of one pose uses.
 
     Parameters
     ----------
     pose, quantity : str
-    limit, value, std : float
-        In the quantity's unit: the limit; the value of the predicted shape where it is tightest,
-        and its standard deviation to first order.
-    probability, error : float
-        That a new repeat of the pose violates the limit, by the parameters' covariance, the
-        fixtures and the cable's own scatter; and the standard error of a counted one.
+    limit, value : float
+        In the quantity's unit: the limit, and the value where the shape is tightest.
     at : float [m]
         Arc length from the start where the shape is tightest.
     holder : str
         The fixture there, of a force or a moment; else empty.
-    draws, lost : int
-        Shapes that were solved to count the probability, 0 where first order suffices; and those of
-        them where the cable snaps to another shape, which count as violations.
-    shares : mapping of str to float
-        Parts of the variance by their causes, the largest first.
-    decided_by : str
-        The largest cause in words, with its size.
     s, used : (K,)
         Arc lengths [m], and the share of the limit that is used there: 1 at the limit.
     """
@@ -64,29 +53,15 @@ class LimitCheck:
     quantity: str
     limit: float
     value: float
-    std: float
-    probability: float
-    error: float
     at: float
     holder: str
-    draws: int
-    lost: int
-    shares: Mapping[str, float]
-    decided_by: str
     s: FloatArray
     used: FloatArray
 
     @property
-    def verdict(self) -> Verdict:
-        """Fail where the value itself violates the limit, pass below a probability of 1 %."""
-        if self.used.max() > 1:
-            return "fail"
-        return "pass" if self.probability < SAFE else "risk"
-
-    @property
-    def method(self) -> str:
-        """How the probability was found."""
-        return counted(self.draws, "draw") if self.draws else "first order"
+    def margin(self) -> float:
+        """Share of the limit that is left where the shape is tightest; negative beyond it."""
+        return float(1 - self.used.max())
 
     @property
     def where(self) -> str:
@@ -101,13 +76,6 @@ class LimitCheck:
         return f"{' ± '.join(format(size * x, form) for x, form in forms)} {unit}"
 
     @property
-    def chance(self) -> str:
-        """The probability as text."""
-        if not SHOWN < self.probability < 1 - SHOWN:
-            return "< 0.1 %" if self.probability < 0.5 else "> 99.9 %"
-        return f"{100 * self.probability:.{1 if self.probability < 0.1 else 0}f} %"
-
-    @property
     def label(self) -> str:
         """What is limited, in words."""
         return self.quantity.replace("_", " ")
@@ -116,6 +84,59 @@ class LimitCheck:
     def bound(self) -> str:
         """The limit as text, with its side."""
         return f"{'≥' if self.quantity == 'bend_radius' else '≤'} {self.text(self.limit)}"
+
+    def __str__(self) -> str:
+        return f"{self.label} {self.text(self.value)} at {self.where} of {self.pose} ({self.bound})"
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LimitCheck(LimitUse):
+    """One quantity of one pose beside its limit, and how likely a new repeat violates it.
+
+    Parameters
+    ----------
+    std : float
+        Standard deviation of the value to first order.
+    probability, error : float
+        That a new repeat of the pose violates the limit, by the parameters' covariance, the
+        fixtures and the cable's own scatter; and the standard error of a counted one.
+    draws, lost : int
+        Shapes that were solved to count the probability, 0 where first order suffices; and those of
+        them where the cable snaps to another shape, which count as violations.
+    shares : mapping of str to float
+        Parts of the variance by their causes, the largest first.
+    decided_by : str
+        The largest cause in words, with its size.
+    """
+
+    std: float
+    probability: float
+    error: float
+    draws: int
+    lost: int
+    shares: Mapping[str, float]
+    decided_by: str
+
+    @property
+    def verdict(self) -> Verdict:
+        """Fail where the value itself violates the limit, pass below a probability of 1 %."""
+        if self.used.max() > 1:
+            return "fail"
+        return "pass" if self.probability < SAFE else "risk"
+
+    @property
+    def method(self) -> str:
+        """How the probability was found."""
+        return counted(self.draws, "draw") if self.draws else "first order"
+
+    @property
+    def chance(self) -> str:
+        """The probability as text."""
+        if not SHOWN < self.probability < 1 - SHOWN:
+            return "< 0.1 %" if self.probability < 0.5 else "> 99.9 %"
+        return f"{100 * self.probability:.{1 if self.probability < 0.1 else 0}f} %"
 
     def __str__(self) -> str:
         return (
@@ -142,6 +163,23 @@ _LOOSE = 0.1
 _TRY = "{'bend_radius': 0.05, 'force': 8.0}, of the commands --limits bend_radius=0.05 force=8"
 
 
+def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Limits:
+    """Limits that a caller gives, or the session's.
+
+    Raises
+    ------
+    DloError
+        If there is none, or one has no meaning for this cable.
+    """
+    asked = _given(Limits, limits, _TRY) or known.limits
+    if not asked.given:
+        raise DloError(f"no limit is given, and the session declared none.\n  Try: {_TRY}")
+    held = (model.start, model.end, *model.clips)
+    if wrong := [*asked.problems(held, model.in_space, model.cable.length)]:
+        raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
+    return asked
+
+
 def check_limits(
     cable: CasadiCable,
     known: Metadata,
@@ -151,9 +189,7 @@ def check_limits(
     tolerances: Asked = None,
 ) -> tuple[LimitCheck, ...]:
     """Checks of a fitted cable's shape, see `Shape.check`."""
-    asked = _given(Limits, limits, _TRY) or known.limits
-    if not asked.given:
-        raise DloError(f"no limit is given, and the session declared none.\n  Try: {_TRY}")
+    asked = asked_limits(cable.model, known, limits)
     beside = _given(DeclaredTolerances, tolerances, "tolerances={'end': 2e-3} [m]")
     stds = {} if beside is None else beside.model_dump(exclude_unset=True)
     possible = tolerances_of(cable.model)
@@ -164,9 +200,6 @@ def check_limits(
     if large := [x for x in ("end", "length") if stds.get(x, 0.0) > _LOOSE * length]:
         text = f"tolerances.{large[0]}: {stds[large[0]]:g} m for a cable of {length:g} m"
         raise DloError(f"{text}.\n  Try: metres, such as {stds[large[0]] / 1e3:g}")
-    held = (cable.model.start, cable.model.end, *cable.model.clips)
-    if wrong := [*asked.problems(held, cable.model.in_space, length)]:
-        raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
     uncertainty = known.uncertainty.installed(cable.model, stds)
     return limit_checks(cable, known.coefficients, pose, found, uncertainty, asked)
 
@@ -180,6 +213,83 @@ def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
     return kind(**given)
 
 
+def bounds_of(limits: Limits) -> dict[str, float]:
+    """Upper bounds of the sizes of `sizes_of`, by their names: of a bend radius the curvature's."""
+    return {_size(x): 1 / y if x == "bend_radius" else y for x, y in limits.given.items()}
+
+
+def _size(quantity: str) -> str:
+    return "curvature" if quantity == "bend_radius" else quantity
+
+
+@dataclass(frozen=True)
+class _Resolved:
+    """A shape on meshes of which the last one resolves its sharpest bend.
+
+    Where a state has changed the rest curvature, it is known on the fit's elements alone, and these
+    are used.
+    """
+
+    cable: CasadiCable
+    coefficients: FloatArray
+    pose: HeldPose
+    meshes: list[tuple[CableModel, Equilibrium]]
+
+    @classmethod
+    def of(
+        cls,
+        cable: CasadiCable,
+        coefficients: FloatArray,
+        pose: HeldPose,
+        found: Equilibrium,
+        limits: Limits,
+    ) -> Self:
+        """On the meshes that the limits ask for."""
+        meshes = [(cable.model, found)]
+        if limits.bend_radius is not None and not cable.model.has_state:
+            meshes = resolved(cable.model, cable.p, coefficients, pose, found)
+        return cls(cable, coefficients, pose, meshes)
+
+    def rest_on(self, mesh: CableModel) -> FloatArray:
+        """Rest curvature (n_rests,) [1/m] on one of the meshes."""
+        known = self.cable
+        return known.rest if mesh is known.model else mesh.rest_basis @ self.coefficients
+
+    def on(self, quantity: str) -> tuple[CableModel, Equilibrium]:
+        """The mesh on which a quantity is measured, and the shape there."""
+        return self.meshes[-1 if quantity in ("bend_radius", "twist") else 0]
+
+    def sizes(self, mesh: CableModel, shape: Equilibrium, quantity: str) -> FloatArray:
+        """Sizes (K,) of a quantity on a mesh, see `sizes_of`."""
+        given = Inputs.of(self.cable.p, self.rest_on(mesh), self.pose.vector[None])
+        return sizes_of(mesh, shape.shapes, given, _size(quantity))[0]
+
+    def uses(self, limits: Limits) -> tuple[LimitUse, ...]:
+        """How much of each limit the shape uses, in their order."""
+        out, bounds = [], bounds_of(limits)
+        for quantity, limit in limits.given.items():
+            mesh, shape = self.on(quantity)
+            here = self.sizes(mesh, shape, quantity)
+            places, holders = places_of(mesh, self.pose, shape, _size(quantity))
+            tight = int(here.argmax())
+            value = 1 / here[tight] if quantity == "bend_radius" else here[tight]
+            where = float(places[tight]), holders[tight], places
+            used = here / bounds[_size(quantity)]
+            out.append(LimitUse(self.pose.name, quantity, limit, float(value), *where, used))
+        return tuple(out)
+
+
+def limit_uses(
+    cable: CasadiCable,
+    coefficients: FloatArray,
+    pose: HeldPose,
+    found: Equilibrium,
+    limits: Limits,
+) -> tuple[LimitUse, ...]:
+    """How much of each limit a shape uses, as `limit_checks` without probabilities."""
+    return _Resolved.of(cable, coefficients, pose, found, limits).uses(limits)
+
+
 def limit_checks(
     cable: CasadiCable,
     coefficients: FloatArray,
@@ -191,8 +301,7 @@ def limit_checks(
     """Checks of one predicted shape, one for each limit, in their order.
 
     A bend is measured on a mesh that resolves it, see `resolved`; draws are solved on one of
-    elements twice as long. Where a state has changed the rest curvature, it is known on the fit's
-    elements alone, and these are used.
+    elements twice as long.
 
     Parameters
     ----------
@@ -201,56 +310,31 @@ def limit_checks(
     limits : Limits
         With a meaning for this cable, see `Limits.problems`.
     """
-    model, p, rest = cable.model, cable.p, cable.rest
-    names = {x: "curvature" if x == "bend_radius" else x for x in limits.given}
-    bounds = {names[x]: 1 / y if x == "bend_radius" else y for x, y in limits.given.items()}
-    meshes = [(model, found)]
-    if "curvature" in bounds and not model.has_state:
-        meshes = resolved(model, p, coefficients, pose, found)
-
-    def rest_on(mesh: CableModel) -> FloatArray:
-        return rest if mesh is model else mesh.rest_basis @ coefficients
-
-    def sizes(mesh: CableModel, shape: Equilibrium, name: str) -> FloatArray:
-        given = Inputs.of(p, rest_on(mesh), pose.vector[None])
-        return sizes_of(mesh, shape.shapes, given, name)[0]
-
-    drawn, near = meshes[-2:][0]
-    along = ("curvature", "twist")
-    true = {name: (meshes[-1] if name in along else meshes[0]) for name in bounds}
-    found_sizes = {name: sizes(*mesh, name) for name, mesh in true.items()}
+    shape, bounds = _Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
+    drawn, near = shape.meshes[-2:][0]
     # What a size is on the mesh of the draws, over what it is.
-    ratio = {x: sizes(drawn, near, x).max() / y.max() for x, y in found_sizes.items()}
+    ratio = {
+        _size(x): shape.sizes(drawn, near, x).max() / shape.sizes(*shape.on(x), x).max()
+        for x in limits.given
+    }
     own = uncertainty.pose_scatter
-    with_own = own.within(drawn), own.values(p, drawn)
-    varied = Varied(*with_own, rest_on(drawn), pose, near, uncertainty)
+    with_own = own.within(drawn), own.values(cable.p, drawn)
+    varied = Varied(*with_own, shape.rest_on(drawn), pose, near, uncertainty)
     likely = varied.exceedances({name: ratio[name] * bound for name, bound in bounds.items()})
     out = []
-    for quantity, limit in limits.given.items():
-        name = names[quantity]
-        chance, here = likely[name], found_sizes[name]
-        places, holders = places_of(true[name][0], pose, true[name][1], name)
-        tight = int(here.argmax())
-        value, std = float(here[tight]), chance.std / ratio[name]
-        if quantity == "bend_radius":
-            value, std = 1 / value, std / value**2
+    for use in shape.uses(limits):
+        name = _size(use.quantity)
+        chance, std = likely[name], likely[name].std / ratio[name]
         out.append(
             LimitCheck(
-                pose=pose.name,
-                quantity=quantity,
-                limit=limit,
-                value=value,
-                std=float(std),
+                **vars(use),
+                std=float(std * use.value**2 if use.quantity == "bend_radius" else std),
                 probability=chance.probability,
                 error=chance.error,
-                at=float(places[tight]),
-                holder=holders[tight],
                 draws=chance.draws,
                 lost=chance.lost,
                 shares=chance.shares,
-                decided_by=_said(model, uncertainty, chance),
-                s=places,
-                used=here / bounds[name],
+                decided_by=_said(cable.model, uncertainty, chance),
             )
         )
     return tuple(out)

@@ -153,7 +153,7 @@ class Varied:
         """
         names = tuple(bounds)
         causes = self.uncertainty.causes_in(self.model)
-        sizes, slopes = self._linear(names)
+        sizes, slopes = self.linear(names)
         z = np.random.default_rng(0).standard_normal((LINEAR, len(causes)))
         solved, lost = self._solved(z[:PAIRED], names)
         likely = {x: _crossing(sizes[x], slopes[x], bounds[x], z) for x in names}
@@ -202,9 +202,7 @@ class Varied:
             self.found.shapes, self.p, self.rest, by_rest, by_p, by_deviation
         )
 
-    def _linear(
-        self, names: tuple[str, ...]
-    ) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    def linear(self, names: tuple[str, ...]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
         """Sizes (K,) and their derivatives (K, q) by the ways in which a repeat may differ."""
         count = len(self.uncertainty.causes_in(self.model))
         z = _STEP * np.vstack([np.eye(count), -np.eye(count), np.zeros((1, count))])

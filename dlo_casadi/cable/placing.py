@@ -1,0 +1,446 @@
+"""Where to put clips: arc lengths and places that keep limits over several poses of the ends.
+
+A minimax problem: z are the arc lengths and places of the clips, u_r(z) the share of its limit
+that is used at one arc length of one pose,
+
+    min_z max_r u_r(z)    s.t.   low <= place <= high,   |chord of a span| <= ROOM x its cable
+
+or the greatest force is made least with all u_r(z) <= 1. Each step solves the linear program of the
+first-order model within a trust region, and is taken if the shapes solved anew confirm it.
+
+References
+----------
+Madsen, IMA J. Appl. Math. 16 (1975): minimax solutions by linear programs in a trust region.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import linprog, minimize
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimate import Metadata
+from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.limits import Asked, LimitUse, asked_limits, bounds_of, limit_uses
+from dlo_casadi.config import Clip, Limits
+from dlo_casadi.effects import ClipSlip
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.limits import Varied, fixtures_of, sizes_of
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
+from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.errors import DloError, EquilibriumError, counted
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.show.text import vector
+
+Aim = Literal["margin", "force"]
+Sizes = Mapping[str, FloatArray]
+# Largest chord of a span over its cable: beyond it 1 mm changes the pull of a span of 0.25 m by a
+# sixth and more. First guesses have more room, if there is any.
+ROOM, ROOMY = 0.95, (0.8, 0.9, 0.95)
+# First, largest and last radius of the trust region, in lengths of the cable.
+FIRST, LARGEST, LAST = 0.05, 0.2, 1e-4
+# Numbers of first guesses and of steps from each; of the best that go on, and their largest number
+# of steps; largest number of rounds, after which bends are resolved.
+GUESSES, TRIED, STARTS, STEPS, ROUNDS = 16, 6, 3, 60, 4
+# Scatter of first guesses [lengths].
+SCATTER = 0.05
+# Weight of a share beyond a limit against the force that is made least.
+PENALTY = 10.0
+# Relative change of what resolved bends use that ends the rounds.
+SETTLED = 5e-3
+_TRY = "within=((0.1, 0.0), (0.3, 0.2)) [m]: the lowest and the highest coordinates of the clips"
+
+
+@dataclass(frozen=True, eq=False)
+class Placing:
+    """Pinned clips, and what the cable uses of its limits between them.
+
+    Parameters
+    ----------
+    clips : tuple of Clip
+        As `FittedCable.solve` takes them.
+    uses : tuple of LimitUse
+        Of each limit in each pose; empty without limits.
+    force : float [N]
+        Greatest force of the cable on any of its fixtures and clips, in all poses.
+    at : str
+        Where: the fixture and the pose.
+    """
+
+    clips: tuple[Clip, ...]
+    uses: tuple[LimitUse, ...]
+    force: float
+    at: str
+
+    @property
+    def binding(self) -> LimitUse | None:
+        """The limit of which most is used, its pose and place; None without limits."""
+        return min(self.uses, key=lambda use: use.margin, default=None)
+
+    @property
+    def margin(self) -> float:
+        """Share of its limit that is left where most is used: 1 = nothing used, < 0 = violated."""
+        return 1.0 if self.binding is None else self.binding.margin
+
+    def __str__(self) -> str:
+        lines = [f"{counted(len(self.clips), 'pinned clip')}, margin {self.margin:.1%}"]
+        for clip in self.clips:
+            lines.append(f"  {clip.name}: at {clip.at:.4f} m, {vector(clip.place, '.4f', 'm')}")
+        if self.binding is not None:
+            lines.append(f"  binds: {self.binding}")
+        return "\n".join([*lines, f"  greatest force: {self.force:.4g} N on the {self.at}"])
+
+    __repr__ = __str__
+
+
+def placed(
+    cable: CasadiCable,
+    known: Metadata,
+    count: int,
+    poses: Sequence[Mapping[str, Any]],
+    within: ArrayLike,
+    limits: Asked,
+    aim: Aim,
+) -> Placing:
+    """See `FittedCable.place`."""
+    if aim not in get_args(Aim):
+        raise DloError(f"aim: one of {', '.join(get_args(Aim))} belongs here, found {aim!r}")
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise DloError(f"count: a number of clips, 1 or more, belongs here, found {count!r}")
+    if isinstance(poses, Mapping) or not len(poses):
+        raise DloError("poses: [{'end': (0.3, -0.1)}, ...] belongs here, as `solve` takes them")
+    try:
+        region = np.array(within, dtype=float)
+    except (TypeError, ValueError):
+        region = np.full(1, np.nan)
+    d = cable.model.node.dimension
+    if region.shape != (2, d) or not np.isfinite(region).all() or (region[0] > region[1]).any():
+        raise DloError(
+            f"within: two corners of a region belong here, found {within!r}.\n  Try: {_TRY}"
+        )
+    default: dict[str, Any] = {"turns": 0.0, "branch": None, "clips": []}
+    held = tuple(
+        replace(held_pose(cable.model, known.fixtures, default | dict(pose)), name=f"pose_{k}")
+        for k, pose in enumerate(poses, start=1)
+    )
+    between, asked = cable.with_clips(["pinned"] * int(count)), Limits()
+    if aim == "margin" or limits is not None or known.limits.given:
+        asked = asked_limits(between.model, known, limits)
+    return _Search(
+        between, known.coefficients, held, region / cable.model.cable.length, asked, aim
+    ).best()
+
+
+@dataclass(frozen=True)
+class _Hung:
+    """The lowest shapes of all poses with the clips at z.
+
+    `sizes` of each pose by their names; `aims` (R,) are made least, `others` (S,) kept below 1.
+    """
+
+    z: FloatArray
+    shapes: tuple[Equilibrium, ...]
+    sizes: tuple[Sizes, ...]
+    aims: FloatArray
+    others: FloatArray
+
+    @property
+    def merit(self) -> float:
+        """What is made least."""
+        return float(self.aims.max() + PENALTY * max(self.others.max(initial=0.0) - 1, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Search for z (count (1 + d),) in lengths of the cable: arc length and place of each clip.
+
+    `poses` are without clips, `region` (2, d) in lengths.
+    """
+
+    cable: CasadiCable
+    coefficients: FloatArray
+    poses: tuple[HeldPose, ...]
+    region: FloatArray
+    limits: Limits
+    aim: Aim
+
+    @cached_property
+    def count(self) -> int:
+        """Number of clips."""
+        return len(self.cable.model.clips)
+
+    @cached_property
+    def length(self) -> float:
+        """Length of the cable [m]."""
+        return self.cable.model.cable.length
+
+    @cached_property
+    def slipping(self) -> CasadiCable:
+        """The cable with a slip of each clip as a parameter: its derivatives are those by `at`."""
+        model, p = self.cable.model, self.cable.p
+        for k in range(self.count):
+            if (slip := ClipSlip(clip=k)).label not in [effect.label for effect in model.effects]:
+                model, p = model.with_effect(slip), np.append(p, 0.0)
+        return CasadiCable(model, p, self.cable.rest)
+
+    @cached_property
+    def ways(self) -> Uncertainty:
+        """Slips and moves of clips by 1 m, as what varies."""
+        slips = tuple(f"{ClipSlip(clip=k).label}.ds" for k in range(self.count))
+        moves = [
+            f"clip_{k}_{axis}" for k in range(self.count) for axis in self.cable.model.node.axes
+        ]
+        return Uncertainty(slips, np.eye(len(slips)), dict.fromkeys(moves, 1.0), PoseScatter())
+
+    @cached_property
+    def columns(self) -> list[int]:
+        """Columns of the derivatives by `ways` in the order of z."""
+        causes = self.ways.causes_in(self.slipping.model)
+        moves = [np.flatnonzero([x == f"clip_{k}" for x in causes]) for k in range(self.count)]
+        return [int(column) for k, own in enumerate(moves) for column in (k, *own)]
+
+    @cached_property
+    def bounds(self) -> FloatArray:
+        """Least and greatest z (2, count (1 + d))."""
+        least, (low, high) = 1 / self.cable.model.n, self.region
+        return np.tile([[least, *low], [1 - least, *high]], self.count)
+
+    def held(self, z: FloatArray) -> list[HeldPose]:
+        """The poses, held by the clips, too."""
+        rows = self.length * z.reshape((self.count, -1))
+        clips = tuple(
+            HeldClip("pinned", tuple(row[1:].tolist()), float(row[0]), name=f"clip_{k}")
+            for k, row in enumerate(rows, start=1)
+        )
+        return [replace(pose, clips=clips) for pose in self.poses]
+
+    def spare(self, z: FloatArray, room: float = ROOM) -> tuple[FloatArray, FloatArray]:
+        """Cable (poses spans,) of spans beyond their chords, in lengths; derivatives by z."""
+        d, count = self.region.shape[1], self.count
+        rows, found = z.reshape((count, 1 + d)), []
+        for pose in self.poses:
+            ends = [[0.0, *np.array(pose.start) / self.length]]
+            last = [] if pose.end is None else [[1.0, *np.array(pose.end) / self.length]]
+            steps = np.diff(np.array([*ends, *rows, *last]), axis=0)
+            for k, step in enumerate(steps):
+                chord, slope = np.linalg.norm(step[1:]), np.zeros((count + 2, 1 + d))
+                slope[k + 1] = [room, *-step[1:] / max(chord, 1e-12)]
+                slope[k] = -slope[k + 1]
+                found.append((room * step[0] - chord, slope[1:-1].ravel()))
+        spare, slopes = (np.array(part) for part in zip(*found, strict=True))
+        return spare, slopes
+
+    def hung(self, z: FloatArray, scales: FloatArray) -> _Hung:
+        """The lowest shapes at z; an EquilibriumError where there is none."""
+        known, poses = self.slipping, self.held(z)
+        shapes, sizes = [], []
+        for eq in solve_equilibria(known.model, known.p, known.rest, poses):
+            if isinstance(eq, EquilibriumError):
+                raise eq
+            shapes.append(eq)
+        for pose, eq in zip(poses, shapes, strict=True):
+            given = Inputs.of(known.p, known.rest, pose.vector[None])
+            names = (*self.bounded, "force")
+            sizes.append({x: sizes_of(known.model, eq.shapes, given, x)[0] for x in names})
+        return _Hung(z, tuple(shapes), tuple(sizes), *self._split(sizes, scales))
+
+    @cached_property
+    def bounded(self) -> dict[str, float]:
+        """Upper bounds of sizes by their names."""
+        return bounds_of(self.limits)
+
+    def _split(self, sizes: Sequence[Sizes], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What is made least and what is kept, of sizes, or of their derivatives, in each pose.
+
+        `scales` (poses, limits): resolved sizes over those on the mesh of the fit.
+        """
+        shares = [
+            one[name] * scale / bound
+            for one, row in zip(sizes, scales, strict=True)
+            for scale, (name, bound) in zip(row, self.bounded.items(), strict=True)
+        ]
+        forces = np.concatenate([one["force"] for one in sizes]) / self.weight
+        none = forces[:0]
+        return (
+            (np.concatenate(shares), none)
+            if self.aim == "margin"
+            else (forces, np.concatenate([none, *shares]))
+        )
+
+    @cached_property
+    def weight(self) -> float:
+        """A scale of forces [N]: the cable's weight, and what bends it."""
+        cable = self.cable.model.cable
+        weight = cable.mass * np.linalg.norm(self.cable.model.gravity)
+        return float(weight + cable.bending_stiffness / cable.length**2)
+
+    def slopes(self, now: _Hung, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives (R, size of z), (S, size of z) of `aims` and `others`."""
+        known, names, sizes = self.slipping, (*self.bounded, "force"), []
+        for pose, eq in zip(self.held(now.z), now.shapes, strict=True):
+            varied = Varied(known.model, known.p, known.rest, pose, eq, self.ways)
+            by_ways = varied.linear(tuple(dict.fromkeys(names)))[1]
+            sizes.append({k: self.length * x[:, self.columns] for k, x in by_ways.items()})
+        return self._split(sizes, scales)
+
+    def best(self) -> Placing:
+        """The best of all first guesses; an error where none keeps the limits."""
+        scales, lost = np.ones((len(self.poses), len(self.bounded))), EquilibriumError("")
+        hung: list[_Hung] = []
+        for z in self._guesses():
+            try:
+                hung.append(self._descended(self.hung(z, scales), scales, TRIED))
+            except EquilibriumError as error:
+                lost = error
+        clips = counted(self.count, "pinned clip")
+        if not hung:
+            happened = lost.message.partition("\n  Try:")[0]
+            what = f"no shapes were found with {clips} in the region: {happened}"
+            raise DloError(f"{what}.\n  Try: another region, ends nearer to the start.")
+        firsts = sorted(hung, key=lambda one: one.merit)[:STARTS]
+        best = min((self._improved(one, scales) for one in firsts), key=self._order)
+        if best.margin < 0:
+            raise DloError(
+                f"no places of {clips} were found that keep the limits in "
+                f"{counted(len(self.poses), 'pose')}. The best found: {best}\n"
+                "  Try: a larger region, more clips, other ends."
+            )
+        return best
+
+    def _guesses(self) -> list[FloatArray]:
+        """First guesses: where the cable hangs without clips, moved until each span has room."""
+        known, curves = self.cable.with_clips(()), []
+        for pose in self.poses:
+            eq = solve_equilibrium(known.model, known.p, known.rest, pose)
+            given = Inputs.of(known.p, known.rest, pose.vector[None])
+            curve = assembly_of(known.model).curve(eq.shapes, given)[0]
+            curves.append(NodeCurve.of(self.length, curve))
+        rng, guesses, most = np.random.default_rng(0), [], -np.inf
+        for _ in range(GUESSES):
+            at = np.arange(1, self.count + 1) + rng.uniform(-0.3, 0.3, self.count)
+            at /= self.count + 1
+            places = np.mean([curve.at(at * self.length) for curve in curves], axis=0)
+            places = places / self.length + rng.normal(0.0, SCATTER, places.shape)
+            first = np.column_stack([at, places]).ravel().clip(*self.bounds)
+            for room in ROOMY:
+                z = self._with_room(first, room)
+                spare = float(self.spare(z, room)[0].min())
+                if spare > -LAST:
+                    guesses.append(z)
+                    break
+            most = max(most, spare)
+        if not guesses:
+            raise DloError(
+                f"no room for {counted(self.count, 'clip')} in the region: a span is longer than "
+                f"{ROOM:.0%} of its cable, by {-1e3 * most * self.length:.3g} mm in the best of "
+                f"{GUESSES} tries.\n  Try: a region nearer to the ends, fewer clips."
+            )
+        return guesses
+
+    def _with_room(self, first: FloatArray, room: float) -> FloatArray:
+        """The z nearest to a first one at which no span is longer than this share of its cable.
+
+        That set is convex.
+        """
+        spans = {
+            "type": "ineq",
+            "fun": lambda z: self.spare(z, room)[0],
+            "jac": lambda z: self.spare(z, room)[1],
+        }
+        found = minimize(  # type: ignore[call-overload]
+            lambda z: (((z - first) ** 2).sum(), 2 * (z - first)),
+            first,
+            jac=True,
+            bounds=self.bounds.T,
+            constraints=spans,
+            method="SLSQP",
+        )
+        return np.clip(found.x, *self.bounds)
+
+    def _improved(self, now: _Hung, scales: FloatArray) -> Placing:
+        """The placing reached from a first guess; rounds end when its bends are resolved."""
+        found: list[Placing] = []
+        for _ in range(ROUNDS):
+            now, before = self._descended(now, scales, STEPS), scales
+            uses = [
+                limit_uses(self.slipping, self.coefficients, pose, eq, self.limits)
+                for pose, eq in zip(self.held(now.z), now.shapes, strict=True)
+            ]
+            found.append(self._told(now, [use for row in uses for use in row]))
+            used = np.array([[use.used.max() for use in row] for row in uses])
+            own = [[x[name].max() / y for name, y in self.bounded.items()] for x in now.sizes]
+            scales = used / np.array(own)
+            if np.allclose(before, scales, rtol=SETTLED):
+                break
+            aims, others = self._split(now.sizes, scales)
+            now = replace(now, aims=aims, others=others)
+        return min(found, key=self._order)
+
+    def _order(self, one: Placing) -> tuple[float, float]:
+        """Sorts placings, the best first."""
+        over = 0.0 if self.aim == "force" else np.inf
+        return -min(one.margin, over), one.force
+
+    def _descended(self, now: _Hung, scales: FloatArray, steps: int) -> _Hung:
+        """After so many steps, or where the trust region shrinks to nothing."""
+        radius, slopes = FIRST, self.slopes(now, scales)
+        for _ in range(steps):
+            step, foreseen = self._step(now, slopes, radius)
+            if radius < LAST or now.merit - foreseen < LAST:
+                break
+            try:
+                new = self.hung(now.z + step, scales)
+            except EquilibriumError:
+                radius /= 4
+                continue
+            share = (now.merit - new.merit) / (now.merit - foreseen)
+            if share > 0.75:
+                radius = min(2 * radius, LARGEST)
+            elif share < 0.25:
+                radius /= 2
+            if share > 0.1:
+                now = new
+                slopes = self.slopes(now, scales)
+        return now
+
+    def _step(
+        self, now: _Hung, slopes: tuple[FloatArray, FloatArray], radius: float
+    ) -> tuple[FloatArray, float]:
+        """Best step of the first-order model within a radius, and the merit it foresees.
+
+        Variables: the step, the greatest aim, and the greatest violation.
+        """
+        size = len(now.z)
+        spare, by_z = self.spare(now.z)
+        parts = (
+            (slopes[0], (-1.0, 0.0), -now.aims),
+            (slopes[1], (0.0, -1.0), 1 - now.others),
+            (-by_z, (0.0, 0.0), spare),
+        )
+        rows = np.vstack([np.column_stack([a, np.tile(x, (len(a), 1))]) for a, x, _ in parts])
+        right = np.concatenate([b for *_, b in parts])
+        low, high = (self.bounds - now.z).clip(-radius, radius)
+        limits = [*zip(low, high, strict=True), (None, None), (0.0, None)]
+        found = linprog([*np.zeros(size), 1.0, PENALTY], rows, right, bounds=limits)
+        if found.x is None or found.fun is None:
+            return np.zeros(size), now.merit
+        return found.x[:size], float(found.fun)
+
+    def _told(self, now: _Hung, uses: Sequence[LimitUse]) -> Placing:
+        """A placing in words of the configuration."""
+        poses = self.held(now.z)
+        model, worst = self.slipping.model, []
+        for pose, eq, sizes in zip(poses, now.shapes, now.sizes, strict=True):
+            named = zip(sizes["force"], fixtures_of(model, pose, eq), strict=True)
+            worst += [(float(force), f"{holder.name} in {pose.name}") for force, holder in named]
+        clips = (Clip(name=x.name, kind="pinned", at=x.at, place=x.place) for x in poses[0].clips)
+        return Placing(tuple(clips), tuple(uses), *max(worst))

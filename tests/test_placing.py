@@ -1,0 +1,132 @@
+"""Where to put clips: against a search on a grid and random places, and messages for bad input."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.cable import placing
+from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.limits import limit_uses
+from dlo_casadi.cable.placing import ROOM, placed
+from dlo_casadi.config import Limits
+from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import CableModel
+
+KNOWN = SimpleNamespace(fixtures={}, limits=Limits(), coefficients=np.zeros(0))
+LIMITS = {"bend_radius": 0.04, "force": 6.0}
+POSES = [{"end": (0.5, 0.0)}, {"end": (0.4, 0.2)}]
+
+
+@pytest.fixture(autouse=True)
+def fewer_starts(monkeypatch):
+    """Quicker, and good enough for one or two clips on a line."""
+    monkeypatch.setattr(placing, "GUESSES", 4)
+    monkeypatch.setattr(placing, "STARTS", 2)
+
+
+def cable(n=12, **more) -> CasadiCable:
+    data = CableData(0.8, 0.05, 0.006, 0.02, **more.pop("also", {}))
+    model = CableModel(data, n, n_rest=0, **more)
+    return CasadiCable(model, model.nominal, np.zeros(model.chain.n_rests))
+
+
+def used(known: CasadiCable, clips: list[dict], limits: dict, poses=POSES):
+    """What solved shapes use of the limits."""
+    held = known.with_clips(["pinned"] * len(clips))
+    asked = {"turns": 0.0, "branch": None, "clips": clips}
+    for pose in poses:
+        own = held_pose(held.model, {}, asked | pose)
+        eq = solve_equilibrium(held.model, held.p, held.rest, own)
+        yield from limit_uses(held, KNOWN.coefficients, own, eq, Limits(**limits))
+
+
+def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():
+    known, place = cable(), (0.25, -0.15)
+    found = placed(known, KNOWN, 1, POSES, (place, place), LIMITS, "margin")
+    chords = [0.0, 0.8] + np.array([1, -1]) * [
+        np.hypot(*place) / ROOM,
+        max(np.hypot(*np.subtract(pose["end"], place)) for pose in POSES) / ROOM,
+    ]
+    margins = [
+        min(x.margin for x in used(known, [{"kind": "pinned", "at": s, "place": place}], LIMITS))
+        for s in np.linspace(*chords, 21)
+    ]
+    assert found.clips[0].place == pytest.approx(place)
+    # Between points of the grid the best margin is at most that of a kink: it may be 0.02 higher.
+    assert max(margins) - 1e-3 < found.margin < max(margins) + 0.02
+
+
+def test_two_clips_on_a_wall_keep_limits_with_what_is_said_of_them():
+    known, wall = cable(), ((0.05, -0.1), (0.4, -0.1))
+    found = placed(known, KNOWN, 2, POSES, wall, LIMITS, "margin")
+    clips = [clip.model_dump() for clip in found.clips]
+    again = list(used(known, clips, LIMITS))
+    assert [x.value for x in again] == pytest.approx([x.value for x in found.uses], rel=1e-3)
+    assert 0 < found.margin == found.binding.margin < 1
+    assert found.force == pytest.approx(max(x.value for x in found.uses if x.quantity == "force"))
+    assert all(0.05 <= x.place[0] <= 0.4 and x.place[1] == -0.1 for x in found.clips)
+    assert str(found.binding) in str(found)
+
+    rng, others = np.random.default_rng(0), []
+    for steps in rng.uniform(-0.01, 0.01, (12, 2, 2)):
+        moved = [
+            {**clip, "at": clip["at"] + ds, "place": (clip["place"][0] + dx, -0.1)}
+            for clip, (ds, dx) in zip(clips, steps, strict=True)
+        ]
+        others.append(min(x.margin for x in used(known, moved, LIMITS)))
+    assert max(others) < found.margin
+
+
+def test_the_least_force_may_use_more_of_the_bend_radius():
+    known, wall = cable(), ((0.05, -0.1), (0.4, -0.1))
+    sharp = {"bend_radius": 0.07}
+    least = placed(known, KNOWN, 1, POSES, wall, sharp, "force")
+    mild = placed(known, KNOWN, 1, POSES, wall, sharp, "margin")
+    assert least.force < mild.force
+    assert 0 <= least.margin < mild.margin
+    free = placed(known, KNOWN, 1, POSES, wall, None, "force")
+    assert (free.uses, free.binding, free.margin) == ((), None, 1.0)
+    assert free.force <= least.force + 1e-3
+
+
+def test_no_place_near_a_clip_in_space_is_better():
+    known = cable(8, gravity=(0.0, 0.0, -9.81), also={"torsional_stiffness": 0.015})
+    poses, box = [{"end": (0.5, 0.1, 0.0)}], ((0.1, -0.1, -0.3), (0.4, 0.2, 0.0))
+    found = placed(known, KNOWN, 1, poses, box, {"force": 3.0}, "margin")
+    (clip,) = (one.model_dump() for one in found.clips)
+    rng = np.random.default_rng(0)
+    for ds, *step in rng.uniform(-0.01, 0.01, (8, 4)):
+        place = np.clip(np.add(clip["place"], step), *box)
+        other = [{**clip, "at": clip["at"] + ds, "place": tuple(place)}]
+        assert min(x.margin for x in used(known, other, {"force": 3.0}, poses)) < found.margin
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"limits": {"force": 0.2}}, r"no places of 1 pinned clip .* 2 poses.*\n.*≤ 0.2 N"),
+        ({"limits": None}, "no limit is given"),
+        ({"limits": {"moment": 1.0}}, "no end is clamped"),
+        (
+            {"within": ((2.0, 0.0), (2.1, 0.1))},
+            "a span is longer than 95% of its cable, by [0-9.]+e",
+        ),
+        ({"within": ((0.3, 0.0), (0.1, 0.1))}, "two corners of a region"),
+        ({"within": (0.1, 0.2)}, "two corners of a region"),
+        ({"within": "wall"}, "two corners of a region"),
+        ({"count": 0}, "1 or more"),
+        ({"aim": "beauty"}, "one of margin, force"),
+        ({"poses": []}, "as `solve` takes them"),
+        ({"poses": [{"end": (0.5, 0.0), "start_heading": 0.1}]}, "start_heading has no meaning"),
+        ({"poses": [{"end": (5.0, 0.0)}]}, "5.0000 m from the start"),
+    ],
+)
+def test_messages(changed, said):
+    wall = ((0.05, -0.1), (0.4, -0.1))
+    asked = {"count": 1, "poses": POSES, "within": wall, "limits": LIMITS, "aim": "margin"}
+    with pytest.raises(DloError, match=f"(?s){said}"):
+        placed(cable(), KNOWN, **(asked | changed))
