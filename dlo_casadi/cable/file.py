@@ -52,8 +52,8 @@ FILE = "parameters.yaml"
 SCHEMA = "dlo-parameters/1"
 # Keys on which a prediction depends, beside the values of the parameters.
 _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
-# Tolerance of a value at its bound, relative to the bound or the parameter's scale: rounding of
-# value = nominal + scale x, or exp(x), some 1e-14, and the tolerance of solvers.
+# Tolerance of a value at its bound, relative to the bound or the parameter's scale: for rounding of
+# value = nominal + scale x, or exp(x), about 1e-14, and for the tolerance of solvers.
 _ROUNDING = 1e-9
 # Relative tolerance of a covariance's symmetry and correlations: they are inverses of matrices.
 _DIGITS = 1e-6

@@ -69,7 +69,7 @@ class LimitUse:
         return self.holder or f"s = {self.at:.3f} m"
 
     def text(self, *values: float) -> str:
-        """A value of the quantity with its unit; or also its standard deviation."""
+        """A value of the quantity with its unit, and its standard deviation if it is given."""
         unit = UNITS[self.quantity]
         unit, size = ("mm", 1e3) if unit == "m" else (unit, 1.0)
         forms = zip(values, (".4g", ".2g"), strict=False)

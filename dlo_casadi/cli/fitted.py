@@ -256,7 +256,7 @@ def shape_table(chosen: argparse.Namespace) -> None:
 
 
 def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
-    """The poses; what a list does not contain is given, or the same in all poses of the session."""
+    """The poses; columns that a list lacks are taken from the options or the session."""
     model, shared = cable.model, cable.metadata.fixtures
     x, y = chosen.start or shared.get("start") or (0.0, 0.0)
     fixed = {"start_x": float(x), "start_y": float(y)}

@@ -21,7 +21,7 @@ from dlo_casadi.cli.guard import signals
 from dlo_casadi.errors import counted
 from dlo_casadi.runtime.parallel import Tally
 
-# Without a terminal, shortest time between two lines about the same part [s].
+# Shortest time between two lines about the same part, without a terminal [s].
 PATIENCE = 10.0
 
 

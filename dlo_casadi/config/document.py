@@ -17,8 +17,8 @@ _LARGEST = 500_000
 _MOST_VALUES = _LARGEST // 2
 # Levels of lists and mappings; a configuration has seven.
 _DEEPEST = 30
-# No text: control characters beside tab and line breaks, which a terminal obeys, and halves of
-# surrogate pairs, except those that stand for the bytes of a file's name that is not UTF-8.
+# Characters that are refused: control characters other than tab and line breaks, which a terminal
+# would obey; and lone surrogates, except those that stand for bytes of file names (PEP 383).
 _NO_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udc7f\udd00-\udfff]")
 
 

@@ -26,7 +26,7 @@ def template(
     clips: Sequence[str] = (),
     remarks: Sequence[str] = (),
 ) -> str:
-    """Text of a configuration with placeholders for what only its user knows.
+    """Text of a configuration with placeholders for values that only the user knows.
 
     Parameters
     ----------

@@ -158,7 +158,7 @@ AXES = {
 # ---- types -------------------------------------------------------------------------------------
 
 
-# Items of a list that a section shows of itself.
+# Longest list that the text of a section shows in full.
 _SHOWN = 6
 
 

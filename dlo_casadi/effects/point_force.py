@@ -33,7 +33,7 @@ class PointForce(PointLoad):
 
 
 class UnknownPull(PointLoad):
-    """A force at one place of the cable that may be another one in every pose.
+    """A force at one place of the cable, different in every pose.
 
         V_j = - (f + f_j) . r(s)                                      [J]
 

@@ -34,7 +34,7 @@ from dlo_casadi.thresholds import DIFFERENT, LACKING_SHARE, MESH_SHARE
 MISFIT_STD = 0.01
 # A first guess of an undeclared noise, only until it has been estimated.
 FIRST_STD = 3e-4
-# Rise of the objective from a mesh to the next finer one by which a fit has got stuck: of two poses
+# Factor on the objective, from a mesh to the next finer one, at which a fit is stuck: of two poses
 # in space 20 elements left 280 and 40 left 6327, while two meshes of a fit differ by a few percent.
 STUCK = 2.0
 # Turns per length, several times what heavy cables were measured to have, 0.1 to 0.3 1/m.
@@ -95,7 +95,7 @@ def fit_model(
     noise = replace(noise, readings=readings or first_reading_noise(model))
     priors = Priors.of(tolerances, model)
     if count == 1:
-        # One pose does not deviate from others: what is wrong with it is wrong with the session.
+        # A single pose has no deviations of its own: its errors are those of the session.
         priors = replace(priors, scatter=SCATTER_FLOOR * priors.scatter)
     problem = Problem(unknowns, tuple(measured), noise, priors)
     theta = unknowns.pack(first, np.zeros(model.n_coefficients))

@@ -184,7 +184,7 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
 
 
 def _tells_no_side(model: CableModel, pose: HeldPose) -> bool:
-    """Whether a cable has sides, see `CableModel.tipped_by`, of which the pose tells none."""
+    """Whether a cable has two sides, see `CableModel.tipped_by`, and the pose names neither."""
     return model.tipped_by is not None and not pose.branch and not pose.turns
 
 

@@ -41,7 +41,7 @@ from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_
 from dlo_casadi.sensing.restricted import Deviance, most_likely
 from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE, SIGNIFICANCE
 
-# Of the length: beside a fixture all repeats are where it holds them.
+# Share of the length beside each fixture that is left out: repeats agree where they are held.
 _BESIDE_FIXTURES = 0.02
 # Largest difference of ends [lengths] and clamps [rad] of two poses that are held in the same way:
 # the shape of any cable then moves by about this share of its length at most.

@@ -19,8 +19,8 @@ AXES = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 # EA and GA over weight and buckling load, where no stretch was found: a strain of 1 % at that load.
 # With more, cables come to rest elsewhere, probably for the rounding of single precision.
 STIFF = 100.0
-# Time step over the largest that an explicit solver could take, and iterations in a step. They
-# matter at rest, too: what these do not correct of a step's free fall remains.
+# Time step over the largest one of an explicit solver, and iterations in a step. They also change
+# the shape at rest: a part of each step's free fall remains uncorrected.
 _COURANT, ITERATIONS = 2.0, 40
 # At rest [m/s]: in single precision nodes keep creeping at some 1e-4.
 _REST_SPEED = 5e-4

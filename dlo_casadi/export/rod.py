@@ -285,7 +285,7 @@ def features_of(model: CableModel, p: FloatArray, pose: HeldPose) -> dict[Featur
 def _features(
     effect: Effect, terms: Lagrangian, local: dict[str, ca.SX], p: FloatArray, pose: HeldPose
 ) -> list[Feature]:
-    """What an effect needs of a target; places of the ends and weights are carried by all."""
+    """Features that an effect needs; all targets carry places of the ends, and weights."""
     cable, found = terms.model.cable, list[Feature]()
     if isinstance(effect, SectionLaw):
         cell, square = Cell(ca.SX.sym("s"), ca.SX(1e-3), 1e-3), ca.SX.sym("square")

@@ -13,7 +13,7 @@ from dlo_casadi.export import newton
 from dlo_casadi.export.common import Relaxed, rounded
 from dlo_casadi.export.rod import Fixture, Rod
 
-# What the proposal assumes of a material that says nothing: E = 1 MPa, Poisson's ratio 0.3 [Pa].
+# Moduli [Pa] that the proposal assumes of a material without values: E 1 MPa, Poisson's ratio 0.3.
 DEFAULT = (1e6, 1e6 / 2.6)
 # Distance [link lengths] of the points by which a clamp holds its link, against its roll.
 _LEVER = 5.0

@@ -102,7 +102,7 @@ class MeasuredPoints:
         """
         along, every = self.s, np.arange(len(self.points))
         if along is None:
-            # Lengths of chords that are longer than the noise, on which they must not depend.
+            # Chords are longer than the noise, so that their lengths do not depend on it.
             ends = np.linspace(0, every[-1], min(most, len(every))).astype(int)
             along = np.interp(every, ends, chord_lengths(self.points[ends]))
         share = (along - along[0]) / (along[-1] - along[0])

@@ -40,7 +40,7 @@ class Wishes:
     """Where the cable leaves the start body, in its axes [m]; at its origin when empty."""
     end_offset: Sequence[float] = ()
     cable: str = ""
-    """What the names of the cable's markers contain; all that are left when empty."""
+    """Text in the names of the cable's markers; if empty, all markers that no gripper has."""
     at: Sequence[float] = ()
     """Arc lengths of its markers from the start [m], ascending; measured in the poses if empty."""
     hold: float = 0.5

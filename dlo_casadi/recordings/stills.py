@@ -23,8 +23,8 @@ _QUIET = 0.1  # share of the time that the cable is still, at least
 # changes by a few per cent.
 _MOVES = 2.0
 _FLOOR = 1.0e-5  # m, a noise below the resolution of files
-# Scatter of a still stretch over the noise from frame to frame, at most: filters of the export
-# make it ten times larger, slow motion hundreds.
+# Largest ratio of the scatter of a still stretch to the noise from frame to frame: filters of the
+# export make it about 10, slow motion hundreds.
 _NEVER = 50.0
 _OUTLIER = 5.0  # median absolute deviations from which a frame is left out of a mean
 

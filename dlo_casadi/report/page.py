@@ -190,7 +190,7 @@ def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = (
 
 
 def hints(messages: Sequence[str]) -> list[str]:
-    """What the messages say to try, each once."""
+    """The advice in messages (their "Try: ..."), without repetitions."""
     found = [hint for text in messages for hint in re.findall(r"Try: (.+)", text)]
     return list(dict.fromkeys(hint[:1].upper() + hint[1:] for hint in found))
 

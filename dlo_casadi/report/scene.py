@@ -184,7 +184,7 @@ def upright(gravity: Sequence[float]) -> FloatArray:
 def scenes_of(
     config: Config, poses: Sequence[PoseInput], stages: Sequence[Stage]
 ) -> tuple[Sequence[Scene], list[tuple[list[Mark], list[Mark]]]]:
-    """A scene for each pose, all on one scale, and what stands `around` its cable there.
+    """A scene for each pose, all on one scale, and the marks `around` its cable.
 
     The last stage's forces are drawn.
     """

@@ -14,7 +14,7 @@ from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import APART, NOTABLE
 
-# By what name tables and charts have the RMS distance that the noise of points gives by itself.
+# Name, in tables and charts, of the RMS distance caused by the noise of points alone.
 NOISE_ALONE = "noise alone"
 # The errors of a stage, of which some poses were measured in another equilibrium.
 ON_BRANCH = "on the measured branch"
@@ -266,7 +266,7 @@ def reading_text(reading: NextReading) -> str:
 
 
 def finding_of(outcome: Outcome, row: Ranked) -> tuple[str, str]:
-    """What a candidate has led to, and the sentence: added, tied, or neither (an empty word)."""
+    """Status of a candidate, "added", "tied" or empty, and a sentence on it."""
     for effect in outcome.effects:
         if row.name == effect.name:
             return "added", "added to the model"

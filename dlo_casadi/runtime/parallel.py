@@ -197,7 +197,7 @@ def map_as_completed(
                 else:
                     if isinstance(error, losses):
                         if lost < retries:
-                            # Run alone: no other task can then be the cause of the last loss.
+                            # The last repetition runs alone: no other task can cause its loss.
                             put_off = again if lost + 1 < retries else suspects
                             put_off.append((index, item, lost + 1))
                             continue

@@ -99,7 +99,7 @@ class MeasuredPose:
 
     @property
     def relative_white(self) -> FloatArray:
-        """The same of white errors, which are smaller for means of points."""
+        """Relative standard deviations of white errors, smaller for means of points."""
         return np.concatenate([sensor.weight / np.sqrt(sensor.count) for sensor in self.sensors])
 
     @property

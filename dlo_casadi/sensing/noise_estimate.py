@@ -169,7 +169,7 @@ def estimate_noise(
     """
     samples = [sample.thinned(max_points) for sample in _telling(samples)]
     everything, samples = samples, samples[:: max(1, -(-len(samples) // _MOST_POSES))]
-    # A weak correlation must not be dropped: smooth residuals would then look significant. The
+    # A weak correlation is kept: without it smooth residuals would look significant. The
     # likelihood alone decides, without a penalty on the number of parameters.
     found = [_white(samples, cable_length)]
     found += [_correlated(samples, cable_length, kernel) for kernel in KERNELS]

@@ -22,7 +22,7 @@ _UNSURE = 2.0
 # Smallest sine of the angle between cable and line of sight. In ten rendered poses pixels are off
 # their neighbours' fitted line by 0.04 mm RMS below it, 0.02 mm up to twice it, 0.014 mm above.
 _STEEP = 0.4
-_SURE_PX = 2.0  # largest distance of a pixel from a curve that is nearly right
+_SURE_PX = 2.0  # largest distance of a pixel from an approximate curve
 
 
 @dataclass(frozen=True)

@@ -239,7 +239,7 @@ def out_of_step(session: ReadSession) -> tuple[Suspicion, ...]:
 
 
 def single_poses(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Poses that are wrong by themselves; of each the first reason.
+    """Single wrong poses, each with its first reason.
 
     Points that run to and fro in their order; an end where all others have their start, as if both
     were exchanged; a line that ends far from the fixtures.

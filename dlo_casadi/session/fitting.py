@@ -289,7 +289,7 @@ def simpler_fits(
     options: EstimationOptions, declared: CableModel, measured: Sequence[MeasuredPose], n: int
 ) -> tuple[SimplerFits, list[Stage]]:
     """The simpler fits, and their stages on a mesh of n elements."""
-    # One number of a model that is far off by itself: a coarse mesh finds it.
+    # A single number of a simplified model: a coarse mesh suffices.
     model = straight(declared).with_mesh(min(n, first_mesh(declared)))
     alone = fit_stiffness(model, measured)
     missing, loop, seconds = _not_applicable(options, declared, measured), None, 0.0

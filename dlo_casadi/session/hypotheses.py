@@ -34,7 +34,7 @@ _IN_A_PLANE = {
 _PIECES = 16
 # A line of less than this share of the cable's length may show a part of it alone.
 _PART = 0.9
-# Points of a line between which its length is measured: noise makes a dense line longer.
+# Number of points between which the length of a line is measured: noise lengthens dense lines.
 _SPARSE = 60
 
 

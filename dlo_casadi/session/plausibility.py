@@ -405,7 +405,7 @@ def _other_gravity(
 
 
 def _kept_by_turning(pose: Pose, length: float) -> FloatArray:
-    """What turned points of a pose must keep (n, d): the end from the start, in lengths, clamps."""
+    """Vectors (n, d) that a turn of a pose must keep: end from start [lengths], clamps."""
     kept: list[FloatArray] = [np.zeros(len(pose.start))]
     if pose.end is not None:
         kept.append((np.array(pose.end) - pose.start) / length)

@@ -43,7 +43,7 @@ from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_paramete
 
 
 class Progress(Protocol):
-    """Who wants to know how far a run has come."""
+    """Receiver of a run's progress."""
 
     def step(self, name: str, done: int, total: int) -> None:
         """`done` of `total` parts of the named work are finished."""

@@ -76,7 +76,7 @@ class Profiles:
         return core, self.values[:, np.abs(self.offset) > 0.8 * diameter]
 
     def average(self, trusted: Flags, along: float) -> "Profiles":
-        """Average trusted profiles along the curve, with a Gaussian of deviation `along` [m].
+        """Average trusted profiles along the curve by a Gaussian; its std is `along` [m].
 
         That reduces the noise of pixels and compression without a bias by curvature, since the
         profiles follow the curve.

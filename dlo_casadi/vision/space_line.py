@@ -30,7 +30,7 @@ from dlo_casadi.vision.space_curve import (
 from dlo_casadi.vision.workplane import KnownCable
 
 _AGREE = 0.6  # smallest share of a photograph's pixels on the common line: each may hide parts
-_READINGS = 8  # largest number of orders of loops that are tried: loops are few
+_READINGS = 8  # largest number of orders of loops that are tried
 _SURE = 0.9  # share of pixels from which the first curve of a pair is good enough
 _AGREE_PX = 1.0  # px, errors of the cameras' poses, added to four standard deviations
 _FAR = 0.05  # of the length: largest distance of the line's end from its fixture
