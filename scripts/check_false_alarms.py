@@ -1,7 +1,8 @@
 """False alarms of the diagnosis on simulated sessions, and what it names of hidden effects.
 
     python scripts/check_false_alarms.py [--sets 300] [--seed 0] [--jobs N] [--output FILE]
-                                         [--scatter | [--space] [--hidden | --random SOURCE]]
+                                         [--scatter | [--space]
+                                         [--hidden | --random SOURCE | --table]]
 
 Each set takes the cable and the poses of a bench session, a new smooth rest curvature and
 stiffness, fixtures, length and scale drawn from their tolerances, and noise that is partly
@@ -16,8 +17,8 @@ own, of 0.1 to 0.3 1/m.
 With --space they are random cables between two grippers in space, with --hidden cables in the plane
 of which one or two effects are not declared, with both the same in space: see hidden_sets.py. With
 --random SOURCE the poses differ in a rest curvature, moments of pins, ... of their own instead, and
-it is counted how often that is named. Of
-hidden effects those count that the data show: that make the declared model less likely by e^15 when
+it is counted how often that is named. With --table two poses to all touch a table that is not
+declared. Of hidden effects those count that the data show: that make the declared model less likely by e^15 when
 both are fitted from the truth. How often each is named, alone or among what cannot be told from it,
 is counted, and how often a wrong one is.
 """
@@ -143,13 +144,14 @@ def main() -> None:
     kinds.add_argument("--space", action="store_true", help="of cables in space")
     parser.add_argument("--hidden", action="store_true", help="one or two effects hidden in each")
     parser.add_argument("--random", default="", choices=RANDOM_SIZES, help="of each pose's own")
+    parser.add_argument("--table", action="store_true", help="on a table that is not declared")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
     rows: dict[int, dict] = {}
     seconds = []
     with open_executor(args.jobs, args.scheduler) as executor:
-        if args.space or args.hidden or args.random:
+        if args.space or args.hidden or args.random or args.table:
             count_random(args, executor)
             return
         work = partial(run_one, seed=args.seed, scatter=args.scatter)
@@ -179,6 +181,7 @@ def count_random(args: argparse.Namespace, executor: Executor) -> None:
     """Random sessions with nothing hidden, or with one or two effects."""
     rows: dict[int, dict] = {}
     options = {"space": args.space, "hide": args.hidden, "random": args.random}
+    options["table"] = args.table
     work = partial(run_random, seed=args.seed, **options)
     for done in map_as_completed(executor, work, range(args.sets)):
         row = rows[done.index] = done.value
@@ -215,11 +218,13 @@ def summary(rows: list[dict]) -> str:
     return ", ".join(said)
 
 
-def run_random(index: int, seed: int, space: bool, hide: bool, random: str = "") -> dict:
+def run_random(
+    index: int, seed: int, space: bool, hide: bool, random: str = "", table: bool = False
+) -> dict:
     """Simulate and fit one random session, and say what was found of its truth."""
     generator = generator_of(seed, index)
     count = 1 + index % 2 if hide else 0
-    found = simulated(generator, 3 if space else 2, count, random)
+    found = simulated(generator, 3 if space else 2, count, random, table)
     begin = time.process_time()
     row = {"hidden": found.hidden, "refused": "", "wrong": [], "inside": {}, "worse": False}
     try:
@@ -228,7 +233,8 @@ def run_random(index: int, seed: int, space: bool, hide: bool, random: str = "")
         row["refused"] = error.message.splitlines()[0]
         result = None
     row["cpu_seconds"] = time.process_time() - begin
-    row["shown"] = shown_by(found)
+    # No score tells of a table: all count that two poses touch.
+    row["shown"] = list(found.hidden) if table else shown_by(found)
     row["missed"] = []
     if result is None:
         row["missed"] = [*row["shown"], *([random] if random else [])]

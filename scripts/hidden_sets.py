@@ -6,7 +6,7 @@ hidden. Sizes run from hardly to plainly visible; the declared stiffness is up t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
-from dlo_casadi.effects import EFFECTS, CableData
+from dlo_casadi.effects import EFFECTS, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import Prediction, predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.noise import NoiseModel
@@ -128,20 +128,25 @@ class Simulated:
 
 
 def simulated(
-    generator: np.random.Generator, dimension: int, count: int, random: str = ""
+    generator: np.random.Generator,
+    dimension: int,
+    count: int,
+    random: str = "",
+    table: bool = False,
 ) -> Simulated:
     """A random session with `count` hidden effects, in the plane (2) or in space (3).
 
-    `random`: what differs from pose to pose, see `PoseScatter`; nothing by default.
+    `random`: what differs from pose to pose, see `PoseScatter`; nothing by default. `table`: two
+    poses to all that hang low enough touch a level plane.
     """
     while True:
-        found = _tried(generator, dimension, count, random)
+        found = _tried(generator, dimension, count, random, table)
         if found is not None:
             return found
 
 
 def _tried(
-    generator: np.random.Generator, dimension: int, count: int, random: str
+    generator: np.random.Generator, dimension: int, count: int, random: str, table: bool
 ) -> Simulated | None:
     """As `simulated`; None where the poses have no stable equilibria."""
     length, mass = generator.uniform(0.5, 1.0), generator.uniform(0.03, 0.12)
@@ -185,6 +190,12 @@ def _tried(
         values[f"random.{random}"] = size
     else:
         shapes = predict_poses(model, p, rest, true)
+    if table and all(shapes):
+        height = _table_under(generator, model, true, shapes)
+        model = model.with_effect(ContactPlane())
+        p, hidden = np.append(p, height), (*hidden, ContactPlane.name)
+        values["contact_plane.height"] = height
+        shapes = predict_poses(model, p, rest, true) if height < 0 else [None]
     if any(shape is None or not shape.equilibrium.stable for shape in shapes):
         return None
     marked, read = generator.random() < 0.5, "mass_error" in hidden
@@ -212,6 +223,25 @@ def _tried(
         force_std=FORCE_STD if read else None,
     )
     return Simulated(session, hidden, values)
+
+
+def _table_under(
+    generator: np.random.Generator,
+    model: CableModel,
+    poses: Sequence[HeldPose],
+    shapes: Sequence[Prediction],
+) -> float:
+    """Height [m] of a table that some poses touch and no fixture; 0 where that cannot be."""
+    radius, up = model.cable.diameter / 2, len(model.gravity) - 1
+    s = np.linspace(0.0, model.cable.length, 201)
+    lowest = np.sort([shape.curve.at(s)[:, up].min() for shape in shapes])
+    most = min(min(pose.start[up], pose.end[up]) for pose in poses) - 0.02 * model.cable.length
+    touching = int(np.searchsorted(lowest, most))
+    if touching < 2:
+        return 0.0
+    k = int(generator.integers(2, touching + 1))
+    above = min(lowest[k], most) if k < len(lowest) else most
+    return float(lowest[k - 1] + generator.uniform(0.2, 0.8) * (above - lowest[k - 1]) - radius)
 
 
 def _rest(generator: np.random.Generator, model: CableModel) -> NDArray[np.floating]:
