@@ -201,6 +201,14 @@ class BandMatrix:
         own, across = full[:, kept:, kept:], full[:, :kept, kept:]
         return full[:, :kept, :kept] - across @ np.linalg.solve(own, _transposed(across))
 
+    @property
+    def coupled(self) -> BoolArray:
+        """Which unknowns of the border (k,) depend on any other, in some pose."""
+        others = self.corner.any(axis=0)
+        np.fill_diagonal(others, val=False)
+        unsure = (np.diagonal(self.corner, axis1=1, axis2=2) == 0).any(axis=0)
+        return np.asarray(others.any(axis=0) | self.border.any(axis=(0, 1, 2)) | unsure)
+
     def factor(self) -> BandFactor:
         """Eliminate the nodes."""
         return BandFactor(self)
@@ -219,6 +227,17 @@ class BandFactor:
     """The elimination of a `BandMatrix`, to solve with and to read the inertia from."""
 
     def __init__(self, matrix: BandMatrix) -> None:
+        coupled = matrix.coupled
+        self._coupled, self._alone = np.flatnonzero(coupled), np.flatnonzero(~coupled)
+        own = np.diagonal(matrix.corner, axis1=1, axis2=2)
+        self._of_alone = own[:, self._alone]
+        # Internal unknowns are no negative eigenvalues.
+        self._internal = matrix.internal
+        self._not_counted = (own[:, own.shape[1] - matrix.internal :] < 0).sum(axis=1)
+        if len(self._alone):
+            at = self._coupled
+            corner = matrix.corner[:, at[:, None], at]
+            matrix = replace(matrix, border=matrix.border[..., at], corner=corner)
         self.matrix = matrix
         self._least = LEAST_PIVOT * matrix.scale[:, None, None]
         self._levels: list[_Level] = []
@@ -297,9 +316,9 @@ class BandFactor:
         numpy.linalg.LinAlgError
             If a matrix is not finite.
         """
-        k, extra = right.y.shape[1], self.matrix.internal
-        if extra:
-            right = Vector(right.x, np.pad(right.y, [(0, 0), (0, extra), (0, 0)]))
+        k = right.y.shape[1]
+        rows = np.pad(right.y, [(0, 0), (0, self._internal), (0, 0)])
+        right = Vector(right.x, rows[:, self._coupled])
         found = self._once(right)
         size = right.size
         before = np.inf
@@ -310,7 +329,9 @@ class BandFactor:
                 break
             before = worst
             found = found + self._once(left)
-        return Vector(found.x, found.y[:, :k])
+        rows[:, self._coupled] = found.y
+        rows[:, self._alone] /= self._of_alone[..., None]
+        return Vector(found.x, rows[:, :k])
 
     @cached_property
     def negative(self) -> IntArray:
@@ -323,6 +344,5 @@ class BandFactor:
             values, _ = self._conditions
             total += (values < 0).sum(axis=1)
             singular = np.abs(values).min(axis=1) < ZERO_PIVOT
-        own = np.diagonal(self.matrix.corner, axis1=1, axis2=2)
-        total -= (own[:, own.shape[1] - self.matrix.internal :] < 0).sum(axis=1)
+        total += (self._of_alone < 0).sum(axis=1) - self._not_counted
         return np.where(singular, -1, total)
