@@ -19,8 +19,8 @@ of which one or two effects are not declared, with both the same in space: see h
 --random SOURCE the poses differ in a rest curvature, moments of pins, ... of their own instead, and
 it is counted how often that is named. With --table two poses to all touch a table that is not
 declared. Of hidden effects those count that the data show: that make the declared model less likely
-by e^15 when both are fitted from the truth. How often each is named, alone or among what cannot be told from it,
-is counted, and how often a wrong one is.
+by e^15 when both are fitted from the truth. How often each is named, alone or among what cannot be
+told from it, is counted, and how often a wrong one is.
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ def simulated(
     """A random session with `count` hidden effects, in the plane (2) or in space (3).
 
     `random`: what differs from pose to pose, see `PoseScatter`; nothing by default. `table`: two
-    poses to all that hang low enough touch a level plane.
+    fitted poses to all that hang low enough touch a level plane.
     """
     while True:
         found = _tried(generator, dimension, count, random, table)
@@ -209,7 +209,7 @@ def _tried(
         known = {
             key: value for key, value in vars(pose).items() if key.endswith(("heading", "tation"))
         }
-        role = "held_out" if k % 5 == 4 else "fit"
+        role = "held_out" if _held_out(k) else "fit"
         at = {"at": s} if marked else {}
         poses.append(
             dlo.Pose(pose.start, pose.end, points=points, role=role, **at, **known, **readings)
@@ -231,10 +231,11 @@ def _table_under(
     poses: Sequence[HeldPose],
     shapes: Sequence[Prediction],
 ) -> float:
-    """Height [m] of a table that some poses touch and no fixture; 0 where that cannot be."""
+    """Height [m] of a table that fitted poses touch and no fixture; 0 where that cannot be."""
     radius, up = model.cable.diameter / 2, len(model.gravity) - 1
     s = np.linspace(0.0, model.cable.length, 201)
-    lowest = np.sort([shape.curve.at(s)[:, up].min() for shape in shapes])
+    fitted = [shape for k, shape in enumerate(shapes) if not _held_out(k)]
+    lowest = np.sort([shape.curve.at(s)[:, up].min() for shape in fitted])
     most = min(min(pose.start[up], pose.end[up]) for pose in poses) - 0.02 * model.cable.length
     touching = int(np.searchsorted(lowest, most))
     if touching < 2:
@@ -242,6 +243,11 @@ def _table_under(
     k = int(generator.integers(2, touching + 1))
     above = min(lowest[k], most) if k < len(lowest) else most
     return float(lowest[k - 1] + generator.uniform(0.2, 0.8) * (above - lowest[k - 1]) - radius)
+
+
+def _held_out(k: int) -> bool:
+    """Whether the pose of this number is not fitted."""
+    return k % 5 == 4
 
 
 def _rest(generator: np.random.Generator, model: CableModel) -> NDArray[np.floating]:
