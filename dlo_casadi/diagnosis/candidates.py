@@ -11,9 +11,10 @@ import numpy as np
 from dlo_casadi.effects import EFFECTS, Effect, Fitted, Load, Setup
 from dlo_casadi.effects.cable import CableData
 from dlo_casadi.effects.setup import height_of
+from dlo_casadi.estimation.resting import resting_height
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
-from dlo_casadi.thresholds import ALIKE, RESTING_APART, RESTING_NOISE
+from dlo_casadi.thresholds import ALIKE
 
 
 @dataclass(frozen=True)
@@ -130,25 +131,6 @@ def candidates_of(
         resting=resting_height(fit),
     )
     return candidates(fit.model, setup, exclude)
-
-
-def resting_height(fit: Fit) -> float | None:
-    """The lowest height [m] that shapes of several poses have in common, if there is one.
-
-    What lies on a table is at the same height in all poses, and nothing is below it. Fixtures are
-    where they are held.
-    """
-    model, problem = fit.model, fit.problem
-    if not (any(model.gravity) and model.chain.kind.smooth):
-        return None
-    places = np.linspace(0.0, model.cable.length, 201)
-    seen = problem.observed(fit.point)
-    heights = height_of([seen[j].curve.at(places) for j in problem.used], model.gravity)
-    lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
-    hanging = lowest[(inside > 0) & (inside < len(places) - 1)]
-    apart = max(RESTING_NOISE * fit.noise.of_points.std, RESTING_APART * model.cable.length)
-    shared = hanging[hanging < lowest.min() + apart]
-    return float(shared.mean()) if len(shared) > 1 else None
 
 
 def equivalents(

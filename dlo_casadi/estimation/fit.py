@@ -12,6 +12,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
+from dlo_casadi.estimation.resting import on_planes
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from, weighed
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
@@ -153,7 +154,8 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
     loose, begun = begin(loose, theta, own)
     fits = [fit_from(loose, begun, fixed=own)]
     if own.any():
-        fits.append(fit_from(*begin(loose, problem.unknowns.off_bounds(theta))))
+        first = on_planes(loose, begun, problem.unknowns.off_bounds(theta))
+        fits.append(fit_from(*begin(loose, first)))
     best = min((fit for fit in fits if fit), key=lambda fit: fit.point.objective, default=None)
     if best is None:
         raise EstimationError(
