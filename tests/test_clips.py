@@ -8,7 +8,6 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
 
-from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, ClipOffset, ClipSlip
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
@@ -16,7 +15,7 @@ from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import first_guesses
-from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
+from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
@@ -203,12 +202,6 @@ def test_a_pose_with_other_clips_than_the_model():
     model, pose, _ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(EquilibriumError, match="the pose has the clips none, the model pinned"):
         solve_equilibrium(model, model.nominal, np.zeros(40), replace(pose, clips=()))
-
-
-def test_the_c_solver_refuses_clips_in_a_plane():
-    model, *_ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
-    with pytest.raises(DloError, match="not in a plane"):
-        generate(model, model.nominal, np.zeros(40))
 
 
 @pytest.mark.parametrize("kind", ["pinned", "clamped"])

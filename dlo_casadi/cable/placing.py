@@ -27,7 +27,7 @@ from dlo_casadi.cable.estimate import Metadata
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, asked_limits, bounds_of, limit_uses
 from dlo_casadi.config import Clip, Limits
-from dlo_casadi.effects import ClipSlip
+from dlo_casadi.effects import ALONG_CABLE
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.limits import Varied, fixtures_of, sizes_of
@@ -188,14 +188,16 @@ class _Search:
         """The cable with a slip of each clip as a parameter: its derivatives are those by `at`."""
         model, p = self.cable.model, self.cable.p
         for k in range(self.count):
-            if (slip := ClipSlip(clip=k)).label not in [effect.label for effect in model.effects]:
+            if (slip := ALONG_CABLE(clip=k)).label not in [
+                effect.label for effect in model.effects
+            ]:
                 model, p = model.with_effect(slip), np.append(p, 0.0)
         return CasadiCable(model, p, self.cable.rest)
 
     @cached_property
     def ways(self) -> Uncertainty:
         """Slips and moves of clips by 1 m, as what varies."""
-        slips = tuple(f"{ClipSlip(clip=k).label}.ds" for k in range(self.count))
+        slips = tuple(f"{ALONG_CABLE(clip=k).label}.ds" for k in range(self.count))
         moves = [
             f"clip_{k}_{axis}" for k in range(self.count) for axis in self.cable.model.node.axes
         ]

@@ -375,6 +375,7 @@ def declared_setup(config: Config) -> Setup:
     """How the cable is held and measured, as far as a configuration tells."""
     cable, experiment = config.cable, config.experiment
     measurement = experiment.measurement
+    starts = [pose.start for pose in experiment.poses] or [(0.0,) * len(experiment.gravity)]
     return Setup(
         cable=CableData(
             length=cable.length,
@@ -395,7 +396,7 @@ def declared_setup(config: Config) -> Setup:
         tolerances=experiment.tolerances.model_dump(),
         clips=experiment.clips,
         obstacles=len(experiment.obstacles),
-        level=float(height_of(experiment.poses[0].start, experiment.gravity)),
+        level=float(height_of(starts[0], experiment.gravity)),
     )
 
 

@@ -85,6 +85,8 @@ EFFECTS: dict[str, type[Effect]] = {
 
 # The effect that estimates a mass that is not declared.
 UNKNOWN_MASS: type[Effect] = MassError
+# The effect whose parameter moves a clip along the cable, for derivatives by its arc length.
+ALONG_CABLE = ClipSlip
 
 # Effects that may differ at random from pose to pose.
 _KINDS: list[type[Effect]] = [PinMoment, *EFFECTS.values()]

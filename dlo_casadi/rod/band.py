@@ -204,8 +204,8 @@ class BandMatrix:
     @property
     def coupled(self) -> BoolArray:
         """Which unknowns of the border (k,) depend on any other, in some pose."""
-        others = self.corner.any(axis=0)
-        np.fill_diagonal(others, val=False)
+        others = np.asarray(self.corner.any(axis=0))
+        others[np.diag_indices(len(others))] = False
         unsure = (np.diagonal(self.corner, axis1=1, axis2=2) == 0).any(axis=0)
         return np.asarray(others.any(axis=0) | self.border.any(axis=(0, 1, 2)) | unsure)
 
