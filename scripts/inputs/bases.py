@@ -125,7 +125,7 @@ def obstructed_session(folder: Path, in_space: bool) -> Session:
     files = {pose["file"]: _lines(header, straight) for pose in poses}
     config = load_config(Session(document, files).write(folder))
     model = declared_model(config).model
-    held = [item.pose for item in measured_poses(config, read_inputs(config, lambda *_: None))]
+    held = [item.pose for item in measured_poses(config, read_inputs(config))]
     shapes = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), held)
     shown = [found.curve.at(np.linspace(0.02, 0.43, 12)) for found in shapes]
     files = {name: _lines(header, points) for name, points in zip(files, shown, strict=True)}
