@@ -71,7 +71,7 @@ def centerline_session(name: str, poses: int, **model: Any) -> Session:
 
 
 def obstructed_session(folder: Path, in_space: bool) -> Session:
-    """Two poses of a cable through a clip and over obstacles, with limits; shapes as predicted."""
+    """A pose of a cable through clips and over obstacles, with limits; its shape as predicted."""
 
     def place(x: float, height: float) -> list[float]:
         return [x, 0.0, height] if in_space else [x, height]
@@ -81,20 +81,17 @@ def obstructed_session(folder: Path, in_space: bool) -> Session:
     directions = (
         ({"start_orientation": up, "end_orientation": down, "turns": 0}) if in_space else {}
     )
-    poses = [
-        {
-            "file": f"pose_0{k + 1}.csv",
-            "start": place(0.0, 0.0),
-            "end": place(end, 0.02),
-            **directions,
-            "clips": [
-                {"name": "first", "kind": "pinned", "at": 0.12, "place": place(0.07, 0.09)},
-                {"kind": "eyelet", "place": place(0.2, 0.09)},
-            ],
-            "role": "fit",
-        }
-        for k, end in enumerate((0.27, 0.3))
-    ]
+    pose = {
+        "file": "pose_01.csv",
+        "start": place(0.0, 0.0),
+        "end": place(0.27, 0.02),
+        **directions,
+        "clips": [
+            {"name": "first", "kind": "pinned", "at": 0.12, "place": place(0.07, 0.09)},
+            {"kind": "eyelet", "place": place(0.2, 0.09)},
+        ],
+        "role": "fit",
+    }
     kind = "clamped" if in_space else "pinned"
     plane = {"kind": "plane", "point": place(0.0, -0.05), "normal": place(0.0, 1.0)}
     bar = {"kind": "capsule", "a": place(0.3, 0.15), "b": place(0.4, 0.2), "radius": 0.01}
@@ -113,7 +110,7 @@ def obstructed_session(folder: Path, in_space: bool) -> Session:
             "measurement": {"kind": "centerlines", "std": 3.0e-4},
             "tolerances": {"clip": 1e-3, "slip": 1e-3, "obstacle": 5e-4},
             "obstacles": [{"name": "table", **plane}, {"name": "bar", **bar}],
-            "poses": poses,
+            "poses": [pose],
         },
         "model": {"n": _MESH},
         "estimation": {"plausibility": False},
@@ -122,14 +119,13 @@ def obstructed_session(folder: Path, in_space: bool) -> Session:
     }
     header = "x_m,y_m,z_m" if in_space else "x_m,y_m"
     straight = np.array([place(x, 0.0) for x in (0.1, 0.2)])
-    files = {pose["file"]: _lines(header, straight) for pose in poses}
-    config = load_config(Session(document, files).write(folder))
-    model = declared_model(config).model
-    held = [item.pose for item in measured_poses(config, read_inputs(config))]
-    shapes = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), held)
-    shown = [found.curve.at(np.linspace(0.02, 0.43, 12)) for found in shapes]
-    files = {name: _lines(header, points) for name, points in zip(files, shown, strict=True)}
-    return Session(document, files)
+    drawn = Session(document, {"pose_01.csv": _lines(header, straight)})
+    config = load_config(drawn.write(folder))
+    model, inputs = declared_model(config).model, read_inputs(config, lambda *_: None)
+    held = [item.pose for item in measured_poses(config, inputs)]
+    (shape,) = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), held)
+    points = shape.curve.at(np.linspace(0.02, 0.43, 12))
+    return Session(document, {"pose_01.csv": _lines(header, points)})
 
 
 def _lines(header: str, points: np.ndarray) -> bytes:
