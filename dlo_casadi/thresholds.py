@@ -179,5 +179,6 @@ FIRST_ORDER = 0.02
 # it: of second order, what is left is a third of it.
 RESOLVED = 0.01
 # Distance between the lowest places of two shapes at which they may rest on the same table: so many
-# standard deviations of a point, and lengths of the cable.
-RESTING_NOISE, RESTING_APART = 3.0, 3e-3
+# standard deviations of a point, within these shares of the cable's length. It decides what is
+# tried, not what is found.
+RESTING_NOISE, RESTING_APART = 3.0, (3e-3, 1e-2)

@@ -128,7 +128,7 @@ def candidates_of(
         directions=(float(shapes.x[:, 0].mean()), float(shapes.x[:, -1].mean())),
         largest_bend=float(problem.equilibria.bends(shapes, fit.p, fit.rest).max()),
         level=float(height_of(problem.history[0].pose.start, fit.model.gravity)),
-        resting=resting_height(fit),
+        resting=resting_height(problem),
     )
     return candidates(fit.model, setup, exclude)
 

@@ -22,7 +22,7 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
+from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.screening import (
     RelaxedScreen,
@@ -161,11 +161,9 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     start = dict(candidate.scans[0])
     fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
     near, _ = from_data(base)
-    for other in candidates_of(near, None, ()):
-        if other.name == candidate.name:
-            begun = RelaxedStart.of(near, Screened(other, 0.0, 1.0, dict(other.scans[0])))
-            fit = _fit_from_data(near, begun, 3)
-            fits += [fit and fit.reweighed(base.noise, base.problem.priors)]
+    begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
+    fit = _fit_from_data(near, begun, 3)
+    fits.append(fit and fit.reweighed(base.noise, base.problem.priors))
     best = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     if best is None:
         return Screened(candidate, 0.0, 1.0, start)

@@ -154,7 +154,7 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
     loose, begun = begin(loose, theta, own)
     fits = [fit_from(loose, begun, fixed=own)]
     if own.any():
-        first = on_planes(loose, begun, problem.unknowns.off_bounds(theta))
+        first = on_planes(loose, problem.unknowns.off_bounds(theta))
         fits.append(fit_from(*begin(loose, first)))
     best = min((fit for fit in fits if fit), key=lambda fit: fit.point.objective, default=None)
     if best is None:

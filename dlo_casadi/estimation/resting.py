@@ -5,43 +5,38 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import Setup
 from dlo_casadi.effects.setup import height_of
-from dlo_casadi.estimation.problem import Problem, Values
-from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.measured_shapes import measured_shapes
+from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.thresholds import RESTING_APART, RESTING_NOISE
 
 
-def resting_height(fit: Fit) -> float | None:
-    """The lowest height [m] that shapes of several poses have in common, if there is one.
+def resting_height(problem: Problem) -> float | None:
+    """The lowest height [m] that measured shapes of several poses share, if there is one.
 
     What lies on a table is at the same height in all poses, and nothing is below it. Fixtures are
     where they are held.
     """
-    model, problem = fit.model, fit.problem
+    model = problem.unknowns.model
     if not (any(model.gravity) and model.chain.kind.smooth):
         return None
-    places = np.linspace(0.0, model.cable.length, 201)
-    seen = problem.observed(fit.point)
+    length, rest = model.cable.length, np.zeros(model.chain.n_rests)
+    places, (shapes, _) = np.linspace(0.0, length, 201), measured_shapes(problem)
+    seen = problem.equilibria.seen(shapes, problem.unknowns.fixed, rest)
     heights = height_of([seen[j].curve.at(places) for j in problem.used], model.gravity)
     lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
     hanging = lowest[(inside > 0) & (inside < len(places) - 1)]
-    apart = max(RESTING_NOISE * fit.noise.of_points.std, RESTING_APART * model.cable.length)
+    least, most = (share * length for share in RESTING_APART)
+    apart = np.clip(RESTING_NOISE * problem.noise.of_points.std, least, most)
     shared = hanging[hanging < lowest.min() + apart]
     return float(shared.mean()) if len(shared) > 1 else None
 
 
-def on_planes(problem: Problem, values: Values, theta: FloatArray) -> FloatArray:
-    """Theta whose effects without derivative where they vanish begin where shapes rest.
-
-    Parameters
-    ----------
-    values : Values
-        Whose shapes are those measured.
-    theta : (size,)
-    """
+def on_planes(problem: Problem, theta: FloatArray) -> FloatArray:
+    """Theta (size,) whose effects without derivative where they vanish begin where shapes rest."""
     unknowns = problem.unknowns
     model, p = unknowns.model, unknowns.p(theta)
     asked = [x for x in model.effects if not x.gradual]
-    found = resting_height(Fit(problem, problem.evaluate(values))) if asked else None
+    found = resting_height(problem) if asked else None
     if found is None:
         return theta
     for effect in asked:
