@@ -1,9 +1,10 @@
 """Clips held against others: python scripts/check_clips.py [--count 200] [--fixtures FOLDER].
 
 Random cables with one to four clips of all kinds, in the plane and in space: how many are solved
-where IPOPT finds a minimum from starts of its own (in the plane), and whether any result is not a
-minimum. One shape against scipy's solve_bvp with an interior point. With a folder of sessions, what
-their fits say beside the truth next to it.
+where IPOPT finds a minimum from starts of its own, where IPOPT finds a lower one, and whether any
+result is not a minimum; what is missed is listed by its number, which with --only is tried alone.
+One shape against scipy's solve_bvp with an interior point. With a folder of sessions, what their
+fits say beside the truth next to it.
 """
 
 import argparse
@@ -12,6 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from benchmarks.space_ipopt import Ipopt
 from scipy.integrate import solve_bvp
 from scipy.spatial.transform import Rotation
 
@@ -25,9 +27,10 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import HeldClip, node_places
+from dlo_casadi.model.clips import HeldClip, clamped_nodes, node_places
 
-ELEMENTS = 32
+# Elements in the plane, and in space.
+ELEMENTS = {False: 32, True: 16}
 # Starts of IPOPT, and the largest distance of a clip from the free cable, as a share of the length.
 STARTS, MOVED = 6, 0.04
 # Largest chord of a span over its length.
@@ -37,14 +40,19 @@ KINDS = {False: ("pinned", "clamped", "eyelet"), True: ("pinned", "clamped", "sw
 
 def random_pose(
     rng: np.random.Generator, spatial: bool
-) -> tuple[CableModel, HeldPose, list[np.ndarray]] | None:
-    """A cable held by clips near places where it hung without them; in a plane starts of IPOPT."""
+) -> tuple[CableModel, HeldPose, list[np.ndarray], list[float]] | None:
+    """A cable held by clips near places where it hung without them; starts of IPOPT.
+
+    These are the nodes of the free cable, and turned at random along it; and the arc lengths of
+    eyelets.
+    """
     mass, stiffness = 10 ** rng.uniform(-2, -0.3), 10 ** rng.uniform(-3, -1)
     twist = {"torsional_stiffness": stiffness / 1.3} if spatial else {}
     cable = CableData(1.0, mass, 0.008, stiffness, **twist)
     ends = {"start": "clamped", "end": "clamped"} if spatial or rng.random() < 0.5 else {}
     gravity = (0.0, 0.0, -9.81) if spatial else (0.0, -9.81)
-    free = CableModel(cable, ELEMENTS, n_rest=0, gravity=gravity, **ends)
+    mesh = {"n": ELEMENTS[spatial], "n_rest": 0, "gravity": gravity, **ends}
+    free = CableModel(cable, **mesh)
     d, turned = len(gravity), rng.normal(0, 0.4, (2, 3))
     reach = rng.uniform(0.4, 0.85) * np.eye(d)[0] + rng.normal(0, 0.15, d)
     held = {}
@@ -76,47 +84,62 @@ def random_pose(
         direction = {"orientation": tuple(frame)} if spatial else {"heading": float(frame[0])}
         own = direction if clamp else {}
         clips.append(HeldClip(kind, tuple(place), None if kind == "eyelet" else float(s), **own))
-    model = CableModel(
-        cable, ELEMENTS, n_rest=0, gravity=gravity, clips=tuple(c.kind for c in clips), **ends
-    )
-    starts = [hung.x[:, 0] + rng.normal(0, 0.3, 4) @ waves() for _ in range(STARTS - 1)]
-    held_pose = HeldPose(pose.start, pose.end, clips=tuple(clips), **held)
-    return model, held_pose, [] if spatial else [hung.x[:, 0], *starts]
+    model = CableModel(cable, clips=tuple(c.kind for c in clips), **mesh)
+    waves = np.sin(np.pi * np.outer(np.linspace(0, 1, model.n + 1), np.arange(1, 5)))
+    turns = 0.3 * waves @ rng.normal(size=(STARTS - 1, 4, free.node.increment))
+    starts = [hung.x, *(free.node.moved(hung.x, turn) for turn in turns)]
+    slid = [float(s) for s, clip in zip(at, clips, strict=True) if clip.kind == "eyelet"]
+    return model, HeldPose(pose.start, pose.end, clips=tuple(clips), **held), starts, slid
 
 
-def waves() -> np.ndarray:
-    """Smooth changes of the headings along the cable."""
-    return np.sin(np.pi * np.outer(np.arange(1, 5), np.linspace(0, 1, ELEMENTS + 1)))
+def by_own_starts(
+    model: CableModel, pose: HeldPose, starts: list[np.ndarray], slid: list[float]
+) -> list[float]:
+    """Energies [J] of stable minima that IPOPT finds."""
+    rest = np.zeros(model.chain.n_rests)
+    if not model.in_space:
+        found = [by_ipopt(model, model.nominal, rest, pose, x[:, 0]) for x in starts]
+        return [own.energy for own in found if own is not None and own.stable]
+    solver, energies = Ipopt(model, clamped_nodes(model.chain, pose.clips)), []
+    for one in solver.solve(model.nominal, rest, pose, starts, slid):
+        (eq,) = solve_equilibria(model, model.nominal, rest, [pose], [one.frames])
+        same = isinstance(eq, Equilibrium) and np.isclose(eq.energy, one.energy, rtol=1e-6)
+        energies += [eq.energy] if same and eq.stable else []
+    return energies
 
 
-def check_random(count: int) -> None:
+def check_random(count: int, where: tuple[bool, ...], only: int | None, ipopt: bool) -> None:
     """Count what is solved."""
-    for spatial in (False, True):
+    for spatial in where:
         rng, found, began = np.random.default_rng(0), Counter(), time.process_time()
-        while found["cables"] < count // 2:
+        missed: dict[str, list[int]] = {}
+        while found["cables"] < count:
             drawn = random_pose(rng, spatial)
             if drawn is None:
                 continue
-            model, pose, starts = drawn
+            model, pose, starts, slid = drawn
             found["cables"] += 1
+            if only not in (None, found["cables"]):
+                continue
             rest = np.zeros(model.chain.n_rests)
             (eq,) = solve_equilibria(model, model.nominal, rest, [pose])
             solved = isinstance(eq, Equilibrium)
             found["solved"] += solved
-            if not solved:
-                found["no room"] += "of cable between" in eq.message
-            elif not eq.stable:
-                found["not a minimum"] += 1
-            minima = [by_ipopt(model, model.nominal, rest, pose, phi) for phi in starts]
-            minima = [own.energy for own in minima if own is not None and own.stable]
-            if minima:
-                found["by IPOPT"] += 1
-                found["both"] += solved
-                found["IPOPT lower"] += (
-                    solved and min(minima) < eq.energy - 1e-9 * abs(eq.energy) - 1e-12
-                )
-        where = "in space" if spatial else "in a plane"
-        print(f"{where}: {dict(found)}, {time.process_time() - began:.0f} s", flush=True)
+            minima = by_own_starts(model, pose, starts, slid) if ipopt else []
+            found["by IPOPT"] += bool(minima)
+            own = eq.energy if solved else np.inf
+            what = {
+                "not a minimum": solved and not eq.stable,
+                "IPOPT alone": bool(minima) and not solved,
+                "IPOPT lower": solved and min(minima, default=own) < own - 1e-8 * abs(own) - 1e-12,
+                "neither": not (solved or minima),
+            }
+            for name in (name for name, so in what.items() if so):
+                missed.setdefault(name, []).append(found["cables"])
+            if only is not None:
+                print(pose, getattr(eq, "message", own), minima)
+        said = "in space" if spatial else "in a plane"
+        print(f"{said}: {dict(found)}, {time.process_time() - began:.0f} s; {missed}", flush=True)
 
 
 def check_bvp() -> None:
@@ -187,11 +210,18 @@ def check_fixtures(folder: Path) -> None:
 def main() -> None:
     """Run the checks that are asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--count", type=int, default=200, help="random cables")
+    parser.add_argument("--count", type=int, default=100, help="random cables, of each dimension")
+    parser.add_argument(
+        "--where", nargs="+", choices=("plane", "space"), default=["plane", "space"]
+    )
+    parser.add_argument("--only", type=int, help="number of one random cable")
+    parser.add_argument("--no-ipopt", action="store_true", help="count what is solved alone")
     parser.add_argument("--fixtures", type=Path, help="folder of sessions, its truth beside it")
     chosen = parser.parse_args()
-    check_bvp()
-    check_random(chosen.count)
+    if chosen.only is None:
+        check_bvp()
+    where = tuple(name == "space" for name in chosen.where)
+    check_random(chosen.count, where, chosen.only, not chosen.no_ipopt)
     if chosen.fixtures is not None:
         check_fixtures(chosen.fixtures)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -18,7 +19,8 @@ from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.model.clips import HeldClip, clamped_nodes
+from dlo_casadi.model.whole_pose import potential
 
 LENGTH, EI = 1.0, 0.02  # m, N m^2
 CABLE = CableData(LENGTH, mass=0.2, diameter=0.01, bending_stiffness=EI)
@@ -155,6 +157,26 @@ def test_ipopt_finds_the_same_minimum(second):
     energies = [own.energy for own in found if own is not None and own.stable]
     assert eq.stable
     assert eq.energy == pytest.approx(min(energies), rel=1e-9)
+
+
+def test_ipopts_statement_in_space_has_the_same_energy_and_conditions():
+    """Through a swivel, whose frame rolls with the cable, and an eyelet."""
+    model, pose, eq = solved(
+        IN_SPACE, (0.7, 0.2, 0.1), 10, LOOM, gravity=(0.0, 0.0, -9.81), start="clamped",
+        start_orientation=turned(0, 0.2, 0.1),
+    )  # fmt: skip
+    problem = potential(model, clamped_nodes(model.chain, pose.clips))
+    held, lam = model.are_multipliers, ca.DM(eq.multipliers)
+    total = problem.energy + ca.dot(lam[np.flatnonzero(held).tolist()], problem.conditions)
+    inner = problem.coordinates[eq.x.size + (~held).sum() :]
+    outputs = [total, ca.gradient(total, inner), ca.hessian(total, inner)[0]]
+    stated = ca.Function("stated", [problem.coordinates, problem.parameters], outputs)
+    x = np.concatenate([eq.x.ravel(), eq.multipliers[~held], np.zeros(inner.numel())])
+    rest, still = np.zeros(model.chain.n_rests), np.zeros(len(model.deviation_names))
+    given = np.concatenate([model.nominal, rest, pose.vector, still])
+    value, slope, bend = (np.array(block) for block in stated(x, given))
+    least = value - slope.T @ np.linalg.solve(bend, slope) / 2
+    assert least.item() == pytest.approx(eq.energy, rel=1e-9)
 
 
 def test_the_tangent_is_the_derivative_of_the_balance():

@@ -11,9 +11,10 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import clip_size, moved_rest
+from dlo_casadi.model.clips import CLAMPS, clip_size, moved_rest
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.node import quaternion_product
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     given, zero = [energy, conditions[multipliers]], ca.SX.zeros(len(multipliers))
     given.append(reached)
     energy, conditions, reached = ca.substitute(given, [s.lam[multipliers]], [zero])
-    for node, frame in zip(clamped, _clip_frames(model, s), strict=True):
+    for node, frame in zip(clamped, _clip_frames(model, s, clamped), strict=True):
         # Nothing else depends on the own coordinates of a node that a clip holds.
         energy += ca.sumsqr(s.x[_rows(model, node)] - frame) / 2
     coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
@@ -191,14 +192,25 @@ def _rows(model: CableModel, node: int) -> list[int]:
     return list(range(c * node, c * (node + 1)))
 
 
-def _clip_frames(model: CableModel, s: PoseSymbols) -> list[Any]:
-    """Frames of the clips that hold the cable's direction and roll, from the pose."""
-    size, c = clip_size(model.node), model.node.coordinates
-    ends = [
-        model.n_pose - size * (len(model.clips) - k) + size - 1 for k in range(len(model.clips))
-    ]
-    kinds = zip(ends, model.clips, strict=True)
-    return [s.pose[last - c : last] for last, kind in kinds if kind == "clamped"]
+def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) -> list[Any]:
+    """Frames of clamped clips, from the pose; swivels are rolled as the nodes that they hold are.
+
+    As `clips.Clipped.of`.
+    """
+    size, c, count = clip_size(model.node), model.node.coordinates, len(model.clips)
+    held, frames = [k for k, kind in enumerate(model.clips) if kind in CLAMPS], []
+    for k, node in zip(held, clamped, strict=True):
+        last = model.n_pose - size * (count - k) + size - 1
+        frame = s.pose[last - c : last]
+        if model.clips[k] == "swivel":
+            x, y, z, w = parts = ca.vertsplit(frame)
+            own = ca.vertsplit(s.x[_rows(model, node)])
+            roll, _, _, rest = quaternion_product((-x, -y, -z, w), own)
+            length = ca.sqrt(roll**2 + rest**2)
+            turn = (roll / length, ca.SX(0), ca.SX(0), rest / length)
+            frame = ca.vertcat(*quaternion_product(parts, turn))
+        frames.append(frame)
+    return frames
 
 
 def _segment_arguments(
@@ -215,8 +227,8 @@ def _segment_arguments(
         for k, row in model.sliding.items():
             at[k] = s.lam[row]
         places = ca.SX(ca.DM(chain.places))
-        held = [k for k, kind in enumerate(model.clips) if kind == "clamped"]
-        for k, node, frame in zip(held, clamped, _clip_frames(model, s), strict=True):
+        held = [k for k, kind in enumerate(model.clips) if kind in CLAMPS]
+        for k, node, frame in zip(held, clamped, _clip_frames(model, s, clamped), strict=True):
             x[:, node], places[node] = frame, at[k]
         low, width = places[:-1].T, (places[1:] - places[:-1]).T
         if clamped:

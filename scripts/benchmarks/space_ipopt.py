@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from time import process_time
 
@@ -32,12 +32,13 @@ class Ipopt:
     """min V(increments of the frames) s.t. end position and clamps, exact derivatives.
 
     Increments are about the frames of a first guess, which are parameters. A clamp's frame is a
-    condition as the end position is. Stability is not checked, as by IPOPT it is not.
+    condition as the end position is. Stability is not checked, as by IPOPT it is not. `clamped`:
+    nodes that clamped clips hold, see `clips.clamped_nodes`.
     """
 
-    def __init__(self, model: CableModel) -> None:
+    def __init__(self, model: CableModel, clamped: tuple[int, ...] = ()) -> None:
         self.model, node = model, model.node
-        problem, count = potential(model), model.n + 1
+        problem, count = potential(model, clamped), model.n + 1
         frames, turns = ca.SX.sym("frames", 4 * count), ca.SX.sym("turns", 3 * count)
         inner = problem.coordinates[4 * count :]
         moved = [
@@ -67,13 +68,24 @@ class Ipopt:
             },
         )
 
-    def solve(self, p: FloatArray, rest: FloatArray, pose: HeldPose) -> Iterator[Found]:
-        """Each first guess from which IPOPT converges."""
+    def solve(
+        self,
+        p: FloatArray,
+        rest: FloatArray,
+        pose: HeldPose,
+        guesses: Iterable[FloatArray] | None = None,
+        places: Sequence[float] = (),
+    ) -> Iterator[Found]:
+        """Each first guess from which IPOPT converges; by default the documented ones.
+
+        `places`: first guesses of the arc lengths [m] of eyelets.
+        """
         model, count = self.model, self.model.n + 1
         deviation = np.zeros(len(model.deviation_names))
-        for guess in guessed_frames(model, p, rest, pose):
+        for guess in guessed_frames(model, p, rest, pose) if guesses is None else guesses:
             given = np.concatenate([guess.ravel(), p, rest, pose.vector, deviation])
             start = np.zeros(3 * count + self._rest)
+            start[3 * count : 3 * count + len(places)] = places
             begin = process_time()
             out = self._solver(x0=start, p=given, lbg=0.0, ubg=0.0)
             seconds = process_time() - begin
