@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.kernels import Kernels, kernels_of
+from dlo_casadi.codegen.kernels import Held, Kernels, kernels_of
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.equilibrium.solve import coarse_rest
@@ -50,10 +50,13 @@ class Case:
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
         """Kernels of its meshes by their names in C, the cable's own first."""
-        return {"kernel": self.kernels(self.model, self.rest)}
+        return {"kernel": self.kernels(self.model, self.rest, self.model.clamped_between)}
 
-    def kernels(self, model: CableModel, rest: FloatArray) -> Kernels:
-        """Kernels of a mesh, without what holds the cable between its ends."""
+    def kernels(self, model: CableModel, rest: FloatArray, moved: bool) -> Kernels:
+        """Kernels of a mesh, without what holds the cable between its ends.
+
+        `moved`: whether nodes move along the cable.
+        """
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
@@ -66,9 +69,8 @@ class Case:
             )
         # Before a clip there is a force also in a cable whose end is free.
         bare = replace(bare, end="pinned") if bare.end == "free" else bare
-        return kernels_of(
-            bare, p, rest, self.inline, "clamped" if model.clamped_between else "pinned"
-        )
+        slides = bool(self.model.sliding)
+        return kernels_of(bare, p, rest, self.inline, Held(moved, slides))
 
     @property
     def holds(self) -> int:
@@ -262,33 +264,31 @@ class _SpaceCase(Case):
     # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
     # guesses on the fine mesh.
     least_coarse, coarsening = 6, 2.0
-    # Fewest elements of a span there: of 400 cables with three clips, 8 lead to a higher
-    # equilibrium with 6 elements, none with 8.
-    coarse_span = 2
-
-    @property
-    def coarse_element(self) -> str:
-        """Kind of the elements for first guesses: few arcs do not reach from clip to clip."""
-        return self.model.element if self.model.clips else "arc"
+    # Arcs of a span between clips there, and of one more with each eyelet.
+    coarse_span = 3
 
     @property
     def coarse_elements(self) -> int:
-        """Number of elements of the mesh for first guesses; 0 if it is the model's own."""
-        model, spans = self.model, len(self.model.clips) + 1
-        least = max(self.least_coarse, self.coarse_span * spans)
-        count = min(model.n, max(least, round(model.n / self.coarsening)))
-        itself = count == model.n and model.element == self.coarse_element
-        hangs = self.model.end == "free" and not self.model.clips
-        return 0 if hangs or itself else count
+        """Number of arcs of the mesh for first guesses; 0 if there is none."""
+        model, eyelets = self.model, len(self.model.sliding)
+        spans = len(model.clips) - eyelets + 1
+        if model.end == "free" and not model.clips:
+            return 0
+        least = max(self.least_coarse, round(model.n / self.coarsening))
+        if model.clips:
+            each = max(self.coarse_span * (1 + eyelets), self.least_coarse // spans)
+            least = spans * min(each, model.n // spans)
+        count = min(model.n, least)
+        return 0 if count == model.n and model.element == "arc" else count
 
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
         found = super().meshes
         if not self.coarse_elements:
             return found
-        coarse = self.model.with_mesh(self.coarse_elements, self.coarse_element)
+        coarse = self.model.with_mesh(self.coarse_elements, "arc")
         rest = coarse_rest(self.model, coarse, self.rest)
-        return found | {"coarse_kernel": self.kernels(coarse, rest)}
+        return found | {"coarse_kernel": self.kernels(coarse, rest, bool(self.model.clips))}
 
     @property
     def clamps(self) -> FloatArray:

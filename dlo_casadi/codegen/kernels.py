@@ -14,7 +14,6 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
@@ -191,35 +190,50 @@ def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
     return 25_000 + sum(kernels.code_size for kernels in meshes) + 8 * len(numbers)
 
 
-def kernels_of(
-    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool = True, *held: ClipKind
-) -> Kernels:
-    """Kernels of a model at given parameters; `inline` as in `generate`.
+@dataclass(frozen=True)
+class Held:
+    """How something holds a cable inside of a segment.
 
-    The model has neither clips nor tethers. `held`: a kind of clip that holds the cable inside of
-    one segment; if it is clamped, nodes are moved along the cable.
+    `moved`: whether nodes move along the cable; `slides`: whether the cable may slide through.
     """
-    model, bare = replace(model, clips=held), model
-    places, moved = model.chain.layout.segments, model.clamped_between
+
+    moved: bool
+    slides: bool
+
+
+def kernels_of(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    inline: bool = True,
+    held: Held | None = None,
+) -> Kernels:
+    """Kernels of a model without clips and tethers; `inline` as in `generate`."""
+    bare, moved = model, held is not None and held.moved
+    if held is not None:
+        model = replace(model, clips=("clamped" if moved else "pinned",))
+    places = model.chain.layout.segments
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
     shared = np.zeros(0) if inline else np.asarray(p, float)
     rows = np.insert(own, 1, places[:, 1], axis=1)
     whole = (0, len(own))
-    held_by = partial(_told, model, parameters, rows.shape[1], inside=True)
-    holder = Kernel(whole, rows, held_by, moved) if held else None
+    holder = None
+    if held is not None:
+        inside = partial(_told, model, parameters, rows.shape[1], held)
+        holder = Kernel(whole, rows, inside, moved)
     if moved:
         plain = partial(_told, model, parameters, rows.shape[1])
         return Kernels(
             (Kernel(whole, own[:, :0], plain, moved),), _ends(bare, parameters), shared, holder
         )
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
-    # A point force acts on all of a segment, on none of it, or at a place inside it.
+    # A point force acts on all of a segment, on none of it, or at a place in it.
     shares = np.array([np.array(lagrangian_of(bare).shares(p, place)).ravel() for place in places])
-    inside = (shares > 0) & (shares < 1)
-    alone = np.arange(len(own))[:, None] * inside
+    within = (shares > 0) & (shares < 1)
+    alone = np.arange(len(own))[:, None] * within
     told = (
-        np.column_stack([kinds.round(14), shares * ~inside, alone]) if inline else kinds.round(14)
+        np.column_stack([kinds.round(14), shares * ~within, alone]) if inline else kinds.round(14)
     )
     edges = [0, *(np.flatnonzero(np.any(np.diff(told, axis=0), axis=1)) + 1), len(own)]
     segments = tuple(
@@ -229,17 +243,17 @@ def kernels_of(
     return Kernels(segments, _ends(bare, parameters), shared, holder)
 
 
-def _told(model: CableModel, p: ca.SX, width: int, *, inside: bool = False) -> ca.Function:
+def _told(model: CableModel, p: ca.SX, width: int, held: Held | None = None) -> ca.Function:
     """(x, lam, row, p) -> `_in_order` of a segment of a cable with one clip.
 
-    The row (width,) has its start and length [m] and rest strains inside. `inside`: the clip holds
-    it at the share `row[width]`, and lam are the force beyond and that of the clip. Then there are,
+    The row (width,) has its start and length [m] and rest strains inside. `held`: the clip holds it
+    at the share `row[width]`, and lam are the force beyond and that of the clip. Then there are,
     after the other results, the derivatives by the force inside, first, then with the first node,
     the last node, the force beyond and itself; and derivatives by the place on the cable [1/m]: of
-    the Lagrangian, of its gradient by the first node, the last node, the force beyond and that
-    inside; and the second one of the Lagrangian.
+    the Lagrangian and, if it slides, of its gradient by the first node, the last node, the force
+    beyond and that inside; and the second one of the Lagrangian.
     """
-    d, terms = model.node.dimension, lagrangian_of(model)
+    d, terms, inside = model.node.dimension, lagrangian_of(model), held is not None
     row, lam, own = (ca.SX.sym("i", size) for size in (width + inside, d, d))
     x = ca.SX.sym("x", 2 * model.node.coordinates)
     start, length, share = row[0], row[1], row[width] if inside else ca.SX(0)
@@ -260,9 +274,10 @@ def _told(model: CableModel, p: ca.SX, width: int, *, inside: bool = False) -> c
     if inside:
         outputs += [found.by_lam[d:], *(_rows(part[:, d:]) for part in found.mixed)]
         outputs += [_rows(found.lam_lam[:d, d:]), _triangle(found.lam_lam[d:, d:])]
-        slopes = ca.vertcat(found.value, *found.slopes, found.by_lam)
-        by_place = ca.jacobian(slopes, share) / length
-        outputs += [by_place, ca.jacobian(by_place[0], share) / length]
+        slopes = [found.value]
+        slopes += [*found.slopes, found.by_lam] if held is not None and held.slides else []
+        by_place = ca.jacobian(ca.vertcat(*slopes), share) / length
+        outputs += [by_place, ca.jacobian(by_place[0], share) / length][: len(slopes)]
     else:
         outputs = ca.substitute(outputs, [own], [ca.SX.zeros(d)])
     told = ca.cse([ca.densify(ca.vertcat(*outputs))])
