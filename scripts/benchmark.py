@@ -145,6 +145,10 @@ def run_space() -> dict[str, Any]:
         "largest_over_smallest": times.max() / times.min(),
         "farthest_from_the_line": np.abs(times / line - 1).max(),
     }
+    out["clips"] = {
+        " ".join(kinds): space_speed.clipped(*kinds)
+        for kinds in (("pinned",), ("pinned", "pinned"), ("clamped", "pinned"), ("eyelet",))
+    }
     return out
 
 
