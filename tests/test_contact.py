@@ -234,6 +234,9 @@ def test_a_plane_that_is_not_declared():
     for name, true in (("contact_plane.height", -0.17), ("bending_stiffness", 2e-3)):
         assert fit.value(name) == pytest.approx(true, abs=3 * fit.std(name))
     assert fit.residual_rms < 4e-4 < fits[0].residual_rms
+    # Declared without a height, it begins where the shapes rest.
+    declared = fit_model(model, fits[0].problem.history, Tolerances(), 3e-4)
+    assert declared.value("contact_plane.height") == pytest.approx(-0.17, abs=5e-4)
 
 
 def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():
