@@ -35,23 +35,12 @@ WORTH = 0.1
 # score the true effect had all in six cables simulated by this program; in four sessions of another
 # simulator (space_pull, space_taper, space_drift, space_flat) 1, 1, 0.86 and 0.71.
 NEAR_LEADER = 0.3
-# Probability of a score below which a candidate is refitted where a scatter from pose to pose was
-# estimated: that may hold the effect, and the refit is tested with what is left of the scatter. Of
-# a drift the probability was 0.026, and below 1e-6 with the scatter that it leaves.
-PLAUSIBLE = 0.1
 # Score of a candidate with fewer parameters than the chosen one, relative to that, from which on it
 # may be the larger of two effects that the chosen one stands for: of two the larger has half.
 LARGER_OF_TWO = 0.5
-# Factor by which an effect may raise the error of poses predicted from their ends alone; beyond it
-# the effect misleads. A judgement: a correct lumped mass raised it from 10.9 to 11.2 mm, all but
-# 1 mm of it from one pose on another equilibrium; a wrong effect raised it from 6 to 178 mm.
-MISLEADING = 1.25
-# Mean difference in the errors of left-out poses, in standard errors, beyond which a candidate
-# predicts clearly worse: 95 % of a normal distribution.
-CLEARLY_WORSE = 2.0
-# Difference in BIC beyond which the data reject a rival ("very strong" evidence, Kass and Raftery
-# 1995), whatever its cross-validated error.
-BIC_APART = 10.0
+# Difference in log likelihood beyond which the data reject a rival: "very strong" evidence (Kass
+# and Raftery, J. Am. Stat. Assoc. 90, 1995).
+EVIDENCE_APART = 5.0
 
 # Difference of -2 log likelihood below which two random effects cannot be told apart: a likelihood
 # ratio of 20. Moments of both pins and smooth rest curvatures differed by 2 to 9 in three sessions.
@@ -65,12 +54,10 @@ DIFFERENT = 6
 # ---- what an explanation has to do -------------------------------------------------------------
 
 # Largest error of a left-out pose that a model may make and still explain the data, relative to
-# the error expected from noise, fixtures, parameters and the cable's scatter; a larger one is
-# accepted of a model with effects if it is below this share of the error without them. Measured, a
-# complete model's error is 0.9 to 1.3 times the expected one (eight sessions); without the effect
-# 0.85 and 1.6 times where the effect is small, and 3 to 41 times on the eight others.
+# the error expected from noise, fixtures, parameters and the cable's scatter. Measured, a complete
+# model's error is 0.9 to 1.3 times the expected one (eight sessions); without the effect 0.85 and
+# 1.6 times where the effect is small, and 3 to 41 times on the eight others.
 UNSEEN = 2.0
-UNSEEN_LEFT = 0.5
 # Largest share of the declared model's mean square error beyond the noise left by effects that are
 # reported beside an unexplained residual. Measured: a force for a drift leaves 0.38; gradient,
 # scale and offset for stretch 0.89; softening of a real glass-fibre strip 0.08.

@@ -53,7 +53,7 @@ TABLES = ("clean", "mass", "loads", "clamps")
 NUMBERS = (0, 1, 3, 6, 12)  # of poses with wrench measurements
 MASS, POSITION = 0.03, 0.3  # kg, m: of the lumped mass
 STIFFNESS, HEADING = 1500.0, 0.35  # N m/rad, rad: of the spring at the start
-APART = 10.0  # of twice the log evidence, as BIC_APART of the diagnosis
+APART = 10.0  # of twice the log evidence, twice EVIDENCE_APART of the diagnosis
 RIVALS = {"loads": "lumped_mass over point_force", "clamps": "start_spring over clamp_angle"}
 
 

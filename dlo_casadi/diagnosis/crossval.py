@@ -10,13 +10,14 @@ there is one pose only, stretches of its arc take the place of poses.
 References
 ----------
 Beirami et al., On optimal generalizability in parametric learning, NeurIPS 2017.
+Vehtari, Gelman and Gabry, Practical Bayesian model evaluation, Statistics and Computing 27 (2017).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -29,7 +30,6 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
-from dlo_casadi.thresholds import CLEARLY_WORSE
 
 # Stretches into which the arc of a single pose is cut.
 STRETCHES = 5
@@ -43,7 +43,7 @@ class CrossValidation:
     ----------
     squares : (folds,) [m^2]
         Sum of squared errors of each fold: distances of its points, and readings as
-        `NoiseModel.units` count them.
+        `NoiseModel.units` count them; infinite where it could not be predicted.
     counts : (folds,)
         Number of points and components of readings of each fold.
     complete : bool
@@ -53,6 +53,8 @@ class CrossValidation:
     expected : float [m]
         Error of everything that noise, fixtures, the cable's scatter and what the other folds know
         of the parameters let expect, to first order; of a single pose's stretches it is not told.
+    densities : (folds,)
+        Log density of each fold under the covariance, to first order, that this error comes from.
     """
 
     squares: FloatArray
@@ -60,6 +62,7 @@ class CrossValidation:
     complete: bool
     of_points: float | None = None
     expected: float = 0.0
+    densities: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def error(self) -> float:
@@ -73,51 +76,35 @@ class CrossValidation:
         """Root mean square distance over all points [m]."""
         return self.error if self.of_points is None or not self.complete else self.of_points
 
-    def clearly_worse_than(self, other: CrossValidation) -> bool:
-        """Whether the mean paired difference of the folds exceeds its standard error clearly."""
-        if not (self.complete and other.complete):
-            return not self.complete
-        gap = self._excess_over(other)
-        if len(gap) < 2:
-            return bool(gap.sum() > 0)
-        error = float(gap.std(ddof=1)) / np.sqrt(len(gap))
-        return bool(gap.mean() > CLEARLY_WORSE * error)
+    @property
+    def log_density(self) -> float:
+        """Log predictive density of everything that was left out."""
+        return float(self.densities.sum())
+
+    def loses_more_than(self, other: CrossValidation) -> bool:
+        """Whether a fold is not predicted that the other predicts."""
+        return bool((np.isinf(self.squares) & np.isfinite(other.squares)).any())
 
     def chance_of_gain(self, other: CrossValidation) -> float:
         """Probability of a gain as large as that of the other, if it predicts no better.
 
         One-sided paired t test over the folds; 1 where there is but one.
         """
-        if not self.complete:
-            return 0.0
-        gap = self._excess_over(other)
+        gap = other.densities - self.densities
         if len(gap) < 2:
             return 1.0
         t = gap.mean() / max(gap.std(ddof=1) / np.sqrt(len(gap)), 1e-300)
         return float(stdtr(len(gap) - 1, -t))
 
-    def _excess_over(self, other: CrossValidation) -> FloatArray:
-        """Difference of the mean squares, fold by fold [m^2]."""
-        return np.asarray(self.squares / self.counts - other.squares / other.counts)
 
-
-def cross_validate(
-    fit: Fit, executor: Executor | None = None, shapes: Shapes | None = None
-) -> CrossValidation:
+def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
     All folds are solved together, some 6 ms each. Only where a state is carried is each a
     task of its own; it runs in this process unless an executor is given.
-
-    Parameters
-    ----------
-    shapes : Shapes, optional
-        Equilibria at the fit's unknowns from which the folds are followed: the fitted ones, on
-        whichever branch a pose was measured, by default; or `predicted_shapes`.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
-    shapes = fit.point.shapes if shapes is None else shapes
     problem, lin = fit.problem, fit.linearization
     thetas, covariances = [], []
     total = fit.normal
@@ -129,13 +116,44 @@ def cross_validate(
         theta, covariance = _without(fit, total.hessian - h_j, total.gradient - g_j)
         thetas.append(theta)
         covariances.append(covariance)
-    predicted = _predicted(fit, shapes, thetas, executor or InProcess())
+    predicted = _predicted(fit, thetas, executor or InProcess())
     items = [problem.measured[j] for j in problem.used]
     errors = [
         None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
         for item, seen in zip(items, predicted, strict=True)
     ]
-    return replace(_validation(errors), expected=fit.expected_with(covariances))
+    folds = zip(predicted, thetas, covariances, strict=True)
+    densities = [_density(fit, k, *fold) for k, fold in enumerate(folds)]
+    expected = fit.expected_with(covariances)
+    return replace(_validation(errors), expected=expected, densities=np.array(densities))
+
+
+def _density(
+    fit: Fit, k: int, seen: Observed | None, theta: FloatArray, covariance: FloatArray
+) -> float:
+    """Log density of the k-th fitted pose where it is predicted, or to first order if it is not."""
+    problem, lin, white = fit.problem, fit.linearization, fit.problem.whitening[k]
+    a, own = lin.by_theta[k], lin.by_deviation[k]
+    if seen is None:
+        off = lin.residuals[k] + a @ (theta - fit.point.theta) - own @ fit.own_deviations[k]
+    else:
+        item = problem.measured[problem.used[k]]
+        off = white @ item.residual(seen, item.located(seen, fit.point.projections[k]))
+    ways = np.concatenate([a @ _root(covariance), own * problem.deviation_std], axis=1)
+    return _log_density(off, ways) + float(np.linalg.slogdet(white)[1])
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Square root F with F F^T = covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _log_density(white: FloatArray, ways: FloatArray) -> float:
+    """Log density of whitened residuals (R,) with covariance 1 + ways ways^T, constants dropped."""
+    factor = np.linalg.cholesky(np.eye(ways.shape[1]) + ways.T @ ways)
+    shared = np.linalg.solve(factor, ways.T @ white)
+    return float((shared @ shared - white @ white) / 2 - np.log(np.diag(factor)).sum())
 
 
 def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> CrossValidation:
@@ -152,40 +170,40 @@ def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> Cross
 
 def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unknowns after one step with a part of the data left out, and their covariance."""
-    lower, upper = fit.problem.unknowns.bounds
-    # A direction without any information (the place of a mass of zero) must not move.
-    ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian)) + NO_INFORMATION * np.eye(len(gradient))
+    unknowns = fit.problem.unknowns
+    lower, upper = unknowns.bounds
+    # A direction without any information (the place of a mass of zero) is known by its bounds.
+    ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian)) + np.diag(1 / unknowns.widest**2)
     covariance = np.linalg.inv(hessian + ridge)
     return np.clip(fit.point.theta - covariance @ gradient, lower, upper), covariance
 
 
-def _predicted(
-    fit: Fit, shapes: Shapes, thetas: list[FloatArray], executor: Executor
-) -> list[Observed | None]:
+def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[Observed | None]:
     """What each fitted pose looks like at its own unknowns, from declared end conditions."""
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
     if fit.model.has_state:
-        folds = map_in_order(executor, partial(_predict_all, fit, shapes), thetas)
+        folds = map_in_order(executor, partial(_predict_all, fit), thetas)
         return [seen[j] for j, seen in zip(problem.used, folds, strict=True)]
     p = np.repeat(fit.p[None], equilibria.m, axis=0)
     rest = np.repeat(fit.rest[None], equilibria.m, axis=0)
     for j, theta in zip(problem.used, thetas, strict=True):
         p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
-    solved, converged = equilibria.solve(_declared(shapes), p, rest)
+    solved, converged = equilibria.solve(_declared(fit), p, rest)
     seen = equilibria.seen(solved, p, rest)
     return [seen[j] if converged[j] else None for j in problem.used]
 
 
-def _predict_all(fit: Fit, shapes: Shapes, theta: FloatArray) -> list[Observed | None]:
+def _predict_all(fit: Fit, theta: FloatArray) -> list[Observed | None]:
     """All poses in order at one value of the unknowns, a state carried along."""
     equilibria, unknowns = fit.problem.equilibria, fit.problem.unknowns
     p, rest = unknowns.p(theta), unknowns.rest(theta)
-    solved, converged = equilibria.solve(_declared(shapes), p, rest)
+    solved, converged = equilibria.solve(_declared(fit), p, rest)
     return [*equilibria.seen(solved, p, rest)] if converged.all() else [None] * equilibria.m
 
 
-def _declared(shapes: Shapes) -> Shapes:
-    """Shapes held as declared, from which to solve."""
+def _declared(fit: Fit) -> Shapes:
+    """The fitted shapes held as declared, from which to solve."""
+    shapes = fit.point.shapes
     return replace(shapes, deviation=np.zeros_like(shapes.deviation))
 
 
@@ -200,9 +218,10 @@ def _stretches(fit: Fit) -> CrossValidation:
     prior = np.zeros((size + n_dev, size + n_dev))
     prior[:size, :size] = problem.precision
     prior[size:, size:] = np.diag(1 / problem.deviation_std**2)
-    own = fit.point.shapes.deviation[j, problem.equilibria.used_deviations]
-    pull = np.concatenate([fit.point.theta - problem.mean, own])
+    pull = np.concatenate([fit.point.theta - problem.mean, fit.own_deviations[0]])
+    noise = np.linalg.inv(problem.whitening[0])
     errors: list[tuple[FloatArray, FloatArray] | None] = []
+    densities = []
     for left_out in np.array_split(points, min(STRETCHES, len(points))):
         kept = np.ones(item.n_residuals, dtype=bool)
         kept[item.on_points] = ~np.isin(item.point_of, left_out)
@@ -212,7 +231,14 @@ def _stretches(fit: Fit) -> CrossValidation:
         step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
         lower, upper = problem.unknowns.bounds
         theta = np.clip(fit.point.theta + step[:size], lower, upper)
-        seen = _predict_all(fit, fit.point.shapes, theta)[j]
+        seen = _predict_all(fit, theta)[j]
         missed = None if seen is None else item.misses(seen.curve)[left_out]
         errors.append(None if missed is None else (missed, np.zeros(0)))
-    return _validation(errors)
+        off: FloatArray = lin.raw[0] + lin.raw_directions[0] @ step
+        if seen is not None:
+            off = item.residual(seen, item.located(seen, fit.point.projections[0]))
+        rows, ways = noise[~kept], lin.raw_directions[0][~kept] @ _root(np.linalg.inv(hessian))
+        white = np.linalg.inv(np.linalg.cholesky(rows @ rows.T))
+        told = _log_density(white @ off[~kept], white @ ways)
+        densities.append(told + float(np.linalg.slogdet(white)[1]))
+    return replace(_validation(errors), densities=np.array(densities))

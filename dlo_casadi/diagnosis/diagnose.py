@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Literal
-
-import numpy as np
 
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
@@ -20,15 +19,10 @@ from dlo_casadi.diagnosis.selection import (
     Ranked,
     as_complete,
     choose,
-    explained_by,
-    improving,
-    in_place_of,
-    misleads,
+    p_values_of,
     p_with_closed_noise,
     ranking,
-    shortcoming,
     sidak,
-    why_lost,
 )
 from dlo_casadi.diagnosis.structure import (
     Structure,
@@ -37,7 +31,8 @@ from dlo_casadi.diagnosis.structure import (
     structure_of,
 )
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
-from dlo_casadi.effects import PointLoad
+from dlo_casadi.effects import PointLoad, StateEffect
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import at_random, fine_enough
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
@@ -45,16 +40,13 @@ from dlo_casadi.estimation.variances import SETTLED_MODES, settle
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import (
-    BIC_APART,
     DIFFERENT,
     LARGER_OF_TWO,
     LEFT,
     NEAR_LEADER,
-    PLAUSIBLE,
     REFITTED,
     SIGNIFICANCE,
     UNSEEN,
-    UNSEEN_LEFT,
     WORTH,
 )
 
@@ -74,7 +66,7 @@ class Diagnosis:
     structure_before, structure_after : Structure
     added : tuple of AddedEffect
     ranked : tuple of Ranked
-        All candidates of the first step: those confirmed by BIC, then the others by score.
+        All candidates of the first step: those refitted by `support`, then the others by score.
     unexplained : bool
         Whether structure is left, or poses that were left out are not predicted.
     pull : UnknownForce or None
@@ -166,11 +158,6 @@ class Search:
         return self.validation.error if self.validation.complete else 0.0
 
     @property
-    def loses_poses(self) -> bool:
-        """Whether the declared model cannot follow the poses that are left out."""
-        return self.several and not self.validation.complete
-
-    @property
     def several(self) -> bool:
         """Whether an unknown force may have a cause: in one pose a force fits as well as any."""
         return len(self.declared.problem.used) > 1 and self.max_effects > 0
@@ -190,25 +177,27 @@ class Search:
     def _screened(self, current: Fit) -> list[Screened]:
         """Score tests of all `candidates_of` a fit, best first."""
         listed = candidates_of(current, self.center, self.exclude)
-        return refits.scored(current, listed, screening_degrees(current), self.executor)
+        degrees = screening_degrees(current)
+        with suppress(EstimationError):
+            return refits.scored(current, listed, degrees, self.executor)
+        # A pose that is held out has no equilibrium: what poses leave behind cannot be told.
+        listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
+        return refits.scored(current, listed, degrees, self.executor)
 
     def closed(self) -> Diagnosis:
         """What the search finds, without effects that explain too little."""
-        fit = self.declared
-        # Where left-out poses are not even reached no effect can be followed: first the force.
-        lost = self.loses_poses and fit.noise.source != "misfit"
-        force = estimate_unknown_force(fit, self.executor) if lost else None
-        found = self.among_simpler(self.run(force))
-        other = self.at_random(found)
-        if other is not None:
-            return replace(self, declared=other).closed()
-        if found.unexplained and force is not None:
-            found = self.run()
-        elif found.unexplained:
+        fit, found, force = self.declared, self.run(), None
+        found = found.or_better(self.of_simpler_effects(found))
+        near = self.at_random(found)
+        if near is not None:
+            return replace(self, declared=near).closed()
+        # Where left-out poses are not even reached refits may have begun too far from the effect.
+        lost = fit.noise.source != "misfit" and not self.validation.complete
+        if found.unexplained or (lost and self.several):
             force = estimate_unknown_force(fit if found.added else found.fit, self.executor)
-            found = self.with_cause_of(force, found)
+            found = found.or_better(self.of_causes(force))
         if found.unexplained and found.added:
-            found = self.without_wrong_causes(found, force)
+            found = self.without_wrong_causes(found)
             if found.added or not fit.errors_known:
                 force = estimate_unknown_force(found.fit, self.executor)
         tried = {row.name for row in found.ranked}
@@ -242,79 +231,75 @@ class Search:
         current, validation = self.declared, self.validation
         added: list[AddedEffect] = []
         ranked: list[Ranked] = []
-        lost: dict[str, str] = {}
         for k in range(self.max_effects):
             self.step("search for a missing effect", k, self.max_effects)
-            misfit = current.noise.source == "misfit"
-            tried, far = list[Confirmed | None](), list[str]()
-            if misfit and force is None:
-                screened, tried, far = self._from_data(current)
-            else:
-                screened = self.first if k == 0 else self._screened(current)
-            p_values = {x.candidate.name: sidak(x.p_value, len(screened)) for x in screened}
-            if k == 0 and force is not None:
-                tried = self._causes(force, screened)
-            elif not misfit:
-                tried = self._leading(current, screened, p_values)
-            explaining = explained_by(current, tried)
-            confirmed = explaining or improving(tried, validation, self.doubt)
-            if k == 0:
-                ranked = ranking(screened, p_values, confirmed, tried)
-            # What a second effect explains may be what the first one, if wrong, has left.
-            apart = np.inf if added and not explaining else BIC_APART
-            chosen, misleading = choose(confirmed, apart), []
-            while chosen and not explaining and misleads(chosen[0], current, validation):
-                misleading.append(chosen[0])
-                confirmed.remove(chosen[0])
-                chosen = choose(confirmed, apart)
-            if k == 0:
-                why = partial(shortcoming, validation=validation, doubt=self.doubt)
-                other = (lambda _: NOT_NEAR) if explaining else why
-                lost = why_lost(tried, confirmed, misleading, chosen, other)
-                lost |= dict.fromkeys(far, NOT_NEAR)
-            if chosen is None:
-                break
-            winner, rivals = chosen
-            p_value = p_values[winner.candidate.name]
-            if k == 0 and force is not None:
-                single = survival(winner.gain, len(winner.candidate.frees), noise_degrees(current))
-                p_value = sidak(single, len(screened))
-            closed = winner.fit if explaining else as_complete(winner.fit)
-            scatters = current.problem.priors.pose_scatter.std > 0
-            if (scatters or not closed.errors_known) and not misfit:
-                again = p_with_closed_noise(current, closed, winner, len(screened))
-                # A scatter from pose to pose may be nothing but the effect.
-                p_value = again if scatters else max(p_value, again)
-            if p_value > self.significance:
-                if not added:
-                    names = [item.candidate.name for item in (winner, *rivals)]
+            screened, p_values, tried, far = self._refitted(current, force if k == 0 else None)
+            chosen, lost = choose(tried, current, validation, self.doubt)
+            lost |= dict.fromkeys(far, NOT_NEAR)
+            closed, p_value = current, 1.0
+            if chosen:
+                winner, *rivals = chosen
+                closed = as_complete(winner.fit)
+                p_value = p_values[winner.candidate.name]
+                scatters = current.problem.priors.pose_scatter.std > 0
+                misfit = current.noise.source == "misfit"
+                if (scatters or not closed.errors_known) and not misfit:
+                    again = p_with_closed_noise(current, closed, winner, len(screened))
+                    # A scatter from pose to pose may be nothing but the effect.
+                    p_value = again if scatters else max(p_value, again)
+                if p_value > self.significance:
+                    names = [item.candidate.name for item in chosen]
                     lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
+            if k == 0:
+                rows = ranking(screened, p_values, tried, current, validation)
+                ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
+            if p_value > self.significance:
                 break
-            current = closed
-            after = cross_validate(current)
-            added.append(AddedEffect(winner.candidate, p_value, validation, after, tuple(rivals)))
-            validation = after
+            current, before = closed, validation
+            validation = cross_validate(current)
+            added.append(AddedEffect(winner.candidate, p_value, before, validation, tuple(rivals)))
         self.step("search for a missing effect", self.max_effects, self.max_effects)
-        listed = tuple(replace(row, reason=lost.get(row.name, "")) for row in ranked)
-        return self._ended(*self._pruned(current, added), listed)
+        return self._ended(*self._pruned(current, added), tuple(ranked))
 
-    def among_simpler(self, found: Found) -> Found:
-        """What is found, or effects of fewer parameters each that are likelier together.
+    def _refitted(
+        self, current: Fit, force: UnknownForce | None
+    ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
+        """Candidates screened, their p-values, refits of the likely ones, and who stays far off."""
+        far: list[str] = []
+        if current.noise.source == "misfit" and force is None:
+            screened, tried, far = self._from_data(current)
+            return screened, p_values_of(screened), tried, far
+        screened = self.first if current is self.declared else self._screened(current)
+        p_values = p_values_of(screened)
+        if force is None:
+            return screened, p_values, self._leading(current, screened, p_values), far
+        tried = self._causes(force, screened)
+        for item in tried:
+            if item is not None:
+                dof = len(item.candidate.frees)
+                single = survival(item.gain, dof, noise_degrees(current))
+                p_values[item.candidate.name] = sidak(single, len(screened))
+        return screened, p_values, tried, far
+
+    def of_simpler_effects(self, found: Found) -> Found | None:
+        """Search among effects of fewer parameters each, if the larger of two may be one of them.
 
         An effect of many parameters may stand for two of one each.
         """
         if not found.added or self.declared.noise.source == "misfit":
-            return found
+            return None
         winner = found.added[0].candidate
         scores = {item.candidate.name: item.score for item in self.first}
-        enough = LARGER_OF_TWO * scores[winner.name]
         free = {item.candidate.name: len(item.candidate.frees) for item in self.first}
         others = [name for name in scores if free[name] >= len(winner.frees)]
-        if not any(scores[name] >= enough for name in scores.keys() - others):
-            return found
-        other = replace(self, exclude=[*self.exclude, *others]).run()
-        likelier = other.fit.log_evidence >= found.fit.log_evidence
-        return in_place_of(found, other) if likelier and not other.unexplained else found
+        best = max((scores[name] for name in scores.keys() - others), default=0.0)
+        if best < LARGER_OF_TWO * scores[winner.name]:
+            return None
+        return replace(self, exclude=[*self.exclude, *others]).run()
+
+    def of_causes(self, force: UnknownForce | None) -> Found | None:
+        """Search that begins with the causes of a force, if there is one that may have some."""
+        return self.run(force) if force is not None and self.several else None
 
     def at_random(self, found: Found) -> Fit | None:
         """The declared model with random effects, if it misfits and they explain more."""
@@ -336,11 +321,8 @@ class Search:
             if smaller is None:
                 continue
             screened = self._screened(smaller)
-            single = {item.candidate.name: item.p_value for item in screened}
-            p_value = sidak(single.get(effect.candidate.name, 0.0), len(screened))
-            price = len(effect.candidate.frees) * np.log(fit.problem.n_residuals)
-            gain = 2 * (smaller.point.objective - fit.point.objective)
-            if gain < price or p_value > self.significance:
+            p_value = p_values_of(screened).get(effect.candidate.name, 0.0)
+            if smaller.log_evidence > fit.log_evidence or p_value > self.significance:
                 fit = settle(smaller)
                 added = [item for item in added if item is not effect]
         return fit, added
@@ -349,9 +331,11 @@ class Search:
         self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
     ) -> list[Confirmed | None]:
         """Refits of the significant candidates with the highest scores."""
-        scatters = current.problem.priors.pose_scatter.std > 0
-        most = PLAUSIBLE if scatters else self.significance
-        significant = [x for x in screened if p_values[x.candidate.name] < most]
+        # A scatter from pose to pose may hold the effect: the refit is tested with what is left.
+        any_ = current.problem.priors.pose_scatter.std > 0
+        significant = [
+            x for x in screened if any_ or p_values[x.candidate.name] < self.significance
+        ]
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         return list(map_in_order(self.executor, partial(refits.confirm, current), worthy))
@@ -370,24 +354,20 @@ class Search:
         for starts in (1, 3):
             refit = partial(confirm_from_data, current, near, starts=starts)
             tried = list(map_in_order(self.executor, refit, kept))
-            if explained_by(current, tried):
+            if any(item and item.fit.noise.source != "misfit" for item in tried):
                 break
         return screened, tried, far
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.
 
-        Two free forces in each pose would gain more than their price if the law were wrong.
+        A force in each pose would be likelier if the law were wrong.
         """
         loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
         refit = partial(refits.confirm_cause, self.declared, force)
-        free = 2 * len(self.declared.problem.used) + 1
-        price = free * np.log(self.declared.problem.n_residuals)
-        return [
-            item
-            for item in map_in_order(self.executor, refit, loads)
-            if item is not None and item.bic >= force.gain - price
-        ]
+        least = force.fit.log_evidence
+        tried = map_in_order(self.executor, refit, loads)
+        return [item for item in tried if item is not None and item.fit.log_evidence >= least]
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         """What has been found, and whether it explains the data."""
@@ -403,8 +383,6 @@ class Search:
     def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
         limit = UNSEEN * max(fit.expected_error, validation.expected)
-        if added:
-            limit = max(limit, UNSEEN_LEFT * self.error)
         # From one pose alone another one is not predicted to first order of the covariance.
         told = bool(added) or len(self.declared.problem.used) > 2
         unpredicted = told and validation.error > limit
@@ -412,37 +390,14 @@ class Search:
         unexplained |= fit.noise.source == "misfit"
         return Found(fit, tuple(added), ranked, validation, structure, unexplained)
 
-    def with_cause_of(self, force: UnknownForce | None, found: Found) -> Found:
-        """Return a search that begins with a cause of the force, if it explains the data."""
-        if force is None or not self.several:
-            return found
-        other = self.run(force)
-        return found if other.unexplained else other
-
-    def without_wrong_causes(self, found: Found, force: UnknownForce | None) -> Found:
+    def without_wrong_causes(self, found: Found) -> Found:
         """Withdraw effects that do not explain nearly all of what the declared model lacks.
 
         Something is missing still, and a wrong effect may stand for a part of it. Effects stay
         if the mean square error of what is left out, beyond noise and fixtures, falls to less
         than LEFT of what it was: then what is missing beside them is small against what they
-        explain. And all go if one force in each pose explains more than they do.
+        explain.
         """
         floor = found.fit.expected_error**2
         after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))
-        if after <= LEFT * before and not self._needless(found, force):
-            return found
-        return self._ended(self.declared, [], found.ranked)
-
-    def _needless(self, found: Found, alone: UnknownForce | None) -> bool:
-        """Whether one force per pose on the declared model does better than with the effects."""
-        if alone is None or not self.several:
-            return False
-        force = estimate_unknown_force(found.fit, self.executor)
-        n = np.log(self.declared.problem.n_residuals)
-        extra = sum(len(item.candidate.frees) for item in found.added) * n
-        if force is None:
-            return True
-        if 2 * alone.fit.point.objective >= 2 * force.fit.point.objective + extra:
-            return False
-        p = [structure_of(x, noise_degrees(x)).p_value for x in (alone.fit, found.fit)]
-        return p[0] > p[1]
+        return found if after <= LEFT * before else self._ended(self.declared, [], found.ranked)

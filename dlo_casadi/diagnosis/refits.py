@@ -78,15 +78,12 @@ class Confirmed:
     validation : CrossValidation
     gain : float
         Decrease of twice the objective.
-    bic : float
-        Gain minus the price of the parameters, q log N; larger is better.
     """
 
     screened: Screened
     fit: Fit
     validation: CrossValidation
     gain: float
-    bic: float
 
     @classmethod
     def of(cls, screened: Screened, base: Fit, fit: Fit | None) -> Confirmed | None:
@@ -94,8 +91,7 @@ class Confirmed:
         if fit is None:
             return None
         gain = 2 * (base.point.objective - fit.point.objective)
-        price = float(len(screened.candidate.frees) * np.log(max(base.problem.n_residuals, 2)))
-        return cls(screened, fit, cross_validate(fit), gain, gain - price)
+        return cls(screened, fit, cross_validate(fit), gain)
 
     @property
     def candidate(self) -> Candidate:
@@ -259,8 +255,9 @@ def confirm_from_data(
         fit = _fit_from_data(near, start, starts)
         if fit is not None and misfits(fit):
             fit = descend(fit.reweighed(base.noise, base.problem.priors))
-        elif fit is not None:
-            fit = refine(fit, first=True)
+        if fit is not None and not misfits(fit):
+            known = start.problem
+            fit = refine(fit.reweighed(known.noise, known.priors), first=True)
         return Confirmed.of(start.screened, base, fit)
     return None
 

@@ -1,21 +1,21 @@
 """Which of the refitted candidates is added: evidence, cross-validation, significance."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.crossval import CrossValidation
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of, settle
-from dlo_casadi.thresholds import LEAST_NOISE_DEGREES, MISLEADING
+from dlo_casadi.thresholds import EVIDENCE_APART, LEAST_NOISE_DEGREES
 
 
 @dataclass(frozen=True)
@@ -63,19 +63,6 @@ class Ranked:
     reason: str = ""
 
 
-def explained_by(current: Fit, tried: Iterable[Confirmed | None]) -> list[Confirmed]:
-    """Candidates that leave none of a misfit: with them the points are as sure as they are known.
-
-    Beside a misfit their gains tell little; they are compared by their evidence.
-    """
-    if current.noise.source != "misfit":
-        return []
-    refits = [x for x in tried if x is not None and x.validation.complete]
-    close = [item for item in refits if item.fit.noise.source != "misfit"]
-    least = min((item.fit.log_evidence for item in close), default=0.0)
-    return [replace(item, bic=2 * (item.fit.log_evidence - least)) for item in close]
-
-
 @dataclass(frozen=True)
 class Found:
     """Where a search has ended.
@@ -97,14 +84,23 @@ class Found:
     structure: Structure
     unexplained: bool
 
+    def or_better(self, other: Self | None) -> Self:
+        """Itself, or what another search has found if only that explains the data, or it better."""
+        if other is None or other._order <= self._order:
+            return self
+        names = " and ".join(item.candidate.name for item in other.added) or "no effect"
+        known = {item.name for item in other.ranked}
+        chosen = {x.name for item in self.added for x in (item.candidate, *item.rival_candidates)}
+        rest = (
+            replace(x, reason=f"less likely than {names}") if x.name in chosen else x
+            for x in self.ranked
+            if x.name not in known
+        )
+        return replace(other, ranked=(*other.ranked, *rest))
 
-def in_place_of(found: Found, other: Found) -> Found:
-    """Other effects that are likelier together, with that as the reason against those found."""
-    reason = "less likely than " + " and ".join(item.candidate.name for item in other.added)
-    first = found.added[0]
-    chosen = {item.name for item in (first.candidate, *first.rival_candidates)}
-    rows = (replace(x, reason=reason) if x.name in chosen else x for x in found.ranked)
-    return replace(other, ranked=tuple(rows))
+    @property
+    def _order(self) -> tuple[bool, float]:
+        return not self.unexplained, self.fit.log_evidence
 
 
 def as_complete(fit: Fit) -> Fit:
@@ -115,6 +111,11 @@ def as_complete(fit: Fit) -> Fit:
 def sidak(p_value: float, tried: int) -> float:
     """Probability that the best of so many independent tests is as good (Sidak)."""
     return float(-np.expm1(tried * np.log1p(-min(p_value, 1 - 1e-16))))
+
+
+def p_values_of(screened: Sequence[Screened]) -> dict[str, float]:
+    """Probability of each score where nothing is missing, as the best of all, by names."""
+    return {item.candidate.name: sidak(item.p_value, len(screened)) for item in screened}
 
 
 def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) -> float:
@@ -142,31 +143,37 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     return sidak(survival(gain, dof, max(LEAST_NOISE_DEGREES, noise.slow_dof)), tried)
 
 
-def improving(
-    tried: Iterable[Confirmed | None], validation: CrossValidation, doubt: float | None
-) -> list[Confirmed]:
-    """Refits that improve both the fit and what it predicts."""
-    return [x for x in tried if x is not None and not shortcoming(x, validation, doubt)]
+def gains(item: Confirmed, base: Fit, validation: CrossValidation) -> tuple[float, float]:
+    """How much likelier a refit makes the data than its base does, twice: logarithms.
+
+    By marginal likelihood, and by the predictive density of poses that are left out (of which the
+    base's is in `validation`). Both agree where nothing else is missing. A wrong effect bends to
+    what is fitted, and predicts what is left out badly.
+    """
+    evidence = item.fit.log_evidence - base.log_evidence
+    return evidence, item.validation.log_density - validation.log_density
 
 
-def shortcoming(item: Confirmed, validation: CrossValidation, doubt: float | None) -> str:
-    """Why a refit does not improve both the fit and what it predicts; empty if it does.
+def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
+    """Harmonic mean of both `gains`, which the smaller decides; that itself if it is negative."""
+    one, other = gains(item, base, validation)
+    smaller = min(one, other)
+    return smaller if smaller <= 0 else 2 * one * other / (one + other)
+
+
+def shortcoming(
+    item: Confirmed, base: Fit, validation: CrossValidation, doubt: float | None
+) -> str:
+    """Why a refit is no better than its base; empty if it is.
 
     Repeats of one or two poses have in common whatever is wrong with their measurement. There
     whole repeats decide: a gain as large must have less than the probability `doubt` if those
     left out are predicted no better (Student's t).
     """
-    if item.bic <= 0:
-        return f"explains less than its parameters cost: BIC {-item.bic:.3g} behind no effect"
-    if not item.validation.complete:
+    if item.validation.loses_more_than(validation):
         return "with it a pose that is left out cannot be predicted"
-    # An effect that explains the fitted poses but predicts the others worse is none. A nuisance
-    # is in the model already; without its prior it predicts about as well.
-    worse = item.validation.error > validation.error
-    if item.candidate.nuisance:
-        worse = item.validation.clearly_worse_than(validation)
-    if worse:
-        return _worse(item.validation, validation)
+    if (behind := -support(item, base, validation)) >= 0:
+        return f"makes the data less likely than no effect: log likelihood {behind:.3g} behind"
     chance = 0.0 if doubt is None else validation.chance_of_gain(item.validation)
     if doubt is not None and chance >= doubt:
         return f"predicts what is left out no better than by chance: p = {chance:.2g}"
@@ -174,100 +181,49 @@ def shortcoming(item: Confirmed, validation: CrossValidation, doubt: float | Non
 
 
 def choose(
-    confirmed: Sequence[Confirmed], apart: float
-) -> tuple[Confirmed, list[Confirmed]] | None:
-    """The best by cross-validation (BIC among those not clearly worse), and its rivals.
-
-    Rivals are those not clearly worse whose BIC falls short by less than `apart`.
-    """
-    if not confirmed:
-        return None
-    leader = min(confirmed, key=lambda item: item.validation.error)
-    close = [
-        item for item in confirmed if not item.validation.clearly_worse_than(leader.validation)
-    ]
-    winner = max(close, key=lambda item: item.bic)
-    rivals = [item for item in close if item is not winner and item.bic > winner.bic - apart]
-    return winner, sorted(rivals, key=lambda item: -item.bic)
-
-
-def why_lost(
     tried: Iterable[Confirmed | None],
-    confirmed: Sequence[Confirmed],
-    misleading: Sequence[Confirmed],
-    chosen: tuple[Confirmed, list[Confirmed]] | None,
-    why: Callable[[Confirmed], str],
-) -> dict[str, str]:
-    """Why refits are neither chosen nor rivals of the one that is, by the candidates' names.
+    base: Fit,
+    validation: CrossValidation,
+    doubt: float | None,
+) -> tuple[list[Confirmed], dict[str, str]]:
+    """The best of some refits by `support` and its rivals, and why the others are not, by names.
 
-    Parameters
-    ----------
-    confirmed : sequence of Confirmed
-        Among which was chosen, without those that are `misleading`.
-    why : callable
-        Reason of a refit that is in neither of these.
+    Both gains have to be positive. Rivals are those that fall short by less than EVIDENCE_APART.
     """
-    reasons = {item.candidate.name: why(item) for item in tried if item is not None}
-    for item in misleading:
-        reasons[item.candidate.name] = "misleads: where only ends are known it predicts worse"
-    if chosen is None:
-        return reasons
-    winner, rivals = chosen
-    leader = min(confirmed, key=lambda item: item.validation.error)
-    for item in confirmed:
-        if item.validation.clearly_worse_than(leader.validation):
-            reasons[item.candidate.name] = _worse(item.validation, leader.validation)
-            reasons[item.candidate.name] += f" with {leader.candidate.name}"
+    refits = [item for item in tried if item is not None]
+    why = {item.candidate.name: shortcoming(item, base, validation, doubt) for item in refits}
+    order = {x.candidate.name: support(x, base, validation) for x in refits}
+    better = [item for item in refits if not why[item.candidate.name]]
+    better.sort(key=lambda item: -order[item.candidate.name])
+    chosen = []
+    for item in better:
+        behind = order[better[0].candidate.name] - order[item.candidate.name]
+        if behind < EVIDENCE_APART:
+            chosen.append(item)
         else:
-            behind = winner.bic - item.bic
-            reasons[item.candidate.name] = f"BIC {behind:.3g} behind {winner.candidate.name}"
-    kept = {item.candidate.name for item in (winner, *rivals)}
-    return {name: reason for name, reason in reasons.items() if name not in kept}
-
-
-def _worse(one: CrossValidation, other: CrossValidation) -> str:
-    """That one predicts worse than another."""
-    errors = f"{1e3 * one.error:.3g} mm instead of {1e3 * other.error:.3g} mm"
-    return f"predicts what is left out worse: {errors}"
-
-
-def misleads(item: Confirmed, before: Fit, validation: CrossValidation) -> bool:
-    """Whether a fit with an effect tells a user, who knows the ends alone, worse than one without.
-
-    A nuisance never does. `validation` follows the branches on which poses were measured, without
-    the effect.
-    """
-    told = 0.0 if item.candidate.nuisance else _told(item.fit)
-    return told > validation.rmse and told > MISLEADING * _told(before)
-
-
-def _told(fit: Fit) -> float:
-    """Cross-validated error [m] of poses of which nothing but the ends is known."""
-    shapes = predicted_shapes(fit.problem, fit.point)
-    return cross_validate(fit, shapes=shapes).rmse
+            first = better[0].candidate.name
+            why[item.candidate.name] = f"log likelihood {behind:.3g} behind {first}"
+    return chosen, {name: reason for name, reason in why.items() if reason}
 
 
 def ranking(
     screened: Sequence[Screened],
     p_values: Mapping[str, float],
-    confirmed: Sequence[Confirmed],
     tried: Iterable[Confirmed | None],
+    base: Fit,
+    validation: CrossValidation,
 ) -> list[Ranked]:
-    """All candidates: those confirmed, then other refits, by BIC; the rest by score."""
-    worthy = {item.candidate.name: item for item in confirmed}
-    refitted = {item.candidate.name: item for item in tried if item is not None} | worthy
+    """All candidates: those refitted by `support`, the rest by score."""
+    refitted = {item.candidate.name: item for item in tried if item is not None}
+    order = {name: support(item, base, validation) for name, item in refitted.items()}
 
     def error(name: str) -> float | None:
         found = refitted.get(name)
         return found.validation.rmse if found and found.validation.complete else None
-
-    def order(row: Ranked) -> tuple[bool, float, float]:
-        known = refitted.get(row.name)
-        return (row.name not in worthy, -known.bic if known else np.inf, -row.score)
 
     names = [item.candidate.name for item in screened]
     rows = [
         Ranked(name, item.score, p_values[name], error(name))
         for name, item in zip(names, screened, strict=True)
     ]
-    return sorted(rows, key=order)
+    return sorted(rows, key=lambda row: (-order.get(row.name, -np.inf), -row.score))

@@ -28,7 +28,7 @@ from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES, CableModel
-from dlo_casadi.thresholds import BIC_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
+from dlo_casadi.thresholds import EVIDENCE_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
 
 # Probability below the upper end of a 95 % interval.
 BELOW_HIGH_END = 0.975
@@ -311,7 +311,7 @@ def as_measured(fit: Fit) -> Fit:
     else:
         if _gaps(found):
             return fit
-    return found if fit.log_evidence - found.log_evidence < BIC_APART / 2 else fit
+    return found if fit.log_evidence - found.log_evidence < EVIDENCE_APART else fit
 
 
 def _gaps(fit: Fit) -> list[EnergyGap]:

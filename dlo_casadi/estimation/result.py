@@ -161,6 +161,13 @@ class Fit:
         return out
 
     @property
+    def own_deviations(self) -> FloatArray:
+        """Deviations (fitted poses, n_deviations) of each fitted pose's own."""
+        problem = self.problem
+        used = np.ix_(problem.used, problem.equilibria.used_deviations)
+        return np.asarray(self.point.shapes.deviation[used])
+
+    @property
     def _taken(self) -> list[FloatArray]:
         """Whitened residuals (R_j, size) by theta, each pose's own deviations following."""
         lin = self.linearization

@@ -250,8 +250,11 @@ class SearchSettings:
         return replace(found, decades=1, predicts=False) if model.surfaces else found
 
 
+# misfit: of 37 hidden sets searches left 0.012 (a taper) and 0.06 (softening and a weight) in two;
+# there scores lead nowhere, and an estimated noise may swallow the effect. Real wires and bench
+# sessions left less than 0.0052.
 # other_minima: of 26 sessions in the plane 16 left less; no second search led elsewhere there.
-IN_PLANE = SearchSettings(20, 0.0, np.inf, 0.001, 3, predicts=True, converged_first=False)
+IN_PLANE = SearchSettings(20, 0.0, 0.01, 0.001, 3, predicts=True, converged_first=False)
 # std: of three sessions in which an effect is missing, one (space_flat) found its minimum at the
 # noise, too; at 3 mm two did, and one with a drift in neither. A judgement.
 # misfit: in four sessions in which an effect is missing the searches left 0.0025 to 0.0083, in

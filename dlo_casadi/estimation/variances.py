@@ -205,9 +205,8 @@ def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
 
 def _beyond_tolerances(fit: Fit) -> bool:
     """Whether the poses' ends differ from declared ones by more than their scatter, clearly."""
-    problem = fit.problem
-    own = fit.point.shapes.deviation[np.ix_(problem.used, problem.equilibria.used_deviations)]
-    return bool(((own / problem.deviation_std) ** 2).sum() > own.size + 2 * np.sqrt(2 * own.size))
+    own = fit.own_deviations / fit.problem.deviation_std
+    return bool((own**2).sum() > own.size + 2 * np.sqrt(2 * own.size))
 
 
 def _scatter_of_source(fit: Fit, noise: NoiseModel, scatter: PoseScatter) -> ScatterEstimate:

@@ -19,7 +19,7 @@ NOISE_ALONE = "noise alone"
 # The errors of a stage, of which some poses were measured in another equilibrium.
 ON_BRANCH = "on the measured branch"
 # How candidates are ordered; the score alone does not tell how well a refit does.
-CANDIDATE_ORDER = "first those that a refit confirms, by BIC, then other refits, the rest by score"
+CANDIDATE_ORDER = "first those that were refitted, by log likelihood, the rest by score"
 # Stages of every report, in this order; `closed` only where an effect was added.
 ALWAYS: tuple[StageName, ...] = ("initial", "stiffness_only", "algorithm1", "batch")
 STAGE_LABELS: dict[StageName, str] = {

@@ -38,8 +38,8 @@ from dlo_casadi.session.hypotheses import (
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import (
     BEYOND_EFFECTS,
-    BIC_APART,
     CONTRADICTS,
+    EVIDENCE_APART,
     FITS,
     HEADING_OFF,
     MUCH_BETTER,
@@ -195,8 +195,8 @@ class Comparison(NamedTuple):
         (fit, other, weight), own = self.other, self.own
         if fit is None or not weight or own.weight or other > BEYOND_EFFECTS * self.length:
             return False
-        # Difference of the BIC of two models with the same unknowns.
-        return bool(2 * fit.problem.n_residuals * np.log(own.rms / other) > BIC_APART)
+        # Difference in log likelihood of two models with the same unknowns.
+        return bool(fit.problem.n_residuals * np.log(own.rms / other) > EVIDENCE_APART)
 
 
 def compare(

@@ -7,7 +7,7 @@ import pytest
 
 from dlo_casadi.diagnosis.crossval import CrossValidation
 from dlo_casadi.diagnosis.refits import Confirmed
-from dlo_casadi.diagnosis.selection import improving
+from dlo_casadi.diagnosis.selection import choose
 from dlo_casadi.diagnosis.structure import limiting_spread
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -43,17 +43,19 @@ def test_hangings_that_differ_by_more_than_the_noise_limit_every_prediction(scat
 
 
 @pytest.mark.parametrize(
-    ("errors", "doubt", "kept"),
+    ("gains", "doubt", "kept"),
     [
-        ([0.8, 1.0, 0.9, 1.1, 0.7], None, True),  # an effect worth it, were the points independent
-        ([0.8, 1.0, 0.9, 1.1, 0.7], 0.005, False),  # but two of five repeats are no better
-        ([0.3, 0.4, 0.3, 0.5, 0.4], 0.005, True),  # all are
+        ([20.0, 0.0, 10.0, -10.0, 30.0], None, True),  # worth it, were the points independent
+        ([20.0, 0.0, 10.0, -10.0, 30.0], 0.005, False),  # but two of five repeats are no better
+        ([70.0, 60.0, 70.0, 50.0, 60.0], 0.005, True),  # all are
     ],
 )
-def test_only_a_clear_gain_counts_where_poses_do_not_repeat(errors, doubt, kept):
-    """Mean square errors of each left-out repeat; 1 without the effect."""
+def test_only_a_clear_gain_counts_where_poses_do_not_repeat(gains, doubt, kept):
+    """Gains in log density of each left-out repeat."""
     counts = np.full(5, 40.0)
-    before = CrossValidation(counts * 1.0, counts, True)
-    added = SimpleNamespace(candidate=SimpleNamespace(nuisance=False))
-    tried = Confirmed(added, None, CrossValidation(counts * errors, counts, True), 100.0, 90.0)
-    assert improving([tried], before, doubt) == ([tried] if kept else [])
+    before = CrossValidation(counts, counts, True, densities=np.zeros(5))
+    added = SimpleNamespace(candidate=SimpleNamespace(name="effect"))
+    after = CrossValidation(counts, counts, True, densities=np.array(gains))
+    tried = Confirmed(added, SimpleNamespace(log_evidence=100.0), after, 100.0)
+    chosen, _ = choose([tried], SimpleNamespace(log_evidence=0.0), before, doubt)
+    assert chosen == ([tried] if kept else [])

@@ -258,7 +258,7 @@ def test_the_candidates_are_printed_in_their_order(outcome):
     printed = StringIO()
     Console(file=printed, width=120).print(candidate_table(diagnosed))
     text = " ".join(printed.getvalue().split())
-    assert "tried: first those that a refit confirms, by BIC, then other refits" in text
+    assert "tried: first those that were refitted, by log likelihood" in text
     assert "under the noise left once it is in the model" in text
     rows = [" ".join(line.split()) for line in printed.getvalue().splitlines()]
     assert "lumped_mass 12.3 1e-09 0.2 mm added to the model" in rows
