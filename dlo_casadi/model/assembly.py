@@ -17,7 +17,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
+from dlo_casadi.model.clips import ClipLoad, Clipped, Unheld, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
@@ -59,7 +59,7 @@ class Assembly:
         # Numbers that tell the rest strains inside a segment.
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
-        self._functions: dict[str, Mapped] = {}
+        self._functions: dict[tuple[str, int, bool], Mapped] = {}
         self.depth, self.everywhere, self._outwards = DEPTH, False, outwards(model)
 
     def softened(self, depth: float) -> Assembly:
@@ -92,10 +92,12 @@ class Assembly:
 
     # ---- calls ---------------------------------------------------------------------------------
 
-    def _mapped(self, name: str, count: int) -> Mapped:
-        if name not in self._functions:
-            self._functions[name] = Mapped(getattr(functions_of(self.model), name), count)
-        return self._functions[name]
+    def _mapped(self, name: str, count: int, unheld: bool = False) -> Mapped:
+        key = name, count, unheld
+        if key not in self._functions:
+            function = getattr(functions_of(self.model, unheld), name)
+            self._functions[key] = Mapped(function, count)
+        return self._functions[key]
 
     def _call_segments(
         self, name: str, shapes: Shapes, given: Inputs, touching: Touching | None = None
@@ -110,8 +112,14 @@ class Assembly:
         count, clipped = self._segments, self.clipped(shapes, given)
         own = clipped.rest(self.chain.rest_inside(given.rest[..., None]))[..., 0]
         p, deviation = (_repeated(one, count) for one in (given.p, shapes.deviation))
-        both = clipped.carried(self._both(shapes.x))
-        return self._mapped(name, count)(both, lam, p, own, clipped.segments(), deviation)
+        both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
+        if not self.model.clips:
+            return self._mapped(name, count)(both, lam, p, own, table, deviation)
+        pulls = [self.model.end_pull, *self.model.pulls[self.model.n_springs :]]
+        width = None if self.model.clamped_between else self.chain.h
+        unheld = Unheld.of(table, self.model.clips, pulls, width)
+        arguments = both, lam, p, own, table, deviation
+        return unheld.evaluated(name, self._mapped, arguments, 2 * self.b)
 
     def clipped(self, shapes: Shapes, given: Inputs) -> Clipped:
         """Where the clips are on the cable."""
@@ -332,18 +340,14 @@ class Assembly:
 
     def reactions(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `reaction_rows`."""
-        found, touching = (
-            self._call_ends("reactions", shapes, given)[0][..., 0],
-            self.touching(shapes, given),
-        )
+        found = self._call_ends("reactions", shapes, given)[0][..., 0]
+        touching = self.touching(shapes, given)
         return touching.held(found) if touching else found
 
     def readings(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """`reactions` as measured by sensors."""
-        found, touching = (
-            self._call_ends("readings", shapes, given)[0][..., 0],
-            self.touching(shapes, given),
-        )
+        found = self._call_ends("readings", shapes, given)[0][..., 0]
+        touching = self.touching(shapes, given)
         return touching.held(found) if touching else found
 
     def contacts(self, shapes: Shapes, given: Inputs) -> list[tuple[Contact, ...]]:

@@ -7,7 +7,7 @@ cable. A clamped clip bends the cable by a moment: the nearest node is moved to 
 frame, so that no element has a jump of curvature inside.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,6 +22,13 @@ from dlo_casadi.rod.node import Heading, Node, quaternion_product
 # A swivel is a clamp in space in which the cable may roll about its axis.
 ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
 CLAMPS = ("clamped", "swivel")
+# Axes along which outputs of functions of segments are derivatives by nodes and border.
+_BORDER_AXES = {
+    "segment": ((), (2,), (2, 3)),
+    "segment_slope": ((2,),),
+    "segment_sensitivity": ((2,),),
+    "segment_curve_slopes": ((), (3,), ()),
+}
 
 
 @dataclass(frozen=True)
@@ -261,6 +268,85 @@ class Clipped:
             slope = 6 * u * v * chord / width + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1
             out[rows, clamp.index] = np.concatenate([place, slope], axis=1)
         return out
+
+
+@dataclass(frozen=True)
+class Unheld:
+    """Segments with no clip inside, on which all forces beyond them act as one at their end.
+
+    Functions of a segment take several times as long with clips inside as without.
+
+    Parameters
+    ----------
+    beyond : (m, n_segments, k)
+        1 where a segment lies before a clip, else 0; of the segments inside of which it is any.
+    inside : (m, j)
+        Segments in which the j clips are that hold no node.
+    rows : (1 + k, dimension)
+        Rows of the border of the forces on the end's holder, -1 of a free end, and on the clips.
+    """
+
+    beyond: FloatArray
+    inside: IntArray
+    rows: IntArray
+
+    @classmethod
+    def of(
+        cls, table: FloatArray, kinds: Sequence[str], rows: list[list[int]], width: float | None
+    ) -> "Unheld":
+        """From the rows of `Clipped.segments`; `width` [m] of all segments, if it is one."""
+        count = len(kinds)
+        share = (table[..., -count:] - table[..., :1]) / (width or table[..., 1:2])
+        nodes = [k for k, kind in enumerate(kinds) if kind not in CLAMPS]
+        dimension = len(rows[-1])
+        ends = rows if rows[0] else [[-1] * dimension, *rows[1:]]
+        # One segment, also of a clip at a node: the derivatives by its arc length are one-sided.
+        inside = np.maximum((share >= 0).sum(axis=1)[:, nodes] - 1, 0)
+        return cls((share > 0.5).astype(float), inside, np.array(ends))
+
+    def evaluated(
+        self,
+        name: str,
+        mapped: Callable[[str, int, bool], Callable[..., list[FloatArray]]],
+        arguments: Sequence[FloatArray],
+        first: int,
+    ) -> list[FloatArray]:
+        """Outputs (m, n_segments, rows, columns) of a function of segments.
+
+        `mapped` (name, number of segments, unheld) -> the function; the second of its arguments is
+        the border, whose rows begin at `first` where outputs have them.
+        """
+        both, lam, *others = arguments
+        found = mapped(name, lam.shape[1], True)(both, self.summed(lam), *others)
+        for out, axes in zip(found, _BORDER_AXES.get(name, ((),) * len(found)), strict=True):
+            for axis in axes:
+                self._spread(out, axis, first)
+        if self.inside.size:
+            here = np.arange(len(lam))[:, None], self.inside
+            held = mapped(name, self.inside.shape[1], False)(*(one[here] for one in arguments))
+            for out, one in zip(found, held, strict=True):
+                out[here] = one
+        return found
+
+    def summed(self, lam: FloatArray) -> FloatArray:
+        """Border (m, n_segments, n_lam) with the sum of the forces beyond as the first clip's."""
+        own, (end, *clips) = lam.copy(), self.rows
+        total = np.zeros(lam.shape[:2] + end.shape) if end[0] < 0 else lam[..., end]
+        for k, rows in enumerate(clips):
+            total = total + self.beyond[..., [k]] * lam[..., rows]
+        own[..., clips[0]] = total
+        return own
+
+    def _spread(self, out: FloatArray, axis: int, first: int) -> None:
+        """Derivatives by the sum, from row `first` on of an axis, to those by all forces."""
+        rows = np.moveaxis(out, axis, 0)
+        end, *clips = first + self.rows
+        total = rows[clips[0]].copy()
+        shape = (*self.beyond.shape[:2], *(1,) * (out.ndim - 3))
+        if self.rows[0, 0] >= 0:
+            rows[end] = total
+        for k, own in enumerate(clips):
+            rows[own] = total * self.beyond[..., k].reshape(shape)
 
 
 def _within(mean: Any, a: Any, c: Any, x: Any, w: Any) -> tuple[Any, Any, Any]:

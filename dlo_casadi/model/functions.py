@@ -24,10 +24,12 @@ class Functions:
     Parameters
     ----------
     model : CableModel
+    unheld : bool
+        See `Lagrangian`.
     """
 
-    def __init__(self, model: CableModel) -> None:
-        self.model, self.terms = model, lagrangian_of(model)
+    def __init__(self, model: CableModel, unheld: bool = False) -> None:
+        self.model, self.terms = model, lagrangian_of(model, unheld)
         self.node, self.kind = model.node, model.chain.kind
         x, lam, p, deviation = (getattr(self.terms, k) for k in ("x", "lam", "p", "deviation"))
         rest, place = self.terms.rest_strains, self.terms.place
@@ -125,7 +127,7 @@ class Functions:
     @cached_property
     def _framed(self) -> SegmentInFrame:
         """The segment in space, at this model's own symbols."""
-        free, lam = not self.model.end_pull, self.terms.lam
+        free, lam = not self.terms.end_pull, self.terms.lam
         multipliers = [ca.SX.zeros(3)] * free + [lam[rows] for rows in self._force_rows]
         _, _, p, rest, place, deviation = self._segment_arguments
         numbers = SegmentNumbers(p, rest, place, deviation, ca.SX(self.terms.shares(p, place)))
@@ -134,7 +136,7 @@ class Functions:
     @property
     def _force_rows(self) -> list[list[int]]:
         """Rows, in the border, of the forces on the end's holder, on springs and on clips."""
-        return [rows for rows in (self.model.end_pull, *self.model.pulls) if rows]
+        return [rows for rows in (self.terms.end_pull, *self.terms.pulls) if rows]
 
     @cached_property
     def _about_nodes(self) -> SegmentDerivatives:
@@ -146,7 +148,7 @@ class Functions:
     def _of_forces(self) -> ca.DM:
         """Matrix from both nodes and these forces to both nodes and the border."""
         every = np.eye(6 + self.model.n_lam)
-        none = [np.zeros((len(every), 3))] * (not self.model.end_pull)
+        none = [np.zeros((len(every), 3))] * (not self.terms.end_pull)
         forces = [every[:, 6 + np.array(rows)] for rows in self._force_rows]
         return ca.sparsify(ca.DM(np.hstack([every[:, :6], *none, *forces])))
 
@@ -403,6 +405,6 @@ class Functions:
 
 
 @lru_cache(maxsize=MODELS)
-def functions_of(model: CableModel) -> Functions:
+def functions_of(model: CableModel, unheld: bool = False) -> Functions:
     """The functions of a model, made once."""
-    return Functions(model)
+    return Functions(model, unheld)

@@ -64,6 +64,8 @@ class Lagrangian:
     Parameters
     ----------
     model : CableModel
+    unheld : bool
+        Of a segment with no clip inside: its end is pulled by the first clip's force; `Unheld`.
 
     Attributes
     ----------
@@ -85,8 +87,10 @@ class Lagrangian:
         Internal unknowns of an element, which are eliminated.
     """
 
-    def __init__(self, model: CableModel) -> None:
+    def __init__(self, model: CableModel, unheld: bool = False) -> None:
         self.model, self.node, self.kind = model, model.node, model.chain.kind
+        n, pulls = model.n_springs, model.pulls
+        self.end_pull, self.pulls = (pulls[n], pulls[:n]) if unheld else (model.end_pull, pulls)
         self.p = ca.SX.sym("p", len(model.parameters))
         self.pose = ca.SX.sym("pose", model.n_pose)
         self.deviation = ca.SX.sym("deviation", len(model.deviation_names))
@@ -173,10 +177,8 @@ class Lagrangian:
     @cached_property
     def stretch(self) -> ca.SX:
         """True length without load over the declared one."""
-        factor = ca.SX(1)
-        for effect, local in self.effects_of(Kinematics):
-            factor = factor * effect.stretch(self.model.cable, local)
-        return factor
+        cable, effects = self.model.cable, self.effects_of(Kinematics)
+        return prod((effect.stretch(cable, local) for effect, local in effects), start=ca.SX(1))
 
     @cached_property
     def axial_compliance(self) -> ca.SX:
@@ -262,9 +264,8 @@ class Lagrangian:
 
     def work_along(self, segment: Segment, forces: list[ca.SX]) -> ca.SX:
         """Work of `forces_on` a segment along it [J]."""
-        nodes, weights = self.kind.rule
+        (nodes, weights), work = self.kind.rule, ca.SX(0)
         shares = ca.vertsplit(self.share_symbols)
-        work = ca.SX(0)
         for force, u, weight in zip(forces, nodes, weights, strict=False):
             work += weight * segment.length * ca.dot(force, self.kind.tangent(segment, u))
         for force, share in zip(forces[len(nodes) :], shares, strict=False):
@@ -279,15 +280,15 @@ class Lagrangian:
     @cached_property
     def share_symbols(self) -> ca.SX:
         """Shares (0 to 1) of a segment that lie before each point force, spring, and clip."""
-        return ca.SX.sym("share", len(self.dead_forces) + len(self.model.pulls))
+        return ca.SX.sym("share", len(self.dead_forces) + len(self.pulls))
 
     @cached_property
     def shares(self) -> ca.Function:
         """(p, place) -> the shares of a segment (n_forces + n_springs + n_clips,)."""
         start = self.place[0]
-        positions = [local.position for local in self.dead_forces]
-        positions += [local.position for local in self.springs]
-        positions += ca.vertsplit(self.place[LAYOUT_SIZE:]) if self.model.clips else []
+        positions = [local.position for local in (*self.dead_forces, *self.springs)]
+        if len(self.pulls) > self.model.n_springs:
+            positions += ca.vertsplit(self.place[LAYOUT_SIZE:])
         found = [ca.fmin(ca.fmax((s - start) / self.length, 0), 1) for s in positions]
         return ca.Function("shares", [self.p, self.place], [ca.vertcat(ca.SX.zeros(0), *found)])
 
@@ -303,9 +304,9 @@ class Lagrangian:
     def work_of_multipliers(self, segment: Segment) -> ca.SX:
         """Work of the multipliers of places, of the end, springs and clips, along a segment [J]."""
         work = ca.SX(0)
-        if self.model.end_pull:
-            work = ca.dot(self.lam[self.model.end_pull], self.kind.advance(segment))
-        for k, rows in enumerate(self.model.pulls):
+        if self.end_pull:
+            work = ca.dot(self.lam[self.end_pull], self.kind.advance(segment))
+        for k, rows in enumerate(self.pulls):
             share = self.share_symbols[len(self.dead_forces) + k]
             work += ca.dot(self.lam[rows], self.kind.advance(segment, share))
         return work
@@ -358,9 +359,9 @@ class Lagrangian:
         numbers : SegmentNumbers
         """
         spread, dead = len(self.kind.rule[0]), len(self.dead_forces)
-        weights = np.zeros((spread + dead + len(self.model.pulls), multipliers.shape[1]))
+        weights = np.zeros((spread + dead + len(self.pulls), multipliers.shape[1]))
         weights[:spread, 0] = -1.0
-        weights[spread + dead :, 1:] = -np.eye(len(self.model.pulls))
+        weights[spread + dead :, 1:] = -np.eye(len(self.pulls))
         loads = self.segment_forces(numbers.p, numbers.place, numbers.deviation)
 
         def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
@@ -374,7 +375,7 @@ class Lagrangian:
     def segment_forces(self) -> ca.Function:
         """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `segment_in_frame`."""
         forces = self.forces_on(self.segment(self.stretch, self.inner, ca.SX(0)))
-        forces += [ca.SX.zeros(self.node.dimension)] * len(self.model.pulls)
+        forces += [ca.SX.zeros(self.node.dimension)] * len(self.pulls)
         arguments = [self.p, self.place, self.deviation]
         return ca.Function("segment_forces", arguments, [ca.horzcat(*forces)])
 
@@ -389,7 +390,7 @@ class Lagrangian:
         kind, h, inner = self.kind, self.length, self.inner
         ratio, local = ca.SX.sym("ratio"), ca.SX.sym("local", self.local.numel())
         segment = self.segment(ratio, inner, inner**2, local)
-        count = len(self.forces_on(segment)) + len(self.model.pulls)
+        count = len(self.forces_on(segment)) + len(self.pulls)
         forces = ca.SX.sym("force", self.node.dimension, count)
         energy = self.elastic_energy(segment) - self.work_along(segment, ca.horzsplit(forces))
         tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
@@ -444,6 +445,6 @@ class Lagrangian:
 
 
 @lru_cache(maxsize=MODELS)
-def lagrangian_of(model: CableModel) -> Lagrangian:
+def lagrangian_of(model: CableModel, unheld: bool = False) -> Lagrangian:
     """The expressions of a model, made once."""
-    return Lagrangian(model)
+    return Lagrangian(model, unheld)
