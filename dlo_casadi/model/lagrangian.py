@@ -286,7 +286,7 @@ class Lagrangian:
     def shares(self) -> ca.Function:
         """(p, place) -> the shares of a segment (n_forces + n_springs + n_clips,)."""
         start = self.place[0]
-        positions = [local.position for local in (*self.dead_forces, *self.springs)]
+        positions = [x.position for x in self.dead_forces] + [x.position for x in self.springs]
         if len(self.pulls) > self.model.n_springs:
             positions += ca.vertsplit(self.place[LAYOUT_SIZE:])
         found = [ca.fmin(ca.fmax((s - start) / self.length, 0), 1) for s in positions]
