@@ -42,7 +42,7 @@ from dlo_casadi.show.text import html_table, millimetres
 _POINTS = 101
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FittedCable(KnownCable):
     """A fitted cable: its model with the fitted values, and what is known of their errors.
 
