@@ -312,17 +312,20 @@ class Search:
         return fine_enough(near, near.model.n, finest=self.finest)[0] if self.finest else near
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
-        """Backward step: without the effects that a later one has made superfluous.
+        """Backward step: without the effects that others have made superfluous.
 
-        An effect has to be as significant as when it was added, and worth its parameters.
+        An effect has to be worth its parameters, and as significant as when it was added. The last
+        one is significant, but may have led out of a local minimum in which there is no need of it.
         """
-        for effect in added[:-1]:
+        for effect in added:
             smaller = refits.refit_without(fit, effect.candidate)
             if smaller is None:
                 continue
-            screened = self._screened(smaller)
-            p_value = p_values_of(screened).get(effect.candidate.name, 0.0)
-            if smaller.log_evidence > fit.log_evidence or p_value > self.significance:
+            needless = smaller.log_evidence > fit.log_evidence
+            if not needless and effect is not added[-1]:
+                p_values = p_values_of(self._screened(smaller))
+                needless = p_values.get(effect.candidate.name, 0.0) > self.significance
+            if needless:
                 fit = settle(smaller)
                 added = [item for item in added if item is not effect]
         return fit, added
