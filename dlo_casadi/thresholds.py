@@ -165,7 +165,7 @@ FIRST_ORDER = 0.02
 # Relative change of the least bend radius on half the element size below which the mesh resolves
 # it: of second order, what is left is a third of it.
 RESOLVED = 0.01
-# Distance between the lowest places of two shapes at which they may rest on the same table: so many
-# standard deviations of a point, within these shares of the cable's length. It decides what is
-# tried, not what is found.
+# Largest distance between the lowest places of two shapes that may rest on the same table: in
+# standard deviations of a point, and its bounds in lengths of the cable. It decides whether a plane
+# is tried, not whether it is found.
 RESTING_NOISE, RESTING_APART = 3.0, (3e-3, 1e-2)

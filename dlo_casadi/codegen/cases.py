@@ -203,7 +203,7 @@ class _PlaneCase(Case):
     name, try_steps = "plane", 13
     # Doubles of a workspace per node, as in the template: arrays, border, two-point segments.
     doubles = 12 + 2 + 2 * 15
-    # Of a segment that is held inside.
+    # Doubles of a workspace for each segment with a clip or tether inside.
     held_doubles = 15 + 2 + 2 + 2 + 4 + 3 + 8
 
     @property
@@ -258,7 +258,7 @@ class _SpaceCase(Case):
     name, try_steps = "space", 12
     # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
     doubles = 4 + 4 + 4 + 3 + 6 + 9 + 58
-    # Of a segment that is held inside.
+    # Doubles of a workspace for each segment with a clip or tether inside.
     held_doubles = 58 + 3 + 9 + 9 + 9 + 6 + 14
     # Fewest arcs of the coarse mesh, and number of fine elements in each. Of 3,000 random clamped
     # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
