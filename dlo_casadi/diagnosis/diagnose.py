@@ -255,6 +255,9 @@ class Search:
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
             if p_value > self.significance:
                 break
+            if current.noise.source == "misfit" and self.finest:
+                # Beside a misfit the mesh was left coarse, and what it lacks looks like an effect.
+                closed, _ = fine_enough(closed, closed.model.n, finest=self.finest)
             current, before = closed, validation
             validation = cross_validate(current)
             added.append(AddedEffect(winner.candidate, p_value, before, validation, tuple(rivals)))
