@@ -36,7 +36,7 @@ from dlo_casadi.rod.obstacles import Surface, surfaces_near
 
 # Depth [lengths] under a force as large as the cable's weight: it keeps apart contacts that depend
 # on each other.
-DEPTH = 1e-8
+DEPTH = 1e-10
 # Gap [lengths] that counts as much as such a force in deciding whether a contact is active: larger
 # than what the force bends segments.
 BALANCED = 1.0
