@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import Bounds, minimize
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.errors import EstimationError
 
 # Slope at which a search ends, by parameters in units of their standard errors.
 _FLAT = 0.01
@@ -44,6 +45,11 @@ def most_likely(
 
     By L-BFGS-B. Newton steps with the average information take more evaluations: far from the
     optimum it is a tenth of the second derivative.
+
+    Raises
+    ------
+    EstimationError
+        If the sums are lost in rounding where the search ends.
     """
 
     def sloped(q: FloatArray) -> tuple[float, FloatArray]:
@@ -62,4 +68,11 @@ def most_likely(
         options={"gtol": _FLAT, "ftol": 1e-7},
     )
     q = np.clip(found.x, low, high)
-    return q, deviance(q)
+    try:
+        return q, deviance(q)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            "the sizes of the errors cannot be estimated: their likelihood is lost in rounding "
+            f"({error}).\n"
+            "  Try: the noise as measurement.std, or poses that differ more."
+        ) from error

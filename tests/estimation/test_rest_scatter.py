@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.repeats import RestLikelihood, ScatterSample, estimate_pose_scatter
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, modes_of
 from dlo_casadi.sensing.restricted import Deviance
@@ -127,3 +128,11 @@ def test_modes_have_the_std_along_the_cable():
     for smoothness in (0.5, 0.12):
         variance = (waves**2 @ PoseScatter(0.3, smoothness).sizes(MODES) ** 2).mean()
         assert variance == pytest.approx(0.09, rel=1e-4)  # means over cells instead of values
+
+
+def test_a_likelihood_that_is_lost_in_rounding_is_told():
+    """Sensitivities of 1e20, as of a fit that has run away, leave no covariance to factorise."""
+    samples, distances = session(0.1)
+    lost = [ScatterSample(x.e, 1e20 * x.random, x.own, x.shared) for x in samples]
+    with pytest.raises(EstimationError, match="lost in rounding"):
+        RestLikelihood(lost, distances).best(0.5, None)
