@@ -49,7 +49,7 @@ def most_likely(
     Raises
     ------
     EstimationError
-        If the sums are lost in rounding where the search ends.
+        If rounding leaves no covariance that can be factorised where the search ends.
     """
 
     def sloped(q: FloatArray) -> tuple[float, FloatArray]:
@@ -72,7 +72,7 @@ def most_likely(
         return q, deviance(q)
     except np.linalg.LinAlgError as error:
         raise EstimationError(
-            "the sizes of the errors cannot be estimated: their likelihood is lost in rounding "
-            f"({error}).\n"
-            "  Try: the noise as measurement.std, or poses that differ more."
+            "noise and scatter from pose to pose cannot be estimated: rounding leaves no covariance "
+            "that can be factorised, as of a fit that has run away.\n"
+            "  Try: the units of mass and length, the noise as measurement.std."
         ) from error

@@ -130,9 +130,9 @@ def test_modes_have_the_std_along_the_cable():
         assert variance == pytest.approx(0.09, rel=1e-4)  # means over cells instead of values
 
 
-def test_a_likelihood_that_is_lost_in_rounding_is_told():
+def test_a_covariance_that_cannot_be_factorised_is_told():
     """Sensitivities of 1e20, as of a fit that has run away, leave no covariance to factorise."""
     samples, distances = session(0.1)
     lost = [ScatterSample(x.e, 1e20 * x.random, x.own, x.shared) for x in samples]
-    with pytest.raises(EstimationError, match="lost in rounding"):
+    with pytest.raises(EstimationError, match="rounding leaves no covariance"):
         RestLikelihood(lost, distances).best(0.5, None)
