@@ -255,9 +255,9 @@ class Search:
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
             if p_value > self.significance:
                 break
-            if current.noise.source == "misfit" and self.finest:
-                # Beside a misfit the mesh was left coarse, and what it lacks looks like an effect.
-                closed, _ = fine_enough(closed, closed.model.n, finest=self.finest)
+            if current.noise.source == "misfit":
+                # The mesh of a misfit is coarse, and its error would look like the next effect.
+                closed = self._fine(closed)
             current, before = closed, validation
             validation = cross_validate(current)
             added.append(AddedEffect(winner.candidate, p_value, before, validation, tuple(rivals)))
@@ -381,10 +381,14 @@ class Search:
             fit = settle(fit)
         found = self._judged(fit, added, ranked)
         # What effects leave may be the mesh's, which was fine enough for what they explain.
-        if found.unexplained and added and self.finest:
-            finer, _ = fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)
+        if found.unexplained and added:
+            finer = self._fine(fit)
             found = found if finer is fit else self._judged(finer, added, ranked)
         return found
+
+    def _fine(self, fit: Fit) -> Fit:
+        """A fit with effects on a mesh that is fine enough, where the mesh may be refined."""
+        return fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)[0] if self.finest else fit
 
     def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
