@@ -1,8 +1,8 @@
 """Contact against others: python scripts/check_contact.py [--count 100] [--where plane] ...
 
 Closed forms: a heavy beam laid on a table, a cable over a cylinder, a rod between walls. Random
-cables with one to three obstacles against IPOPT with inequalities on the same energy; what is
-missed is listed by its number, which with --only is tried alone. With a folder of sessions
+cables with one to three obstacles against IPOPT with inequalities on the same energy: cables that
+differ are listed by their numbers, and --only tries one of them alone. With a folder of sessions
 (--fixtures), what their fits say beside the truth next to it.
 """
 
@@ -29,12 +29,12 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.obstacles import Capsule, Obstacle, Plane
 
 MESHES = (20, 40, 80)
-# Shortening of a rod, of that at first contact, from which on it touches along a stretch.
+# Shortening of the rod from which on it touches along a stretch, relative to that at first contact.
 LINE = 12 / np.pi**2
 # Elements of random cables in the plane, and in space; random starts of IPOPT.
 ELEMENTS, STARTS = {False: 30, True: 24}, 4
-# Shares of m g L + EI/L: by which energies differ that are not the same, and the least force, per
-# length, of a contact that is compared.
+# Least difference of energies that are not the same, relative to m g L + EI/L, and least force of a
+# contact that counts, relative to the same per length.
 SAME_ENERGY, LIGHTEST = 1e-8, 1e-6
 
 
