@@ -72,7 +72,7 @@ def most_likely(
         return q, deviance(q)
     except np.linalg.LinAlgError as error:
         raise EstimationError(
-            "noise and scatter from pose to pose cannot be estimated: rounding leaves no covariance "
-            "that can be factorised, as of a fit that has run away.\n"
+            "noise and scatter from pose to pose cannot be estimated: rounding leaves no "
+            "covariance that can be factorised, as of a fit that has run away.\n"
             "  Try: the units of mass and length, the noise as measurement.std."
         ) from error

@@ -9,6 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 
+from benchmarks.ipopt import Ipopt
 from benchmarks.random_cables import (
     AnyCable,
     check,
@@ -19,7 +20,6 @@ from benchmarks.random_cables import (
     random_problem,
     space_problem,
 )
-from benchmarks.space_ipopt import Ipopt
 
 from dlo_casadi.codegen import STATUSES
 from dlo_casadi.equilibrium.solve import solve_equilibrium
