@@ -27,11 +27,11 @@ from benchmarks import (
     memory,
     peers,
     random_cables,
-    space_ipopt,
     space_peers,
     space_speed,
     speed,
 )
+from benchmarks.ipopt import Ipopt
 
 from dlo_casadi.codegen import STATUSES
 from dlo_casadi.io.files import make_folder, write_file
@@ -167,7 +167,7 @@ def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
             "higher": 0,
             "ipopt_failed": 0,
         }
-        ipopt = space_ipopt.Ipopt(random_cables.space_problem(rng, 1, 12, element).model)
+        ipopt = Ipopt(random_cables.space_problem(rng, 1, 12, element).model)
         worst, total = 0.0, 0.0
         for cable in range(cables):
             problem = random_cables.space_problem(rng, poses, 12, element)

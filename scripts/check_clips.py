@@ -13,7 +13,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from benchmarks.space_ipopt import Ipopt
+from benchmarks.ipopt import Ipopt
 from scipy.integrate import solve_bvp
 from scipy.spatial.transform import Rotation
 

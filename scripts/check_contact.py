@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from benchmarks.space_ipopt import Ipopt
+from benchmarks.ipopt import Ipopt
 from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo

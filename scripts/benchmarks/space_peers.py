@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.ipopt import Ipopt
 from benchmarks.peers import COURANT, missing_elastica, missing_mujoco, relax, relax_rod
-from benchmarks.space_ipopt import Ipopt
 from benchmarks.space_speed import CABLE, FINE, Timed, problem, reference
 from dlo_casadi.equilibrium.guesses import guessed_frames
 from dlo_casadi.equilibrium.pose import HeldPose
