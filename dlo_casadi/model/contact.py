@@ -35,7 +35,8 @@ from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.obstacles import Surface, surfaces_near
 
 # Depth [lengths] under a force as large as the cable's weight: it keeps apart contacts that depend
-# on each other.
+# on each other. Of 95 random cables in the plane that touch where IPOPT's do, 4 differ in energy by
+# more than 1e-8 of m g L + EI/L; with a depth of 1e-8 it is 24 (`scripts/check_contact.py`).
 DEPTH = 1e-10
 # Gap [lengths] that counts as much as such a force in deciding whether a contact is active: larger
 # than what the force bends segments.
