@@ -197,13 +197,15 @@ def check_fixtures(folder: Path) -> None:
         began, result = time.process_time(), dlo.fit(session)
         print(result)
         print({k: v for k, v in truth.items() if k != "poses"})
-        shapes = list(result.stages[-1].shapes.values())
+        shapes = result.stages[-1].shapes
+        true = {f"pose_{k:02d}": pose["clip_at"] for k, pose in enumerate(truth["poses"], 1)}
         apart = [
             abs(clip["at"] - s)
-            for shape, pose in zip(shapes, truth["poses"], strict=False)
-            for clip, s in zip(shape.clips, pose["clip_at"], strict=True)
+            for name, shape in shapes.items()
+            for clip, s in zip(shape.clips, true[name], strict=True)
         ]
-        print(f"arc lengths off by at most {1e3 * max(apart):.2f} mm")
+        left = sorted(true.keys() - shapes.keys())
+        print(f"arc lengths off by at most {1e3 * max(apart):.2f} mm; without a shape: {left}")
         print(f"{time.process_time() - began:.0f} s", flush=True)
 
 

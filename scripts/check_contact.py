@@ -234,7 +234,7 @@ def check_fixtures(folder: Path) -> None:
     """Fits of sessions beside their truth."""
     for name in ("table", "ramp", "table_hidden"):
         began = time.process_time()
-        result = dlo.fit(folder / name / "session.yaml", output=None)
+        result = dlo.fit(folder / name / "session.yaml")
         truth = read_yaml(folder.parent / f"{folder.name}_truth" / name / "truth.yaml")
         print(f"{name}: {time.process_time() - began:.0f} s, truth {truth}\n{result.summary()}")
 
