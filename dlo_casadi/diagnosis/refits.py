@@ -151,15 +151,16 @@ def scored(
 def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screened:
     """Test of a candidate that has no derivative where it vanishes: what a refit gains.
 
-    It starts from the base, and from the measured shapes, where it also ends: the base's noise may
-    hold what it lacks.
+    It starts from the base; and from the measured shapes, unless the base leaves no more than a
+    declared noise: else its noise may hold what it lacks.
     """
     start = dict(candidate.scans[0])
     fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
-    near, _ = from_data(base)
-    begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
-    fit = _fit_from_data(near, begun, 3)
-    fits.append(fit and fit.reweighed(base.noise, base.problem.priors))
+    if base.beyond_noise or not base.noise.known:
+        near, _ = from_data(base)
+        begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
+        fit = _fit_from_data(near, begun, 3)
+        fits.append(fit and fit.reweighed(base.noise, base.problem.priors))
     best = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     if best is None:
         return Screened(candidate, 0.0, 1.0, start)
