@@ -350,17 +350,20 @@ class Search:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
         Beside a misfit scores tell nothing, and a refit leads where the declared model has gone.
-        Other starts are tried where none explains the shapes. Last: who stays far from them.
+        Where the nearest does not explain the shapes other starts of it are tried, then of the
+        next. Last: who stays far from them.
         """
         near, softness = refits.from_data(current)
         listed = candidates_of(near, self.center, self.exclude)
         screened = refits.screened_from_data(near, softness, listed)
         likely = [x for x in screened if x.score >= NEAR_LEADER * screened[0].score][:REFITTED]
         kept, far = refits.nearest(near, likely, self.executor)
-        for starts in (1, 3):
-            refit = partial(confirm_from_data, current, near, starts=starts)
-            tried = list(map_in_order(self.executor, refit, kept))
-            if any(item and item.fit.noise.source != "misfit" for item in tried):
+        refit = partial(confirm_from_data, current, near)
+        tried = list(map_in_order(self.executor, partial(refit, starts=1), kept))
+        for k in sorted(range(len(kept)), key=lambda k: kept[k].left):
+            if not refits.explains(tried[k]):
+                tried[k] = refit(kept[k])
+            if refits.explains(tried[k]):
                 break
         return screened, tried, far
 

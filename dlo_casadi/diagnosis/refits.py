@@ -22,6 +22,7 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
+from dlo_casadi.arrays import BoolArray
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.screening import (
@@ -171,7 +172,7 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
 
 def scored_from_data(near: Fit, softness: float, candidate: Candidate) -> Screened:
     """The same in a relaxed model, at the measured shapes."""
-    problem, begun = _begun(near, candidate, candidate.scans[0])
+    problem, begun = _begun(near, candidate.add_to(near.model), candidate.scans[0])
     values = Relaxation(problem, softness).solve(begun, steps=SHORT)
     before = Relaxation(near.problem, softness).objective(near.point)
     gain = max(before - Relaxation(problem, softness).objective(values), 0.0)
@@ -192,7 +193,22 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
     """
     values = start_from(force, screened.candidate)
     fit = _followed(force.fit, screened.candidate.add_to(base.model), values, STEPS_FROM_FORCES)
+    if fit is not None and base.noise.before is not None and not misfits(fit):
+        fit = _at_noise(fit, base.noise.before)
     return Confirmed.of(screened, base, fit)
+
+
+def explains(item: Confirmed | None) -> bool:
+    """Whether a refit comes to its points as near as their noise lets expect."""
+    if item is None or item.fit.noise.source == "misfit":
+        return False
+    return item.fit.chi2_per_dof < REACHED
+
+
+def _at_noise(fit: Fit, noise: NoiseModel) -> Fit:
+    """A fit that comes to its points, weighed by their noise instead of that of a misfit."""
+    priors = Priors.of(fit.problem.priors.tolerances, fit.model)
+    return refine(fit.reweighed(noise, priors), first=True)
 
 
 @dataclass(frozen=True)
@@ -216,14 +232,20 @@ class RelaxedStart:
     left: float
 
     @classmethod
-    def of(cls, near: Fit, screened: Screened, *, estimated: bool = False) -> RelaxedStart:
-        """From the relaxed shapes, the candidate not there yet or at its one-step estimate."""
-        first, scan = screened.start, screened.candidate.scans[0]
-        first = first if estimated else {k: v for k, v in first.items() if k in scan}
-        problem, begun = _begun(near, screened.candidate, first)
-        values = relaxed(problem, begun, COMPARED)
-        left = Relaxation(problem, COMPARED[-1]).objective(values)
-        return cls(screened, problem, begun, values, left)
+    def of(cls, near: Fit, screened: Screened) -> RelaxedStart:
+        """From the relaxed shapes, the candidate not there yet.
+
+        In parameters in which it is linear: an anchor is nowhere while its tether does not pull.
+        """
+        candidate = screened.candidate
+        scan = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
+        linear, begun = _begun(near, candidate.add_linear_to(near.model), scan)
+        values = relaxed(linear, begun, COMPARED[:1], _places(linear, candidate))
+        values = relaxed(linear, values, COMPARED[1:-1])
+        problem, values = _in_own_parameters(near, candidate, linear, values)
+        strict = Relaxation(problem, COMPARED[-1])
+        values = strict.solve(values)
+        return cls(screened, problem, begun, values, strict.objective(values))
 
 
 def nearest(
@@ -231,17 +253,12 @@ def nearest(
 ) -> tuple[list[RelaxedStart], list[str]]:
     """Starts of the candidates that leave little more than the one that leaves least.
 
-    Last: names of the others, which do not come near from their one-step estimates either: an
-    anchor is nowhere while its tether has no stiffness.
+    Last: names of the others.
     """
-    far, kept = list(likely), list[RelaxedStart]()
-    for estimated in (False, True):
-        begin = partial(RelaxedStart.of, near, estimated=estimated)
-        begun = [*kept, *map_in_order(executor, begin, far)]
-        most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
-        kept = [start for start in begun if start.left <= most]
-        far = [start.screened for start in begun if start.left > most]
-    return kept, [item.candidate.name for item in far]
+    begun = list(map_in_order(executor, partial(RelaxedStart.of, near), likely))
+    most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
+    kept = [start for start in begun if start.left <= most]
+    return kept, [start.screened.candidate.name for start in begun if start.left > most]
 
 
 def confirm_from_data(
@@ -257,8 +274,7 @@ def confirm_from_data(
         if fit is not None and misfits(fit):
             fit = descend(fit.reweighed(base.noise, base.problem.priors))
         if fit is not None and not misfits(fit):
-            known = start.problem
-            fit = refine(fit.reweighed(known.noise, known.priors), first=True)
+            fit = _at_noise(fit, start.problem.noise)
         return Confirmed.of(start.screened, base, fit)
     return None
 
@@ -270,12 +286,12 @@ def _fit_from_data(near: Fit, start: RelaxedStart, starts: int) -> Fit | None:
     parameters in which the candidate is linear; the relaxed shapes with its one-step estimate. A
     pose that turns into another equilibrium on the way of one rarely does so on the others'.
     """
-    screened, best = start.screened, None
+    screened, own, best = start.screened, start.problem.unknowns.model, None
     left = SOFTNESS[len(COMPARED) :]
     ways: tuple[Callable[[], Fit | None], ...] = (
         partial(fit_from, start.problem, start.begun, left, followed=start.values),
         partial(_anew, near, screened),
-        lambda: fit_from(*_begun(near, screened.candidate, screened.start), SOFTNESS),
+        lambda: fit_from(*_begun(near, own, screened.start), SOFTNESS),
     )
     for way in ways[:starts]:
         fit = way()
@@ -287,9 +303,8 @@ def _fit_from_data(near: Fit, start: RelaxedStart, starts: int) -> Fit | None:
     return best
 
 
-def _begun(near: Fit, candidate: Candidate, values: Mapping[str, float]) -> tuple[Problem, Values]:
-    """A candidate beside relaxed shapes, its parameters at values or nominal."""
-    model = candidate.add_to(near.model)
+def _begun(near: Fit, model: CableModel, values: Mapping[str, float]) -> tuple[Problem, Values]:
+    """A model with a candidate at relaxed shapes, its parameters at values or nominal."""
     problem = _from_data(near, model)
     theta = problem.unknowns.pack(near.values_in(model, values), near.coefficients)
     shapes = carried_shapes(problem, near, relaxed=True)
@@ -300,25 +315,41 @@ def _begun(near: Fit, candidate: Candidate, values: Mapping[str, float]) -> tupl
 def _anew(near: Fit, screened: Screened) -> Fit | None:
     """Fit with a candidate from the measured shapes and nominal parameters, at its best place."""
     candidate = screened.candidate
-    linear, own = candidate.add_linear_to(near.model), candidate.add_to(near.model)
+    linear = candidate.add_linear_to(near.model)
     problem = _from_data(near, linear)
     known = dict(zip(linear.names, linear.nominal.tolist(), strict=True))
     known |= {name: screened.start[name] for name in candidate.scans[0] if name in screened.start}
     begun = np.array([known[name] for name in linear.names])
     p = np.where(problem.unknowns.free, begun, problem.unknowns.fixed)
     theta = problem.unknowns.pack(p, np.zeros(linear.n_coefficients))
-    problem, found = begin(problem, problem.unknowns.off_bounds(theta))
+    theta, fixed = problem.unknowns.off_bounds(theta), _places(problem, candidate)
+    problem, found = begin(problem, theta, fixed)
     found = relaxed(problem, found, SOFTNESS[1:3])
-    if linear != own:
-        known = dict(zip(linear.names, problem.unknowns.p(found.theta).tolist(), strict=True))
-        prefix = f"{candidate.effect.label}."
-        part = {name: value for name, value in known.items() if name.startswith(prefix)}
-        known |= candidate.of_linear(own.cable, part)
-        rest = problem.unknowns.coefficients(found.theta)
-        problem = _from_data(near, own)
-        p = np.array([known[name] for name in own.names])
-        found = replace(found, theta=problem.unknowns.pack(p, rest))
-    return fit_from(problem, found, SOFTNESS[2:])
+    return fit_from(*_in_own_parameters(near, candidate, problem, found), SOFTNESS[2:])
+
+
+def _places(problem: Problem, candidate: Candidate) -> BoolArray:
+    """Which unknowns say where or which way a candidate acts.
+
+    They stay where its score is largest until it acts: before, a step of theirs leads anywhere.
+    """
+    return np.isin(problem.unknowns.names, list(candidate.scans[0]))
+
+
+def _in_own_parameters(
+    near: Fit, candidate: Candidate, linear: Problem, values: Values
+) -> tuple[Problem, Values]:
+    """Relaxed values of parameters in which a candidate is linear, in its own parameters."""
+    before, model = linear.unknowns.model, candidate.add_to(near.model)
+    if before == model:
+        return linear, values
+    known = dict(zip(before.names, linear.unknowns.p(values.theta).tolist(), strict=True))
+    prefix = f"{candidate.effect.label}."
+    part = {name: value for name, value in known.items() if name.startswith(prefix)}
+    known |= candidate.of_linear(model.cable, part)
+    problem, rest = _from_data(near, model), linear.unknowns.coefficients(values.theta)
+    p = np.array([known[name] for name in model.names])
+    return problem, replace(values, theta=problem.unknowns.pack(p, rest))
 
 
 def _followed(

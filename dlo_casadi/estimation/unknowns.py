@@ -9,8 +9,12 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.effects import Load
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.model.cable_model import STIFFNESS_RATIO_STD, STIFFNESSES, CableModel
+
+# Units of the sizes of loads; others are places and directions.
+LOAD_UNITS = ("N", "N/m", "kg")
 
 # A weak prior of the rest curvature: a turn per length, one standard deviation.
 REST_TURNS_STD = 1.0
@@ -84,6 +88,18 @@ class Unknowns:
     def _logs(self) -> BoolArray:
         """Which entries of theta are logarithms."""
         return np.array([q.log for q in self._parameters] + [False] * self.n_rest, dtype=bool)
+
+    @cached_property
+    def are_loads(self) -> BoolArray:
+        """Which entries (size,) of theta are the size of a load."""
+        loads = [effect for effect in self.model.effects if isinstance(effect, Load)]
+        names = {
+            f"{effect.label}.{q.name}"
+            for effect in loads
+            for q in effect.parameters(self.model.cable)
+            if q.unit in LOAD_UNITS and not q.log
+        }
+        return np.array([name in names for name in self.names], dtype=bool)
 
     @cached_property
     def scales(self) -> FloatArray:

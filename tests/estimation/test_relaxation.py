@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import CableData, Tether
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Load, SpringAt
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -75,6 +75,43 @@ def test_stiffness_roll_and_twists_are_found_from_any_stiffness(rolled, factor):
     assert p[MODEL.names.index(END_ROLL)] == pytest.approx(ROLL, abs=0.1)
     twist = MODEL.node.turning(measured_shapes(problem, ROLL)[0].x)
     np.testing.assert_allclose(MODEL.node.turning(found.shapes.x), twist, atol=0.5)
+
+
+@pytest.mark.parametrize("factor", [0.02, 50.0])
+def test_a_spring_and_a_stiffness_far_off_are_found_together(factor):
+    """The spring pulls with many times the weight; nothing is known but its place."""
+    spring = Tether()
+    pulled = CableModel(CABLE, 8, "quadratic", n_rest=0, effects=(spring,), **HELD)
+    true = {"tether.stiffness": 9.0, "tether.position": 0.4, "tether.anchor_x": 0.35}
+    true |= {"tether.anchor_y": -0.3, "tether.anchor_z": 0.15}
+    p = np.array(
+        [true.get(name, q.nominal) for name, q in zip(pulled.names, pulled.parameters, strict=True)]
+    )
+    rng, rest = np.random.default_rng(2), np.zeros(pulled.chain.n_rests)
+    s, measured = np.linspace(0.02, 0.98, 12) * CABLE.length, []
+    for _ in range(8):
+        place = (rng.uniform(0.6, 0.8) * CABLE.length, *rng.uniform(-0.15, 0.15, 2))
+        along = {f"{end}_orientation": (0.0, 0.0, 0.0, 1.0) for end in ("start", "end")}
+        pose = HeldPose((0.0, 0.0, 0.0), place, **along)
+        (shape,) = predict_poses(pulled, p, rest, [pose])
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 3))
+        measured.append(MeasuredPose.of_points(pose, points, s=s))
+    model = replace(pulled, effects=(spring.linear(),))
+    start = model.nominal.copy()
+    start[model.stiffness_indices] *= factor
+    start[model.names.index("tether.position")] = 0.4
+    unknowns = Unknowns(model, np.ones(len(start), dtype=bool), start)
+    problem = Problem(unknowns, tuple(measured), NoiseModel(NOISE), Priors.of(Tolerances(), model))
+    theta = unknowns.off_bounds(unknowns.pack(start, np.zeros(0)))
+    still = np.array([name == "tether.position" for name in unknowns.names])
+    weighed, found = begin(problem, theta, still)
+    found = dict(
+        zip(model.names, unknowns.p(relaxed(weighed, found, SOFTNESS[1:3]).theta), strict=True)
+    )
+
+    assert found["bending_stiffness"] == pytest.approx(CABLE.bending_stiffness, rel=0.1)
+    assert found["tether.stiffness"] == pytest.approx(9.0, rel=0.1)
+    assert found["tether.fx"] == pytest.approx(9.0 * 0.35, rel=0.1)
 
 
 def test_without_softness_left_the_shapes_are_equilibria(rolled):
