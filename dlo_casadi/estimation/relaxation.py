@@ -270,8 +270,12 @@ class Relaxation:
         nodes, border, own, q = self._counts
         free = np.ones(q - own, dtype=bool) if fixed is None else ~fixed
         kept = np.concatenate([np.ones(own, dtype=bool), free, [True]])
+        model = self.problem.unknowns.model
         damped = np.eye(border, q + 1) * max(damping, NO_INFORMATION)
         damped[nodes:] *= NO_INFORMATION
+        # A force of contact as its gap, in lengths: where neither holds nothing else bounds a step.
+        of_contact = damping * gap_per_force(model, AT_A_DISTANCE) / model.cable.length
+        damped[self._contacts, self._contacts] += of_contact * np.eye(border - nodes - model.n_lam)
         triangles, shared = [], []
         for rows in linearized.poses:
             stacked = np.concatenate([rows, damped])[:, kept]
