@@ -306,6 +306,13 @@ def _otherwise(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
     # Forces of few poses are nearly parallel: a turn or an arm that is fitted explains any error.
     if count < FITTED_READINGS:
         return
+    # It halves what an effect does to the readings, too: one that is there leaves nothing odd.
+    yield from (way for way in _fitted(one) if one.misfit(way.meant) < MISREAD)
+
+
+def _fitted(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
+    """Ways to read what was measured that are fitted to what the shapes need."""
+    a, size = one.measured, one.measured.shape[1]
     if one.forces is not None:
         yield from _about_elsewhere(one, one.forces)
     if size > 1:
