@@ -72,6 +72,17 @@ class CrossValidation:
         return float(np.sqrt(self.squares.sum() / self.counts.sum()))
 
     @property
+    def error_of_most(self) -> float:
+        """`error` of the folds that could be predicted [m]; infinite where most could not.
+
+        A pose at the edge of its stability has no equilibrium beside it, whatever the model.
+        """
+        known = np.isfinite(self.squares)
+        if 2 * known.sum() <= len(known):
+            return float("inf")
+        return float(np.sqrt(self.squares[known].sum() / self.counts[known].sum()))
+
+    @property
     def rmse(self) -> float:
         """Root mean square distance over all points [m]."""
         return self.error if self.of_points is None or not self.complete else self.of_points

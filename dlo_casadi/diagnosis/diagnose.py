@@ -68,7 +68,7 @@ class Diagnosis:
     ranked : tuple of Ranked
         All candidates of the first step: those refitted by `support`, then the others by score.
     unexplained : bool
-        Whether structure is left, or poses that were left out are not predicted.
+        Whether structure is left, or most poses that were left out are not predicted.
     pull : UnknownForce or None
         Where that is so: the load that assumes no cause; None where none fits.
     weight : HiddenWeight or None
@@ -398,7 +398,7 @@ class Search:
         limit = UNSEEN * max(fit.expected_error, validation.expected)
         # From one pose alone another one is not predicted to first order of the covariance.
         told = bool(added) or len(self.declared.problem.used) > 2
-        unpredicted = told and validation.error > limit
+        unpredicted = told and validation.error_of_most > limit
         unexplained = structure.p_noise < self.significance or unpredicted
         unexplained |= fit.noise.source == "misfit"
         return Found(fit, tuple(added), ranked, validation, structure, unexplained)
