@@ -182,7 +182,10 @@ def _fit_to_misfit(near: Fit) -> Fit:
     """
     doubted = near.noise.doubted(MISFIT_STD * near.model.cable.length)
     noise = replace(doubted, source="misfit", before=near.noise)
-    return descend(near.reweighed(noise, Priors.of(near.problem.priors.tolerances, near.model)))
+    priors = Priors.of(near.problem.priors.tolerances, near.model)
+    # Ends that give way in single poses would take up what is missing, and predict worse.
+    priors = replace(priors, scatter=SCATTER_FLOOR * priors.scatter)
+    return descend(near.reweighed(noise, priors))
 
 
 # ---- meshes ------------------------------------------------------------------------------------
