@@ -220,7 +220,7 @@ class _PlaneCase(Case):
             *(chain.places / model.cable.length),
             *resting_headings(chain, self.rest),
             *(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)),
-            *(self.holding if self.holds else ()),
+            *self.holding,
         ]
 
     @property
