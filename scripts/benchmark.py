@@ -146,8 +146,12 @@ def run_space() -> dict[str, Any]:
         "farthest_from_the_line": np.abs(times / line - 1).max(),
     }
     out["clips"] = {
-        " ".join(kinds): space_speed.clipped(*kinds)
-        for kinds in (("pinned",), ("pinned", "pinned"), ("clamped", "pinned"), ("eyelet",))
+        f"{' '.join(kinds)}, {where.__name__}": space_speed.clipped(kinds, where(kinds))
+        for kinds in (
+            *(("pinned",), ("eyelet",)),
+            *(("pinned", "pinned"), ("clamped", "pinned"), ("pinned", "eyelet")),
+        )
+        for where in (space_speed.near, space_speed.slack)
     }
     return out
 

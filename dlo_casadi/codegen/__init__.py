@@ -3,6 +3,7 @@
 from dlo_casadi.codegen.compiled import CompiledSolver
 from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import (
+    QUANTITIES,
     STATUSES,
     Capsule,
     CompiledShape,
@@ -10,4 +11,5 @@ from dlo_casadi.codegen.shapes import (
     HalfSpace,
     ShapePath,
     Slope,
+    Usage,
 )

@@ -220,7 +220,7 @@ class _PlaneCase(Case):
             *(chain.places / model.cable.length),
             *resting_headings(chain, self.rest),
             *(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)),
-            *(self.holding if self.holds else ()),
+            *self.holding,
         ]
 
     @property
@@ -327,7 +327,7 @@ class _SpaceCase(Case):
         # fine mesh, and if all fail, one on the fine mesh from the first guess; a descent takes 80
         # steps. The template checks the number.
         hangs = self.model.end == "free" and not self.model.clips
-        guesses = 3 if hangs else 8 * (3 if self.model.sliding else 1)
+        guesses = 3 if hangs else 8 + 2 * bool(self.model.sliding)
         held = self.held_doubles * self.holds + (11 + 58) * n if self.holds else 0
         return {
             "WORKSPACE": (self.doubles + 3 * self.border) * (n + 2)

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import (
+    QUANTITIES,
     STATUSES,
     AnyPose,
     CompiledShape,
@@ -24,6 +25,7 @@ from dlo_casadi.codegen.shapes import (
     Obstacle,
     ShapePath,
     Slope,
+    Usage,
     no_equilibrium,
     pose_table,
     records_of,
@@ -42,6 +44,7 @@ _ARGUMENTS = {
     "dlo_step": "ppippn",
     "dlo_sensitivity": "ppppn",
     "dlo_clearance": "ppnpp",
+    "dlo_limits": "pppnppp",
     "dlo_batch": "pnipppn",
     "dlo_path": "pnipppppn",
 }
@@ -249,6 +252,55 @@ class CompiledSolver:
         DloError
             If there is no obstacle or another object, or a number is not finite.
         """
+        given, along = self._obstacles(obstacles), self._along(slope)
+        kept, out = self._record_of(shape), np.zeros(1, self._records.gap)
+        status = self._call("dlo_clearance", kept, given, len(given), along, out)
+        if status:
+            count = counted(len(obstacles), "obstacle")
+            raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
+        return Gap(**_values(out[0]))
+
+    def limits(
+        self,
+        shape: CompiledShape,
+        limits: Mapping[str, float],
+        obstacles: Sequence[Obstacle] = (),
+        slope: Slope | None = None,
+    ) -> dict[str, Usage]:
+        """How much of its limits a shape uses, by the names in QUANTITIES, the tightest one first.
+
+        All values are those of the solver's own mesh; `Shape.check` measures bends on a finer one.
+
+        Parameters
+        ----------
+        limits : mapping of str to float
+            Of quantities in QUANTITIES; all are told, also those without a limit.
+        slope : Slope, optional
+            For the gradients.
+
+        Raises
+        ------
+        DloError
+            If a limit has an unknown name or is not positive, the shape is none, or a number is not
+            finite.
+        """
+        if unknown := [name for name in limits if name not in QUANTITIES]:
+            text = f"a shape has no limit {unknown[0]!r}"
+            raise DloError(f"{text}\n  Try: {', '.join(QUANTITIES)}")
+        if wrong := [name for name, limit in limits.items() if not limit > 0]:
+            raise DloError(f"a limit must be positive, found {wrong[0]} {limits[wrong[0]]!r}")
+        bounds = np.array([limits.get(name, 0.0) for name in QUANTITIES], float)
+        given, along = self._obstacles(obstacles), self._along(slope)
+        kept, out = self._record_of(shape), np.zeros(len(QUANTITIES), self._records.usage)
+        tightest = np.zeros(1, np.intc)
+        status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
+        if status:
+            raise DloError(f"no limits ({STATUSES[status]}): the shape is {shape.status!r}")
+        found = {name: Usage(**_values(row)) for name, row in zip(QUANTITIES, out, strict=True)}
+        first = QUANTITIES[tightest[0]]
+        return {first: found[first]} | found
+
+    def _obstacles(self, obstacles: Sequence[Obstacle]) -> Any:
         given = np.zeros(len(obstacles), self._records.obstacle)
         for row, obstacle in zip(given, obstacles, strict=True):
             if not isinstance(obstacle, Obstacle):
@@ -258,13 +310,10 @@ class CompiledSolver:
                 raise DloError(f"places of an obstacle must have {count}, found {obstacle!r}")
             row["kind"], row["radius"] = isinstance(obstacle, HalfSpace), obstacle.radius
             row["a"], row["b"] = obstacle.ends
-        along = None if slope is None else _filled(self._records.slope, slope)
-        kept, out = self._record_of(shape), np.zeros(1, self._records.gap)
-        status = self._call("dlo_clearance", kept, given, len(given), along, out)
-        if status:
-            count = counted(len(obstacles), "obstacle")
-            raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
-        return Gap(**_values(out[0]))
+        return given
+
+    def _along(self, slope: Slope | None) -> Any:
+        return None if slope is None else _filled(self._records.slope, slope)
 
     def _record_of(self, shape: CompiledShape | None) -> Any:
         if shape is None:
@@ -275,7 +324,7 @@ class CompiledSolver:
         return _filled(self._records.shape, shape)
 
     def _call(self, name: str, *arguments: Any) -> int:
-        """Status of a call into the library; all functions but the clearance take a workspace."""
+        """Status of a call into the library; those that solve take a workspace."""
         work = np.empty(self.workspace)
         given = (*arguments, work, work.size)[: len(_ARGUMENTS[name])]
         places = (a.ctypes.data if isinstance(a, np.ndarray) else a for a in given)

@@ -132,6 +132,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
         "END_CLAMPED": model.end == "clamped",
         "END_FREE": model.end == "free",
         "LENGTH": c_number(case.length),
+        "DECLARED_LENGTH": c_number(model.cable.length),
         "RADIUS": c_number(model.cable.diameter / 2),
         "ELASTIC": model.yields,
         "STRETCHES": model.extensible,
@@ -248,7 +249,7 @@ def generate(
     }
     own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
     sources = ("common", case.name, "newton", own[0], "between", *own[1:], "shape")
-    sources += ("clearance", "interface", "casadi")
+    sources += ("clearance", "limits", "interface", "casadi")
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),

@@ -61,9 +61,10 @@ class CompiledShape:
     moments : (2, increment) [N m]
         Of the cable on its clamps (start, end), in space about the world's axes.
     energy : float [J]
-    min_bend_radius : float [m]
-    max_twist : float [1/m]
-        Largest twist of an element, with its sign; 0 in a plane.
+    min_bend_radius, min_bend_at : float [m]
+        And the arc length there, along the declared length.
+    max_twist, max_twist_at : float [1/m, m]
+        Largest twist of an element, with its sign, and its middle; 0 in a plane.
     end_error : float [m]
     imbalance : float [N m]
     iterations : int
@@ -90,7 +91,9 @@ class CompiledShape:
     moments: FloatArray
     energy: float
     min_bend_radius: float
+    min_bend_at: float
     max_twist: float
+    max_twist_at: float
     end_error: float
     imbalance: float
     iterations: int
@@ -131,7 +134,7 @@ class Slope:
         Of the nodes, in space about the world's axes.
     end_force : (dimension, k)
     moments : (2, increment, k)
-    min_bend_radius : (k,)
+    min_bend_radius, max_twist : (k,)
     clip_forces, clip_at, clip_moments, places : (..., k)
         Of those of CompiledShape.
     energy_by_at : (n_clips,) [N]
@@ -143,6 +146,7 @@ class Slope:
     end_force: FloatArray
     moments: FloatArray
     min_bend_radius: FloatArray
+    max_twist: FloatArray
     clip_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
     clip_at: FloatArray = field(default_factory=lambda: np.zeros(0))
     clip_moments: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -207,8 +211,40 @@ class Gap:
     obstacle: int
 
 
+# What a shape must keep, in the order of dlo_quantity.
+QUANTITIES = ("bend_radius", "force", "moment", "twist", "clearance")
+
+
+@dataclass(frozen=True)
+class Usage:
+    """How much of a limit a shape uses.
+
+    Parameters
+    ----------
+    value : float
+        Least bend radius [m], greatest force [N] and moment [N m] on a fixture, greatest twist
+        [1/m], least distance from obstacles [m]; 1e300 where nothing bends, without obstacles.
+    margin : float
+        Share of the limit that is left, negative where it is violated: 1 - value / limit; of a
+        bend radius 1 - limit / value; of a clearance value / limit - 1. 1 without a limit.
+    at : float [m]
+        Arc length of the tightest place from the start.
+    gradient : (k,)
+        Of the value by the columns of the slope; zeros without one.
+    which : int
+        Of forces and moments the fixture: 0 the start, 1 the end, 2 the first clip. Of a clearance
+        the obstacle.
+    """
+
+    value: float
+    margin: float
+    at: float
+    gradient: FloatArray
+    which: int
+
+
 class Records(NamedTuple):
-    """Layouts of dlo_shape, dlo_slope, dlo_obstacle and dlo_gap of a solver's C.
+    """Layouts of dlo_shape, dlo_slope, dlo_obstacle, dlo_gap and dlo_usage of a solver's C.
 
     `columns` are the numbers of a pose by which dlo_slope has derivatives; in a plane not those of
     the start's place.
@@ -218,6 +254,7 @@ class Records(NamedTuple):
     slope: np.dtype[Any]
     obstacle: np.dtype[Any]
     gap: np.dtype[Any]
+    usage: np.dtype[Any]
     columns: int
 
 
@@ -235,12 +272,15 @@ def records_of(model: CableModel) -> Records:
         "places": (n * clamps,),
         "moments": (2, turn),
     }
-    scalars = ("energy", "min_bend_radius", "max_twist", "end_error", "imbalance")
+    scalars = ["energy", "min_bend_radius", "min_bend_at", "max_twist", "max_twist_at"]
+    scalars += ["end_error", "imbalance"]
     slope: dict[str, tuple[int, ...]] = {"points": (n, d, k), "rotations": (nodes, turn, k)}
     slope |= {"end_force": (d, k), "clip_forces": (holds, d, k), "clip_at": (holds, k)}
     slope |= {"clip_moments": (holds * clamps, turn, k), "places": (n * clamps, k)}
-    slope |= {"energy_by_at": (clips,), "moments": (2, turn, k), "min_bend_radius": (k,)}
+    slope |= {"energy_by_at": (clips,), "moments": (2, turn, k)}
+    slope |= {"min_bend_radius": (k,), "max_twist": (k,)}
     gap = {"distance": (), "place": (), "point": (d,), "normal": (d,), "gradient": (k,)}
+    usage = {"value": (), "margin": (), "at": (), "gradient": (k,)}
     return Records(
         _record(
             _floats({"points": (n, d), "x": (nodes, node.coordinates)}),
@@ -250,6 +290,7 @@ def records_of(model: CableModel) -> Records:
         _record(_floats(slope)),
         _record([("kind", np.intc)], _floats({"a": (d,), "b": (d,), "radius": ()})),
         _record(_floats(gap), [("obstacle", np.uintp)]),
+        _record(_floats(usage), [("which", np.intc)]),
         k,
     )
 

@@ -139,7 +139,7 @@ class Limits(ConfigSection):
                 yield ConfigProblem((name,), f"{text}{hint}")
         if self.clearance is not None:
             text = "limits.clearance: a session's obstacles may be touched, no clearance is checked"
-            hint = "leave it out; the compiled solver's clearance(shape, obstacles) measures it"
+            hint = "leave it out; the compiled solver's limits(shape, {...}, obstacles) measures it"
             yield ConfigProblem(("clearance",), f"{text}. Try: {hint}")
         if self.twist is not None and not in_space:
             text = "limits.twist: a cable in a plane (two numbers of gravity) does not twist"

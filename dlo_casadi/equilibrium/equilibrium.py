@@ -1,7 +1,9 @@
 """The equilibrium of a cable in one pose: its shape, forces, energy and stability."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 
@@ -59,7 +61,7 @@ class Equilibrium:
         Mean twist of each cell; zero in a plane.
     min_bend_radius : float [m]
         Smallest radius of curvature along the cable: of the cells' mean curvatures, continued
-        linearly to both ends; of second order in the cells' length.
+        linearly to both ends and to clamped clips; of second order in the cells' length.
     residual : float
         Largest violation of an end condition [m or rad].
     status : Status
@@ -121,29 +123,43 @@ class Equilibrium:
         return self.status is Status.STABLE
 
 
-def places_along(cells: FloatArray) -> FloatArray:
-    """Arc lengths (n_cells + 2,) [m] of `curvatures_along`: start, cells' middles, end."""
-    return np.concatenate([cells[:1, 0], cells.mean(axis=1), cells[-1:, 1]])
+def places_along(cells: FloatArray, clamped: Sequence[int] = ()) -> FloatArray:
+    """Arc lengths (K,) [m] of `curvatures_along` of cells (n_cells, 2) [m]."""
+    own = [cells[stretch] for stretch in _stretches(len(cells), clamped)]
+    return np.concatenate([[x[0, 0], *x.mean(axis=1), x[-1, 1]] for x in own])
 
 
-def curvatures_along(curvature: FloatArray, cells: FloatArray) -> FloatArray:
-    """Sizes (..., n_cells + 2) [1/m] of curvatures (..., axes n_cells) that are means over cells.
+def curvatures_along(
+    curvature: FloatArray, cells: FloatArray, clamped: Sequence[int] = ()
+) -> FloatArray:
+    """Sizes (..., K) [1/m] of curvatures (..., axes n_cells) that are means over cells.
 
-    They are continued linearly to both ends, see `Equilibrium.min_bend_radius`.
+    They are continued linearly to both ends of each stretch, see `Equilibrium.min_bend_radius`;
+    the curvature jumps at clamped clips.
+
+    Parameters
+    ----------
+    cells : (..., n_cells, 2) [m]
+    clamped : sequence of int
+        Numbers of the cells that begin at clamped clips.
     """
-    widths = np.diff(cells, axis=1).ravel()
-    inner = curvature.reshape((*curvature.shape[:-1], -1, len(cells)))
+    widths = np.diff(cells, axis=-1)[..., 0]
+    inner = curvature.reshape((*curvature.shape[:-1], -1, widths.shape[-1]))
     known = inner[..., 0, :] if inner.shape[-2] == 1 else np.linalg.norm(inner, axis=-2)
-    ends = []
-    for outer, beside in ((0, 1), (-1, -2)) if len(cells) > 1 else ((0, 0), (-1, -1)):
-        share = widths[outer] / (widths[outer] + widths[beside])
-        ends.append(known[..., [outer]] + share * (known[..., [outer]] - known[..., [beside]]))
-    return np.abs(np.concatenate([ends[0], known, ends[1]], axis=-1))
+    parts = []
+    for stretch in _stretches(widths.shape[-1], clamped):
+        own, width = known[..., stretch], widths[..., stretch]
+        ends = []
+        for outer, beside in ((0, 1), (-1, -2)) if own.shape[-1] > 1 else ((0, 0), (-1, -1)):
+            share = width[..., [outer]] / (width[..., [outer]] + width[..., [beside]])
+            ends.append(own[..., [outer]] + share * (own[..., [outer]] - own[..., [beside]]))
+        parts += [ends[0], own, ends[1]]
+    return np.abs(np.concatenate(parts, axis=-1))
 
 
-def smallest_radius(curvature: FloatArray, cells: FloatArray) -> float:
-    """Smallest radius [m] of curvatures that are means over cells (n, 2), see `Equilibrium`."""
-    return 1 / max(float(curvatures_along(curvature, cells).max()), 1e-300)
+def _stretches(n_cells: int, clamped: Sequence[int]) -> list[slice]:
+    """Cells between clamped clips."""
+    return [slice(*both) for both in pairwise((0, *clamped, n_cells))]
 
 
 def equilibria_of(
@@ -173,12 +189,14 @@ def equilibria_of(
     strains = assembly.strain(shapes, given)
     on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(node)
     points = assembly.nodes(shapes, given)
+    clipped = assembly.clipped(shapes, given)
     on_clips, contacts = assembly.clip_loads(shapes, given), assembly.contacts(shapes, given)
     if bound_multipliers is None:
         bound_multipliers = np.zeros((len(shapes.x), chain.n_nodes - 1))
     out = []
     for j in range(len(shapes.x)):
         curvature = chain.curvatures(strains[j]).ravel()
+        sizes = curvatures_along(curvature, clipped.cells[j], clipped.clamped_nodes(j))
         known = dict(zip(model.border_names, shapes.lam[j], strict=True))
         moments = [
             node.to_world(x, np.array([known.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
@@ -197,7 +215,7 @@ def equilibria_of(
                 bound_multipliers=bound_multipliers[j],
                 curvature=curvature,
                 twist=strains[j, : chain.n_cells] if twisted else np.zeros(chain.n_cells),
-                min_bend_radius=smallest_radius(curvature, chain.cells),
+                min_bend_radius=1 / max(float(sizes.max()), 1e-300),
                 residual=float(residuals[j]),
                 status=Status.STABLE if stable[j] else Status.UNSTABLE,
                 iterations=int(iterations[j]),

@@ -20,7 +20,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, node_places
+from dlo_casadi.model.clips import CLAMPS, clamped_nodes, node_places
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
 
@@ -63,19 +63,24 @@ def places_of(
         return np.array([item.at for item in own]), [item.name for item in own]
     moved = node_places(model.chain, pose.clips)  # to clamped clips
     cells = np.interp(model.chain.cells, model.chain.places, moved)
-    places = places_along(cells) if quantity == "curvature" else cells.mean(axis=1)
+    clamped = clamped_nodes(model.chain, pose.clips)
+    places = places_along(cells, clamped) if quantity == "curvature" else cells.mean(axis=1)
     return places, [""] * len(places)
 
 
 def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) -> FloatArray:
-    """Sizes (m, K) at `places_of`: curvature, twist [1/m]; force [N], moment [N m] on fixtures."""
+    """Sizes (m, K) at `places_of` in repeats of a pose.
+
+    Curvature, twist [1/m]; force [N], moment [N m] on fixtures.
+    """
     assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
     if quantity in ("curvature", "twist"):
         strain = assembly.strain(shapes, given)
         if quantity == "twist":
             return np.abs(strain[:, : chain.n_cells])  # the first strain in space
-        bends = chain.curvatures(strain)
-        return curvatures_along(bends.reshape((len(bends), -1)), chain.cells)
+        bends, clipped = chain.curvatures(strain), assembly.clipped(shapes, given)
+        clamped = clipped.clamped_nodes(0)  # of one pose
+        return curvatures_along(bends.reshape((len(bends), -1)), clipped.cells, clamped)
     found, loads = assembly.reactions(shapes, given), assembly.clip_loads(shapes, given)
     known = ("pinned", "eyelet", *CLAMPS) if quantity == "force" else CLAMPS
     ends = (("start", model.start), ("end", model.end))

@@ -282,7 +282,7 @@ def _outputs(model: CableModel, symbols: PoseSymbols) -> dict[str, Any]:
 
 @lru_cache
 def _curvature(model: CableModel) -> ca.Function:
-    """(strains) -> curvatures (n_cells + 2,) of cells and both ends, see `smallest_radius`."""
+    """(strains) -> curvatures (n_cells + 2,) of cells and both ends, see `curvatures_along`."""
     widths = np.diff(model.chain.cells, axis=1).ravel()
     strains = ca.SX.sym("strains", len(model.node.strains), len(widths))
     bends = strains[-len(model.node.curvatures) :, :]

@@ -175,6 +175,17 @@ class Clipped:
         low, high = np.zeros(len(self.at)), np.full(len(self.at), self.chain.length)
         return np.asarray(np.all(np.diff(np.column_stack([low, self.at, high])) > 0, axis=1))
 
+    @property
+    def cells(self) -> FloatArray:
+        """Bending cells (m, n_cells, 2) [m]; between moved nodes where a clip is clamped."""
+        if self.clamps:
+            return np.stack([self.places[:, :-1], self.places[:, 1:]], axis=2)
+        return np.broadcast_to(self.chain.cells, (len(self.at), *self.chain.cells.shape))
+
+    def clamped_nodes(self, pose: int) -> list[int]:
+        """Nodes of a pose that carry the frames of its clamped clips."""
+        return [int(clamp.index[pose]) for clamp in self.clamps]
+
     def carried(self, both: FloatArray) -> FloatArray:
         """Nodes (m, n_segments, 2 coordinates) of segments, with the frames of clamped clips."""
         c, rows = both.shape[2] // 2, np.arange(len(both))

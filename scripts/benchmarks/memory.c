@@ -73,6 +73,7 @@ static void *work_off(void *what)
     dlo_slope *slope = malloc(sizeof *slope);
     const dlo_obstacle obstacles[2] = {{DLO_CAPSULE, {0.1}, {0.2}, 0.05},
                                        {DLO_HALF_SPACE, {0.0, -0.5}, {0.0, 1.0}, 0.0}};
+    const double limits[DLO_QUANTITIES] = {0.05, 1.0, 0.1, 5.0, 0.01};
     const dlo_branch branches[] = {DLO_LOWEST,
 #if DLO_DIMENSION == 2
                                    DLO_CCW, DLO_CW
@@ -91,12 +92,15 @@ static void *work_off(void *what)
         dlo_batch(poses, COUNT, branch, shapes, statuses, work, DLO_WORKSPACE_SIZE);
         for (i = 0; i < COUNT; ++i) {
             dlo_gap gap;
+            dlo_usage usages[DLO_QUANTITIES];
+            dlo_quantity tightest;
             dlo_shape near;
             ++job->counts[statuses[i]];
             job->sum += shapes[i].energy;
             dlo_sensitivity(poses + i, shapes + i, slope, work, DLO_WORKSPACE_SIZE);
             dlo_clearance(shapes + i, obstacles, 2, slope, &gap);
-            job->sum += gap.gradient[0];
+            dlo_limits(shapes + i, limits, obstacles, 2, slope, usages, &tightest);
+            job->sum += gap.gradient[0] + usages[tightest].gradient[0];
             poses[i].end[0] += 1e-3;
             dlo_step(poses + i, shapes + i, 4, &near, work, DLO_WORKSPACE_SIZE);
             dlo_solve(poses + i, other, shapes + i, shapes + i, work, DLO_WORKSPACE_SIZE);

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from time import perf_counter, process_time
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -203,11 +203,8 @@ def per_element(n: int, element: str) -> float:
     return float(np.median(fastest)) / n
 
 
-def clipped(*kinds: ClipKind, n: int = 12, repeats: int = 10) -> dict[str, float]:
-    """Cold solves with clips, evenly along the cable and 0.1 % of its length off its shape without.
-
-    Processor time over that of the same poses without clips, Newton steps, and share solved.
-    """
+def near(kinds: Sequence[ClipKind], n: int = 12) -> tuple[HeldPose, ...]:
+    """The poses with clips evenly along the cable, 0.1 % of its length off its shape without."""
     plain, rng, length = problem(n, "quadratic"), np.random.default_rng(0), CABLE.length
     bare = CompiledSolver(plain.model, plain.model.nominal, plain.rest)
     nodes, poses = [round(n * (k + 1) / (len(kinds) + 1)) for k in range(len(kinds))], []
@@ -220,16 +217,69 @@ def clipped(*kinds: ClipKind, n: int = 12, repeats: int = 10) -> dict[str, float
             at = None if kind == "eyelet" else node * length / n
             clips.append(HeldClip(kind, tuple(place), at, orientation=frame))
         poses.append(replace(pose, clips=tuple(clips)))
-    held = CompiledSolver(replace(plain.model, clips=kinds), plain.model.nominal, plain.rest)
-    seconds: dict[int, list[float]] = {0: [], 1: []}
-    for _ in range(repeats):
-        for k, (solver, given) in enumerate(((bare, plain.poses), (held, poses))):
-            begin = process_time()
-            records, statuses = solver.solve_many(given)
-            seconds[k].append(process_time() - begin)
-    solved = statuses == 0
-    return {
-        "over_without": min(seconds[1]) / min(seconds[0]),
-        "steps": float(np.median(records["iterations"][solved])),
-        "solved": float(solved.mean()),
-    }
+    return tuple(poses)
+
+
+def slack(kinds: Sequence[ClipKind], count: int = 100) -> tuple[HeldPose, ...]:
+    """Random poses whose spans have chords of 55 to 95 % of their lengths."""
+    rng, many, length = np.random.default_rng(7), len(kinds), CABLE.length
+    poses = []
+    for _ in range(count):
+        at = (np.arange(1, many + 1) + rng.uniform(-0.3, 0.3, many)) / (many + 1) * length
+        ways = _unit(rng.normal(size=3)) + 0.5 * rng.normal(size=(many + 1, 3))
+        ways /= np.linalg.norm(ways, axis=1)[:, None]
+        spans = np.diff([0.0, *at, length]) * rng.uniform(0.55, 0.95, many + 1)
+        places = np.cumsum(spans[:, None] * ways, axis=0)
+        clips = [
+            HeldClip(
+                kind,
+                tuple(places[k]),
+                None if kind == "eyelet" else float(at[k]),
+                orientation=_facing(ways[k] + ways[k + 1], rng) if kind in CLAMPS else None,
+            )
+            for k, kind in enumerate(kinds)
+        ]
+        frames = {"start_orientation": _facing(ways[0], rng)}
+        frames["end_orientation"] = _facing(ways[-1], rng)
+        poses.append(HeldPose((0.0, 0.0, 0.0), tuple(places[-1]), clips=tuple(clips), **frames))
+    return tuple(poses)
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def _facing(way: FloatArray, rng: np.random.Generator) -> tuple[float, ...]:
+    """A quaternion whose x axis points about that way, with any roll."""
+    turn, _ = Rotation.align_vectors([_unit(way)], [[1.0, 0.0, 0.0]])
+    rolled = turn * Rotation.from_rotvec([rng.uniform(-np.pi, np.pi), 0.0, 0.0])
+    return tuple((Rotation.from_rotvec(0.3 * rng.normal(size=3)) * rolled).as_quat())
+
+
+def clipped(
+    kinds: Sequence[ClipKind], poses: Sequence[HeldPose], repeats: int = 5
+) -> dict[str, float]:
+    """Processor time of solves over that of the same ends without clips, cold and warm.
+
+    With Newton steps of cold ones, and the share that is solved.
+    """
+    plain, rng = problem(12, "quadratic"), np.random.default_rng(1)
+    bare = Timed(replace(plain, poses=()))
+    held = Timed(replace(plain, model=replace(plain.model, clips=tuple(kinds)), poses=()))
+    seconds: dict[str, list[list[float]]] = {"cold": [], "warm": []}
+    steps = []
+    for pose in poses:
+        cold, warm = [], []
+        for solver, own in ((bare, replace(pose, clips=())), (held, pose)):
+            times, shape = solver.solve(own, None, repeats)
+            cold.append(float(times.min()))
+            warm.append(float(solver.solve(moved(own, rng), shape, repeats)[0].min()))
+        if shape["min_bend_radius"][0] > 0:
+            steps.append(int(shape["iterations"][0]))
+            seconds["cold"].append(cold)
+            seconds["warm"].append(warm)
+    found = {}
+    for name, rows in seconds.items():
+        without, with_clips = np.sum(rows, axis=0)
+        found[name] = float(with_clips / without)
+    return found | {"steps": float(np.median(steps)), "solved": len(steps) / len(poses)}

@@ -1,12 +1,13 @@
 // Plans a motion of the gripper that holds a cable's end through a scene of obstacles, with OMPL.
 //
 // A state is the gripper's place, in space its place and orientation, in SE(3); the shape of the
-// cable there comes from the generated solver. A state is valid if the whole cable keeps clear of
-// the obstacles, bends no tighter than allowed, pulls the gripper no harder and, in space, is
-// twisted no more. A motion is valid if the cable can be led along it without snapping over or
-// looping, and all its shapes are valid. Prints a line for each shape along the path: its nodes,
-// then bend radius [m], force on the gripper [N], twist [1/m] and distance from the obstacles [m];
-// and on the standard error how often each limit has turned a state or a motion down.
+// cable there comes from the generated solver. Clips may hold the cable on its way. A state is valid
+// if the shape keeps the limits: the whole cable clear of the obstacles, bent and twisted no more
+// than allowed, and no fixture, clip or gripper pulled harder. A motion is valid if the cable can be
+// led along it without snapping over or looping, and all its shapes are valid. Prints a line for each
+// shape along the path: its nodes, then least bend radius [m], greatest force [N] and moment [N m] on
+// a fixture, twist [1/m] and distance from the obstacles [m]; and on the standard error how often
+// each limit has turned a state or a motion down.
 //
 //   cable_planner <scene file> <branch: ccw or cw, in space lowest> <iterations> <seed>
 //
@@ -15,7 +16,8 @@
 //                                                         with its orientation qx qy qz qw
 //   held qx qy qz qw                                      of the cable's start, in space
 //   capsule PLACE PLACE radius | half_space PLACE NORMAL  obstacles; equal places are a sphere
-//   clearance c | bend_radius r | force f | twist t       limits [m, m, N, 1/m]
+//   clip at PLACE                                         pinned, in the order along the cable
+//   bend_radius r | force f | moment m | twist t | clearance c     limits [m, N, N m, 1/m, m]
 
 #include <dlo_solver.h>
 
@@ -29,12 +31,14 @@
 #include <ompl/util/Console.h>
 #include <ompl/util/RandomNumbers.h>
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <fstream>
 #include <iostream>
+#include <iterator>
 #include <limits>
 #include <map>
 #include <memory>
@@ -51,10 +55,14 @@ using Turn = std::array<double, 4>;
 struct Scene {
     Place start{}, goal{}, low{}, high{};
     Turn start_turn{0.0, 0.0, 0.0, 1.0}, goal_turn{0.0, 0.0, 0.0, 1.0}, held{0.0, 0.0, 0.0, 1.0};
-    double clearance = 0.0, bend_radius = 0.0;
-    double force = std::numeric_limits<double>::infinity(), twist = force;
+    double limits[DLO_QUANTITIES] = {};
+    std::vector<std::pair<double, Place>> clips;
     std::vector<dlo_obstacle> obstacles;
 };
+
+// Names of limits in scene files, by dlo_quantity.
+static const char *const NAMES[] = {"bend_radius", "force", "moment", "twist", "clearance"};
+static_assert(std::size(NAMES) == DLO_QUANTITIES);
 
 template <typename Numbers>
 static void read(std::ifstream &file, Numbers &numbers)
@@ -94,18 +102,22 @@ static Scene read_scene(const char *name)
             if (word == "capsule")
                 file >> obstacle.radius;
             scene.obstacles.push_back(obstacle);
-        } else if (word == "clearance") {
-            file >> scene.clearance;
-        } else if (word == "bend_radius") {
-            file >> scene.bend_radius;
-        } else if (word == "force") {
-            file >> scene.force;
-        } else if (word == "twist") {
-            file >> scene.twist;
+        } else if (word == "clip") {
+            std::pair<double, Place> clip;
+            file >> clip.first;
+            read(file, clip.second);
+            scene.clips.push_back(clip);
+        } else if (std::find(std::begin(NAMES), std::end(NAMES), word) != std::end(NAMES)) {
+            file >> scene.limits[std::find(std::begin(NAMES), std::end(NAMES), word) - NAMES];
         } else {
             std::cerr << name << ": unknown item " << word << "\n";
             std::exit(2);
         }
+    }
+    if (scene.clips.size() != DLO_CLIPS) {
+        std::cerr << name << ": " << scene.clips.size() << " clips, the solver has " << DLO_CLIPS
+                  << "\n";
+        std::exit(2);
     }
     return scene;
 }
@@ -125,15 +137,17 @@ static void put(ob::State *state, const Place &place, const Turn &turn)
     at->rotation().w = turn[3];
 }
 
-static dlo_pose pose_of(const Scene &scene, const ob::State *state)
+static dlo_pose ends_of(const Scene &scene, const ob::State *state)
 {
     const auto *at = state->as<Space::StateType>();
     const auto &turn = at->rotation();
-    return {{0.0, 0.0, 0.0},
-            {at->getX(), at->getY(), at->getZ()},
-            {scene.held[0], scene.held[1], scene.held[2], scene.held[3]},
-            {turn.x, turn.y, turn.z, turn.w},
-            0.0};
+    dlo_pose pose{};
+    const Place end{at->getX(), at->getY(), at->getZ()};
+    const Turn last{turn.x, turn.y, turn.z, turn.w};
+    std::copy(end.begin(), end.end(), pose.end);
+    std::copy(scene.held.begin(), scene.held.end(), pose.start_orientation);
+    std::copy(last.begin(), last.end(), pose.end_orientation);
+    return pose;
 }
 
 static dlo_branch branch_of(const std::string &) { return DLO_LOWEST; }
@@ -147,14 +161,27 @@ static void put(ob::State *state, const Place &place, const Turn &)
         state->as<Space::StateType>()->values[k] = place[k];
 }
 
-static dlo_pose pose_of(const Scene &, const ob::State *state)
+static dlo_pose ends_of(const Scene &, const ob::State *state)
 {
-    const double *at = state->as<Space::StateType>()->values;
-    return {{0.0, 0.0}, {at[0], at[1]}, 0.0, 0.0};
+    dlo_pose pose{};
+    std::copy_n(state->as<Space::StateType>()->values, D, pose.end);
+    return pose;
 }
 
 static dlo_branch branch_of(const std::string &word) { return word == "cw" ? DLO_CW : DLO_CCW; }
 #endif
+
+static dlo_pose pose_of(const Scene &scene, const ob::State *state)
+{
+    dlo_pose pose = ends_of(scene, state);
+#if DLO_CLIPS
+    for (std::size_t k = 0; k < DLO_CLIPS; ++k) {
+        pose.clips[k].at = scene.clips[k].first;
+        std::copy(scene.clips[k].second.begin(), scene.clips[k].second.end(), pose.clips[k].place);
+    }
+#endif
+    return pose;
+}
 
 // The cable in the scene: one workspace, so one object for each thread.
 class Cable {
@@ -200,21 +227,13 @@ public:
         return judge(why, "motion") ? shapes : std::vector<dlo_shape>();
     }
 
-    double distance(const dlo_shape &shape) const
+    // How much of its limits a shape uses; the tightest one.
+    dlo_quantity use(const dlo_shape &shape, dlo_usage *usages) const
     {
-        dlo_gap gap;
-        if (scene_.obstacles.empty())
-            return std::numeric_limits<double>::infinity();
-        dlo_clearance(&shape, scene_.obstacles.data(), scene_.obstacles.size(), nullptr, &gap);
-        return gap.distance;
-    }
-
-    static double force(const dlo_shape &shape)
-    {
-        double square = 0.0;
-        for (double part : shape.end_force)
-            square += part * part;
-        return std::sqrt(square);
+        dlo_quantity tightest;
+        dlo_limits(&shape, scene_.limits, scene_.obstacles.data(), scene_.obstacles.size(), nullptr,
+                   usages, &tightest);
+        return tightest;
     }
 
     std::size_t solves = 0;
@@ -231,13 +250,9 @@ private:
     // The limit that a shape does not keep, or none.
     const char *limit(const dlo_shape &shape) const
     {
-        if (shape.min_bend_radius < scene_.bend_radius)
-            return "bend radius";
-        if (force(shape) > scene_.force)
-            return "force";
-        if (std::fabs(shape.max_twist) > scene_.twist)
-            return "twist";
-        return distance(shape) < scene_.clearance ? "clearance" : nullptr;
+        dlo_usage usages[DLO_QUANTITIES];
+        const dlo_quantity tightest = use(shape, usages);
+        return usages[tightest].margin < 0.0 ? NAMES[tightest] : nullptr;
     }
 
     // The shape that a motion leads to must be the one that the state stands for.
@@ -348,8 +363,11 @@ int main(int argc, char **argv)
             for (const auto &point : shape.points)
                 for (double number : point)
                     std::printf("%.6f ", number);
-            std::printf("%.6f %.6f %.6f %.6f\n", shape.min_bend_radius, Cable::force(shape),
-                        std::fabs(shape.max_twist), cable.distance(shape));
+            dlo_usage usages[DLO_QUANTITIES];
+            cable.use(shape, usages);
+            for (const dlo_usage &usage : usages)
+                std::printf("%.6g ", usage.value);
+            std::printf("\n");
         }
     }
     return 0;

@@ -1,10 +1,11 @@
 """Plan a motion of the gripper that holds a cable's end with OMPL in C++, and draw it.
 
-    python scripts/planner/plan.py --output DIR [--space] [--parameters PARAMETERS.yaml]
+    python scripts/planner/plan.py --output DIR [--space | --clips] [--parameters PARAMETERS.yaml]
 
 Generates the solver, builds cable_planner against it, plans, measures the clearance again and
 writes shapes.txt and plan.png. Without parameters a made-up cable of 0.9 m is used, pinned in the
-plane or, with --space, clamped in space, where the gripper moves in SE(3).
+plane or, with --space, clamped in space, where the gripper moves in SE(3); with --clips two clips
+hold it there, too, and the gripper threads its end through a window.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from scipy.interpolate import CubicSpline
 
 from dlo_casadi.codegen import Capsule, HalfSpace, generate
 from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
@@ -32,10 +34,11 @@ Scene = dict[str, list[list[float]]]
 LIMITS = {
     "bend_radius": (0, True),
     "force": (1, False),
-    "twist": (2, False),
-    "clearance": (3, True),
+    "moment": (2, False),
+    "twist": (3, False),
+    "clearance": (4, True),
 }
-UNITS = {"bend_radius": "m", "force": "N", "twist": "1/m", "clearance": "m"}
+UNITS = {"bend_radius": "m", "force": "N", "moment": "N m", "twist": "1/m", "clearance": "m"}
 
 
 def example(*, in_space: bool = False) -> tuple[CableModel, FloatArray, FloatArray]:
@@ -51,9 +54,14 @@ def example(*, in_space: bool = False) -> tuple[CableModel, FloatArray, FloatArr
     return model, model.nominal, np.zeros(model.chain.n_rests)
 
 
-def scene_of(model: CableModel) -> Path:
+def scene_of(*, in_space: bool, clips: bool) -> Path:
     """The scene that comes with the example."""
-    return HERE / ("scene_in_space.txt" if model.in_space else "scene.txt")
+    return HERE / f"scene{'_with_clips' if clips else '_in_space' if in_space else ''}.txt"
+
+
+def with_clips(cable: CasadiCable, scene: Scene) -> CasadiCable:
+    """The cable in the clips of a scene, all pinned."""
+    return cable.with_clips(["pinned"] * len(scene.get("clip", [])))
 
 
 def read_scene(path: Path) -> Scene:
@@ -146,6 +154,8 @@ def draw(shapes: FloatArray, scene: Scene, path: Path) -> None:
         axes.plot(
             *_dense(shapes[i]).T, color=plt.get_cmap("viridis")(1 - k / (len(shown) - 1)), lw=1.5
         )
+    for _, *place in scene.get("clip", []):
+        axes.plot(*([x] for x in place), "rs", ms=5)
     axes.plot(*shapes[:, -1].T, "k--", lw=1.0, label="way of the gripper")
     axes.plot(*([x] for x in scene["start"][0][:d]), "ko", mfc="w", label="start")
     axes.plot(*([x] for x in scene["goal"][0][:d]), "k*", ms=12, label="goal")
@@ -168,18 +178,19 @@ def tightest(rows: FloatArray, scene: Scene) -> str:
 
 
 def plan(
-    output: Path, parameters: Path | None, *, in_space: bool, scene_file: Path | None, tries: int
+    output: Path, parameters: Path | None, *, in_space: bool, scene_file: Path, tries: int
 ) -> str:
     """Generate, build, plan, check, draw; what the planner said."""
     if parameters is None:
-        model, p, rest = example(in_space=in_space)
+        bare = CasadiCable(*example(in_space=in_space))
     else:
         from dlo_casadi.cable.file import load
 
-        cable = load(parameters)
-        model, p, rest = cable.model, cable.p, cable.rest
-    scene_file = scene_file or scene_of(model)
-    generate(model, p, rest).write(output / "solver")
+        bare = load(parameters)
+    scene = read_scene(scene_file)
+    cable = with_clips(bare, scene)
+    model = cable.model
+    generate(model, cable.p, cable.rest).write(output / "solver")
     program = build(output / "solver", output / "build")
     branch = "lowest" if model.in_space else "ccw"
     command = [str(program), str(scene_file), branch, str(tries), "1"]
@@ -193,7 +204,6 @@ def plan(
     rows = np.loadtxt(output / "shapes.txt")
     points, numbers = rows[:, : -len(LIMITS)], rows[:, -len(LIMITS) :]
     shapes = points.reshape(len(rows), model.n + 1, -1)
-    scene = read_scene(scene_file)
     radius = model.cable.diameter / 2
     least = min(clearance(shape, radius, scene) for shape in shapes)
     # The spline is not the solver's cubic: they differ by less than a millimetre.
@@ -210,7 +220,9 @@ def main() -> int:
     """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--space", action="store_true", help="the example in space")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--space", action="store_true", help="the example in space")
+    where.add_argument("--clips", action="store_true", help="in space, held by two clips")
     parser.add_argument("--parameters", type=Path)
     parser.add_argument("--scene", type=Path, help="otherwise that of the example")
     parser.add_argument("--iterations", type=int, default=2000, help="of RRT*")
@@ -219,8 +231,8 @@ def main() -> int:
         said = plan(
             chosen.output,
             chosen.parameters,
-            in_space=chosen.space,
-            scene_file=chosen.scene,
+            in_space=chosen.space or chosen.clips,
+            scene_file=chosen.scene or scene_of(in_space=chosen.space, clips=chosen.clips),
             tries=chosen.iterations,
         )
     except DloError as error:

@@ -1,7 +1,7 @@
 """Plan the same motion from Python, with the PyPI package ompl and the compiled solver.
 
     pip install ompl
-    python scripts/planner/plan_python.py --output DIR [--space]
+    python scripts/planner/plan_python.py --output DIR [--space | --clips]
 
 Compiles the solver, plans with RRT*, writes plan_python.png.
 """
@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plan import Scene, draw, example, obstacles_of, read_scene, scene_of
+from plan import LIMITS, Scene, draw, example, obstacles_of, read_scene, scene_of, with_clips
 
 from dlo_casadi.codegen import CompiledShape, CompiledSolver
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.model.clips import HeldClip
 
 try:
     from ompl import base as ob
@@ -45,9 +47,13 @@ class InPlane:
 class InSpace:
     """The gripper's place and orientation, in SE(3); the cable is clamped."""
 
-    def __init__(self, held: list[float]) -> None:
-        self.space, self.solver = ob.SE3StateSpace(), CompiledSolver(*example(in_space=True))
-        self.held = tuple(held)
+    def __init__(self, scene: Scene) -> None:
+        cable = with_clips(CasadiCable(*example(in_space=True)), scene)
+        self.space = ob.SE3StateSpace()
+        self.solver = CompiledSolver(cable.model, cable.p, cable.rest)
+        clips = scene.get("clip", [])
+        self.clips = tuple(HeldClip("pinned", tuple(place), at) for at, *place in clips)
+        self.held = tuple(scene["held"][0])
 
     def put(self, state: Any, numbers: list[float]) -> None:
         """Set a state."""
@@ -59,7 +65,8 @@ class InSpace:
         """What the solver is asked for."""
         turn, place = state.rotation(), (state.getX(), state.getY(), state.getZ())
         last = (turn.x, turn.y, turn.z, turn.w)
-        return HeldPose((0.0, 0.0, 0.0), place, start_orientation=self.held, end_orientation=last)
+        frames = {"start_orientation": self.held, "end_orientation": last}
+        return HeldPose((0.0, 0.0, 0.0), place, clips=self.clips, **frames)
 
 
 class Leader:
@@ -68,21 +75,15 @@ class Leader:
     def __init__(self, gripper: InPlane | InSpace, scene: Scene) -> None:
         self.gripper, self.refused = gripper, Counter[str]()
         self.obstacles = obstacles_of(scene, gripper.solver.model.node.dimension)
-        self.scene = {name: numbers[0][0] for name, numbers in scene.items()}
+        self.limits = {name: scene[name][0][0] for name in LIMITS if name in scene}
 
     def limit(self, shape: CompiledShape) -> str | None:
         """The limit that a shape does not keep."""
-        scene = self.scene
         if shape.status != "ok":
             return "no equilibrium"
-        if shape.min_bend_radius < scene.get("bend_radius", 0.0):
-            return "bend radius"
-        if np.linalg.norm(shape.end_force) > scene.get("force", np.inf):
-            return "force"
-        if abs(shape.max_twist) > scene.get("twist", np.inf):
-            return "twist"
-        gap = self.gripper.solver.clearance(shape, self.obstacles)
-        return "clearance" if gap.distance < scene.get("clearance", 0.0) else None
+        usages = self.gripper.solver.limits(shape, self.limits, self.obstacles)
+        tightest = next(iter(usages))
+        return tightest if usages[tightest].margin < 0 else None
 
     def place(self, state: Any) -> bool:
         """Whether the gripper may be in a state."""
@@ -131,13 +132,16 @@ def main() -> int:
     """Plan and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--space", action="store_true", help="the example in space")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--space", action="store_true", help="the example in space")
+    where.add_argument("--clips", action="store_true", help="in space, held by two clips")
     parser.add_argument("--scene", type=Path, help="otherwise that of the example")
     parser.add_argument("--seconds", type=float, default=10.0)
     chosen = parser.parse_args()
     chosen.output.mkdir(parents=True, exist_ok=True)
-    scene = read_scene(chosen.scene or scene_of(example(in_space=chosen.space)[0]))
-    gripper = InSpace(scene["held"][0]) if chosen.space else InPlane()
+    in_space = chosen.space or chosen.clips
+    scene = read_scene(chosen.scene or scene_of(in_space=in_space, clips=chosen.clips))
+    gripper = InSpace(scene) if in_space else InPlane()
     leader = Leader(gripper, scene)
     ou.RNG.setSeed(1)
 
@@ -157,7 +161,7 @@ def main() -> int:
     gripper.put(goal, scene["goal"][0])
     problem.setStartAndGoalStates(start, goal, 1e-3)
     planner = og.RRTstar(information)
-    planner.setRange(0.4 if chosen.space else 0.15)
+    planner.setRange(0.4 if in_space else 0.15)
     planner.setProblemDefinition(problem)
     planner.setup()
     solved = planner.solve(chosen.seconds)
@@ -175,7 +179,7 @@ def main() -> int:
             return 1
         shapes += [shape.points for shape in led]
     draw(np.array(shapes), scene, chosen.output / "plan_python.png")
-    length = f"{path.length():.3f} m{' + rad' if chosen.space else ''}"
+    length = f"{path.length():.3f} m{' + rad' if in_space else ''}"
     print(f"path of the gripper: {length}\n{chosen.output / 'plan_python.png'}")
     return 0
 

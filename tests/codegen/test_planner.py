@@ -23,9 +23,13 @@ def missing():
     ("where", "iterations", "limits"),
     [
         pytest.param((), "300", ("bend_radius", "clearance"), marks=pytest.mark.long),
-        (("--space",), "100", ("bend_radius", "force", "twist", "clearance")),
+        pytest.param(
+            *(("--space",), "100", ("bend_radius", "force", "twist", "clearance")),
+            marks=pytest.mark.long,
+        ),
+        (("--clips",), "100", ("bend_radius", "force", "moment", "twist", "clearance")),
     ],
-    ids=["plane", "space"],
+    ids=["plane", "space", "clips"],
 )
 def test_a_path_is_planned_checked_and_drawn(tmp_path, where, iterations, limits):
     command = [sys.executable, str(PLANNER / "plan.py"), "--output", str(tmp_path), *where]
@@ -33,13 +37,15 @@ def test_a_path_is_planned_checked_and_drawn(tmp_path, where, iterations, limits
     assert run.returncode == 0, run.stderr
     assert "turned down for clearance of a motion" in run.stdout
     for name in limits:
-        nearest, limit = re.search(rf"{name} (\S+) \S+ \(limit (\S+)\)", run.stdout).groups()
+        nearest, limit = re.search(rf"{name} (\S+) [^(\n]+ \(limit (\S+)\)", run.stdout).groups()
         assert (float(nearest) >= float(limit)) == (name in ("bend_radius", "clearance"))
     assert (tmp_path / "plan.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
-    "where", [(), pytest.param(("--space",), marks=pytest.mark.long)], ids=["plane", "space"]
+    "where",
+    [(), *(pytest.param((x,), marks=pytest.mark.long) for x in ("--space", "--clips"))],
+    ids=["plane", "space", "clips"],
 )
 def test_the_same_from_python(tmp_path, where):
     pytest.importorskip("ompl", reason="the PyPI package ompl is not installed")
