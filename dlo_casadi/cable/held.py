@@ -11,7 +11,12 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
-from dlo_casadi.config.supports import Obstacle, clip_problems, obstacle_problems
+from dlo_casadi.config.supports import (
+    Obstacle,
+    clip_problems,
+    obstacle_problems,
+    over_problems,
+)
 from dlo_casadi.config.values import AXES, MESH
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
@@ -108,11 +113,15 @@ def reaction_texts(
 
 
 def among(
-    model: CableModel, p: FloatArray, obstacles: Sequence[Obstacle | Mapping[str, Any]]
+    model: CableModel,
+    p: FloatArray,
+    obstacles: Sequence[Obstacle | Mapping[str, Any]],
+    over: bool | Mapping[str, bool] | None = None,
 ) -> dict[str, Any]:
     """Model and parameters `p` of a cable among obstacles, checked as those of a session.
 
-    They are where they are declared: an `obstacle_offset` is of the session's own.
+    They are where they are declared: an `obstacle_offset` is of the session's own. `over` as of
+    `HeldPose`.
 
     Raises
     ------
@@ -123,6 +132,8 @@ def among(
     if wrong := [x.message for x in obstacle_problems(listed, model.node.dimension)]:
         raise DloError("; ".join(wrong))
     surfaces = tuple(item.surface(k) for k, item in enumerate(listed, start=1))
+    if unsided := [*over_problems(over, surfaces, model.gravity)]:
+        raise DloError(f"over: {'; '.join(unsided)}")
     model = replace(model, obstacles=surfaces)
     moved = outwards(model)[: len(surfaces)]
     return {"model": model, "p": np.where(moved.any(axis=0), model.nominal, p)}

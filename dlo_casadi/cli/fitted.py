@@ -79,6 +79,12 @@ POSE = (
     *POSE,
     option("--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"),
     option("--obstacles", type=Path, metavar="FILE", help="YAML: a list, as in an experiment"),
+    option(
+        "--over",
+        nargs="+",
+        metavar="SIDE",
+        help="over or under bars: true or false of all, or NAME=true ... of some",
+    ),
     *LIMITS,
     option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
     codes="2 is also a pose without an equilibrium",
@@ -105,7 +111,7 @@ def predict(chosen: argparse.Namespace) -> None:
         asked[name] = [] if path is None else read_yaml(path)
         if not isinstance(asked[name], list):
             raise DloError(f"{path}: a list of {name} belongs here: - {{kind: {kind}, ...}}")
-    shape = load(chosen.parameters).solve(**asked)
+    shape = load(chosen.parameters).solve(**asked, over=_sides(chosen.over))
     if figure is not None:
         save_figure(figure, shape.plot())
     # What a reader of the prediction should know of the file it came from.
@@ -132,6 +138,25 @@ def predict(chosen: argparse.Namespace) -> None:
         page.print(limits_table(shape.cable.name, checks))
     if figure is not None:
         page.say(f"Figure: {figure}")
+
+
+def _sides(words: list[str] | None) -> bool | dict[str, bool] | None:
+    """Sides of bars, of true or false alone or of NAME=true ..."""
+    if words is None:
+        return None
+    said = {"true": True, "false": False}
+    if len(words) == 1 and words[0] in said:
+        return said[words[0]]
+    pairs = [word.rpartition("=") for word in words]
+    if wrong := [
+        word
+        for word, (name, _, side) in zip(words, pairs, strict=True)
+        if not (name and side in said)
+    ]:
+        raise DloError(
+            f"--over {wrong[0]}: true, false or NAME=true belongs here, such as bar=true"
+        )
+    return {name: said[side] for name, _, side in pairs}
 
 
 def _checked(shape: Shape, chosen: argparse.Namespace) -> tuple[LimitCheck, ...]:

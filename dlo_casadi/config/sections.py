@@ -189,6 +189,10 @@ class Pose(ConfigSection):
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
     clips: tuple[Clip, ...] = ()
     """What holds the cable between its ends, in the order along it."""
+    over: bool | dict[str, bool] | None = None
+    """Whether the cable passes over (true) or under (false) the bars among the obstacles, or some
+    of them, {bar: true}: whether it crosses the half-plane that stands on a bar's axis, or the one
+    that hangs from it. Without it, the side of lower energy."""
 
     @property
     def paths(self) -> tuple[Path, ...]:

@@ -1,10 +1,10 @@
 """What is between the ends: clips that hold the cable, obstacles; and what is wrong with them."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
-from dlo_casadi.config.problems import ConfigProblem
+from dlo_casadi.config.problems import ConfigProblem, did_you_mean
 from dlo_casadi.config.values import (
     AXES,
     ConfigSection,
@@ -17,7 +17,7 @@ from dlo_casadi.config.values import (
     Quaternion,
 )
 from dlo_casadi.model.clips import HeldClip
-from dlo_casadi.rod.obstacles import Capsule, Plane
+from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 
 # Kinds of clips that a configuration may declare.
@@ -188,6 +188,28 @@ def obstacle_problems(obstacles: Sequence[Obstacle], axes: int) -> Iterator[Conf
         if names.index(name) < k:
             text = f"two obstacles are called {name}"
             yield ConfigProblem(("experiment", "obstacles", k), text)
+
+
+def over_problems(
+    over: bool | Mapping[str, bool] | None, surfaces: Sequence[Surface], gravity: Sequence[float]
+) -> Iterator[str]:
+    """What is wrong with the sides of bars that a pose names."""
+    if over is None:
+        return
+    bars = {bar.name for bar, _ in bars_of(surfaces, gravity)}
+    have = f"those here are {', '.join(sorted(bars))}" if bars else "there is none here"
+    what = "a disc or stadium" if len(gravity) == 2 else "a capsule whose axis is not upright"
+    belongs = f"a cable passes over or under {what}, with gravity; {have}"
+    if not isinstance(over, Mapping):
+        if not bars:
+            yield belongs
+        return
+    names = [one.name for one in surfaces]
+    for name in over:
+        if name not in names:
+            yield f"no obstacle is called {name}{did_you_mean(name, names)}"
+        elif name not in bars:
+            yield f"{name}: {belongs}"
 
 
 def _wrong(item: Obstacle, axes: int) -> Iterator[str]:

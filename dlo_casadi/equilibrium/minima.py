@@ -37,9 +37,10 @@ from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes
-from dlo_casadi.model.contact import outwards
+from dlo_casadi.model.contact import DEPTH, gap_per_force, outwards
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
+from dlo_casadi.rod.obstacles import bars_of
 from dlo_casadi.runtime.executors import interrupts_held
 
 # Longest step of a node [rad].
@@ -55,7 +56,7 @@ FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
 RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
 # these that a given start skips, so that it stays on its side; maximum number of steps of each.
-SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
+SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 3, 20
 # How often the way from one depth to the next is halved where contacts change to and fro. Beyond
 # the depth by which the cable bends between two nodes they change no more.
 HALVINGS = 4
@@ -63,6 +64,10 @@ HALVINGS = 4
 # times the one before, the share SHORTER is taken. What is left of it is the next step, so that the
 # ratio has to be more than a half.
 SHORTER, SAME_SIZE = 0.5, 0.75
+# How often a step that carries a cable through a bar is halved.
+SHORTENED = 6
+# Depth [lengths] of a node in hard obstacles from which on no room is left for the cable.
+NO_ROOM = 1e-6
 # Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8
 # Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
@@ -138,7 +143,8 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
         size = assembly.size(step)
         taken, length = damped(assembly, step, size, last[active])
         last[active] = size
-        now.x[active], now.lam[active] = stepped(assembly, here, taken, length)
+        own = here, taken, length, given.subset(active)
+        now.x[active], now.lam[active] = _on_their_sides(assembly, *own)
         # A shift makes steps small even where forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
@@ -152,8 +158,10 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
     there = np.flatnonzero(balanced)
     converged = np.zeros(m, dtype=bool)
     converged[there] = matrix.subset(there).negative() == wanted
-    ordered = assembly.clipped(now, given).in_order
-    balanced, converged = balanced & ordered, converged & ordered
+    possible = assembly.clipped(now, given).in_order
+    pressed = now.lam[:, assembly.model.n_lam :].max(axis=1, initial=0.0)
+    possible &= pressed * gap_per_force(assembly.model, DEPTH) < NO_ROOM * assembly.chain.length
+    balanced, converged = balanced & possible, converged & possible
     return Minima(now, balanced, converged, energy, iterations)
 
 
@@ -254,6 +262,29 @@ def stepped(
     lam = shapes.lam + share[:, None] * step.y[..., 0]
     for row in assembly.model.sliding.values():
         lam[:, row] = lam[:, row].clip(0.0, assembly.chain.length)
+    return x, lam
+
+
+def _on_their_sides(
+    assembly: Assembly, shapes: Shapes, step: Vector, size: FloatArray, given: Inputs
+) -> tuple[FloatArray, FloatArray]:
+    """As `stepped`, of steps that are halved while they carry a cable through a bar.
+
+    Bars in which the cable's weight alone sinks in by more than their radius are no hindrance.
+    """
+    depth, size = assembly.depth * assembly.chain.length, np.maximum(size, LONGEST_STEP)
+    bars = bars_of(assembly.model.surfaces, assembly.model.gravity)
+    hard = [(bar, up) for bar, up in bars if depth < bar.radius]
+    before = [bar.passed(up, assembly.nodes(shapes, given)) for bar, up in hard]
+    for _ in range(SHORTENED):
+        x, lam = stepped(assembly, shapes, step, size)
+        places = assembly.nodes(replace(shapes, x=x, lam=lam), given) if hard else x
+        through = np.zeros(len(x), dtype=bool)
+        for (bar, up), sides in zip(hard, before, strict=True):
+            through |= (np.array(bar.passed(up, places)) != sides).all(axis=0)
+        if not through.any():
+            break
+        size = np.where(through, 2 * size, size)
     return x, lam
 
 

@@ -17,7 +17,12 @@ from dlo_casadi.equilibrium.equilibrium import (
 from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
 from dlo_casadi.equilibrium.reach import no_equilibrium, out_of_reach
-from dlo_casadi.equilibrium.sides import beside_bars, on_other_side
+from dlo_casadi.equilibrium.sides import (
+    beside_bars,
+    named_sides,
+    on_named_sides,
+    on_other_side,
+)
 from dlo_casadi.equilibrium.spans import border_of, first_guesses
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
@@ -51,7 +56,8 @@ def solve_equilibrium(
     Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
     energy is returned, an unstable one if no other is found. For a pose that names its branch it
     is on that branch, or an error; between two pins the first stable one, as a rule that of the
-    branch's own arc. With `x_init` it is the equilibrium reached from there, on any branch.
+    branch's own arc. For one that names sides of bars the cable passes them there. With `x_init` it
+    is the equilibrium reached from there, on any branch or side.
 
     Parameters
     ----------
@@ -156,6 +162,16 @@ def _chosen(
             )
             return no_equilibrium(pose, what, "fewer turns, or the end farther from the start.")
         found = kept
+    if start is None and found and (asked := named_sides(model, pose)):
+        passing = on_named_sides(model, pose, np.array([eq.points for eq in found]))
+        if not passing.any():
+            said = " and ".join(
+                f"{'over' if over else 'under'} {bar.name}" for bar, _, over in asked
+            )
+            what = f"no equilibrium found in which the cable passes {said}, {where}"
+            hint = "the other side (over), a longer cable, or the bar nearer to its ends."
+            return no_equilibrium(pose, what, hint)
+        found = [eq for eq, kept in zip(found, passing, strict=True) if kept]
     if not found:
         hint = "a finer mesh (model.n), or check the stiffness and the headings."
         if pose.node is Frame:
@@ -295,8 +311,10 @@ class _PoseSearch:
         twists = _twists(coarse, strains[:, : coarse.chain.n_cells])
         usable = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
         x, kept = found.shapes.x, []
+        points = assembly_of(coarse).nodes(found.shapes, given)
         for j, pose in enumerate(poses):
             rows = np.flatnonzero((of == j) & usable)
+            rows = rows[on_named_sides(coarse, pose, points[rows])]
             rows = rows[np.argsort(found.energy[rows], kind="stable")]
             mine = [int(rows[k]) for k in _distinct(model, x[rows])[:FEW]]
             if mine:

@@ -1,7 +1,8 @@
 """First guesses of a cable that clips hold between its ends: arcs, span by span.
 
-A span reaches from one holder to the next. In a plane the arc of a span turns either way; in space
-it bulges along gravity or is rotated about its chord by quarter turns.
+A span reaches from one holder to the next; bars whose sides a pose names count as holders here. In
+a plane the arc of a span turns either way; in space it bulges along gravity or is rotated about its
+chord by quarter turns.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,6 +24,7 @@ from dlo_casadi.equilibrium.guesses import (
     smallest_turn,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.sides import named_sides
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import tangents
 from dlo_casadi.model.functions import functions_of
@@ -37,16 +39,22 @@ MOST_SIDES = 16
 _SLACK = (0.5, 0.15, 0.85)
 # Least length of a span beside an eyelet, relative to its chord.
 _LEAST = 1.0 + 1e-3
+# Number of places along the axis of a bar of which one is passed.
+_ALONG = 21
 
 
 @dataclass(frozen=True)
 class _Holder:
-    """One that holds the cable: an end or a clip. `at` is None of an eyelet, `place` of a tip."""
+    """One that holds the cable: an end, a clip, or a bar that it passes.
+
+    `at` is None of an eyelet and a bar, `place` of a tip.
+    """
 
     at: float | None
     place: FloatArray | None
     frame: FloatArray | None = None
     rolls: bool = False
+    bar: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,6 +90,29 @@ def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
         found.append(_Holder(s, places[:, k], clip.frame, clip.kind == "swivel"))
     own = last if model.end == "clamped" else None
     found.append(_Holder(model.cable.length, None if model.end == "free" else end, own))
+    return found
+
+
+def _with_bars(model: CableModel, pose: HeldPose, held: Sequence[_Holder]) -> list[_Holder]:
+    """All that holds the cable and the bars whose sides a pose names, see `named_sides`.
+
+    Each bar comes in between those, and is passed there along its axis, where the way gets longer
+    by least.
+    """
+    found = list(held)
+    for bar, up, over in named_sides(model, pose):
+        clear = (bar.radius + model.cable.diameter / 2) * (1 if over else -1)
+        share = np.linspace(0.0, 1.0, _ALONG)[:, None]
+        places = bar.a + share * np.subtract(bar.b, bar.a) + clear * up
+        longer: list[FloatArray] = []
+        for before, after in zip(found, chords(found), strict=False):
+            beyond = found[len(longer) + 1].place
+            ways = [
+                np.linalg.norm(places - x, axis=1) for x in (before.place, beyond) if x is not None
+            ]
+            longer.append(np.sum(ways, axis=0) - after)
+        k, i = np.unravel_index(np.argmin(longer), (len(longer), _ALONG))
+        found.insert(int(k) + 1, _Holder(None, places[i], bar=True))
     return found
 
 
@@ -128,10 +159,11 @@ def first_guesses(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """First guesses of a pose, one by one: nodes (n_nodes, coordinates), and border (n_border,).
 
-    Of a cable without clips `guesses` or `guessed_frames`; with clips arcs span by span.
+    Of a cable without clips `guesses` or `guessed_frames`; with clips, or bars whose sides the pose
+    names, arcs span by span.
     """
     none = np.zeros(model.n_border)
-    if pose.clips:
+    if pose.clips or named_sides(model, pose):
         yield from _span_guesses(model, p, pose)
     elif model.node is Frame:
         yield from ((x, none) for x in guessed_frames(model, p, rest, pose))
@@ -142,13 +174,15 @@ def first_guesses(
 def _span_guesses(
     model: CableModel, p: FloatArray, pose: HeldPose
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    held = holders(model, p, pose)
+    held = _with_bars(model, pose, holders(model, p, pose))
     rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
-    for share in _SLACK if model.sliding else _SLACK[:1]:
+    clips = [k for k, one in enumerate(held) if not one.bar][1:]
+    slides = model.sliding or len(clips) < len(held) - 1
+    for share in _SLACK if slides else _SLACK[:1]:
         at = _arc_lengths(held, share)
         spans, border = spans_of(held, at), np.zeros(model.n_border)
         for k, row in model.sliding.items():
-            border[row] = at[k + 1]
+            border[row] = at[clips[k]]
         if model.node is Frame:
             found = _in_space(model, pose, spans, [(at[k], held[k].frame) for k in rolls])
         else:
