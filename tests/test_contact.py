@@ -371,8 +371,8 @@ def test_a_session_with_obstacles(tmp_path):
         ("kind: sphere", "kind: sphere, a: [0, 0]", "obstacle_2: a sphere has no a, it has center"),
         ("kind: sphere", "kind: sphere, name: table", "two obstacles are called table"),
         ("over: true", "over: {tabel: true}", "did you mean 'table'"),
-        ("over: true", "over: {table: true}", "over: table: a cable passes"),
-        ("gravity: [0, -9.81]", "gravity: [0, 0]", "over: a cable passes .* there is none here"),
+        ("over: true", "over: {table: true}", "over: table: with gravity a cable passes"),
+        ("gravity: [0, -9.81]", "gravity: [0, 0]", "over: with gravity .*; there is none here"),
     ],
 )
 def test_obstacles_that_cannot_be_declared_so(tmp_path, old, new, said):

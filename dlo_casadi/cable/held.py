@@ -11,12 +11,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
-from dlo_casadi.config.supports import (
-    Obstacle,
-    clip_problems,
-    obstacle_problems,
-    over_problems,
-)
+from dlo_casadi.config.supports import Obstacle, Sides, clip_problems, obstacle_problems
 from dlo_casadi.config.values import AXES, MESH
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
@@ -116,7 +111,7 @@ def among(
     model: CableModel,
     p: FloatArray,
     obstacles: Sequence[Obstacle | Mapping[str, Any]],
-    over: bool | Mapping[str, bool] | None = None,
+    over: Sides = None,
 ) -> dict[str, Any]:
     """Model and parameters `p` of a cable among obstacles, checked as those of a session.
 
@@ -129,11 +124,9 @@ def among(
         If one cannot be so.
     """
     listed = [x if isinstance(x, Obstacle) else Obstacle(**x) for x in obstacles]
-    if wrong := [x.message for x in obstacle_problems(listed, model.node.dimension)]:
+    if wrong := [x.message for x in obstacle_problems(listed, model.gravity, [over])]:
         raise DloError("; ".join(wrong))
     surfaces = tuple(item.surface(k) for k, item in enumerate(listed, start=1))
-    if unsided := [*over_problems(over, surfaces, model.gravity)]:
-        raise DloError(f"over: {'; '.join(unsided)}")
     model = replace(model, obstacles=surfaces)
     moved = outwards(model)[: len(surfaces)]
     return {"model": model, "p": np.where(moved.any(axis=0), model.nominal, p)}

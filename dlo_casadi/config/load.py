@@ -13,13 +13,7 @@ from dlo_casadi.config.measuring import DeclaredTolerances
 from dlo_casadi.config.options import DeclaredEffect
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
-from dlo_casadi.config.supports import (
-    clip_problems,
-    clips_differ,
-    obstacle_problems,
-    over_problems,
-    too_short,
-)
+from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short
 from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.effects.setup import height_of
@@ -81,12 +75,11 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
         *wrong_effects(config),
         *_impossible_values(config.experiment, config.cable.length),
         *_wrong_clips(config.experiment, config.cable.length),
-        *(
-            unusable := [
-                *obstacle_problems(config.experiment.obstacles, len(config.experiment.gravity))
-            ]
+        *obstacle_problems(
+            config.experiment.obstacles,
+            config.experiment.gravity,
+            [pose.over for pose in config.experiment.poses],
         ),
-        *([] if unusable else _wrong_sides(config.experiment)),
         *config.limit_problems,
     ]:
         raise source.error(problems)
@@ -188,14 +181,6 @@ def _wrong_clips(experiment: Experiment, length: float) -> Iterator[ConfigProble
         for text, k in clip_problems(pose, length, len(experiment.gravity)):
             at: Place = ("experiment", "poses", i, "clips", k)
             yield ConfigProblem(at, f"{_called(i, pose)}: {text}")
-
-
-def _wrong_sides(experiment: Experiment) -> Iterator[ConfigProblem]:
-    """Find poses that name a side of what has none."""
-    for i, pose in enumerate(experiment.poses):
-        for text in over_problems(pose.over, experiment.surfaces, experiment.gravity):
-            at: Place = ("experiment", "poses", i, "over")
-            yield ConfigProblem(at, f"{_called(i, pose)}: over: {text}")
 
 
 def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:

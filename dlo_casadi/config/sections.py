@@ -423,7 +423,8 @@ class Config(ConfigSection):
         """Limits that have no meaning for this cable."""
         given, ends = self.experiment, self.experiment.boundary
         held = {ends.start, ends.end, *(clip.kind for x in given.poses for clip in x.clips)}
-        found = self.limits.problems(sorted(held), given.in_space, self.cable.length)
+        avoided = any(one.touch == "avoided" for one in given.obstacles)
+        found = self.limits.problems(sorted(held), given.in_space, self.cable.length, avoided)
         return [ConfigProblem(("limits", *place), text) for place, text in found]
 
     @property

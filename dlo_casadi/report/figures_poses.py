@@ -276,7 +276,7 @@ def limits_figure(outcome: Outcome) -> Figure:
 def _draw_row(axes: Axes, item: LimitCheck, y: float, length: float) -> None:
     """The cable of one pose as a bar, or its fixtures as dots; at the right the probability."""
     used = np.clip(item.used, 0.0, 1.0)
-    if item.holder:
+    if item.quantity in ("force", "moment"):
         axes.plot([0.0, length], [y, y], color="#E3E3E3", lw=1, zorder=1)
         axes.scatter(item.s, np.full(len(used), y), c=_USED(used), s=45, marker="s", zorder=2)
     else:

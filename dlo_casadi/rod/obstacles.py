@@ -34,11 +34,15 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane through `point` (d,) [m]; the cable is on the side of its unit `normal` (d,)."""
+    """A plane through `point` (d,) [m]; the cable is on the side of its unit `normal` (d,).
+
+    `touch`: whether the cable is meant to touch it, which a limit of its clearance leaves out.
+    """
 
     point: tuple[float, ...]
     normal: tuple[float, ...]
     name: str = "plane"
+    touch: bool = False
 
     def near(self, places: FloatArray) -> Surface:
         """The surface near places (..., d) [m]."""
@@ -62,13 +66,14 @@ class Plane:
 class Capsule:
     """All places within `radius` [m] of the line from `a` to `b` (d,) [m]; a sphere where a = b.
 
-    In a plane it is a disc or a stadium.
+    In a plane it is a disc or a stadium. `touch` as of a plane.
     """
 
     a: tuple[float, ...]
     b: tuple[float, ...]
     radius: float
     name: str = "capsule"
+    touch: bool = False
 
     def near(self, places: FloatArray) -> Surface:
         """The surface near places (..., d) [m]."""
