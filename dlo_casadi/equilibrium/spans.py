@@ -159,12 +159,14 @@ def first_guesses(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """First guesses of a pose, one by one: nodes (n_nodes, coordinates), and border (n_border,).
 
-    Of a cable without clips `guesses` or `guessed_frames`; with clips, or bars whose sides the pose
-    names, arcs span by span.
+    Of a cable without clips `guesses` or `guessed_frames`; with clips arcs span by span. If the
+    pose names sides of bars, arcs by way of these come first.
     """
-    none = np.zeros(model.n_border)
-    if pose.clips or named_sides(model, pose):
-        yield from _span_guesses(model, p, pose)
+    none, held = np.zeros(model.n_border), holders(model, p, pose)
+    if named_sides(model, pose):
+        yield from _span_guesses(model, pose, _with_bars(model, pose, held))
+    if pose.clips:
+        yield from _span_guesses(model, pose, held)
     elif model.node is Frame:
         yield from ((x, none) for x in guessed_frames(model, p, rest, pose))
     else:
@@ -172,9 +174,8 @@ def first_guesses(
 
 
 def _span_guesses(
-    model: CableModel, p: FloatArray, pose: HeldPose
+    model: CableModel, pose: HeldPose, held: Sequence[_Holder]
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    held = _with_bars(model, pose, holders(model, p, pose))
     rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
     clips = [k for k, one in enumerate(held) if not one.bar][1:]
     slides = model.sliding or len(clips) < len(held) - 1

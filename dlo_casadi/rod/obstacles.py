@@ -6,7 +6,7 @@ axis, without the axis's own direction where the nearest point of the axis is no
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -44,6 +44,11 @@ class Plane:
     name: str = "plane"
     touch: bool = False
 
+    def grown(self, offset: float) -> "Plane":
+        """The same with its surface farther outwards by an offset [m]."""
+        point = np.array(self.point) + offset * np.array(self.normal)
+        return replace(self, point=tuple(point.tolist()))
+
     def near(self, places: FloatArray) -> Surface:
         """The surface near places (..., d) [m]."""
         n = np.array(self.normal)
@@ -74,6 +79,10 @@ class Capsule:
     radius: float
     name: str = "capsule"
     touch: bool = False
+
+    def grown(self, offset: float) -> "Capsule":
+        """The same with its surface farther outwards by an offset [m]."""
+        return replace(self, radius=self.radius + offset)
 
     def near(self, places: FloatArray) -> Surface:
         """The surface near places (..., d) [m]."""
