@@ -56,7 +56,7 @@ FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
 RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
 # these that a given start skips, so that it stays on its side; maximum number of steps of each.
-SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 3, 20
+SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
 # How often the way from one depth to the next is halved where contacts change to and fro. Beyond
 # the depth by which the cable bends between two nodes they change no more.
 HALVINGS = 4
@@ -166,14 +166,31 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
 
 
 def descend_to_contact(
-    assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80, *, near: bool
+    assembly: Assembly,
+    shapes: Shapes,
+    given: Inputs,
+    max_iterations: int = 80,
+    *,
+    near: bool,
+    sided: BoolArray | None = None,
 ) -> Minima:
-    """As `descend`; obstacles are soft at first. `near`: whether shapes keep to their sides."""
+    """As `descend`; obstacles are soft at first. `near`: whether shapes keep to their sides.
+
+    `sided` (m,): whose poses name the sides; these shapes skip another of the depths.
+    """
     if not assembly.model.surfaces:
         return descend(assembly, shapes, given, max_iterations)
-    depths = [x for x in SOFT[KEEPING_SIDE * near :] if x > assembly.depth]
-    for depth in depths:
-        shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
+    first = np.full(len(shapes.x), KEEPING_SIDE * near)
+    if near and sided is not None:
+        first += sided
+    shapes = shapes.subset(np.arange(len(first)))  # a copy
+    depths = [depth for depth in SOFT if depth > assembly.depth]
+    for k, depth in enumerate(depths):
+        rows = np.flatnonzero(first <= k)
+        if len(rows):
+            some = shapes.subset(rows), given.subset(rows)
+            softer = descend(assembly.softened(depth), *some, STEPS_WHILE_SOFT).shapes
+            shapes.x[rows], shapes.lam[rows] = softer.x, softer.lam
     return _hardened(assembly, depths[-1], shapes, given, max_iterations, HALVINGS)
 
 

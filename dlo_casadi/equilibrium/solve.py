@@ -270,7 +270,9 @@ class _PoseSearch:
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool = False
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
-        return given, descend_to_contact(assembly_of(self.model), shapes, given, near=near)
+        sided = np.array([bool(named_sides(self.model, poses[j])) for j in of])
+        assembly = assembly_of(self.model)
+        return given, descend_to_contact(assembly, shapes, given, near=near, sided=sided)
 
     def _descended(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool
