@@ -55,7 +55,8 @@ FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
 # back from beyond 1e6.
 RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
-# these that a given start skips, so that it stays on its side; maximum number of steps of each.
+# these that a given start skips to stay on its side, one more where a pose names it: 16 elements in
+# space found it in none of three poses otherwise; maximum number of steps of each.
 SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
 # How often the way from one depth to the next is halved where contacts change to and fro. Beyond
 # the depth by which the cable bends between two nodes they change no more.
@@ -169,24 +170,16 @@ def descend_to_contact(
     assembly: Assembly,
     shapes: Shapes,
     given: Inputs,
+    skipped: int | IntArray,
     max_iterations: int = 80,
-    *,
-    near: bool,
-    sided: BoolArray | None = None,
 ) -> Minima:
-    """As `descend`; obstacles are soft at first. `near`: whether shapes keep to their sides.
-
-    `sided` (m,): whose poses name the sides; these shapes skip another of the depths.
-    """
+    """As `descend`; each shape skips the first `skipped` (m,) of the depths SOFT."""
     if not assembly.model.surfaces:
         return descend(assembly, shapes, given, max_iterations)
-    first = np.full(len(shapes.x), KEEPING_SIDE * near)
-    if near and sided is not None:
-        first += sided
-    shapes = shapes.subset(np.arange(len(first)))  # a copy
+    shapes = shapes.subset(np.arange(len(shapes.x)))  # a copy
     depths = [depth for depth in SOFT if depth > assembly.depth]
     for k, depth in enumerate(depths):
-        rows = np.flatnonzero(first <= k)
+        rows = np.flatnonzero(np.broadcast_to(skipped, len(shapes.x)) <= k)
         if len(rows):
             some = shapes.subset(rows), given.subset(rows)
             softer = descend(assembly.softened(depth), *some, STEPS_WHILE_SOFT).shapes
@@ -291,14 +284,13 @@ def _on_their_sides(
     """
     depth, size = assembly.depth * assembly.chain.length, np.maximum(size, LONGEST_STEP)
     bars = bars_of(assembly.model.surfaces, assembly.model.gravity)
-    hard = [(bar, up) for bar, up in bars if depth < bar.radius]
-    before = [bar.passed(up, assembly.nodes(shapes, given)) for bar, up in hard]
+    bars = [(bar, up) for bar, up in bars if depth < bar.radius]
+    before = assembly.nodes(shapes, given) if bars else shapes.x
     for _ in range(SHORTENED):
         x, lam = stepped(assembly, shapes, step, size)
-        places = assembly.nodes(replace(shapes, x=x, lam=lam), given) if hard else x
-        through = np.zeros(len(x), dtype=bool)
-        for (bar, up), sides in zip(hard, before, strict=True):
-            through |= (np.array(bar.passed(up, places)) != sides).all(axis=0)
+        after = assembly.nodes(replace(shapes, x=x, lam=lam), given) if bars else x
+        sides = [np.array([bar.passed(up, y) for y in (before, after)]) for bar, up in bars]
+        through = np.any([(x != y).all(axis=0) for x, y in sides], axis=0)
         if not through.any():
             break
         size = np.where(through, 2 * size, size)

@@ -14,7 +14,7 @@ from dlo_casadi.equilibrium.equilibrium import (
     Equilibrium,
     equilibria_of,
 )
-from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend_to_contact
+from dlo_casadi.equilibrium.minima import KEEPING_SIDE, Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
 from dlo_casadi.equilibrium.reach import no_equilibrium, out_of_reach
 from dlo_casadi.equilibrium.sides import (
@@ -271,8 +271,8 @@ class _PoseSearch:
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
         sided = np.array([bool(named_sides(self.model, poses[j])) for j in of])
-        assembly = assembly_of(self.model)
-        return given, descend_to_contact(assembly, shapes, given, near=near, sided=sided)
+        skipped = (KEEPING_SIDE + sided) * near
+        return given, descend_to_contact(assembly_of(self.model), shapes, given, skipped)
 
     def _descended(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool
