@@ -16,7 +16,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import tangents
 from dlo_casadi.rod.node import Frame
-from dlo_casadi.rod.obstacles import Capsule, bars_of
+from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 
 # Distance of a bar [lengths] from a cable without obstacles beyond which it has one side alone.
 NEAR_BAR = 0.1
@@ -86,6 +86,18 @@ def on_other_side(
     least = 0.0 if pose.end is None else np.pi
     apart = (turns * turn < 0) & (np.abs(turns - turn) > least)
     return np.asarray(apart & (model.tipped_by is not None and not pose.turns and not pose.branch))
+
+
+def touchdowns(model: CableModel, points: FloatArray) -> list[FloatArray]:
+    """Places (d,) [m] where a cable may touch planes: above its deepest one of points (n, d)."""
+    found = []
+    for plane in model.surfaces:
+        if isinstance(plane, Plane):
+            gaps = plane.near(points).distance - model.cable.diameter / 2
+            deepest = int(gaps.argmin())
+            if gaps[deepest] < 0:
+                found.append(points[deepest] - gaps[deepest] * np.array(plane.normal))
+    return found
 
 
 def _turned(model: CableModel, x: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:

@@ -22,8 +22,9 @@ from dlo_casadi.equilibrium.sides import (
     named_sides,
     on_named_sides,
     on_other_side,
+    touchdowns,
 )
-from dlo_casadi.equilibrium.spans import border_of, first_guesses
+from dlo_casadi.equilibrium.spans import arches, border_of, first_guesses
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -250,7 +251,8 @@ class _PoseSearch:
     def _beside(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
         """Guesses beside obstacles, and the pose of each: first ones, and without obstacles.
 
-        All minima without obstacles are lifted out of them; of the lowest, see `sides`.
+        All minima without obstacles are lifted out of them; of the lowest, see `sides`, and where
+        it is deepest below a plane it touches down, with its slack on either side.
         """
         model, none = self.model, [None] * len(poses)
         alone, p = replace(model, obstacles=()).without_kind(ContactEffect, self.p)
@@ -263,6 +265,9 @@ class _PoseSearch:
                 x, points = stable[i].x, stable[i].points
                 every = [x] if k else beside_bars(model, x, points[: len(x)])
                 pairs += [(j, one, border_of(model, poses[j], one)) for one in every]
+                for place in () if k else touchdowns(model, points):
+                    ways = arches(model, self.p, poses[j], place)
+                    pairs += [(j, one, border) for one, border in ways]
         rows, nodes, lam = zip(*pairs, strict=True)
         return np.array(rows), Shapes.declared(np.array(nodes), np.array(lam), len(model.clips))
 
