@@ -174,6 +174,25 @@ def test_other_fixtures_make_a_shape_less_certain(fitted, capsys):
     assert row["decided_by"].startswith("5 mm at the end")
 
 
+def test_a_prediction_over_or_under_a_bar(fitted, tmp_path, capsys):
+    (tmp_path / "bar.yaml").write_text(
+        "- {name: bar, kind: sphere, center: [0.15, -0.2], radius: 0.02}"
+    )
+    words = ["predict", str(fitted), "--end", "0.3", "-0.1", "--json"]
+    words += ["--obstacles", str(tmp_path / "bar.yaml"), "--over"]
+    heights = {}
+    for side in ("true", "false", "bar=true"):
+        assert main([*words, side]) == 0
+        points = np.array(json.loads(capsys.readouterr().out)["points"])
+        heights[side] = np.interp(0.15, points[:, 0], points[:, 1])
+    assert heights["true"] == heights["bar=true"] > -0.18 > -0.22 > heights["false"]
+    for side, said in (("maybe", "NAME=true"), ("rod=true", "no obstacle is called 'rod'")):
+        assert main([*words, side]) == 2
+        assert said in capsys.readouterr().err
+    assert main([*words[:5], "--over", "true"]) == 2
+    assert "there is none here" in capsys.readouterr().err
+
+
 def test_the_clearance_from_what_the_cable_shall_not_touch(fitted, tmp_path, capsys):
     """On the table it may lie; from the hot plate it keeps a distance, with a probability."""
     from dlo_casadi import load
