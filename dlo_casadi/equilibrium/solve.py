@@ -170,7 +170,7 @@ def _chosen(
                 f"{'over' if over else 'under'} {bar.name}" for bar, _, over in asked
             )
             what = f"no equilibrium found in which the cable passes {said}, {where}"
-            hint = "the other side (over), a longer cable, or the bar nearer to its ends."
+            hint = "the other side (over), a longer cable, or a finer mesh (model.n)."
             return no_equilibrium(pose, what, hint)
         found = [eq for eq, kept in zip(found, passing, strict=True) if kept]
     if not found:
