@@ -1,6 +1,8 @@
 """Contact with obstacles against closed forms, balance of forces, and differences."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +27,9 @@ from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.obstacles import Capsule, Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+from benchmarks.ipopt import Ipopt
 
 LENGTH, WEIGHT, EI, RADIUS = 1.0, 1.0, 0.02, 0.003  # m, N, N m^2, m
 CABLE = CableData(LENGTH, WEIGHT / 9.81, 2 * RADIUS, EI)
@@ -254,6 +259,62 @@ def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():
     assert found.energy == pytest.approx(min(energies), abs=1e-8)
 
 
+@pytest.mark.parametrize(
+    ("bar", "ends"),
+    [
+        ((0.3, -0.3), ((0.0, 0.0), (0.6, 0.05))),
+        ((0.3, -0.05, -0.22), ((0.0, 0.0, 0.0), (0.7, 0.1, 0.0))),
+    ],
+)
+def test_a_pose_names_the_side_of_a_bar(bar, ends):
+    """Either side is a stable shape with its nodes outside; IPOPT from there finds the same."""
+    half = np.array([0.05, 0.3, 0.02]) if len(bar) == 3 else np.zeros(2)
+    bar = Capsule(tuple(bar - half), tuple(bar + half), 0.03, "bar")
+    cable, n = (LOOM, 24) if len(half) == 3 else (CABLE, 48)
+    energies = {}
+    for over in (None, True, False, {"bar": True}):
+        model, found = solved(cable, HeldPose(*ends, over=over), bar, n=n)
+        assert found.stable
+        (above,), (below,) = bar.passed(bar.up(model.gravity), found.points[None])
+        assert above != below
+        assert over is None or above == (over is True or over == {"bar": True})
+        assert bar.near(found.points).distance.min() > RADIUS - 1e-6 * LENGTH
+        energies[above] = found.energy
+        if over is None:
+            lowest = found.energy
+            continue
+        given = model.nominal, np.zeros(model.chain.n_rests), HeldPose(*ends)
+        (one,) = Ipopt(model).solve(*given, [found.x])
+        assert one.energy == pytest.approx(found.energy, abs=1e-8)
+    assert energies[True] > energies[False] + 1e-4
+    assert lowest == pytest.approx(energies[False], abs=1e-12)
+
+
+def test_a_free_end_hangs_over_a_bar():
+    """Frictionless: from the clamp over the bar, all beyond hangs down on its other side."""
+    bar = Capsule((0.3, 0.0), (0.3, 0.0), 0.03, "bar")
+    soft, pose = replace(CABLE, bending_stiffness=2e-3), HeldPose((0.0, 0.0), start_heading=0.0)
+    held = {"n": 48, "start": "clamped", "end": "free"}
+    _, found = solved(soft, replace(pose, over=True), bar, **held)
+    assert found.stable
+    assert found.points[-1] == pytest.approx([0.34, -0.6], abs=0.05)
+    assert not solved(soft, pose, bar, **held)[1].contacts  # it is lower beside the bar
+    with pytest.raises(EquilibriumError, match="in which the cable passes under bar, its end free"):
+        solved(soft, replace(pose, over=False), bar, **held)
+
+
+def test_which_side_of_a_bar_a_line_passes():
+    bar = Capsule((0.0, -0.2, 0.0), (0.0, 0.2, 0.0), 0.02)
+    up, x = bar.up((0.0, 0.0, -9.81)), np.linspace(-1.0, 1.0, 8)
+    lines = [
+        np.stack([x, 0 * x + y, z + 0 * x], axis=1) for y, z in ((0, 0.1), (0.1, -0.1), (0.3, 0.1))
+    ]
+    loop = np.array([[-1, 0, 0.1], [1, 0, 0.1], [1, 0, -0.1], [-1, 0, -0.1], [-1, 0, 0]])
+    above, below = bar.passed(up, np.array([*lines, np.pad(loop, ((0, 3), (0, 0)), mode="edge")]))
+    assert above.tolist() == [True, False, False, False]
+    assert below.tolist() == [False, True, False, False]
+
+
 def test_ipopt_lays_a_free_end_on_a_table():
     pose = HeldPose((0.0, 0.0), start_heading=0.0)
     model, found = solved(CABLE, pose, TABLE, n=24, start="clamped", end="free")
@@ -287,14 +348,16 @@ experiment:
     - {name: table, kind: plane, point: [0, -0.1], normal: [0, 2]}
     - {kind: sphere, center: [0.3, -0.2], radius: 0.05}
   poses:
-    - {file: a.csv, start: [0, 0], end: [0.6, 0.1]}
+    - {file: a.csv, start: [0, 0], end: [0.6, 0.1], over: true}
 """
 
 
 def test_a_session_with_obstacles(tmp_path):
     (tmp_path / "a.csv").touch()
     (tmp_path / "session.yaml").write_text(SESSION)
-    table, ball = load_config(tmp_path / "session.yaml").experiment.surfaces
+    experiment = load_config(tmp_path / "session.yaml").experiment
+    table, ball = experiment.surfaces
+    assert experiment.poses[0].held.over is True
     assert table == Plane((0.0, -0.1), (0.0, 1.0), "table")
     assert ball == Capsule((0.3, -0.2), (0.3, -0.2), 0.05, "obstacle_2")
 
@@ -307,6 +370,9 @@ def test_a_session_with_obstacles(tmp_path):
         ("point: [0, -0.1]", "point: [0, 0, -0.1]", r"table: point: \[x, y\] belongs here"),
         ("kind: sphere", "kind: sphere, a: [0, 0]", "obstacle_2: a sphere has no a, it has center"),
         ("kind: sphere", "kind: sphere, name: table", "two obstacles are called table"),
+        ("over: true", "over: {tabel: true}", "did you mean 'table'"),
+        ("over: true", "over: {table: true}", "over: table: with gravity a cable passes"),
+        ("gravity: [0, -9.81]", "gravity: [0, 0]", "over: with gravity .*; there is none here"),
     ],
 )
 def test_obstacles_that_cannot_be_declared_so(tmp_path, old, new, said):

@@ -13,7 +13,7 @@ from scipy.stats import norm
 from dlo_casadi.cable.limits import LimitCheck, limit_checks
 from dlo_casadi.cli import main
 from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.config import Limits, dump_yaml, load_config
+from dlo_casadi.config import Limits, dump_yaml, load_config, read_yaml
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.limits import _crossing
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -174,6 +174,60 @@ def test_other_fixtures_make_a_shape_less_certain(fitted, capsys):
     assert row["decided_by"].startswith("5 mm at the end")
 
 
+def test_a_prediction_over_or_under_a_bar(fitted, tmp_path, capsys):
+    (tmp_path / "bar.yaml").write_text(
+        "- {name: bar, kind: sphere, center: [0.15, -0.2], radius: 0.02}"
+    )
+    words = ["predict", str(fitted), "--end", "0.3", "-0.1", "--json"]
+    words += ["--obstacles", str(tmp_path / "bar.yaml"), "--over"]
+    heights = {}
+    for side in ("true", "false", "bar=true"):
+        assert main([*words, side]) == 0
+        points = np.array(json.loads(capsys.readouterr().out)["points"])
+        heights[side] = np.interp(0.15, points[:, 0], points[:, 1])
+    assert heights["true"] == heights["bar=true"] > -0.18 > -0.22 > heights["false"]
+    for side, said in (("maybe", "NAME=true"), ("rod=true", "no obstacle is called 'rod'")):
+        assert main([*words, side]) == 2
+        assert said in capsys.readouterr().err
+    assert main([*words[:5], "--over", "true"]) == 2
+    assert "there is none here" in capsys.readouterr().err
+
+
+def test_the_clearance_from_what_the_cable_shall_not_touch(fitted, tmp_path, capsys):
+    """On the table it may lie; from the hot plate it keeps a distance, with a probability."""
+    from dlo_casadi import load
+
+    (tmp_path / "around.yaml").write_text(
+        "- {name: table, kind: plane, point: [0, -0.245], normal: [0, 1], touch: allowed}\n"
+        "- {name: plate, kind: sphere, center: [0.15, -0.15], radius: 0.02}\n"
+    )
+    cable, end = load(fitted), (0.3, -0.1)
+    around = read_yaml(tmp_path / "around.yaml")
+    shape = cable.solve(end, obstacles=around)
+    assert {one.obstacle for one in shape.contacts} == {"table"}
+    there = np.linalg.norm(
+        shape.curve.at(np.linspace(0, shape.curve.length, 4001)) - [0.15, -0.15], axis=1
+    )
+    least = there.min() - 0.02 - shape.cable.model.cable.diameter / 2
+    for limit, verdict in ((0.5 * least, "pass"), (least, "risk"), (2 * least, "fail")):
+        (check,) = shape.check({"clearance": limit})
+        assert check.value == pytest.approx(least, abs=2e-4)
+        assert check.at == pytest.approx(shape.curve.length * there.argmin() / 4000, abs=0.02)
+        assert check.holder == "plate"
+        if limit != least:
+            assert check.verdict == verdict
+            assert check.used.max() == pytest.approx(2 - check.value / limit)
+    near = {"clearance": check.value + check.std}
+    (check,) = shape.check(near)
+    assert check.probability == pytest.approx(0.841, abs=0.05)
+    (tmp_path / "poses.csv").write_text("end_x_m,end_y_m\n0.3,-0.1\n")
+    words = ["limits", str(fitted), str(tmp_path / "poses.csv"), "--json"]
+    words += ["--obstacles", str(tmp_path / "around.yaml"), "--limits", f"clearance={least / 2}"]
+    assert main(words) == 0
+    (row,) = json.loads(capsys.readouterr().out)["limits"]
+    assert (row["quantity"], row["verdict"], row["holder"]) == ("clearance", "pass", "plate")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -184,7 +238,7 @@ def test_other_fixtures_make_a_shape_less_certain(fitted, capsys):
         (["--limits", "force=eight"], "NAME=VALUE"),
         (["--limits", "moment=0.1"], "no end is clamped"),
         (["--limits", "twist=3"], "does not twist"),
-        (["--limits", "clearance=0.01"], "may be touched"),
+        (["--limits", "clearance=0.01"], "no obstacle that the cable is not meant to touch"),
         (["--limits"], "no limit is given"),
         (["--limits", "force=9", "--tolerances", "end=2"], "such as 0.002"),
         (["--limits", "force=9", "--tolerances", "heading=0.1"], "Try: end, length"),
@@ -266,7 +320,7 @@ def test_a_session_checks_its_poses_and_shows_where_they_are_tight(tmp_path):
         ("{bend_radius: 50}", "did you mean 0.05?"),
         ("{moment: 1.0}", "no end is clamped"),
         ("{force: -1}", "larger than 0"),
-        ("{clearance: 0.01}", "may be touched"),
+        ("{clearance: 0.01}", "no obstacle that the cable is not meant to touch"),
         ("{bendradius: 0.05}", "bend_radius"),
     ],
 )

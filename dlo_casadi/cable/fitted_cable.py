@@ -73,12 +73,13 @@ class FittedCable(KnownCable):
         branch: Branch | None = None,
         clips: Sequence[Clip | Mapping[str, Any]] = (),
         obstacles: Sequence[Obstacle | Mapping[str, Any]] = (),
+        over: bool | Mapping[str, bool] | None = None,
     ) -> "Shape":
         """Predict the shape of the cable in a pose.
 
-        Of several equilibria this is the stable one of lowest energy, unless `branch` or `turns`
-        name one. Where it is unknown which of two sides is the lower one, `other_side` has the
-        other.
+        Of several equilibria this is the stable one of lowest energy, unless `branch`, `turns` or
+        `over` name one. Where it is unknown which of two sides is the lower one, `other_side` has
+        the other.
 
         Parameters
         ----------
@@ -103,22 +104,25 @@ class FittedCable(KnownCable):
             default, whatever held it in the session.
         obstacles : sequence of Obstacle or dict
             What the cable may touch, see `Obstacle`; none by default.
+        over : bool or mapping of str to bool, optional
+            Whether the cable passes over or under the bars among the obstacles, see `Pose`.
 
         Raises
         ------
         EquilibriumError
             If the pose has no equilibrium, e.g. because the end is out of reach, or none is found
-            on the branch.
+            on the branch or side.
         DloError
             If the ends are not held as the cable's boundary asks, or are no finite numbers.
         """
         asked = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        pose = held_pose(self.model, self.metadata.fixtures, asked | {"clips": list(clips)})
+        beside = {"clips": list(clips), "over": over}
+        pose = held_pose(self.model, self.metadata.fixtures, asked | beside)
         held = self.with_clips([clip.kind for clip in pose.clips])
-        if obstacles:
-            held = replace(held, **among(held.model, held.p, obstacles))
+        if obstacles or over is not None:
+            held = replace(held, **among(held.model, held.p, obstacles, over))
         return held._solved(pose)
 
     def _solved(self, pose: HeldPose) -> "Shape":

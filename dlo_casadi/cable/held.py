@@ -11,7 +11,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
-from dlo_casadi.config.supports import Obstacle, clip_problems, obstacle_problems
+from dlo_casadi.config.supports import Obstacle, Sides, clip_problems, obstacle_problems
 from dlo_casadi.config.values import AXES, MESH
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
@@ -108,11 +108,15 @@ def reaction_texts(
 
 
 def among(
-    model: CableModel, p: FloatArray, obstacles: Sequence[Obstacle | Mapping[str, Any]]
+    model: CableModel,
+    p: FloatArray,
+    obstacles: Sequence[Obstacle | Mapping[str, Any]],
+    over: Sides = None,
 ) -> dict[str, Any]:
     """Model and parameters `p` of a cable among obstacles, checked as those of a session.
 
-    They are where they are declared: an `obstacle_offset` is of the session's own.
+    They are where they are declared: an `obstacle_offset` is of the session's own. `over` as of
+    `HeldPose`.
 
     Raises
     ------
@@ -120,7 +124,7 @@ def among(
         If one cannot be so.
     """
     listed = [x if isinstance(x, Obstacle) else Obstacle(**x) for x in obstacles]
-    if wrong := [x.message for x in obstacle_problems(listed, model.node.dimension)]:
+    if wrong := [x.message for x in obstacle_problems(listed, model.gravity, [over])]:
         raise DloError("; ".join(wrong))
     surfaces = tuple(item.surface(k) for k, item in enumerate(listed, start=1))
     model = replace(model, obstacles=surfaces)

@@ -29,7 +29,9 @@ Kind = TypeVar("Kind", bound=ConfigSection)
 Verdict = Literal["pass", "risk", "fail"]
 # Smallest probability that is written as a number.
 SHOWN = 1e-3
-UNITS = {"bend_radius": "m", "force": "N", "moment": "N m", "twist": "1/m"}
+UNITS = {"bend_radius": "m", "force": "N", "moment": "N m", "twist": "1/m", "clearance": "m"}
+# Quantities of which a limit is the least value.
+LEAST = ("bend_radius", "clearance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +46,10 @@ class LimitUse:
     at : float [m]
         Arc length from the start where the shape is tightest.
     holder : str
-        The fixture there, of a force or a moment; else empty.
+        The fixture there, of a force or a moment, the nearest obstacle of a clearance; else empty.
     s, used : (K,)
-        Arc lengths [m], and the share of the limit that is used there: 1 at the limit.
+        Arc lengths [m], and the share of the limit that is used there: 1 at the limit, of a
+        clearance 2 where the cable touches.
     """
 
     pose: str
@@ -65,8 +68,10 @@ class LimitUse:
 
     @property
     def where(self) -> str:
-        """The fixture, or the arc length."""
-        return self.holder or f"s = {self.at:.3f} m"
+        """The fixture, or the arc length, and the obstacle there."""
+        if self.quantity in ("force", "moment"):
+            return self.holder
+        return f"s = {self.at:.3f} m{self.holder and f', {self.holder}'}"
 
     def text(self, *values: float) -> str:
         """A value of the quantity with its unit, and its standard deviation if it is given."""
@@ -83,7 +88,7 @@ class LimitUse:
     @property
     def bound(self) -> str:
         """The limit as text, with its side."""
-        return f"{'≥' if self.quantity == 'bend_radius' else '≤'} {self.text(self.limit)}"
+        return f"{'≥' if self.quantity in LEAST else '≤'} {self.text(self.limit)}"
 
     def __str__(self) -> str:
         return f"{self.label} {self.text(self.value)} at {self.where} of {self.pose} ({self.bound})"
@@ -175,7 +180,8 @@ def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Li
     if not asked.given:
         raise DloError(f"no limit is given, and the session declared none.\n  Try: {_TRY}")
     held = (model.start, model.end, *model.clips)
-    if wrong := [*asked.problems(held, model.in_space, model.cable.length)]:
+    avoided = any(not one.touch for one in model.obstacles)
+    if wrong := [*asked.problems(held, model.in_space, model.cable.length, avoided)]:
         raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
     return asked
 
@@ -214,8 +220,12 @@ def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
 
 
 def bounds_of(limits: Limits) -> dict[str, float]:
-    """Upper bounds of the sizes of `sizes_of`, by their names: of a bend radius the curvature's."""
-    return {_size(x): 1 / y if x == "bend_radius" else y for x, y in limits.given.items()}
+    """Upper bounds of the sizes of `sizes_of`, by their names.
+
+    Of a bend radius it is the curvature's; the size of a clearance is its negative.
+    """
+    sizes = {"bend_radius": lambda y: 1 / y, "clearance": lambda y: -y}
+    return {_size(x): sizes.get(x, float)(y) for x, y in limits.given.items()}
 
 
 def _size(quantity: str) -> str:
@@ -272,9 +282,12 @@ class _Resolved:
             here = self.sizes(mesh, shape, quantity)
             places, holders = places_of(mesh, self.pose, shape, _size(quantity))
             tight = int(here.argmax())
-            value = 1 / here[tight] if quantity == "bend_radius" else here[tight]
+            value, used = here[tight], here / bounds[_size(quantity)]
+            if quantity == "bend_radius":
+                value = 1 / value
+            elif quantity == "clearance":
+                value, used = -value, 2 - used
             where = float(places[tight]), holders[tight], places
-            used = here / bounds[_size(quantity)]
             out.append(LimitUse(self.pose.name, quantity, limit, float(value), *where, used))
         return tuple(out)
 
@@ -316,7 +329,8 @@ def limit_checks(
     ratio = {
         _size(x): shape.sizes(drawn, near, x).max() / shape.sizes(*shape.on(x), x).max()
         for x in limits.given
-    }
+        if x != "clearance"  # which hardly depends on the mesh, and may be zero
+    } | {"clearance": 1.0}
     own = uncertainty.pose_scatter
     with_own = own.within(drawn), own.values(cable.p, drawn)
     varied = Varied(*with_own, shape.rest_on(drawn), pose, near, uncertainty)

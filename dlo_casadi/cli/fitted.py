@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
@@ -31,7 +31,10 @@ MESH = (
         help="instead of the fit's; arcs are several times faster than quadratic elements",
     ),
 )
-_LIMITS = "bend_radius [m], force [N], moment [N m], twist [1/m]; as the session declared without"
+_LIMITS = "bend_radius, clearance [m], force [N], moment [N m], twist [1/m]; the session's without"
+OBSTACLES = option(
+    "--obstacles", type=Path, metavar="FILE", help="YAML: a list, as in an experiment"
+)
 LIMITS = (
     option("--limits", nargs="*", metavar="NAME=VALUE", help=f"check limits: {_LIMITS}"),
     option(
@@ -78,7 +81,13 @@ POSE = (
     PARAMETERS,
     *POSE,
     option("--clips", type=Path, metavar="FILE", help="YAML: a list of clips, as in a pose"),
-    option("--obstacles", type=Path, metavar="FILE", help="YAML: a list, as in an experiment"),
+    OBSTACLES,
+    option(
+        "--over",
+        nargs="+",
+        metavar="SIDE",
+        help="over or under bars: true or false of all, or NAME=true ... of some",
+    ),
     *LIMITS,
     option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
     codes="2 is also a pose without an equilibrium",
@@ -100,12 +109,8 @@ def predict(chosen: argparse.Namespace) -> None:
     if figure is not None and figure.suffix.lower() not in DRAWN:
         raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
     asked = {name: getattr(chosen, name) for name in HELD}
-    for name, kind in (("clips", "pinned"), ("obstacles", "plane")):
-        path = getattr(chosen, name)
-        asked[name] = [] if path is None else read_yaml(path)
-        if not isinstance(asked[name], list):
-            raise DloError(f"{path}: a list of {name} belongs here: - {{kind: {kind}, ...}}")
-    shape = load(chosen.parameters).solve(**asked)
+    asked |= {name: _listed(chosen, name) for name in ("clips", "obstacles")}
+    shape = load(chosen.parameters).solve(**asked, over=_sides(chosen.over))
     if figure is not None:
         save_figure(figure, shape.plot())
     # What a reader of the prediction should know of the file it came from.
@@ -134,6 +139,34 @@ def predict(chosen: argparse.Namespace) -> None:
         page.say(f"Figure: {figure}")
 
 
+def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:
+    """Clips or obstacles of the command's file; none without one."""
+    path, kind = getattr(chosen, name), {"clips": "pinned", "obstacles": "plane"}[name]
+    found = [] if path is None else read_yaml(path)
+    if not isinstance(found, list):
+        raise DloError(f"{path}: a list of {name} belongs here: - {{kind: {kind}, ...}}")
+    return found
+
+
+def _sides(words: list[str] | None) -> bool | dict[str, bool] | None:
+    """Sides of bars, of true or false alone or of NAME=true ..."""
+    if words is None:
+        return None
+    said = {"true": True, "false": False}
+    if len(words) == 1 and words[0] in said:
+        return said[words[0]]
+    pairs = [word.rpartition("=") for word in words]
+    if wrong := [
+        word
+        for word, (name, _, side) in zip(words, pairs, strict=True)
+        if not (name and side in said)
+    ]:
+        raise DloError(
+            f"--over {wrong[0]}: true, false or NAME=true belongs here, such as bar=true"
+        )
+    return {name: said[side] for name, _, side in pairs}
+
+
 def _checked(shape: Shape, chosen: argparse.Namespace) -> tuple[LimitCheck, ...]:
     """Checks of a shape against the limits of the command, or those of the session."""
     return shape.check(_named("limits", chosen) or None, tolerances=_named("tolerances", chosen))
@@ -157,6 +190,7 @@ def _named(key: str, chosen: argparse.Namespace) -> dict[str, float]:
 @command(
     PARAMETERS,
     option("poses", type=Path, help="CSV with end_x_m, end_y_m, ...; in space also end_qx, ..."),
+    OBSTACLES,
     *LIMITS,
 )
 def limits(chosen: argparse.Namespace) -> None:
@@ -167,12 +201,12 @@ def limits(chosen: argparse.Namespace) -> None:
     """
     from dlo_casadi.report.terminal import limits_table
 
-    cable = load(chosen.parameters)
+    cable, obstacles = load(chosen.parameters), _listed(chosen, "obstacles")
     checks: list[LimitCheck] = []
     lost: dict[str, str] = {}
     for name, ends in listed_poses(cable.model, chosen.poses).items():
         try:
-            shape = cable.solve(**ends)
+            shape = cable.solve(**ends, obstacles=obstacles)
         except EquilibriumError as error:
             lost[name] = error.message.partition("\n")[0]
             continue

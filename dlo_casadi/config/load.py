@@ -75,7 +75,11 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
         *wrong_effects(config),
         *_impossible_values(config.experiment, config.cable.length),
         *_wrong_clips(config.experiment, config.cable.length),
-        *obstacle_problems(config.experiment.obstacles, len(config.experiment.gravity)),
+        *obstacle_problems(
+            config.experiment.obstacles,
+            config.experiment.gravity,
+            [pose.over for pose in config.experiment.poses],
+        ),
         *config.limit_problems,
     ]:
         raise source.error(problems)

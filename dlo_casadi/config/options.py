@@ -115,7 +115,7 @@ class Limits(ConfigSection):
     twist: Annotated[Positive, within(_TWIST)] | None = None
     """Greatest twist in space, the angle about the axis per length [1/m]."""
     clearance: Annotated[Positive, within(LENGTH._replace(least=1.0e-6))] | None = None
-    """Least distance of the cable's surface from obstacles [m]; not checked yet."""
+    """Least distance of the cable's surface from obstacles without touch: allowed [m]."""
 
     @property
     def given(self) -> dict[str, float]:
@@ -124,11 +124,12 @@ class Limits(ConfigSection):
         return {name: value for name, value in values.items() if value is not None}
 
     def problems(
-        self, held: Sequence[str], in_space: bool, length: float
+        self, held: Sequence[str], in_space: bool, length: float, avoided: bool
     ) -> Iterator[ConfigProblem]:
         """Find limits that have no meaning for a cable.
 
-        `held` are the kinds of its ends and clips, `length` [m] is the cable's.
+        `held` are the kinds of its ends and clips, `length` [m] is the cable's; `avoided`: whether
+        there are obstacles that it is not meant to touch.
         """
         for name in ("bend_radius", "clearance"):
             value = self.given.get(name, 0.0)
@@ -137,9 +138,9 @@ class Limits(ConfigSection):
                 meant = value / 1e3
                 hint = f", did you mean {meant:g}?" if meant < length else ""
                 yield ConfigProblem((name,), f"{text}{hint}")
-        if self.clearance is not None:
-            text = "limits.clearance: a session's obstacles may be touched, no clearance is checked"
-            hint = "leave it out; the compiled solver's limits(shape, {...}, obstacles) measures it"
+        if self.clearance is not None and not avoided:
+            text = "limits.clearance: there is no obstacle that the cable is not meant to touch"
+            hint = "obstacles (experiment: obstacles, --obstacles FILE) without touch: allowed"
             yield ConfigProblem(("clearance",), f"{text}. Try: {hint}")
         if self.twist is not None and not in_space:
             text = "limits.twist: a cable in a plane (two numbers of gravity) does not twist"

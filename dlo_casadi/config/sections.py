@@ -189,6 +189,10 @@ class Pose(ConfigSection):
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
     clips: tuple[Clip, ...] = ()
     """What holds the cable between its ends, in the order along it."""
+    over: bool | dict[str, bool] | None = None
+    """Whether the cable passes over (true) or under (false) the bars among the obstacles, or some
+    of them, {bar: true}: whether it crosses the half-plane that stands on a bar's axis, or the one
+    that hangs from it. Without it, the side of lower energy."""
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -419,7 +423,8 @@ class Config(ConfigSection):
         """Limits that have no meaning for this cable."""
         given, ends = self.experiment, self.experiment.boundary
         held = {ends.start, ends.end, *(clip.kind for x in given.poses for clip in x.clips)}
-        found = self.limits.problems(sorted(held), given.in_space, self.cable.length)
+        avoided = any(one.touch == "avoided" for one in given.obstacles)
+        found = self.limits.problems(sorted(held), given.in_space, self.cable.length, avoided)
         return [ConfigProblem(("limits", *place), text) for place, text in found]
 
     @property

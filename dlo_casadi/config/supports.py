@@ -1,10 +1,10 @@
 """What is between the ends: clips that hold the cable, obstacles; and what is wrong with them."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Protocol
 
-from dlo_casadi.config.problems import ConfigProblem
+from dlo_casadi.config.problems import ConfigProblem, did_you_mean
 from dlo_casadi.config.values import (
     AXES,
     ConfigSection,
@@ -17,7 +17,7 @@ from dlo_casadi.config.values import (
     Quaternion,
 )
 from dlo_casadi.model.clips import HeldClip
-from dlo_casadi.rod.obstacles import Capsule, Plane
+from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 
 # Kinds of clips that a configuration may declare.
@@ -167,6 +167,9 @@ class Obstacle(ConfigSection):
     """End of a capsule's axis [m]."""
     radius: Positive | None = None
     """Radius of a sphere or capsule [m]."""
+    touch: Literal["allowed", "avoided"] = "avoided"
+    """Whether the cable is meant to touch it: limits.clearance then leaves it out. Shapes are the
+    same either way."""
 
     def surface(self, number: int) -> Surface:
         """The same for the statics; `number` names it where it has no name."""
@@ -174,20 +177,49 @@ class Obstacle(ConfigSection):
         if self.kind == "plane":
             normal, point = self.normal or (), self.point or ()
             size = math.hypot(*normal)
-            return Plane(point, tuple(x / size for x in normal), name)
+            return Plane(point, tuple(x / size for x in normal), name, self.touch == "allowed")
         a, b = (self.center, self.center) if self.kind == "sphere" else (self.a, self.b)
-        return Capsule(a or (), b or (), self.radius or 0.0, name)
+        return Capsule(a or (), b or (), self.radius or 0.0, name, self.touch == "allowed")
 
 
-def obstacle_problems(obstacles: Sequence[Obstacle], axes: int) -> Iterator[ConfigProblem]:
-    """What is wrong with obstacles. `axes`: 2 in a plane, 3 in space."""
+# What a pose says of the sides of bars: over all (true) or under them, or some by their names.
+Sides = bool | Mapping[str, bool] | None
+
+
+def obstacle_problems(
+    obstacles: Sequence[Obstacle], gravity: Sequence[float], sides: Sequence[Sides]
+) -> Iterator[ConfigProblem]:
+    """What is wrong with obstacles, and with the sides of bars that poses name."""
     names = [item.name or f"obstacle_{k}" for k, item in enumerate(obstacles, start=1)]
+    usable = True
     for k, (item, name) in enumerate(zip(obstacles, names, strict=True)):
-        for text in _wrong(item, axes):
-            yield ConfigProblem(("experiment", "obstacles", k), f"{name}: {text}")
-        if names.index(name) < k:
-            text = f"two obstacles are called {name}"
-            yield ConfigProblem(("experiment", "obstacles", k), text)
+        wrong = [f"{name}: {text}" for text in _wrong(item, len(gravity))]
+        wrong += [f"two obstacles are called {name}"] if names.index(name) < k else []
+        usable = usable and not wrong
+        yield from (ConfigProblem(("experiment", "obstacles", k), text) for text in wrong)
+    if not usable:
+        return
+    surfaces = [item.surface(k) for k, item in enumerate(obstacles, start=1)]
+    bars = [bar.name for bar, _ in bars_of(surfaces, gravity)]
+    for k, over in enumerate(sides):
+        called = f"pose {k + 1}: over" if len(sides) > 1 else "over"
+        for text in _no_sides(over, names, bars, len(gravity)):
+            yield ConfigProblem(("experiment", "poses", k, "over"), f"{called}: {text}")
+
+
+def _no_sides(over: Sides, names: list[str], bars: list[str], axes: int) -> Iterator[str]:
+    what = "a disc or a stadium" if axes == 2 else "a capsule whose axis is not upright"
+    have = f"those here are {', '.join(bars)}" if bars else "there is none here"
+    belongs = f"with gravity a cable passes over or under {what}; {have}"
+    if not isinstance(over, Mapping):
+        if over is not None and not bars:
+            yield belongs
+        return
+    for name in over:
+        if name not in names:
+            yield f"no obstacle is called {name!r}{did_you_mean(name, names)}"
+        elif name not in bars:
+            yield f"{name}: {belongs}"
 
 
 def _wrong(item: Obstacle, axes: int) -> Iterator[str]:

@@ -14,7 +14,13 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
-from dlo_casadi.equilibrium.minima import TOLERANCE, damped, descend_to_contact, stepped
+from dlo_casadi.equilibrium.minima import (
+    KEEPING_SIDE,
+    TOLERANCE,
+    damped,
+    descend_to_contact,
+    stepped,
+)
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
@@ -190,7 +196,8 @@ class BatchEquilibrium:
         if not len(lost) or self.model.has_state:
             return now, converged
         given = self.given(shapes, p, rest).subset(lost)
-        found = descend_to_contact(self.assembly, shapes.subset(lost), given, DOWNHILL, near=True)
+        some = shapes.subset(lost)
+        found = descend_to_contact(self.assembly, some, given, KEEPING_SIDE, DOWNHILL)
         kept = lost[found.converged]
         now.x[kept] = found.shapes.x[found.converged]
         now.lam[kept] = found.shapes.lam[found.converged]

@@ -20,7 +20,8 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, clamped_nodes, node_places
+from dlo_casadi.model.clips import CLAMPS, clamped_nodes, node_places, tangents
+from dlo_casadi.model.contact import outwards
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
 
@@ -56,11 +57,20 @@ def fixtures_of(model: CableModel, pose: HeldPose, found: Equilibrium) -> list[F
 def places_of(
     model: CableModel, pose: HeldPose, found: Equilibrium, quantity: str
 ) -> tuple[FloatArray, list[str]]:
-    """Arc lengths (K,) [m] at which a quantity has values, and the names of its fixtures there."""
+    """Arc lengths (K,) [m] at which a quantity has values, and the names of what is there.
+
+    These are fixtures, and of a clearance the nearest obstacles.
+    """
     if quantity in ("force", "moment"):
         held = fixtures_of(model, pose, found)
         own = [item for item in held if quantity == "force" or item.clamped]
         return np.array([item.at for item in own]), [item.name for item in own]
+    if quantity == "clearance":
+        known = [one for one in model.obstacles if not one.touch]
+        points = _along(model, found.points, found.x)
+        nearest = np.argmin([one.near(points).distance for one in known], axis=0)
+        along = np.linspace(0.0, model.cable.length, len(points))
+        return along, [known[k].name for k in nearest]
     moved = node_places(model.chain, pose.clips)  # to clamped clips
     cells = np.interp(model.chain.cells, model.chain.places, moved)
     clamped = clamped_nodes(model.chain, pose.clips)
@@ -71,9 +81,18 @@ def places_of(
 def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) -> FloatArray:
     """Sizes (m, K) at `places_of` in repeats of a pose.
 
-    Curvature, twist [1/m]; force [N], moment [N m] on fixtures.
+    Curvature, twist [1/m]; force [N], moment [N m] on fixtures; of a clearance [m] its negative.
     """
     assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
+    if quantity == "clearance":
+        points = _along(model, assembly.nodes(shapes, given), shapes.x)
+        offsets = given.p @ outwards(model).T
+        deep = [
+            offsets[:, [k]] - one.near(points).distance
+            for k, one in enumerate(model.obstacles)
+            if not one.touch
+        ]
+        return np.max(deep, axis=0) + model.cable.diameter / 2
     if quantity in ("curvature", "twist"):
         strain = assembly.strain(shapes, given)
         if quantity == "twist":
@@ -91,6 +110,22 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
         if kind in known
     ]
     return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
+
+
+def _along(model: CableModel, points: FloatArray, x: FloatArray) -> FloatArray:
+    """Places (..., K, d) [m] along cables, four to an element, from their nodes."""
+    slopes = model.chain.h * tangents(model.node, x)
+    u = np.arange(4)[:, None] / 4
+    start, end, out, into = (
+        points[..., :-1, None, :],
+        points[..., 1:, None, :],
+        slopes[..., :-1, None, :],
+        slopes[..., 1:, None, :],
+    )
+    bulge = u * (1 - u) * ((1 - u) * (out - (end - start)) - u * (into - (end - start)))
+    inner = start + u * (end - start) + bulge
+    flat = inner.reshape((*points.shape[:-2], -1, points.shape[-1]))
+    return np.concatenate([flat, points[..., -1:, :]], axis=-2)
 
 
 @dataclass(frozen=True)
@@ -162,7 +197,13 @@ class Varied:
         z = np.random.default_rng(0).standard_normal((LINEAR, len(causes)))
         solved, lost = self._solved(z[:PAIRED], names)
         likely = {x: _crossing(sizes[x], slopes[x], bounds[x], z) for x in names}
-        anew = {x: _beyond(solved[x], bounds[x]) | lost for x in names}
+        softer: dict[str, FloatArray] = dict.fromkeys(names, np.zeros(1))
+        if (
+            self.model.surfaces
+        ):  # draws sink in by as much as the predicted shape does, if solved so
+            (same, _) = self._solved(0 * z[:1], names)
+            softer = {x: same[x] - sizes[x] for x in names}
+        anew = {x: _beyond(solved[x] - softer[x], bounds[x]) | lost for x in names}
         enough = {
             x: not IN_DOUBT[0] < likely[x] < IN_DOUBT[1]
             and _agree(anew[x], _beyond(sizes[x] + z[:PAIRED] @ slopes[x].T, bounds[x]))
@@ -171,7 +212,7 @@ class Varied:
         if not all(enough.values()):
             more, also = self._solved(z[PAIRED:DRAWN], names)
             lost = np.concatenate([lost, also])
-            beyond = {x: _beyond(more[x], bounds[x]) | also for x in names}
+            beyond = {x: _beyond(more[x] - softer[x], bounds[x]) | also for x in names}
             anew = {x: np.concatenate([anew[x], beyond[x]]) for x in names}
         out = {}
         for name in names:

@@ -37,9 +37,10 @@ from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes
-from dlo_casadi.model.contact import outwards
+from dlo_casadi.model.contact import DEPTH, gap_per_force, outwards
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
+from dlo_casadi.rod.obstacles import bars_of
 from dlo_casadi.runtime.executors import interrupts_held
 
 # Longest step of a node [rad].
@@ -54,7 +55,8 @@ FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
 # back from beyond 1e6.
 RUNAWAY = 1e16
 # Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
-# these that a given start skips, so that it stays on its side; maximum number of steps of each.
+# these that a given start skips to stay on its side, one more where a pose names it: 16 elements in
+# space found it in none of three poses otherwise; maximum number of steps of each.
 SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
 # How often the way from one depth to the next is halved where contacts change to and fro. Beyond
 # the depth by which the cable bends between two nodes they change no more.
@@ -63,6 +65,10 @@ HALVINGS = 4
 # times the one before, the share SHORTER is taken. What is left of it is the next step, so that the
 # ratio has to be more than a half.
 SHORTER, SAME_SIZE = 0.5, 0.75
+# How often a step that carries a cable through a bar is halved.
+SHORTENED = 6
+# Depth [lengths] of a node in hard obstacles from which on no room is left for the cable.
+NO_ROOM = 1e-6
 # Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8
 # Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
@@ -138,7 +144,8 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
         size = assembly.size(step)
         taken, length = damped(assembly, step, size, last[active])
         last[active] = size
-        now.x[active], now.lam[active] = stepped(assembly, here, taken, length)
+        own = here, taken, length, given.subset(active)
+        now.x[active], now.lam[active] = _on_their_sides(assembly, *own)
         # A shift makes steps small even where forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
@@ -152,20 +159,31 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
     there = np.flatnonzero(balanced)
     converged = np.zeros(m, dtype=bool)
     converged[there] = matrix.subset(there).negative() == wanted
-    ordered = assembly.clipped(now, given).in_order
-    balanced, converged = balanced & ordered, converged & ordered
+    possible = assembly.clipped(now, given).in_order
+    pressed = now.lam[:, assembly.model.n_lam :].max(axis=1, initial=0.0)
+    possible &= pressed * gap_per_force(assembly.model, DEPTH) < NO_ROOM * assembly.chain.length
+    balanced, converged = balanced & possible, converged & possible
     return Minima(now, balanced, converged, energy, iterations)
 
 
 def descend_to_contact(
-    assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80, *, near: bool
+    assembly: Assembly,
+    shapes: Shapes,
+    given: Inputs,
+    skipped: int | IntArray,
+    max_iterations: int = 80,
 ) -> Minima:
-    """As `descend`; obstacles are soft at first. `near`: whether shapes keep to their sides."""
+    """As `descend`; each shape skips the first `skipped` (m,) of the depths SOFT."""
     if not assembly.model.surfaces:
         return descend(assembly, shapes, given, max_iterations)
-    depths = [x for x in SOFT[KEEPING_SIDE * near :] if x > assembly.depth]
-    for depth in depths:
-        shapes = descend(assembly.softened(depth), shapes, given, STEPS_WHILE_SOFT).shapes
+    shapes = shapes.subset(np.arange(len(shapes.x)))  # a copy
+    depths = [depth for depth in SOFT if depth > assembly.depth]
+    for k, depth in enumerate(depths):
+        rows = np.flatnonzero(np.broadcast_to(skipped, len(shapes.x)) <= k)
+        if len(rows):
+            some = shapes.subset(rows), given.subset(rows)
+            softer = descend(assembly.softened(depth), *some, STEPS_WHILE_SOFT).shapes
+            shapes.x[rows], shapes.lam[rows] = softer.x, softer.lam
     return _hardened(assembly, depths[-1], shapes, given, max_iterations, HALVINGS)
 
 
@@ -254,6 +272,28 @@ def stepped(
     lam = shapes.lam + share[:, None] * step.y[..., 0]
     for row in assembly.model.sliding.values():
         lam[:, row] = lam[:, row].clip(0.0, assembly.chain.length)
+    return x, lam
+
+
+def _on_their_sides(
+    assembly: Assembly, shapes: Shapes, step: Vector, size: FloatArray, given: Inputs
+) -> tuple[FloatArray, FloatArray]:
+    """As `stepped`, of steps that are halved while they carry a cable through a bar.
+
+    Bars in which the cable's weight alone sinks in by more than their radius are no hindrance.
+    """
+    depth, size = assembly.depth * assembly.chain.length, np.maximum(size, LONGEST_STEP)
+    bars = bars_of(assembly.model.surfaces, assembly.model.gravity)
+    bars = [(bar, up) for bar, up in bars if depth < bar.radius]
+    before = assembly.nodes(shapes, given) if bars else shapes.x
+    for _ in range(SHORTENED):
+        x, lam = stepped(assembly, shapes, step, size)
+        after = assembly.nodes(replace(shapes, x=x, lam=lam), given) if bars else x
+        sides = [np.array([bar.passed(up, y) for y in (before, after)]) for bar, up in bars]
+        through = np.any([(x != y).all(axis=0) for x, y in sides], axis=0)
+        if not through.any():
+            break
+        size = np.where(through, 2 * size, size)
     return x, lam
 
 

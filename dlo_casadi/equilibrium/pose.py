@@ -1,8 +1,8 @@
 """End conditions of one pose as declared."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -43,6 +43,8 @@ class HeldPose:
         Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
     clips : tuple of HeldClip
         What holds the cable between its ends, in the order along it.
+    over : bool or mapping of str to bool, optional
+        Whether the cable passes over or under bars, see `Capsule.passed`: all, or some by name.
     """
 
     start: tuple[float, ...]
@@ -56,6 +58,7 @@ class HeldPose:
     name: str = "pose"
     camera_center: tuple[float, float, float] | None = None
     clips: tuple[HeldClip, ...] = ()
+    over: bool | Mapping[str, bool] | None = field(default=None, hash=False)
 
     @property
     def node(self) -> type[Node]:

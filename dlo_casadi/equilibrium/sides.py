@@ -1,9 +1,10 @@
 """Sides on which a cable may hang or pass, across which its energy alone does not lead it.
 
 A cable passes each bar on one of two sides: where a cable without obstacles comes near a bar, first
-guesses push it to either side.
+guesses push it to either side. A pose may name the side.
 """
 
+from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
@@ -15,12 +16,31 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import tangents
 from dlo_casadi.rod.node import Frame
-from dlo_casadi.rod.obstacles import Capsule
+from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 
 # Distance of a bar [lengths] from a cable without obstacles beyond which it has one side alone.
 NEAR_BAR = 0.1
 # Maximum number of bars, the nearest ones, whose sides are combined.
 MOST_BARS = 3
+
+
+def named_sides(model: CableModel, pose: HeldPose) -> list[tuple[Capsule, FloatArray, bool]]:
+    """The bars whose sides a pose names: each with `Capsule.up`, and whether it is passed over."""
+    found = []
+    for bar, up in bars_of(model.surfaces, model.gravity):
+        over = pose.over if not isinstance(pose.over, Mapping) else pose.over.get(bar.name)
+        if over is not None:
+            found.append((bar, up, over))
+    return found
+
+
+def on_named_sides(model: CableModel, pose: HeldPose, points: FloatArray) -> BoolArray:
+    """Whether cables through points (m, n, d) [m] pass all bars on the sides that a pose names."""
+    kept = np.ones(len(points), dtype=bool)
+    for bar, up, over in named_sides(model, pose):
+        above, below = bar.passed(up, points)
+        kept &= above if over else below
+    return kept
 
 
 def beside_bars(model: CableModel, x: FloatArray, points: FloatArray) -> list[FloatArray]:
@@ -66,6 +86,18 @@ def on_other_side(
     least = 0.0 if pose.end is None else np.pi
     apart = (turns * turn < 0) & (np.abs(turns - turn) > least)
     return np.asarray(apart & (model.tipped_by is not None and not pose.turns and not pose.branch))
+
+
+def touchdowns(model: CableModel, points: FloatArray) -> list[FloatArray]:
+    """Places (d,) [m] where a cable may touch planes: above its deepest one of points (n, d)."""
+    found = []
+    for plane in model.surfaces:
+        if isinstance(plane, Plane):
+            gaps = plane.near(points).distance - model.cable.diameter / 2
+            deepest = int(gaps.argmin())
+            if gaps[deepest] < 0:
+                found.append(points[deepest] - gaps[deepest] * np.array(plane.normal))
+    return found
 
 
 def _turned(model: CableModel, x: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:

@@ -14,11 +14,17 @@ from dlo_casadi.equilibrium.equilibrium import (
     Equilibrium,
     equilibria_of,
 )
-from dlo_casadi.equilibrium.minima import Minima, by_ipopt, descend_to_contact
+from dlo_casadi.equilibrium.minima import KEEPING_SIDE, Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
 from dlo_casadi.equilibrium.reach import no_equilibrium, out_of_reach
-from dlo_casadi.equilibrium.sides import beside_bars, on_other_side
-from dlo_casadi.equilibrium.spans import border_of, first_guesses
+from dlo_casadi.equilibrium.sides import (
+    beside_bars,
+    named_sides,
+    on_named_sides,
+    on_other_side,
+    touchdowns,
+)
+from dlo_casadi.equilibrium.spans import arches, border_of, first_guesses
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -51,7 +57,8 @@ def solve_equilibrium(
     Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
     energy is returned, an unstable one if no other is found. For a pose that names its branch it
     is on that branch, or an error; between two pins the first stable one, as a rule that of the
-    branch's own arc. With `x_init` it is the equilibrium reached from there, on any branch.
+    branch's own arc. For one that names sides of bars the cable passes them there. With `x_init` it
+    is the equilibrium reached from there, on any branch or side.
 
     Parameters
     ----------
@@ -156,6 +163,16 @@ def _chosen(
             )
             return no_equilibrium(pose, what, "fewer turns, or the end farther from the start.")
         found = kept
+    if start is None and found and (asked := named_sides(model, pose)):
+        passing = on_named_sides(model, pose, np.array([eq.points for eq in found]))
+        if not passing.any():
+            said = " and ".join(
+                f"{'over' if over else 'under'} {bar.name}" for bar, _, over in asked
+            )
+            what = f"no equilibrium found in which the cable passes {said}, {where}"
+            hint = "the other side (over), a longer cable, or a finer mesh (model.n)."
+            return no_equilibrium(pose, what, hint)
+        found = [eq for eq, kept in zip(found, passing, strict=True) if kept]
     if not found:
         hint = "a finer mesh (model.n), or check the stiffness and the headings."
         if pose.node is Frame:
@@ -234,7 +251,8 @@ class _PoseSearch:
     def _beside(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
         """Guesses beside obstacles, and the pose of each: first ones, and without obstacles.
 
-        All minima without obstacles are lifted out of them; of the lowest, see `sides`.
+        All minima without obstacles are lifted out of them; of the lowest, see `sides`, and where
+        it is deepest below a plane it touches down, with its slack on either side.
         """
         model, none = self.model, [None] * len(poses)
         alone, p = replace(model, obstacles=()).without_kind(ContactEffect, self.p)
@@ -247,6 +265,9 @@ class _PoseSearch:
                 x, points = stable[i].x, stable[i].points
                 every = [x] if k else beside_bars(model, x, points[: len(x)])
                 pairs += [(j, one, border_of(model, poses[j], one)) for one in every]
+                for place in () if k else touchdowns(model, points):
+                    ways = arches(model, self.p, poses[j], place)
+                    pairs += [(j, one, border) for one, border in ways]
         rows, nodes, lam = zip(*pairs, strict=True)
         return np.array(rows), Shapes.declared(np.array(nodes), np.array(lam), len(model.clips))
 
@@ -254,7 +275,9 @@ class _PoseSearch:
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool = False
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
-        return given, descend_to_contact(assembly_of(self.model), shapes, given, near=near)
+        sided = np.array([bool(named_sides(self.model, poses[j])) for j in of])
+        skipped = (KEEPING_SIDE + sided) * near
+        return given, descend_to_contact(assembly_of(self.model), shapes, given, skipped)
 
     def _descended(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool
@@ -295,8 +318,10 @@ class _PoseSearch:
         twists = _twists(coarse, strains[:, : coarse.chain.n_cells])
         usable = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
         x, kept = found.shapes.x, []
+        points = assembly_of(coarse).nodes(found.shapes, given)
         for j, pose in enumerate(poses):
             rows = np.flatnonzero((of == j) & usable)
+            rows = rows[on_named_sides(coarse, pose, points[rows])]
             rows = rows[np.argsort(found.energy[rows], kind="stable")]
             mine = [int(rows[k]) for k in _distinct(model, x[rows])[:FEW]]
             if mine:

@@ -1,7 +1,8 @@
 """First guesses of a cable that clips hold between its ends: arcs, span by span.
 
-A span reaches from one holder to the next. In a plane the arc of a span turns either way; in space
-it bulges along gravity or is rotated about its chord by quarter turns.
+A span reaches from one holder to the next; bars whose sides a pose names count as holders here. In
+a plane the arc of a span turns either way; in space it bulges along gravity or is rotated about its
+chord by quarter turns.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,6 +24,7 @@ from dlo_casadi.equilibrium.guesses import (
     smallest_turn,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.sides import named_sides
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import tangents
 from dlo_casadi.model.functions import functions_of
@@ -37,16 +39,22 @@ MOST_SIDES = 16
 _SLACK = (0.5, 0.15, 0.85)
 # Least length of a span beside an eyelet, relative to its chord.
 _LEAST = 1.0 + 1e-3
+# Number of places along the axis of a bar of which one is passed.
+_ALONG = 21
 
 
 @dataclass(frozen=True)
 class _Holder:
-    """One that holds the cable: an end or a clip. `at` is None of an eyelet, `place` of a tip."""
+    """One that holds the cable: an end, a clip, or a bar that it passes.
+
+    `at` is None of an eyelet and a bar, `place` of a tip.
+    """
 
     at: float | None
     place: FloatArray | None
     frame: FloatArray | None = None
     rolls: bool = False
+    passed: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,6 +91,45 @@ def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
     own = last if model.end == "clamped" else None
     found.append(_Holder(model.cable.length, None if model.end == "free" else end, own))
     return found
+
+
+def _with_bars(model: CableModel, pose: HeldPose, held: Sequence[_Holder]) -> list[_Holder]:
+    """All that holds the cable and the bars whose sides a pose names, see `named_sides`."""
+    found = list(held)
+    for bar, up, over in named_sides(model, pose):
+        clear = (bar.radius + model.cable.diameter / 2) * (1 if over else -1)
+        share = np.linspace(0.0, 1.0, _ALONG)[:, None]
+        places = bar.a + share * np.subtract(bar.b, bar.a) + clear * up
+        _insert(found, places)
+    return found
+
+
+def _insert(held: list[_Holder], places: FloatArray) -> int:
+    """Put one of places (K, d) [m] between the holders, where the way gets longer by least.
+
+    Returns where it stands among them.
+    """
+    longer: list[FloatArray] = []
+    for before, beyond, apart in zip(held, held[1:], chords(held), strict=False):
+        ways = [x.place for x in (before, beyond) if x.place is not None]
+        longer.append(sum(np.linalg.norm(places - x, axis=1) for x in ways) - apart)
+    k, i = np.unravel_index(np.argmin(longer), (len(longer), len(places)))
+    held.insert(int(k) + 1, _Holder(None, places[i], passed=True))
+    return int(k) + 1
+
+
+def arches(
+    model: CableModel, p: FloatArray, pose: HeldPose, place: FloatArray
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """First guesses of a cable that touches down at a place (d,) [m], as `first_guesses`.
+
+    Its slack is in an arch against gravity on either side of the place; all other spans sag.
+    """
+    held = holders(model, p, pose)
+    k = _insert(held, place[None])
+    up = 2 if model.in_space else 1
+    sides = [tuple(up * (i == arch) for i in range(len(held) - 1)) for arch in (k - 1, k)]
+    yield from _span_guesses(model, pose, held, _SLACK[:1], sides)
 
 
 def chords(held: Sequence[_Holder]) -> list[float]:
@@ -128,11 +175,14 @@ def first_guesses(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """First guesses of a pose, one by one: nodes (n_nodes, coordinates), and border (n_border,).
 
-    Of a cable without clips `guesses` or `guessed_frames`; with clips arcs span by span.
+    Of a cable without clips `guesses` or `guessed_frames`; with clips arcs span by span. If the
+    pose names sides of bars, arcs by way of these come first.
     """
-    none = np.zeros(model.n_border)
+    none, held = np.zeros(model.n_border), holders(model, p, pose)
+    if named_sides(model, pose):
+        yield from _span_guesses(model, pose, _with_bars(model, pose, held), _SLACK)
     if pose.clips:
-        yield from _span_guesses(model, p, pose)
+        yield from _span_guesses(model, pose, held, _SLACK if model.sliding else _SLACK[:1])
     elif model.node is Frame:
         yield from ((x, none) for x in guessed_frames(model, p, rest, pose))
     else:
@@ -140,19 +190,25 @@ def first_guesses(
 
 
 def _span_guesses(
-    model: CableModel, p: FloatArray, pose: HeldPose
+    model: CableModel,
+    pose: HeldPose,
+    held: Sequence[_Holder],
+    shares: Sequence[float],
+    sides: Sequence[tuple[int, ...]] | None = None,
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    held = holders(model, p, pose)
+    """Arcs span by span, for shares of the slack; `sides`: combinations of sides of the spans."""
     rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
-    for share in _SLACK if model.sliding else _SLACK[:1]:
+    clips = [k for k, one in enumerate(held) if not one.passed][1:]
+    for share in shares:
         at = _arc_lengths(held, share)
         spans, border = spans_of(held, at), np.zeros(model.n_border)
         for k, row in model.sliding.items():
-            border[row] = at[k + 1]
+            border[row] = at[clips[k]]
         if model.node is Frame:
-            found = _in_space(model, pose, spans, [(at[k], held[k].frame) for k in rolls])
+            edges = [(at[k], held[k].frame) for k in rolls]
+            found = _in_space(model, pose, spans, edges, sides or _sides(spans, 4))
         else:
-            found = _in_plane(model, spans)
+            found = _in_plane(model, spans, sides or _sides(spans, 2))
         for x in found:
             yield x, border
 
@@ -190,10 +246,12 @@ def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
 # ---- in a plane ----------------------------------------------------------------------------------
 
 
-def _in_plane(model: CableModel, spans: Sequence[Span]) -> Iterator[FloatArray]:
+def _in_plane(
+    model: CableModel, spans: Sequence[Span], combinations: Sequence[tuple[int, ...]]
+) -> Iterator[FloatArray]:
     """Headings (n_nodes, 1) [rad]."""
     gravity = np.array(model.gravity)
-    for sides in _sides(spans, 2):
+    for sides in combinations:
         parts = [
             _headings(model, span, (1 - 2 * side) * _sagging(span, gravity))
             for span, side in zip(spans, sides, strict=True)
@@ -251,10 +309,11 @@ def _in_space(
     pose: HeldPose,
     spans: Sequence[Span],
     clamps: Sequence[tuple[float, FloatArray | None]],
+    combinations: Sequence[tuple[int, ...]],
 ) -> Iterator[FloatArray]:
     """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all that hold the roll, too."""
     places, length = model.chain.places, model.chain.length
-    for sides in _sides(spans, 4):
+    for sides in combinations:
         axes = np.zeros((len(places), 3))
         for span, quarter in zip(spans, sides, strict=True):
             inside = (places >= span.start - 1e-9) & (places <= span.end + 1e-9)

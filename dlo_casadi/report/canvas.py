@@ -48,6 +48,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "next-letter": {"color": VERMILLION, "fontsize": 10},
     "letter": {"color": GREY, "fontsize": 7},
     "marker": {"color": "#C9D0D8", "lw": 1.0},
+    "obstacle": {"color": "#A08A6A", "lw": 0.9},
+    "contact": {"color": "#C2571A", "lw": 4.0, "alpha": 0.6, "solid_capstyle": "butt"},
     "axis-x": {"color": "#D0103A", "lw": 1.2},
     "axis-y": {"color": "#00805A", "lw": 1.2},
     "axis-z": {"color": "#3A3AD6", "lw": 1.2},

@@ -113,8 +113,19 @@ def _legend_of(
         ]
     if experiment.clips:
         handles.append(canvas.dot("clip", "D", style.BLACK))
-    if experiment.in_space or readings:
-        where = "ends and clips" if experiment.clips else "the ends"
+    last = stages[-1].stage if stages else None
+    touching = last is not None and any(shape.contacts for shape in last.shapes.values())
+    if experiment.surfaces or (last is not None and last.surfaces):
+        handles.append(canvas.line_of("obstacle", **canvas.STYLES["obstacle"]))
+    if touching:
+        handles.append(canvas.line_of("in contact", **canvas.STYLES["contact"]))
+    if experiment.in_space or readings or touching:
+        on = {
+            "the ends": experiment.in_space or readings,
+            "clips": experiment.clips,
+            "obstacles": touching,
+        }
+        where = " and ".join(name for name, there in on.items() if there)
         handles.append(canvas.line_of(f"force on {where}", color=style.FORCE))
     if readings:
         handles.append(canvas.line_of("force as read", color=style.BLACK, ls=":"))
@@ -276,7 +287,7 @@ def limits_figure(outcome: Outcome) -> Figure:
 def _draw_row(axes: Axes, item: LimitCheck, y: float, length: float) -> None:
     """The cable of one pose as a bar, or its fixtures as dots; at the right the probability."""
     used = np.clip(item.used, 0.0, 1.0)
-    if item.holder:
+    if item.quantity in ("force", "moment"):
         axes.plot([0.0, length], [y, y], color="#E3E3E3", lw=1, zorder=1)
         axes.scatter(item.s, np.full(len(used), y), c=_USED(used), s=45, marker="s", zorder=2)
     else:

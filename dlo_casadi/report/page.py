@@ -65,6 +65,7 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
         photographs=view_pictures(outcome.poses, compared(outcome)),
         room=shown[0].behind.room,
         clips=bool(outcome.config.experiment.clips),
+        obstacles=any(mark.kind == "obstacle" for item in shown for mark in item.under),
         forces_read=any(mark.kind == "force-read" for item in shown for mark in item.over),
         scenes=scene_pictures(outcome),
         charts={name: Markup(inline_svg(chart, name)) for name, chart in charts.items()},

@@ -306,6 +306,9 @@ def _picture(
     if behind.room is not None and last is not None:
         sizes = ", ".join(f"{np.linalg.norm(force):.3g}" for force in last.forces)
         facts.append(("force", "forces on start, end", f"{sizes} N"))
+    for one in () if last is None else last.contacts:
+        force = float(np.linalg.norm(one["force"]))
+        facts.append(("contact", f"force on {one['obstacle']}", f"{force:.3g} N"))
     if last is not None and measurement is not None:
         facts += [("force-read", *fact) for fact in _readings(measurement, last)]
     what = "Photograph" if behind.photograph else "Drawing of the board"

@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
+from dlo_casadi.report.outlines import outlines
+from dlo_casadi.rod.obstacles import Obstacle
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.session.pose_shape import PoseShape
 from dlo_casadi.show.style import arrow
@@ -31,6 +33,8 @@ _MM = 1e3
 _IN_ROOM, _AT_END, _PULLING = 0.15, 1 / 5, 0.25
 # Other shares of it: an axis of a frame, the air above the floor, half of a cross.
 _AXIS, _AIR, _CROSS = 0.09, 0.06, 0.05
+# Half the least length of a stretch that touches something, so that a point is seen, too.
+_TOUCH = 0.006
 # Points of a measured line that are drawn beside others, about.
 _POINTS = 60
 
@@ -200,12 +204,19 @@ def scenes_of(
         scenes = _rooms(config, drawn, [x for shape in last.values() for x in _all_forces(shape)])
     else:
         pairs = [pair for shape in last.values() for pair in _forces_read(shape).values()]
-        board = Plane(length, _scale(_AT_END * length, [force for pair in pairs for force in pair]))
+        known = [force for pair in pairs for force in pair]
+        known += [np.array(one["force"]) for shape in last.values() for one in shape.contacts]
+        board = Plane(length, _scale(_AT_END * length, known))
         scenes = [board] * len(poses)
-    return scenes, [
-        around(scene, declared[pose.name], pose.points, last.get(pose.name))
-        for pose, scene in zip(poses, scenes, strict=True)
-    ]
+    surfaces = stages[-1].surfaces if stages else config.experiment.surfaces
+    marks = []
+    for pose, scene in zip(poses, scenes, strict=True):
+        shape, own = last.get(pose.name), declared[pose.name]
+        under, over = around(scene, own, pose.points, shape)
+        beside = [held_places(own), pose.points if shape is None else shape.curve]
+        under += obstacle_marks(scene, surfaces, np.concatenate(beside), length)
+        marks.append((under, over + ([] if shape is None else contact_marks(scene, shape, length))))
+    return scenes, marks
 
 
 def held_places(pose: Pose) -> FloatArray:
@@ -214,8 +225,9 @@ def held_places(pose: Pose) -> FloatArray:
 
 
 def _all_forces(shape: PoseShape) -> list[FloatArray]:
-    """Forces (d,) [N] of the cable on its fixtures and clips."""
-    return [*shape.forces, *(np.array(clip["force"]) for clip in shape.clips)]
+    """Forces (d,) [N] of the cable on all that it touches."""
+    touched = (*shape.clips, *shape.contacts)
+    return [*shape.forces, *(np.array(one["force"]) for one in touched)]
 
 
 def _rooms(
@@ -313,6 +325,28 @@ def around(
         if f"clip_{k + 1}" in read:
             over.append(scene.force(at, read[f"clip_{k + 1}"][0], "force-read"))
     return under, over + clips
+
+
+def obstacle_marks(
+    scene: Scene, surfaces: Iterable[Obstacle], points: FloatArray, length: float
+) -> list[Mark]:
+    """Obstacles beside points (K, d) [m] of a cable of a length [m]."""
+    lines = (line for one in surfaces for line in outlines(one, points, length))
+    return [Mark("obstacle", scene.points(line)) for line in lines]
+
+
+def contact_marks(scene: Scene, shape: PoseShape, length: float) -> list[Mark]:
+    """The stretches of a predicted cable that touch something, each with its force."""
+    places = np.linspace(0.0, length, len(shape.curve))
+    marks = []
+    for one in shape.contacts:
+        middle, half = (one["from"] + one["to"]) / 2, (one["to"] - one["from"]) / 2
+        s = middle + max(half, _TOUCH * length) * np.linspace(-1.0, 1.0, 21)
+        s = np.clip(s, 0.0, length)
+        points = scene.points(np.stack([np.interp(s, places, x) for x in shape.curve.T], axis=1))
+        marks.append(Mark("contact", points))
+        marks.append(scene.force(points[10], np.array(one["force"])))
+    return marks
 
 
 # ---- all poses of a session in one scene -------------------------------------------------------

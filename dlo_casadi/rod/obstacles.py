@@ -6,16 +6,18 @@ axis, without the axis's own direction where the nearest point of the axis is no
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray
 
 # Least distance [m] from an axis at which a normal is known.
 _ON_AXIS = 1e-12
+# Least share of gravity across the axis of a bar that a cable passes over or under.
+_ACROSS = 0.1
 
 
 class Surface(NamedTuple):
@@ -32,11 +34,20 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane through `point` (d,) [m]; the cable is on the side of its unit `normal` (d,)."""
+    """A plane through `point` (d,) [m]; the cable is on the side of its unit `normal` (d,).
+
+    `touch`: whether the cable is meant to touch it, which a limit of its clearance leaves out.
+    """
 
     point: tuple[float, ...]
     normal: tuple[float, ...]
     name: str = "plane"
+    touch: bool = False
+
+    def grown(self, offset: float) -> "Plane":
+        """The same with its surface farther outwards by an offset [m]."""
+        point = np.array(self.point) + offset * np.array(self.normal)
+        return replace(self, point=tuple(point.tolist()))
 
     def near(self, places: FloatArray) -> Surface:
         """The surface near places (..., d) [m]."""
@@ -60,13 +71,18 @@ class Plane:
 class Capsule:
     """All places within `radius` [m] of the line from `a` to `b` (d,) [m]; a sphere where a = b.
 
-    In a plane it is a disc or a stadium.
+    In a plane it is a disc or a stadium. `touch` as of a plane.
     """
 
     a: tuple[float, ...]
     b: tuple[float, ...]
     radius: float
     name: str = "capsule"
+    touch: bool = False
+
+    def grown(self, offset: float) -> "Capsule":
+        """The same with its surface farther outwards by an offset [m]."""
+        return replace(self, radius=self.radius + offset)
 
     def near(self, places: FloatArray) -> Surface:
         """The surface near places (..., d) [m]."""
@@ -91,6 +107,39 @@ class Capsule:
         gap = gap - axis @ ca.fmax(ca.fmin(share, 1.0), 0.0)
         return ca.sqrt(ca.sum1(gap**2)) - self.radius
 
+    def up(self, gravity: Sequence[float]) -> FloatArray | None:
+        """Unit vector (d,) against gravity and across the axis.
+
+        None where nothing passes over or under it: without gravity, and in space of a sphere or of
+        an axis along gravity.
+        """
+        up, axis = -np.array(gravity, dtype=float), np.subtract(self.b, self.a)
+        least = _ACROSS * float(np.linalg.norm(up))
+        if len(up) == 3:
+            square = float(axis @ axis)
+            up = up - up @ axis / square * axis if square else np.zeros(3)
+        size = float(np.linalg.norm(up))
+        return up / size if size > least else None
+
+    def passed(self, up: FloatArray, points: FloatArray) -> tuple[BoolArray, BoolArray]:
+        """Whether lines (m, n, d) [m] pass over it, and whether under it.
+
+        A line passes over it that crosses the half-plane (in a plane: the half-line) which stands
+        on the axis an odd number of times, and the one that hangs from it an even number of times.
+        """
+        axis, middle = np.subtract(self.b, self.a), np.add(self.a, self.b) / 2
+        across = np.array([up[1], -up[0]]) if len(up) == 2 else np.cross(axis, up)
+        places = points - middle
+        beside = places @ across
+        crossing = (beside[:, 1:] > 0) != (beside[:, :-1] > 0)
+        share = beside[:, :-1] / np.where(crossing, beside[:, :-1] - beside[:, 1:], 1.0)
+        there = places[:, :-1] + share[..., None] * np.diff(places, axis=1)
+        if len(up) == 3:
+            crossing &= np.abs(there @ axis) <= axis @ axis / 2
+        above = there @ up > 0
+        odd = [np.sum(crossing & side, axis=1) % 2 == 1 for side in (above, ~above)]
+        return odd[0] & ~odd[1], odd[1] & ~odd[0]
+
     @property
     def drawn(self) -> dict[str, Any]:
         """As plain data."""
@@ -112,6 +161,14 @@ def _across(normal: FloatArray, axis: FloatArray) -> FloatArray:
     along = np.where(size > 1e-6 * np.linalg.norm(axis), along, other)
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)
     return np.stack([np.cross(normal, along), along], axis=-1)
+
+
+def bars_of(
+    obstacles: Sequence[Obstacle], gravity: Sequence[float]
+) -> list[tuple[Capsule, FloatArray]]:
+    """Those of obstacles over or under which a cable passes, each with `Capsule.up`."""
+    capsules = [(one, one.up(gravity)) for one in obstacles if isinstance(one, Capsule)]
+    return [(bar, up) for bar, up in capsules if up is not None]
 
 
 def surfaces_near(obstacles: Sequence[Obstacle], places: FloatArray) -> Surface:

@@ -21,6 +21,7 @@ from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.rod.obstacles import Obstacle
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 from dlo_casadi.thresholds import DIFFERENT
@@ -82,6 +83,8 @@ class Stage:
     explains : bool or None
         Whether the model explains what was measured; None where that was not judged. Where it does
         not, its parameters have no intervals.
+    surfaces : tuple of Obstacle
+        All that the cable may touch, where the fit has it.
     """
 
     name: StageName
@@ -98,6 +101,7 @@ class Stage:
     readings_fit: ReadingErrors = ReadingErrors()
     readings_held_out: ReadingErrors = ReadingErrors()
     explains: bool | None = None
+    surfaces: tuple[Obstacle, ...] = ()
 
     @property
     def other_branch(self) -> dict[str, BranchShape]:
