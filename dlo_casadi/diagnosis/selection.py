@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import comb, log
 from typing import Self
 
 import numpy as np
@@ -86,7 +87,10 @@ class Found:
 
     def or_better(self, other: Self | None) -> Self:
         """Itself, or what another search has found if only that explains the data, or it better."""
-        if other is None or other._order <= self._order:
+        if other is None:
+            return self
+        candidates = max(len(self.ranked), len(other.ranked))
+        if other._order(candidates) <= self._order(candidates):
             return self
         names = " and ".join(item.candidate.name for item in other.added) or "no effect"
         known = {item.name for item in other.ranked}
@@ -98,9 +102,10 @@ class Found:
         )
         return replace(other, ranked=(*other.ranked, *rest))
 
-    @property
-    def _order(self) -> tuple[bool, float]:
-        return not self.unexplained, self.fit.log_evidence
+    def _order(self, candidates: int) -> tuple[bool, float]:
+        """By the log evidence, all numbers of effects and all sets of as many equally likely."""
+        sets = comb(candidates, min(len(self.added), candidates))
+        return not self.unexplained, self.fit.log_evidence - log(sets)
 
 
 def as_complete(fit: Fit) -> Fit:
