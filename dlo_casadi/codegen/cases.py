@@ -27,23 +27,27 @@ def template(name: str) -> str:
     return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
 
 
-def case_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> "Case":
+def case_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, touches: bool = False
+) -> "Case":
     """Contents of the templates for this cable."""
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
-    return kind(model, p, rest, inline)
+    return kind(model, p, rest, inline, touches)
 
 
 @dataclass(frozen=True)
 class Case:
     """Contents of the templates: the cable's numbers, and the parts of its kind.
 
-    `name` begins the names of its templates; `try_steps`: Newton steps for a part of a path.
+    `touches`: whether it may lie on obstacles. `name` begins the names of its templates;
+    `try_steps`: Newton steps for a part of a path.
     """
 
     model: CableModel
     p: FloatArray
     rest: FloatArray
     inline: bool
+    touches: bool
     name: ClassVar[str]
     try_steps: ClassVar[int]
 
@@ -60,6 +64,8 @@ class Case:
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
+        if self.touches and bare.end == "free":
+            bare = replace(bare, end="pinned")  # the force on an obstacle is one at an end
         if not self.holds:
             return kernels_of(bare, p, rest, self.inline)
         if not bare.chain.kind.smooth:

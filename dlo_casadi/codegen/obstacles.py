@@ -1,0 +1,90 @@
+"""What the generated solver knows of obstacles: how many there may be, and those of the model."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.codegen.kernels import c_number
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.contact import gap_per_force, outwards
+from dlo_casadi.rod import obstacles as rod
+from dlo_casadi.rod.obstacles import Plane
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Obstacles of a solver: `most` of a call, and those of the model where a fit has them."""
+
+    most: int
+    declared: tuple[rod.Obstacle, ...]
+
+    @classmethod
+    def of(cls, model: CableModel, p: FloatArray, most: int) -> "Obstacles":
+        """At least those of the model.
+
+        Raises
+        ------
+        DloError
+            If it is no number of obstacles, or the cable is one of links.
+        """
+        if not isinstance(most, int | np.integer) or not 0 <= most <= 1000:
+            raise DloError(f"obstacles: a whole number, 0 to 1000, found {most!r}")
+        if most and not model.chain.kind.smooth:
+            raise DloError(
+                "a cable of links cannot lie on obstacles\n"
+                "  Try: another element, --element quadratic"
+            )
+        moved = outwards(model) @ p if model.surfaces else ()
+        found = zip(model.surfaces, moved, strict=True)
+        declared = tuple(_moved(surface, float(offset)) for surface, offset in found)
+        return cls(max(int(most), len(declared)), declared)
+
+    def values(self, model: CableModel) -> dict[str, int | str]:
+        """Values of the templates' marks."""
+        d, n, nodes, slots = model.node.dimension, model.n, model.chain.n_nodes, 0
+        holds = len(model.clips) + model.n_springs
+        border, slots = d * (1 + holds) + len(model.sliding), self.most * n
+        rows, columns = model.node.increment * nodes + border, d * n
+        # Both points of a plane, columns with their block, sums and forces; as in the template.
+        size = (2 if d == 2 else 1) * ((2 + d) * slots + d * n) + columns * (d + 4 + 2 * rows)
+        size += columns * (columns + 1) // 2 + columns + d * (d + 1) // 2 * n + d * n + 2 * slots
+        return {
+            "OBSTACLES": self.most,
+            "DECLARED": len(self.declared),
+            "CONTACT_SIZE": size if self.most else 0,
+            "PER_FORCE": c_number(gap_per_force(model, 1.0)),
+        }
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Parts of the templates by their marks."""
+        marks = ("AMONG", "GIVEN", "DECLARED_GIVEN", "NO_OBSTACLES", "OBSTACLES_ARE")
+        if not self.most:
+            return dict.fromkeys((*marks, "DECLARED_OBSTACLES"), "")
+        among = "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     "
+        own = "DECLARED_OBSTACLES, DLO_DECLARED, " if self.declared else "0, 0, "
+        said = """\
+ *   obstacles  in   [n_obstacles], on which the cable may lie, without friction; of all poses
+ *   n_obstacles in  at most DLO_OBSTACLES
+"""
+        found = dict(zip(marks, (among, "obstacles, n_obstacles, ", own, "NULL, 0, ", said)))
+        return found | {"DECLARED_OBSTACLES": ", ".join(map(_initializer, self.declared))}
+
+
+def _moved(surface: rod.Obstacle, offset: float) -> rod.Obstacle:
+    """A surface moved outwards by an offset [m]."""
+    if isinstance(surface, Plane):
+        place = np.array(surface.point) + offset * np.array(surface.normal)
+        return replace(surface, point=tuple(map(float, place)))
+    return replace(surface, radius=surface.radius + offset)
+
+
+def _initializer(surface: rod.Obstacle) -> str:
+    """A surface as an initialiser of dlo_obstacle."""
+    plane = isinstance(surface, Plane)
+    places = (surface.point, surface.normal) if plane else (surface.a, surface.b)
+    a, b = (", ".join(c_number(float(x)) for x in place) for place in places)
+    kind, radius = ("DLO_HALF_SPACE", 0.0) if plane else ("DLO_CAPSULE", surface.radius)
+    return f"{{{kind}, {{{a}}}, {{{b}}}, {c_number(radius)}}}"
