@@ -11,8 +11,8 @@ import numpy as np
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.cases import Case, case_of, template
-from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.kernels import KernelText, c_number, size_of_code, table_to_c
+from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
