@@ -84,9 +84,9 @@ class CompiledShape:
         With clamped clips, of the cable on them, in space about the world's axes.
     places : (n + 1,)
         With clamped clips, arc lengths over length of points and nodes: one is moved to each.
-    contact_forces : (obstacles, n) [N]
-        Sizes of the forces on each obstacle at points 1 to n, across its surface; 0 where the cable
-        does not touch it.
+    contact_forces : (obstacles, 2 n) [N]
+        Sizes of the forces on each obstacle, across its surface: between points 0 and 1, at point
+        1, between 1 and 2, and so on; 0 where the cable does not touch it.
     obstacle_forces : (obstacles, dimension) [N]
         Of the cable on each obstacle.
     """
@@ -258,7 +258,7 @@ def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
     forces |= {
         "clip_moments": (holds * clamps, turn),
         "places": (n * clamps,),
-        "contact_forces": (n_obstacles, model.n),
+        "contact_forces": (n_obstacles, 2 * model.n),
         "obstacle_forces": (n_obstacles, d),
         "moments": (2, turn),
     }
