@@ -49,8 +49,8 @@ class Obstacles:
         rows, columns = model.node.increment * nodes + border, (1 + d) * n
         # Both points of a plane, columns with their block, sums and forces; as in the template.
         size = (2 if d == 2 else 1) * ((3 + d) * slots + d * (3 * n + 2))
-        size += columns * (5 * d + 4 + 2 * rows) + columns * (columns + 1) // 2 + columns
-        size += d * (d + 1) // 2 * n + d * n + (2 + 2 * d) * slots
+        size += columns * (5 * d + 4 + 2 * rows) + columns * (columns + 1) + columns
+        size += d * (d + 1) // 2 * n + d * n + (3 + 2 * d) * slots
         return {
             "OBSTACLES": self.most,
             "DECLARED": len(self.declared),
