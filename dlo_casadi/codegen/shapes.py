@@ -84,9 +84,11 @@ class CompiledShape:
         With clamped clips, of the cable on them, in space about the world's axes.
     places : (n + 1,)
         With clamped clips, arc lengths over length of points and nodes: one is moved to each.
-    contact_forces : (obstacles, 2 n) [N]
-        Sizes of the forces on each obstacle, across its surface: between points 0 and 1, at point
-        1, between 1 and 2, and so on; 0 where the cable does not touch it.
+    contact_forces : (obstacles, 3 n) [N]
+        Sizes of the forces on each obstacle, across its surface, at places of the cable; 0 where it
+        does not touch.
+    contact_places : (obstacles, 3 n)
+        These places: arc lengths over length.
     obstacle_forces : (obstacles, dimension) [N]
         Of the cable on each obstacle.
     """
@@ -110,6 +112,7 @@ class CompiledShape:
     clip_moments: FloatArray = field(default_factory=lambda: np.zeros(0))
     places: FloatArray = field(default_factory=lambda: np.zeros(0))
     contact_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    contact_places: FloatArray = field(default_factory=lambda: np.zeros(0))
     obstacle_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -258,7 +261,8 @@ def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
     forces |= {
         "clip_moments": (holds * clamps, turn),
         "places": (n * clamps,),
-        "contact_forces": (n_obstacles, 2 * model.n),
+        "contact_forces": (n_obstacles, 3 * model.n),
+        "contact_places": (n_obstacles, 3 * model.n),
         "obstacle_forces": (n_obstacles, d),
         "moments": (2, turn),
     }
