@@ -87,7 +87,7 @@ def compare(
         return ("both none" if shape.status != "ok" else "C alone"), 0.0
     if shape.status != "ok":
         return "Python alone", 0.0
-    own = shape.contact_forces[: len(obstacles), 2::3]
+    own = shape.contact_forces[: len(obstacles), 3::4]
     own = own[:, : full.n_contacts // len(obstacles)].ravel()
     other = eq.multipliers[full.n_lam :]
     apart = (shape.energy - eq.energy) / scale

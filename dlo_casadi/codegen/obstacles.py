@@ -45,7 +45,7 @@ class Obstacles:
         """Values of the templates' marks."""
         d, n, nodes, slots = model.node.dimension, model.n, model.chain.n_nodes, 0
         holds = len(model.clips) + model.n_springs
-        border, slots = d * (1 + holds) + len(model.sliding), 3 * self.most * n
+        border, slots = d * (1 + holds) + len(model.sliding), 4 * self.most * n
         rows, columns = model.node.increment * nodes + border, (1 + d) * n
         # Both points of a plane, columns with their block, sums and forces; as in the template.
         size = (2 if d == 2 else 1) * ((3 + d) * slots + d * (3 * n + 2))

@@ -84,10 +84,10 @@ class CompiledShape:
         With clamped clips, of the cable on them, in space about the world's axes.
     places : (n + 1,)
         With clamped clips, arc lengths over length of points and nodes: one is moved to each.
-    contact_forces : (obstacles, 3 n) [N]
+    contact_forces : (obstacles, 4 n) [N]
         Sizes of the forces on each obstacle, across its surface, at places of the cable; 0 where it
         does not touch.
-    contact_places : (obstacles, 3 n)
+    contact_places : (obstacles, 4 n)
         These places: arc lengths over length.
     obstacle_forces : (obstacles, dimension) [N]
         Of the cable on each obstacle.
@@ -261,8 +261,8 @@ def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
     forces |= {
         "clip_moments": (holds * clamps, turn),
         "places": (n * clamps,),
-        "contact_forces": (n_obstacles, 3 * model.n),
-        "contact_places": (n_obstacles, 3 * model.n),
+        "contact_forces": (n_obstacles, 4 * model.n),
+        "contact_places": (n_obstacles, 4 * model.n),
         "obstacle_forces": (n_obstacles, d),
         "moments": (2, turn),
     }
