@@ -234,7 +234,8 @@ class _PlaneCase(Case):
         model, chain, kernels = self.model, self.model.chain, self.meshes["kernel"]
         count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
         # From each first guess there is one free descent, and one guided by springs in 15 stages; a
-        # descent takes 100 steps, and 6 more off saddles. The template checks the number.
+        # descent takes 100 steps, and 6 more off saddles; each may land on obstacles, in 100. The
+        # template checks the number.
         guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
         held = 0
         if self.holds:
@@ -253,7 +254,7 @@ class _PlaneCase(Case):
             "GIVES_END": gives[1],
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
-            "STEPS": (1 + 16 * guesses) * (100 + 6),
+            "STEPS": (1 + 16 * guesses) * (100 + 6) + 200 * guesses * self.touches,
             "HOLDERS": "" if kernels.ends is None else "    add_ends(q, w->table);",
         }
 

@@ -117,7 +117,7 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
     ends = f"start {model.start}, end {model.end}"
     held = [*model.clips, *["pinned"] * len(case.tethers)]
     table, text = case.table, KernelText.of(case.meshes)
-    values = case.values
+    values, tries = case.values, case.try_steps * (1 + case.touches)
     values["WORKSPACE"] = int(values["WORKSPACE"]) + int(contact["CONTACT_SIZE"])
     return (
         values
@@ -160,8 +160,8 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
             "CLAMP_KINDS": ", ".join(str(_CLAMP_KINDS.get(kind, 0)) for kind in held),
             "EYELETS": len(model.sliding),
             "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
-            "TRY_STEPS": case.try_steps,
-            "PATH_STEPS": int(values["STEPS"]) + case.try_steps * (2 * FINEST + 13),
+            "TRY_STEPS": tries,
+            "PATH_STEPS": int(values["STEPS"]) + tries * (2 * FINEST + 13),
         }
     )
 
