@@ -28,18 +28,18 @@ def template(name: str) -> str:
 
 
 def case_of(
-    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, touches: bool = False
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, obstacles: int = 0
 ) -> "Case":
     """Contents of the templates for this cable."""
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
-    return kind(model, p, rest, inline, touches)
+    return kind(model, p, rest, inline, obstacles)
 
 
 @dataclass(frozen=True)
 class Case:
     """Contents of the templates: the cable's numbers, and the parts of its kind.
 
-    `touches`: whether it may lie on obstacles. `name` begins the names of its templates;
+    `obstacles`: on how many it may lie. `name` begins the names of its templates;
     `try_steps`: Newton steps for a part of a path.
     """
 
@@ -47,7 +47,7 @@ class Case:
     p: FloatArray
     rest: FloatArray
     inline: bool
-    touches: bool
+    obstacles: int
     name: ClassVar[str]
     try_steps: ClassVar[int]
 
@@ -64,7 +64,7 @@ class Case:
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
-        if self.touches and bare.end == "free":
+        if self.obstacles and bare.end == "free":
             bare = replace(bare, end="pinned")  # the force on an obstacle is one at an end
         if not self.holds:
             return kernels_of(bare, p, rest, self.inline)
@@ -243,6 +243,7 @@ class _PlaneCase(Case):
             held += (self.border - 2) * count + 2 * self.held_doubles
         if spans := len(model.clips) and len(model.clips) + 1:
             guesses = (2**spans if spans <= 4 else spans + 2) * (3 if model.sliding else 1)
+        landings = 1 + 2 * guesses * (1 + 2 * self.obstacles) if self.obstacles else 0
         return {
             "WORKSPACE": self.doubles * (count + 1) + held,
             "EXAMPLE_CLIPS": self.example_clips,
@@ -254,7 +255,7 @@ class _PlaneCase(Case):
             "GIVES_END": gives[1],
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
-            "STEPS": (1 + 16 * guesses) * (100 + 6) + 200 * guesses * self.touches,
+            "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings,
             "HOLDERS": "" if kernels.ends is None else "    add_ends(q, w->table);",
         }
 
@@ -348,5 +349,5 @@ class _SpaceCase(Case):
             "GIVES_END": self.compliances[1] > 0,
             # Elimination and solution: about 500 operations a node.
             "OPERATIONS": self.meshes["kernel"].operations + 500 * (n + 1),
-            "STEPS": (1 + 3 * guesses) * 80,
+            "STEPS": (1 + 3 * guesses + 3 * self.obstacles) * 80,
         }

@@ -117,7 +117,7 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
     ends = f"start {model.start}, end {model.end}"
     held = [*model.clips, *["pinned"] * len(case.tethers)]
     table, text = case.table, KernelText.of(case.meshes)
-    values, tries = case.values, case.try_steps * (1 + case.touches)
+    values, tries = case.values, case.try_steps * (2 if case.obstacles else 1)
     values["WORKSPACE"] = int(values["WORKSPACE"]) + int(contact["CONTACT_SIZE"])
     return (
         values
@@ -250,7 +250,7 @@ def generate(
     digest = solver_hash(model, p, rest)
     among = Obstacles.of(model, p, obstacles)
     bare, p = replace(model, obstacles=()).without_kind(ContactEffect, p)
-    case = case_of(bare, p, rest, inline, touches=among.most > 0)
+    case = case_of(bare, p, rest, inline, among.most)
     values = {
         mark: value if isinstance(value, str) else str(int(value))
         for mark, value in _values(case, among, prefix, digest).items()
