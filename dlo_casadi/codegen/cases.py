@@ -40,7 +40,8 @@ class Case:
     """Contents of the templates: the cable's numbers, and the parts of its kind.
 
     `obstacles`: on how many it may lie. `name` begins the names of its templates;
-    `try_steps`: Newton steps for a part of a path.
+    `try_steps`: Newton steps for a part of a path, `iterations`: of a
+    descent.
     """
 
     model: CableModel
@@ -50,6 +51,7 @@ class Case:
     obstacles: int
     name: ClassVar[str]
     try_steps: ClassVar[int]
+    iterations: ClassVar[int]
 
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
@@ -206,7 +208,7 @@ def _initializer(frame: Sequence[float]) -> str:
 class _PlaneCase(Case):
     """A cable in a plane."""
 
-    name, try_steps = "plane", 13
+    name, try_steps, iterations = "plane", 13, 100
     # Doubles of a workspace per node, as in the template: arrays, border, two-point segments.
     doubles = 12 + 2 + 2 * 15
     # Doubles of a workspace for each segment with a clip or tether inside.
@@ -263,7 +265,7 @@ class _PlaneCase(Case):
 class _SpaceCase(Case):
     """A cable in space."""
 
-    name, try_steps = "space", 12
+    name, try_steps, iterations = "space", 12, 80
     # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
     doubles = 4 + 4 + 4 + 3 + 6 + 9 + 58
     # Doubles of a workspace for each segment with a clip or tether inside.

@@ -118,6 +118,7 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
     held = [*model.clips, *["pinned"] * len(case.tethers)]
     table, text = case.table, KernelText.of(case.meshes)
     values, tries = case.values, case.try_steps * (2 if case.obstacles else 1)
+    most = tries + (case.iterations if case.obstacles else 0)
     values["WORKSPACE"] = int(values["WORKSPACE"]) + int(contact["CONTACT_SIZE"])
     return (
         values
@@ -161,7 +162,7 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
             "EYELETS": len(model.sliding),
             "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
             "TRY_STEPS": tries,
-            "PATH_STEPS": int(values["STEPS"]) + tries * (2 * FINEST + 13),
+            "PATH_STEPS": int(values["STEPS"]) + most * (2 * FINEST + 13),
         }
     )
 
