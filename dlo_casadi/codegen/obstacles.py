@@ -50,7 +50,7 @@ class Obstacles:
         # Both points of a plane, columns with their block, sums and forces; as in the template.
         size = (2 if d == 2 else 1) * ((3 + d) * slots + d * (3 * n + 2))
         size += columns * (4 * d + 4 + 2 * rows) + columns * (columns + 1) + columns
-        size += d * (d + 1) // 2 * n + d * n + (5 + d) * slots
+        size += d * (d + 1) // 2 * n + d * n + (5 + 3 * d) * slots
         return {
             "OBSTACLES": self.most,
             "DECLARED": len(self.declared),
