@@ -163,7 +163,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=2000, help="random poses of each kind")
     parser.add_argument("--python", type=int, default=0, help="how many of them beside Python")
-    parser.add_argument("--where", nargs="+", choices=("plane", "space"), default=["plane", "space"])
+    parser.add_argument(
+        "--where", nargs="+", choices=("plane", "space"), default=["plane", "space"]
+    )
     parser.add_argument("--kinds", nargs="+", choices=("plane", "all"), default=["plane", "all"])
     parser.add_argument("--elements", type=int, default=12)
     parser.add_argument("--end", choices=("clamped", "pinned", "free"), default="clamped")

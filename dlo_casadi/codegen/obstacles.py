@@ -61,17 +61,29 @@ class Obstacles:
     @property
     def words(self) -> dict[str, str]:
         """Parts of the templates by their marks."""
-        marks = ("AMONG", "GIVEN", "DECLARED_GIVEN", "NO_OBSTACLES", "OBSTACLES_ARE")
         if not self.most:
-            return dict.fromkeys((*marks, "DECLARED_OBSTACLES"), "")
+            return dict.fromkeys(_MARKS, "")
         among = "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     "
         own = "DECLARED_OBSTACLES, DLO_DECLARED, " if self.declared else "0, 0, "
-        said = """\
- *   obstacles  in   [n_obstacles], on which the cable may lie, without friction; of all poses
+        member = "    std::vector<dlo_obstacle> obstacles; /* on which the cable may lie */\n\n"
+        given = ("obstacles, n_obstacles, ", own, "NULL, 0, ", _SAID)
+        hpp = (member, "obstacles.data(), obstacles.size(), ")
+        declared = ", ".join(map(_initializer, self.declared))
+        return dict(zip(_MARKS, (among, *given, *hpp, declared), strict=True))
+
+
+# Marks of obstacles in the templates.
+_MARKS = ("AMONG", "GIVEN", "DECLARED_GIVEN", "NO_OBSTACLES", "OBSTACLES_ARE")
+_MARKS += ("HPP_OBSTACLES", "HPP_GIVEN", "DECLARED_OBSTACLES")
+# What the header says of them.
+_SAID = """\
+ *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie, on the side
+ *                   on which its first guesses, or `warm`, are or come to be. The whole cable, its
+ *                   radius and its fixtures are outside of them but for 1e-6 of its length, else
+ *                   there is no DLO_OK; places at which it touches stay on the cable in
+ *                   derivatives. Along a path it touches down and lifts off without a jump
  *   n_obstacles in  at most DLO_OBSTACLES
 """
-        found = dict(zip(marks, (among, "obstacles, n_obstacles, ", own, "NULL, 0, ", said)))
-        return found | {"DECLARED_OBSTACLES": ", ".join(map(_initializer, self.declared))}
 
 
 def _moved(surface: rod.Obstacle, offset: float) -> rod.Obstacle:

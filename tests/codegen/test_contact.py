@@ -64,7 +64,12 @@ def own(request) -> tuple[CableModel, CompiledSolver]:
 
 @pytest.mark.parametrize(
     ("what", "d", "end"),
-    [("table", 2, "clamped"), ("table", 3, "free"), ("table", 3, "clamped"), ("ball", 3, "clamped")],
+    [
+        ("table", 2, "clamped"),
+        ("table", 3, "free"),
+        ("table", 3, "clamped"),
+        ("ball", 3, "clamped"),
+    ],
 )
 def test_nodes_alone_touch_as_in_python(what, d, end):
     surface = TABLE[d] if what == "table" else ROUND[what]
