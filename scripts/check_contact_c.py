@@ -1,4 +1,4 @@
-"""Contact in the generated C solver: python scripts/check_contact_c.py [--count 2000] [--python 100].
+"""Contact in the generated C solver: python scripts/check_contact_c.py [--count N] [--python M].
 
 Random cables in random poses among one to three obstacles near where they hang without: how many
 have a shape, how deep nodes and whole cables are in obstacles, the sign of the forces, and the

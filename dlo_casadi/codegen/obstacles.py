@@ -43,7 +43,7 @@ class Obstacles:
 
     def values(self, model: CableModel) -> dict[str, int | str]:
         """Values of the templates' marks."""
-        d, n, nodes, slots = model.node.dimension, model.n, model.chain.n_nodes, 0
+        d, n, nodes = model.node.dimension, model.n, model.chain.n_nodes
         holds = len(model.clips) + model.n_springs
         border, slots = d * (1 + holds) + len(model.sliding), 4 * self.most * n
         rows, columns = model.node.increment * nodes + border, (1 + d) * n
@@ -73,14 +73,21 @@ class Obstacles:
 
 
 # Marks of obstacles in the templates.
-_MARKS = ("AMONG", "GIVEN", "DECLARED_GIVEN", "NO_OBSTACLES", "OBSTACLES_ARE")
-_MARKS += ("HPP_OBSTACLES", "HPP_GIVEN", "DECLARED_OBSTACLES")
+_MARKS = (
+    "AMONG",
+    "GIVEN",
+    "DECLARED_GIVEN",
+    "NO_OBSTACLES",
+    "OBSTACLES_ARE",
+    "HPP_OBSTACLES",
+    "HPP_GIVEN",
+    "DECLARED_OBSTACLES",
+)
 # What the header says of them.
 _SAID = """\
- *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie, on the side
- *                   on which its first guesses, or `warm`, are or come to be. The whole cable, its
- *                   radius and its fixtures are outside of them but for 1e-6 of its length, else
- *                   there is no DLO_OK; places at which it touches stay on the cable in
+ *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie. Where
+ *                   the status is DLO_OK the whole cable, its radius and its fixtures are outside of
+ *                   them but for 1e-6 of its length. Places at which it touches stay on the cable in
  *                   derivatives. Along a path it touches down and lifts off without a jump
  *   n_obstacles in  at most DLO_OBSTACLES
 """
@@ -96,8 +103,9 @@ def _moved(surface: rod.Obstacle, offset: float) -> rod.Obstacle:
 
 def _initializer(surface: rod.Obstacle) -> str:
     """A surface as an initialiser of dlo_obstacle."""
-    plane = isinstance(surface, Plane)
-    places = (surface.point, surface.normal) if plane else (surface.a, surface.b)
+    if isinstance(surface, Plane):
+        kind, places, radius = "DLO_HALF_SPACE", (surface.point, surface.normal), 0.0
+    else:
+        kind, places, radius = "DLO_CAPSULE", (surface.a, surface.b), surface.radius
     a, b = (", ".join(c_number(float(x)) for x in place) for place in places)
-    kind, radius = ("DLO_HALF_SPACE", 0.0) if plane else ("DLO_CAPSULE", surface.radius)
     return f"{{{kind}, {{{a}}}, {{{b}}}, {c_number(radius)}}}"

@@ -2,8 +2,8 @@
 
     python scripts/examples/rest_on_the_table.py     draws results/rest_on_the_table.png
 
-The generated solver takes what the cable may touch with each call: the table is an obstacle of the
-solver, which lays the cable on it; the plate is one of the clearance alone, which must stay positive.
+The generated solver takes what the cable may touch with each call. The table is an obstacle of the
+solver, which lays the cable on it; the plate is one of the clearance alone, which has to stay.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ GAP = 0.01  # m between the cable and the plate
 
 
 def cable() -> CompiledSolver:
-    """0.9 m of a heavy cable; `dlo_casadi.load("results/...").compile(obstacles=1)` is a fitted one."""
+    """0.9 m of a heavy cable; of a fitted one `dlo_casadi.load(...).compile(obstacles=1)`."""
     data = CableData(0.9, 0.15, 0.008, 0.02, torsional_stiffness=0.01)
     ends = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
     model = CableModel(data, 16, n_rest=0, **ends)
