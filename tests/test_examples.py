@@ -119,3 +119,10 @@ def test_clips_of_a_door_keep_limits_at_openings_between_those_they_were_placed_
         for check in cable.solve(**pose, clips=placing.clips).check(script.LIMITS):
             assert check.verdict == "pass"
     assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_the_cable_rests_on_the_table_but_not_on_the_hot_plate():
+    script = example("rest_on_the_table")
+    found = script.moved(script.cable(), np.linspace(-0.3, 0.3, 9))
+    assert all(shape.obstacle_forces[0, 2] < 0.0 for shape, _, _ in found)
+    assert [allowed for _, _, allowed in found] == [True] * 8 + [False]

@@ -146,20 +146,22 @@ class FittedCable(KnownCable):
         other_side = self.shape_in(others, beyond)
         return replace(self.shape_in(own, eq), other_side=other_side, tipping=near)
 
-    def compile(self, *, flags: Sequence[str] = ("-O2",)) -> CompiledSolver:
+    def compile(self, *, flags: Sequence[str] = ("-O2",), obstacles: int = 0) -> CompiledSolver:
         """The cable as C, compiled and loaded: thousands of shapes a second.
 
         Parameters
         ----------
         flags : sequence of str
             Of the compiler.
+        obstacles : int
+            Maximum number of obstacles on which the cable may lie, see `CompiledSolver`.
 
         Raises
         ------
         DloError
             If there is no C compiler, or it refuses the flags.
         """
-        return CompiledSolver(self.model, self.p, self.rest, flags=flags)
+        return CompiledSolver(self.model, self.p, self.rest, flags=flags, obstacles=obstacles)
 
     def export(
         self,

@@ -328,6 +328,13 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
     option(
         "--clips", nargs="+", default=(), choices=get_args(ClipKind), help="what holds it between"
     ),
+    option(
+        "--obstacles",
+        type=int,
+        default=0,
+        metavar="N",
+        help="most obstacles on which the cable may lie, handed over with each pose",
+    ),
     *MESH,
     json="print files and hash as JSON",
 )
@@ -339,10 +346,11 @@ def generate_solver(chosen: argparse.Namespace) -> None:
     dlo generate-solver results/cable/parameters.yaml --output solver
     dlo generate-solver results/cable --output solver --prefix rope --elements 40
     dlo generate-solver results/loom --output solver --clips pinned pinned
+    dlo generate-solver results/cable --output solver --obstacles 3
     """
     cable = load(chosen.parameters).with_mesh(chosen.elements, chosen.element)
     cable = cable.with_clips(chosen.clips)
-    solver = generate(cable.model, cable.p, cable.rest, chosen.prefix)
+    solver = generate(cable.model, cable.p, cable.rest, chosen.prefix, obstacles=chosen.obstacles)
     written = solver.write(chosen.output)
     page = Page(chosen)
     page.data({"files": [str(path) for path in written], "solver_hash": solver.hash})

@@ -27,25 +27,31 @@ def template(name: str) -> str:
     return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
 
 
-def case_of(model: CableModel, p: FloatArray, rest: FloatArray, inline: bool) -> "Case":
+def case_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, obstacles: int = 0
+) -> "Case":
     """Contents of the templates for this cable."""
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
-    return kind(model, p, rest, inline)
+    return kind(model, p, rest, inline, obstacles)
 
 
 @dataclass(frozen=True)
 class Case:
     """Contents of the templates: the cable's numbers, and the parts of its kind.
 
-    `name` begins the names of its templates; `try_steps`: Newton steps for a part of a path.
+    `obstacles`: on how many it may lie. `name` begins the names of its templates;
+    `try_steps`: Newton steps for a part of a path, `iterations`: of a
+    descent.
     """
 
     model: CableModel
     p: FloatArray
     rest: FloatArray
     inline: bool
+    obstacles: int
     name: ClassVar[str]
     try_steps: ClassVar[int]
+    iterations: ClassVar[int]
 
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
@@ -60,6 +66,8 @@ class Case:
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
+        if self.obstacles and bare.end == "free":
+            bare = replace(bare, end="pinned")  # the force on an obstacle is one at an end
         if not self.holds:
             return kernels_of(bare, p, rest, self.inline)
         if not bare.chain.kind.smooth:
@@ -200,7 +208,7 @@ def _initializer(frame: Sequence[float]) -> str:
 class _PlaneCase(Case):
     """A cable in a plane."""
 
-    name, try_steps = "plane", 13
+    name, try_steps, iterations = "plane", 13, 100
     # Doubles of a workspace per node, as in the template: arrays, border, two-point segments.
     doubles = 12 + 2 + 2 * 15
     # Doubles of a workspace for each segment with a clip or tether inside.
@@ -228,7 +236,8 @@ class _PlaneCase(Case):
         model, chain, kernels = self.model, self.model.chain, self.meshes["kernel"]
         count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
         # From each first guess there is one free descent, and one guided by springs in 15 stages; a
-        # descent takes 100 steps, and 6 more off saddles. The template checks the number.
+        # descent takes 100 steps, and 6 more off saddles; each may land on obstacles, in 100. The
+        # template checks the number.
         guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
         held = 0
         if self.holds:
@@ -236,6 +245,7 @@ class _PlaneCase(Case):
             held += (self.border - 2) * count + 2 * self.held_doubles
         if spans := len(model.clips) and len(model.clips) + 1:
             guesses = (2**spans if spans <= 4 else spans + 2) * (3 if model.sliding else 1)
+        landings = 1 + 2 * guesses * (1 + 2 * self.obstacles) if self.obstacles else 0
         return {
             "WORKSPACE": self.doubles * (count + 1) + held,
             "EXAMPLE_CLIPS": self.example_clips,
@@ -247,7 +257,7 @@ class _PlaneCase(Case):
             "GIVES_END": gives[1],
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
-            "STEPS": (1 + 16 * guesses) * (100 + 6),
+            "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings,
             "HOLDERS": "" if kernels.ends is None else "    add_ends(q, w->table);",
         }
 
@@ -255,7 +265,7 @@ class _PlaneCase(Case):
 class _SpaceCase(Case):
     """A cable in space."""
 
-    name, try_steps = "space", 12
+    name, try_steps, iterations = "space", 12, 80
     # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
     doubles = 4 + 4 + 4 + 3 + 6 + 9 + 58
     # Doubles of a workspace for each segment with a clip or tether inside.
@@ -341,5 +351,5 @@ class _SpaceCase(Case):
             "GIVES_END": self.compliances[1] > 0,
             # Elimination and solution: about 500 operations a node.
             "OPERATIONS": self.meshes["kernel"].operations + 500 * (n + 1),
-            "STEPS": (1 + 3 * guesses) * 80,
+            "STEPS": (1 + 3 * guesses + 3 * self.obstacles) * 80,
         }

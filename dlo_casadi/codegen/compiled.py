@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.generate import Solver, generate
+from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.shapes import (
     QUANTITIES,
     STATUSES,
@@ -27,6 +28,7 @@ from dlo_casadi.codegen.shapes import (
     Slope,
     Usage,
     no_equilibrium,
+    obstacle_of,
     pose_table,
     records_of,
 )
@@ -48,6 +50,8 @@ _ARGUMENTS = {
     "dlo_batch": "pnipppn",
     "dlo_path": "pnipppppn",
 }
+# Before which of them obstacles belong, if the solver knows any.
+_AMONG = {"dlo_solve": 1, "dlo_step": 1, "dlo_sensitivity": 1, "dlo_batch": 2, "dlo_path": 2}
 
 
 def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",)) -> Path:
@@ -90,6 +94,10 @@ class CompiledSolver:
         Rest strains of the cells: `model.rest_basis @ coefficients`.
     flags : sequence of str
         Of the compiler.
+    obstacles : int
+        Maximum number of obstacles on which the cable may lie; at least those of the model.
+
+    All methods that find shapes take `obstacles`; without them they are those of the model.
 
     Raises
     ------
@@ -109,18 +117,30 @@ class CompiledSolver:
         rest: FloatArray,
         *,
         flags: Sequence[str] = ("-O2",),
+        obstacles: int = 0,
     ) -> None:
         self.model = model
-        self.source = generate(model, p, rest)
+        self.source = generate(model, p, rest, obstacles=obstacles)
+        known = Obstacles.of(model, np.asarray(p, float), obstacles)
+        self.most_obstacles = known.most
+        self.obstacles: tuple[Obstacle, ...] = tuple(map(obstacle_of, known.declared))
         folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
         for name, kinds in _ARGUMENTS.items():
+            if self.most_obstacles and name in _AMONG:
+                kinds = kinds[: _AMONG[name]] + "pn" + kinds[_AMONG[name] :]
             getattr(self._c, name).argtypes = [_TYPES[kind] for kind in kinds]
-        self._records, self.workspace = records_of(model), self.source.workspace
+        self._records = records_of(model, self.most_obstacles)
+        self.workspace = self.source.workspace
 
     def solve(
-        self, pose: AnyPose, *, warm: CompiledShape | None = None, throw: bool = True
+        self,
+        pose: AnyPose,
+        *,
+        warm: CompiledShape | None = None,
+        throw: bool = True,
+        obstacles: Sequence[Obstacle] | None = None,
     ) -> CompiledShape:
         """Shape of the cable in one pose.
 
@@ -143,7 +163,8 @@ class CompiledSolver:
         """
         table, branch = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.shape)
-        status = self._call("dlo_solve", table, branch, self._record_of(warm), out)
+        kept = self._record_of(warm)
+        status = self._call("dlo_solve", table, branch, kept, out, obstacles=obstacles)
         if status and throw:
             raise EquilibriumError(
                 no_equilibrium(STATUSES[status], pose, self.model.cable.length),
@@ -151,7 +172,14 @@ class CompiledSolver:
             )
         return _shape(out[0], status)
 
-    def step(self, shape: CompiledShape, pose: AnyPose, *, steps: int = 4) -> CompiledShape:
+    def step(
+        self,
+        shape: CompiledShape,
+        pose: AnyPose,
+        *,
+        steps: int = 4,
+        obstacles: Sequence[Obstacle] | None = None,
+    ) -> CompiledShape:
         """Shape in a nearby pose after at most `steps` Newton steps; see its `status`.
 
         Raises
@@ -163,11 +191,16 @@ class CompiledSolver:
             raise DloError(f"steps: a whole number of Newton steps belongs here, found {steps!r}")
         table, _ = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.shape)
-        status = self._call("dlo_step", table, self._record_of(shape), steps, out)
+        kept = self._record_of(shape)
+        status = self._call("dlo_step", table, kept, steps, out, obstacles=obstacles)
         return _shape(out[0], status)
 
     def solve_many(
-        self, poses: Poses, *, branch: Branch | None = None
+        self,
+        poses: Poses,
+        *,
+        branch: Branch | None = None,
+        obstacles: Sequence[Obstacle] | None = None,
     ) -> tuple[Any, NDArray[np.intc]]:
         """Shapes of many independent poses.
 
@@ -191,11 +224,16 @@ class CompiledSolver:
         """
         table, number = pose_table(self.model, poses, branch)
         out, statuses = np.zeros(len(table), self._records.shape), np.zeros(len(table), np.intc)
-        self._call("dlo_batch", table, len(table), number, out, statuses)
+        self._call("dlo_batch", table, len(table), number, out, statuses, obstacles=obstacles)
         return out, statuses
 
     def path(
-        self, poses: Poses, *, branch: Branch | None = None, warm: CompiledShape | None = None
+        self,
+        poses: Poses,
+        *,
+        branch: Branch | None = None,
+        warm: CompiledShape | None = None,
+        obstacles: Sequence[Obstacle] | None = None,
     ) -> ShapePath:
         """Shapes along a path, each followed continuously from the one before.
 
@@ -214,11 +252,18 @@ class CompiledSolver:
         table, number = pose_table(self.model, poses, branch)
         out, statuses = np.zeros(len(table), self._records.shape), np.zeros(len(table), np.intc)
         kept, jump = self._record_of(warm), np.zeros(1, np.uintp)
-        self._call("dlo_path", table, len(table), number, kept, out, statuses, jump)
+        given = (table, len(table), number, kept, out, statuses, jump)
+        self._call("dlo_path", *given, obstacles=obstacles)
         shapes = tuple(_shape(record, int(k)) for record, k in zip(out, statuses, strict=True))
         return ShapePath(shapes, int(jump[0]) if jump[0] < len(table) else None)
 
-    def sensitivity(self, shape: CompiledShape, pose: AnyPose) -> Slope:
+    def sensitivity(
+        self,
+        shape: CompiledShape,
+        pose: AnyPose,
+        *,
+        obstacles: Sequence[Obstacle] | None = None,
+    ) -> Slope:
         """Derivatives of a shape by the pose it was solved for.
 
         Raises
@@ -228,7 +273,8 @@ class CompiledSolver:
         """
         table, _ = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.slope)
-        status = self._call("dlo_sensitivity", table, self._record_of(shape), out)
+        kept = self._record_of(shape)
+        status = self._call("dlo_sensitivity", table, kept, out, obstacles=obstacles)
         if status:
             raise EquilibriumError(
                 f"no derivatives ({STATUSES[status]}): is the shape a stable equilibrium of this "
@@ -252,7 +298,7 @@ class CompiledSolver:
         DloError
             If there is no obstacle or another object, or a number is not finite.
         """
-        given, along = self._obstacles(obstacles), self._along(slope)
+        given, along = self._table_of(obstacles), self._along(slope)
         kept, out = self._record_of(shape), np.zeros(1, self._records.gap)
         status = self._call("dlo_clearance", kept, given, len(given), along, out)
         if status:
@@ -290,7 +336,7 @@ class CompiledSolver:
         if wrong := [name for name, limit in limits.items() if not limit > 0]:
             raise DloError(f"a limit must be positive, found {wrong[0]} {limits[wrong[0]]!r}")
         bounds = np.array([limits.get(name, 0.0) for name in QUANTITIES], float)
-        given, along = self._obstacles(obstacles), self._along(slope)
+        given, along = self._table_of(obstacles), self._along(slope)
         kept, out = self._record_of(shape), np.zeros(len(QUANTITIES), self._records.usage)
         tightest = np.zeros(1, np.intc)
         status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
@@ -300,7 +346,8 @@ class CompiledSolver:
         first = QUANTITIES[tightest[0]]
         return {first: found[first]} | found
 
-    def _obstacles(self, obstacles: Sequence[Obstacle]) -> Any:
+    def _table_of(self, obstacles: Sequence[Obstacle]) -> NDArray[Any]:
+        """Obstacles as dlo_obstacle."""
         given = np.zeros(len(obstacles), self._records.obstacle)
         for row, obstacle in zip(given, obstacles, strict=True):
             if not isinstance(obstacle, Obstacle):
@@ -323,10 +370,18 @@ class CompiledSolver:
             raise DloError(f"a shape of this solver, with x of the shape {nodes}, belongs here")
         return _filled(self._records.shape, shape)
 
-    def _call(self, name: str, *arguments: Any) -> int:
-        """Status of a call into the library; those that solve take a workspace."""
-        work = np.empty(self.workspace)
-        given = (*arguments, work, work.size)[: len(_ARGUMENTS[name])]
+    def _call(self, name: str, *arguments: Any, obstacles: Sequence[Obstacle] | None = None) -> int:
+        """Status of a call into the library; all functions but the clearance take a workspace."""
+        work, among = np.empty(self.workspace), self.obstacles if obstacles is None else obstacles
+        given = [*arguments, work, work.size][: len(_ARGUMENTS[name])]
+        if len(among) > self.most_obstacles:
+            raise DloError(
+                f"{counted(len(among), 'obstacle')}, the solver knows at most "
+                f"{self.most_obstacles}\n  Try: CompiledSolver(..., obstacles={len(among)})"
+            )
+        if self.most_obstacles and name in _AMONG:
+            listed = self._table_of(among)
+            given[_AMONG[name] : _AMONG[name]] = [listed, len(listed)]
         places = (a.ctypes.data if isinstance(a, np.ndarray) else a for a in given)
         status: int = getattr(self._c, name)(*places)
         return status

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,9 @@ from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.cases import Case, case_of, template
 from dlo_casadi.codegen.kernels import KernelText, c_number, size_of_code, table_to_c
+from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.shapes import records_of
-from dlo_casadi.effects import MeasurementEffect, StateEffect
+from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
@@ -103,59 +104,68 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
         },
         "rest": list(map(float, rest)),
     }
+    if model.surfaces:
+        content["obstacles"] = [one.drawn for one in model.surfaces]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
+def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[str, int | str]:
     """Values of the templates' marks for any cable."""
     model, node, kind = case.model, case.model.node, case.model.chain.kind
     effects = comment(", ".join(effect.name for effect in model.effects)) or "none"
+    contact = obstacles.values(model)
     ends = f"start {model.start}, end {model.end}"
     held = [*model.clips, *["pinned"] * len(case.tethers)]
     table, text = case.table, KernelText.of(case.meshes)
-    values = case.values
-    return values | {
-        "PREFIX": prefix,
-        "FILE": f"{prefix}_solver",
-        "TITLE": comment(model.cable.name),
-        "VERSION": __version__,
-        "MODEL": f"{counted(model.n, model.element)}, {ends}, effects: {effects}",
-        "HASH": digest,
-        "DIMENSION": node.dimension,
-        "COORDINATES": node.coordinates,
-        "AXES": node.increment,
-        "COLUMNS": records_of(model).columns,
-        "N": model.n,
-        "NODES": model.chain.n_nodes,
-        "NODES_ARE": kind.nodes_are,
-        "START_CLAMPED": model.start == "clamped",
-        "END_CLAMPED": model.end == "clamped",
-        "END_FREE": model.end == "free",
-        "LENGTH": c_number(case.length),
-        "DECLARED_LENGTH": c_number(model.cable.length),
-        "RADIUS": c_number(model.cable.diameter / 2),
-        "ELASTIC": model.yields,
-        "STRETCHES": model.extensible,
-        "SMOOTH": kind.smooth,
-        "SPINS": model.may_spin and not case.rest.any(),
-        "TABLE": table_to_c(table),
-        "EXTRA": text.size,
-        "CODE": size_of_code(case.meshes.values(), table),
-        "KERNELS": text.functions,
-        "LOOPS": text.loops,
-        "HELD": text.holders,
-        "EVEN": text.even,
-        "ROW": 2 + 3 * len(node.strains),
-        "HOLDS": case.holds,
-        "CLIPS": len(model.clips),
-        "CLIP_KINDS": ", ".join(model.clips),
-        "CLAMPS": sum(kind in CLAMPS for kind in model.clips),
-        "CLAMP_KINDS": ", ".join(str(_CLAMP_KINDS.get(kind, 0)) for kind in held),
-        "EYELETS": len(model.sliding),
-        "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
-        "TRY_STEPS": case.try_steps,
-        "PATH_STEPS": int(values["STEPS"]) + case.try_steps * (2 * FINEST + 13),
-    }
+    values, tries = case.values, case.try_steps * (2 if case.obstacles else 1)
+    most = tries + (case.iterations if case.obstacles else 0)
+    values["WORKSPACE"] = int(values["WORKSPACE"]) + int(contact["CONTACT_SIZE"])
+    return (
+        values
+        | contact
+        | {
+            "PREFIX": prefix,
+            "FILE": f"{prefix}_solver",
+            "TITLE": comment(model.cable.name),
+            "VERSION": __version__,
+            "MODEL": f"{counted(model.n, model.element)}, {ends}, effects: {effects}",
+            "HASH": digest,
+            "DIMENSION": node.dimension,
+            "COORDINATES": node.coordinates,
+            "AXES": node.increment,
+            "COLUMNS": records_of(model, obstacles.most).columns,
+            "N": model.n,
+            "NODES": model.chain.n_nodes,
+            "NODES_ARE": kind.nodes_are,
+            "START_CLAMPED": model.start == "clamped",
+            "END_CLAMPED": model.end == "clamped",
+            "END_FREE": model.end == "free",
+            "LENGTH": c_number(case.length),
+            "DECLARED_LENGTH": c_number(model.cable.length),
+            "RADIUS": c_number(model.cable.diameter / 2),
+            "ELASTIC": model.yields,
+            "STRETCHES": model.extensible,
+            "SMOOTH": kind.smooth,
+            "SPINS": model.may_spin and not case.rest.any(),
+            "TABLE": table_to_c(table),
+            "EXTRA": text.size,
+            "CODE": size_of_code(case.meshes.values(), table),
+            "KERNELS": text.functions,
+            "LOOPS": text.loops,
+            "HELD": text.holders,
+            "EVEN": text.even,
+            "ROW": 2 + 3 * len(node.strains),
+            "HOLDS": case.holds,
+            "CLIPS": len(model.clips),
+            "CLIP_KINDS": ", ".join(model.clips),
+            "CLAMPS": sum(kind in CLAMPS for kind in model.clips),
+            "CLAMP_KINDS": ", ".join(str(_CLAMP_KINDS.get(kind, 0)) for kind in held),
+            "EYELETS": len(model.sliding),
+            "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
+            "TRY_STEPS": tries,
+            "PATH_STEPS": int(values["STEPS"]) + most * (2 * FINEST + 13),
+        }
+    )
 
 
 def table_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
@@ -206,6 +216,7 @@ def generate(
     prefix: str = "dlo",
     *,
     inline: bool = True,
+    obstacles: int = 0,
 ) -> Solver:
     """Generate the C solver of a model.
 
@@ -222,6 +233,9 @@ def generate(
     inline : bool
         Whether numbers that all elements share are written into the code; otherwise all numbers
         are in one table, and cables of one kind differ in it alone.
+    obstacles : int
+        Maximum number of obstacles on which the cable may lie, which each call tells; at least
+        those of the model.
 
     Raises
     ------
@@ -229,12 +243,6 @@ def generate(
         If the prefix is not a C identifier or an effect cannot be generated.
     """
     check_prefix(prefix)
-    if model.surfaces:
-        count = counted(len(model.surfaces), "obstacle")
-        raise DloError(
-            f"the C solver has no contact, this cable {count}.\n"
-            "  Try: solve(...) of Python, which knows them."
-        )
     p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
     if len(p) != len(model.parameters) or len(rest) != model.chain.n_rests:
         raise DloError(
@@ -242,14 +250,16 @@ def generate(
             f"{len(model.parameters)} parameters and {model.chain.n_rests} rest curvatures"
         )
     digest = solver_hash(model, p, rest)
-    case = case_of(model, p, rest, inline)
+    among = Obstacles.of(model, p, obstacles)
+    bare, p = replace(model, obstacles=()).without_kind(ContactEffect, p)
+    case = case_of(bare, p, rest, inline, among.most)
     values = {
         mark: value if isinstance(value, str) else str(int(value))
-        for mark, value in _values(case, prefix, digest).items()
+        for mark, value in _values(case, among, prefix, digest).items()
     }
     own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
-    sources = ("common", case.name, "newton", own[0], "between", *own[1:], "shape")
-    sources += ("clearance", "limits", "interface", "casadi")
+    first = ("common", case.name, "contact", "newton", "columns", own[0], "between", "landing")
+    sources = (*first, *own[1:], "shape", "clearance", "limits", "interface", "casadi")
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),
@@ -258,6 +268,6 @@ def generate(
         "example.c": template("example.c.in"),
         f"{prefix}_solver.c": "".join(template(f"{name}.c.in") for name in sources),
     }
-    words = case.words
+    words = case.words | among.words
     filled = {name: fill(marked(text, words), values, prefix) for name, text in found.items()}
     return Solver(prefix, digest, filled, int(values["WORKSPACE"]))

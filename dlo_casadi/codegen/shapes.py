@@ -13,6 +13,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.rod import obstacles
 from dlo_casadi.rod.ends import EndConditions
 
 Place = tuple[float, ...]
@@ -28,6 +29,7 @@ STATUSES = (
     "bad_argument",
     "other_branch",
     "turns_shed",
+    "no_room",
 )
 _BRANCHES = {None: 0, "ccw": 1, "cw": 2}
 # Status -> advice.
@@ -40,6 +42,7 @@ _HINTS = {
     "their order and not two in one element.",
     "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
     "turns_shed": "fewer turns, or the end farther from the start.",
+    "no_room": "the obstacles' places: a fixture is inside of one.",
 }
 
 
@@ -82,6 +85,13 @@ class CompiledShape:
         With clamped clips, of the cable on them, in space about the world's axes.
     places : (n + 1,)
         With clamped clips, arc lengths over length of points and nodes: one is moved to each.
+    contact_forces : (obstacles, 4 n) [N]
+        Sizes of the forces on each obstacle, across its surface, at places of the cable; 0 where it
+        does not touch.
+    contact_places : (obstacles, 4 n)
+        These places: arc lengths over length.
+    obstacle_forces : (obstacles, dimension) [N]
+        Of the cable on each obstacle.
     """
 
     points: FloatArray
@@ -104,6 +114,9 @@ class CompiledShape:
     clip_at: FloatArray = field(default_factory=lambda: np.zeros(0))
     clip_moments: FloatArray = field(default_factory=lambda: np.zeros(0))
     places: FloatArray = field(default_factory=lambda: np.zeros(0))
+    contact_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    contact_places: FloatArray = field(default_factory=lambda: np.zeros(0))
+    obstacle_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -125,7 +138,8 @@ class Slope:
     In a plane by end x, y [m], start heading, end heading [rad], k = 4. In space by start x, y, z
     [m], the rotation of the start about the world's axes x, y, z [rad], and the same of the end,
     k = 12. Then of each clip by its arc length and its place [m] and, if any is clamped, its
-    heading, or rotation about the world's axes [rad].
+    heading, or rotation about the world's axes [rad]. In a plane with obstacles the start x, y [m]
+    come last.
 
     Parameters
     ----------
@@ -139,6 +153,10 @@ class Slope:
         Of those of CompiledShape.
     energy_by_at : (n_clips,) [N]
         Derivatives of the energy by the clips' arc lengths.
+    obstacle_forces : (obstacles, dimension, k)
+    degenerate : int
+        Number of contacts that begin or end with the least change of the pose: then the derivatives
+        are those to one side.
     """
 
     points: FloatArray
@@ -152,6 +170,8 @@ class Slope:
     clip_moments: FloatArray = field(default_factory=lambda: np.zeros(0))
     places: FloatArray = field(default_factory=lambda: np.zeros(0))
     energy_by_at: FloatArray = field(default_factory=lambda: np.zeros(0))
+    obstacle_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    degenerate: int = 0
 
 
 @dataclass(frozen=True)
@@ -183,6 +203,13 @@ class HalfSpace:
 
 
 Obstacle = Capsule | HalfSpace
+
+
+def obstacle_of(surface: obstacles.Obstacle) -> Obstacle:
+    """A surface of a model as the C solver takes it."""
+    if isinstance(surface, obstacles.Plane):
+        return HalfSpace(surface.point, surface.normal)
+    return Capsule(surface.a, surface.b, surface.radius)
 
 
 @dataclass(frozen=True)
@@ -258,18 +285,22 @@ class Records(NamedTuple):
     columns: int
 
 
-def records_of(model: CableModel) -> Records:
-    """Layouts of the structures of a model's solver."""
+def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
+    """Layouts of the structures of a model's solver that knows so many obstacles."""
     node, n, nodes = model.node, model.n + 1, model.chain.n_nodes
     d, turn = node.dimension, node.increment
     clips, holds = len(model.clips), len(model.clips) + model.n_springs
     clamps, turns = model.clamped_between, turn * model.clamped_between
-    k = 2 * turn + (2 * d if model.in_space else d) + (1 + d + turns) * clips
+    starts = model.in_space or n_obstacles > 0
+    k = 2 * turn + (2 * d if starts else d) + (1 + d + turns) * clips
     forces: dict[str, tuple[int, ...]] = {"start_force": (d,), "end_force": (d,)}
     forces |= {"clip_forces": (holds, d), "clip_grip": (holds,), "clip_at": (holds,)}
     forces |= {
         "clip_moments": (holds * clamps, turn),
         "places": (n * clamps,),
+        "contact_forces": (n_obstacles, 4 * model.n),
+        "contact_places": (n_obstacles, 4 * model.n),
+        "obstacle_forces": (n_obstacles, d),
         "moments": (2, turn),
     }
     scalars = ["energy", "min_bend_radius", "min_bend_at", "max_twist", "max_twist_at"]
@@ -277,7 +308,8 @@ def records_of(model: CableModel) -> Records:
     slope: dict[str, tuple[int, ...]] = {"points": (n, d, k), "rotations": (nodes, turn, k)}
     slope |= {"end_force": (d, k), "clip_forces": (holds, d, k), "clip_at": (holds, k)}
     slope |= {"clip_moments": (holds * clamps, turn, k), "places": (n * clamps, k)}
-    slope |= {"energy_by_at": (clips,), "moments": (2, turn, k)}
+    slope |= {"energy_by_at": (clips,), "obstacle_forces": (n_obstacles, d, k)}
+    slope |= {"moments": (2, turn, k)}
     slope |= {"min_bend_radius": (k,), "max_twist": (k,)}
     gap = {"distance": (), "place": (), "point": (d,), "normal": (d,), "gradient": (k,)}
     usage = {"value": (), "margin": (), "at": (), "gradient": (k,)}
@@ -287,7 +319,7 @@ def records_of(model: CableModel) -> Records:
             _floats(forces | dict.fromkeys(scalars, ())),
             [("iterations", np.intc), ("turn", np.intc)],
         ),
-        _record(_floats(slope)),
+        _record(_floats(slope), [("degenerate", np.intc)] if n_obstacles else []),
         _record([("kind", np.intc)], _floats({"a": (d,), "b": (d,), "radius": ()})),
         _record(_floats(gap), [("obstacle", np.uintp)]),
         _record(_floats(usage), [("which", np.intc)]),

@@ -1,0 +1,227 @@
+"""Contact in the generated C solver: beside Python, its derivatives, paths, what it refuses."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from dlo_casadi.codegen import generate
+from dlo_casadi.codegen.compiled import CompiledSolver, compile_library
+from dlo_casadi.codegen.shapes import Capsule, HalfSpace
+from dlo_casadi.effects import CableData, ContactPlane, ObstacleOffset
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod import obstacles as rod
+
+STRICT = ("-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+# Python's contacts are at nodes alone.
+NODES = (*STRICT, "-DBETWEEN=0")
+TABLE = {2: rod.Plane((0.0, -0.19), (0.0, 1.0)), 3: rod.Plane((0.0, 0.0, -0.19), (0.0, 0.0, 1.0))}
+# Under the middle of the cable.
+ROUND = {
+    "disc": rod.Capsule((0.4, -0.26), (0.4, -0.26), 0.08),
+    "ball": rod.Capsule((0.4, 0.05, -0.26), (0.4, 0.05, -0.26), 0.08),
+    "bar": rod.Capsule((0.4, -0.2, -0.26), (0.4, 0.3, -0.26), 0.08),
+}
+
+
+def cable(d: int, end: str = "clamped", n: int = 12) -> CableModel:
+    """A heavy cable, in the plane or in space."""
+    twist = {"torsional_stiffness": 0.02} if d == 3 else {}
+    data = CableData(1.0, 0.2, 0.012, 0.03, **twist)
+    gravity = (*[0.0] * (d - 1), -9.81)
+    return CableModel(data, n, start="clamped", end=end, gravity=gravity, n_rest=0)
+
+
+def pose_of(model: CableModel, *, drop: float = 0.05) -> HeldPose:
+    """Ends 0.85 m apart."""
+    if model.end == "free":
+        end = None
+    else:
+        end = (0.85, drop) if model.node.dimension == 2 else (0.85, 0.1, drop)
+    if model.node.dimension == 2:
+        return HeldPose((0.0, 0.0), end, start_heading=0.1, end_heading=-0.05)
+    frame = (0.02, -0.05, 0.03, 0.998)
+    size = float(np.linalg.norm(frame))
+    turned = tuple(x / size for x in frame)
+    return HeldPose((0.0,) * 3, end, start_orientation=turned, end_orientation=(0.0, 0.0, 0.0, 1.0))
+
+
+def compiled(model: CableModel, *flags: str, obstacles: int = 2) -> CompiledSolver:
+    rest = np.zeros(model.chain.n_rests)
+    return CompiledSolver(model, model.nominal, rest, flags=flags or STRICT, obstacles=obstacles)
+
+
+@pytest.fixture(scope="module", params=[2, 3], ids=["plane", "space"])
+def own(request) -> tuple[CableModel, CompiledSolver]:
+    """A cable that touches its table, and its solver."""
+    model = cable(request.param)
+    return model, compiled(replace(model, obstacles=(TABLE[request.param],)))
+
+
+@pytest.mark.parametrize(
+    ("what", "d", "end"),
+    [
+        ("table", 2, "clamped"),
+        ("table", 3, "free"),
+        ("table", 3, "clamped"),
+        ("ball", 3, "clamped"),
+    ],
+)
+def test_nodes_alone_touch_as_in_python(what, d, end):
+    surface = TABLE[d] if what == "table" else ROUND[what]
+    model = replace(cable(d, end), obstacles=(surface,))
+    found = compiled(model, *NODES).solve(pose_of(model))
+    eq = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose_of(model))
+    assert eq.contacts, "the cable touches"
+    scale = model.cable.mass * 9.81
+    assert found.energy == pytest.approx(eq.energy, abs=1e-8 * scale)
+    assert found.points == pytest.approx(eq.points[: model.n + 1], abs=1e-6)
+    forces = sum(contact.force for contact in eq.contacts)
+    assert found.obstacle_forces[0] == pytest.approx(forces, abs=1e-5 * scale)
+    assert found.start_force == pytest.approx(eq.start_force, abs=1e-5 * scale)
+
+
+def test_whole_cable_is_outside(own):
+    model, solver = own
+    shape = solver.solve(pose_of(model))
+    gap = solver.clearance(shape, solver.obstacles)
+    assert -1e-6 <= gap.distance < 1e-6, "touches, and is nowhere deeper"
+    assert shape.contact_forces.min() == 0.0 < shape.contact_forces.max()
+    weight = np.array([*[0.0] * (model.node.dimension - 1), -model.cable.mass * 9.81])
+    held = shape.start_force + shape.end_force + shape.obstacle_forces.sum(axis=0)
+    assert held == pytest.approx(weight, abs=1e-8)
+    places = shape.contact_places[shape.contact_forces > 0]
+    assert np.all((places > 0.2) & (places < 0.9))
+
+
+def test_no_obstacles_are_as_a_solver_without(own):
+    model, solver = own
+    found = solver.solve(pose_of(model), obstacles=())
+    known = compiled(model, obstacles=0).solve(pose_of(model))
+    assert found.energy == pytest.approx(known.energy, abs=1e-13)
+    assert not found.contact_forces.any()
+
+
+def moved(pose: HeldPose, column: int, step: float, d: int) -> HeldPose:
+    """The pose with one of the numbers moved by which a slope has derivatives."""
+    if d == 2:
+        start, end = np.array(pose.start), np.array(pose.end)
+        first, last = pose.start_heading, pose.end_heading
+        if column < 2:
+            end = end + step * np.eye(2)[column]
+        elif column < 4:
+            first, last = (first + step, last) if column == 2 else (first, last + step)
+        else:
+            start = start + step * np.eye(2)[column - 4]
+        return replace(
+            pose, start=tuple(start), end=tuple(end), start_heading=first, end_heading=last
+        )
+    from scipy.spatial.transform import Rotation
+
+    side, axis = divmod(column, 6)
+    name = ("start", "end")[side]
+    if axis < 3:
+        place = np.array(getattr(pose, name)) + step * np.eye(3)[axis]
+        return replace(pose, **{name: tuple(place)})
+    key = f"{name}_orientation"
+    turn = Rotation.from_rotvec(step * np.eye(3)[axis - 3])
+    frame = (turn * Rotation.from_quat(getattr(pose, key))).as_quat()
+    return replace(pose, **{key: tuple(frame)})
+
+
+@pytest.mark.parametrize("what", ["table", "round"])
+def test_derivatives_through_contacts(own, what):
+    """Of forces, moments, points and the force on the obstacle, by central differences."""
+    model, _ = own
+    d = model.node.dimension
+    name, solver = "disc" if d == 2 else "ball", compiled(own[1].model, *NODES)
+    listed = solver.obstacles
+    if what == "round":
+        listed = (Capsule(ROUND[name].a, ROUND[name].b, ROUND[name].radius),)
+    pose = pose_of(model)
+    shape = solver.solve(pose, obstacles=listed)
+    assert shape.obstacle_forces.any()
+    slope = solver.sensitivity(shape, pose, obstacles=listed)
+    assert slope.degenerate == 0
+    force = solver.limits(shape, {}, slope=slope)["force"]
+    assert force.which == (0 if d == 3 else 1), "in space the start's, which the obstacle changes"
+    step = 1e-5
+    for column in range(slope.min_bend_radius.size):
+        sides = [
+            solver.step(shape, moved(pose, column, sign * step, d), steps=10, obstacles=listed)
+            for sign in (1, -1)
+        ]
+        assert {side.status for side in sides} == {"ok"}
+        loads = [solver.limits(side, {})["force"].value for side in sides]
+        change = (loads[0] - loads[1]) / (2 * step)
+        assert force.gradient[column] == pytest.approx(change, rel=1e-3, abs=2e-3)
+        for key in ("points", "end_force", "moments", "obstacle_forces"):
+            change = np.subtract(*(getattr(side, key) for side in sides)) / (2 * step)
+            told = getattr(slope, key)[..., column]
+            assert told == pytest.approx(change, rel=1e-3, abs=2e-3 * (1 + np.abs(change).max())), (
+                key,
+                column,
+            )
+
+
+def test_a_path_touches_down_and_lifts_off(own):
+    model, solver = own
+    drops = np.concatenate([np.linspace(0.2, 0.04, 20), np.linspace(0.04, 0.2, 20)])
+    pose = pose_of(model)
+    poses = [replace(pose, end=(*pose.end[:-1], float(drop))) for drop in drops]
+    path = solver.path(poses)
+    assert path.first_jump is None
+    forces = np.array([-shape.obstacle_forces[0][-1] for shape in path.shapes])
+    assert forces[0] == forces[-1] == 0.0 < forces[20]
+    for shape in path.shapes:
+        assert solver.clearance(shape, solver.obstacles).distance >= -1e-6
+    energies = [shape.energy for shape in path.shapes]
+    assert energies == pytest.approx(energies[::-1], abs=1e-6), "the same way back"
+
+
+def test_refusals(own):
+    model, solver = own
+    d = model.node.dimension
+    low = replace(pose_of(model), start=(*[0.0] * (d - 1), -0.1899))
+    assert solver.solve(low, throw=False).status == "no_room"
+    flat = HalfSpace((0.0,) * d, (0.0,) * d)
+    assert solver.solve(pose_of(model), throw=False, obstacles=[flat]).status == "bad_argument"
+    with pytest.raises(DloError, match="3 obstacles, the solver knows at most 2"):
+        solver.solve(pose_of(model), obstacles=solver.obstacles * 3)
+    with pytest.raises(DloError, match="0 to 1000"):
+        generate(model, model.nominal, np.zeros(model.chain.n_rests), obstacles=-1)
+
+
+def test_obstacles_of_the_model_with_what_a_fit_moved():
+    model = replace(cable(3), obstacles=(TABLE[3],))
+    model = model.with_effect(ObstacleOffset()).with_effect(ContactPlane())
+    p = model.nominal.copy()
+    p[model.names.index("obstacle_offset.offset")] = 0.01
+    p[model.names.index("contact_plane.height")] = -0.3
+    solver = CompiledSolver(model, p, np.zeros(model.chain.n_rests), flags=STRICT)
+    assert [x.point[2] for x in solver.obstacles] == pytest.approx([-0.18, -0.3])
+    shape = solver.solve(pose_of(model))
+    assert shape.points[:, 2].min() == pytest.approx(-0.18 + 0.006, abs=2e-3)
+    assert shape.obstacle_forces[0, 2] < 0.0 == shape.obstacle_forces[1, 2]
+
+
+def test_casadi_knows_the_obstacles_of_the_model(own, tmp_path):
+    model, solver = own
+    d = model.node.dimension
+    touching = replace(model, obstacles=(TABLE[d],))
+    source = generate(touching, model.nominal, np.zeros(model.chain.n_rests))
+    external = ca.external("dlo_cable", str(compile_library(source, tmp_path, STRICT)))
+    pose = pose_of(model)
+    numbers = np.array([*pose.ends, *([0.0] if d == 3 else [])])
+    shape = solver.solve(pose)
+    assert float(external(numbers)[3]) == pytest.approx(shape.energy, abs=1e-12)
+    x = ca.MX.sym("x", len(numbers))
+    jacobian = ca.Function("j", [x], [ca.jacobian(external(x)[1], x)])
+    slope = solver.sensitivity(shape, pose)
+    first = -d if d == 2 else 0  # the start moves against the table: columns of its place
+    told = np.array(jacobian(numbers))[:, :d]
+    assert told == pytest.approx(slope.end_force[:, first : first + d or None], rel=1e-9)
