@@ -85,6 +85,8 @@ def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",
 class CompiledSolver:
     """Equilibria in the plane and in space by compiled C: thousands of poses a second.
 
+    All methods that find shapes take `obstacles`; without them they are those of the model.
+
     Parameters
     ----------
     model : CableModel
@@ -96,8 +98,6 @@ class CompiledSolver:
         Of the compiler.
     obstacles : int
         Maximum number of obstacles on which the cable may lie; at least those of the model.
-
-    All methods that find shapes take `obstacles`; without them they are those of the model.
 
     Raises
     ------
