@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dlo_casadi.cable.held import among
-from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.candidates import candidates_of
 from dlo_casadi.diagnosis.refits import scored_by_refit
@@ -18,7 +17,7 @@ from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import beside_bars
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
+from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import begin
@@ -330,12 +329,6 @@ def test_a_fixture_inside_of_an_obstacle():
         EquilibriumError, match=r"end \(0.7000, -0.2000\) m is 0.0500 m inside table"
     ):
         solved(CABLE, HeldPose((0.0, 0.0), (0.7, -0.2)), TABLE)
-
-
-def test_the_c_solver_refuses_obstacles():
-    model = CableModel(CABLE, 20, n_rest=0, obstacles=(TABLE,))
-    with pytest.raises(DloError, match="1 obstacle"):
-        generate(model, model.nominal, np.zeros(model.chain.n_rests))
 
 
 SESSION = """\
