@@ -8,8 +8,8 @@ F_j is the gradient of the Lagrangian of pose j, S its scale: h / EI for the ben
 left over at a node, h / GJ for a twisting one, so that S F is the angle [rad] by which the node
 would turn. The measured shapes fix the nodes, in which the balance is linear in forces, loads and
 1 / EI: no equilibrium has to be known, nor a stiffness. Steps are taken in these, the compliances
-and forces and loads per stiffness; in log EI a stiffness 50 times off crept, refused at nearly
-every step, where three steps lead now. The softness then falls to nothing. Where
+and forces and loads per stiffness: those in log EI and newtons are refused nearly everywhere where
+a stiffness is 50 times off. The softness then falls to nothing. Where
 the model lacks something it may be fixed at a size at which the shapes are still those measured:
 what is left over of the balance there is what the model lacks.
 
@@ -313,7 +313,7 @@ class Relaxation:
         damping, least = FIRST_DAMPING, self.objective(values)
         for _ in range(steps):
             found, reached = values, np.inf
-            linearized = self._linearized(values)
+            linearized = self._scaled(self._linearized(values), values)
             for _ in range(REFUSED):
                 try:
                     found = self._stepped(values, linearized, damping, fixed)
@@ -334,15 +334,16 @@ class Relaxation:
     def _scaled(self, linearized: _Linearized, values: Values) -> _Linearized:
         """Rows of a step in which loads grow with the bending stiffness, as all forces do."""
         unknowns = self.problem.unknowns
-        loads, size = unknowns.are_loads, unknowns.size
-        growth = self._growth(values)[-size:]
-        by = np.eye(size) + np.outer(loads * values.theta, growth)
+        if not unknowns.are_loads.any():
+            return linearized
+        grown = unknowns.are_loads * values.theta
+        growth = self._growth(values)[-unknowns.size :]
+        at = slice(-unknowns.size - 1, -1)
 
         def changed(rows: FloatArray) -> FloatArray:
-            at = slice(rows.shape[1] - 1 - size, rows.shape[1] - 1)
-            rows = rows.copy()
-            rows[:, at] = rows[:, at] @ by
-            return rows
+            more = np.zeros_like(rows)
+            more[:, at] = np.outer(rows[:, at] @ grown, growth)
+            return rows + more
 
         return _Linearized([changed(rows) for rows in linearized.poses], changed(linearized.prior))
 
@@ -350,8 +351,7 @@ class Relaxation:
         self, values: Values, linearized: _Linearized, damping: float, fixed: BoolArray | None
     ) -> Values:
         """Values after a damped step within reach."""
-        problem = self.problem
-        reduced = self._reduced(self._scaled(linearized, values), damping, fixed)
+        problem, reduced = self.problem, self._reduced(linearized, damping, fixed)
         unknowns, equilibria = problem.unknowns, problem.equilibria
         nodes, border, own, _ = self._counts
         free = np.ones(unknowns.size, dtype=bool) if fixed is None else ~fixed
