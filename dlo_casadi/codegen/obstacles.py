@@ -1,6 +1,6 @@
 """What the generated solver knows of obstacles: how many there may be, and those of the model."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.kernels import c_number
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.contact import gap_per_force, outwards
+from dlo_casadi.model.contact import gap_per_force, surfaces_at
 from dlo_casadi.rod import obstacles as rod
 from dlo_casadi.rod.obstacles import Plane
 
@@ -36,9 +36,7 @@ class Obstacles:
                 "a cable of links cannot lie on obstacles\n"
                 "  Try: another element, --element quadratic"
             )
-        moved = outwards(model) @ p if model.surfaces else ()
-        found = zip(model.surfaces, moved, strict=True)
-        declared = tuple(_moved(surface, float(offset)) for surface, offset in found)
+        declared = surfaces_at(model, p)
         return cls(max(int(most), len(declared)), declared)
 
     def values(self, model: CableModel) -> dict[str, int | str]:
@@ -91,14 +89,6 @@ _SAID = """\
  *                   cable in derivatives. Along a path it touches down and lifts off without a jump
  *   n_obstacles in  at most DLO_OBSTACLES
 """
-
-
-def _moved(surface: rod.Obstacle, offset: float) -> rod.Obstacle:
-    """A surface moved outwards by an offset [m]."""
-    if isinstance(surface, Plane):
-        place = np.array(surface.point) + offset * np.array(surface.normal)
-        return replace(surface, point=tuple(map(float, place)))
-    return replace(surface, radius=surface.radius + offset)
 
 
 def _initializer(surface: rod.Obstacle) -> str:

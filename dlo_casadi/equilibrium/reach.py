@@ -8,7 +8,7 @@ from dlo_casadi.equilibrium.spans import chords, fixed_stretches, holders
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes
-from dlo_casadi.model.contact import outwards
+from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.lagrangian import lagrangian_of
 
 
@@ -51,10 +51,10 @@ def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str]
     """Why obstacles leave no equilibrium, and what to try: a fixture is inside of one."""
     held = [("start", pose.start), *((clip.name, clip.place) for clip in pose.clips)]
     held += [("end", pose.end)] if pose.end is not None else []
-    offsets = outwards(model) @ p if model.surfaces else ()
+    surfaces = surfaces_at(model, p)
     for name, place in held:
-        for obstacle, offset in zip(model.surfaces, offsets, strict=True):
-            depth = offset - float(obstacle.near(np.array(place)).distance)
+        for obstacle in surfaces:
+            depth = -float(obstacle.near(np.array(place)).distance)
             if depth > 0:
                 at = ", ".join(f"{x:.4f}" for x in place)
                 what = f"no equilibrium: the {name} ({at}) m is {depth:.4f} m inside"

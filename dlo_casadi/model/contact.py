@@ -32,7 +32,7 @@ from dlo_casadi.effects import ContactEffect
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.rod.obstacles import Surface, surfaces_near
+from dlo_casadi.rod.obstacles import Obstacle, Surface, surfaces_near
 
 # Depth [lengths] under a force as large as the cable's weight: it keeps apart contacts that depend
 # on each other. Of 95 random cables in the plane that touch where IPOPT's do, 4 differ in energy by
@@ -353,6 +353,12 @@ def outwards(model: CableModel) -> FloatArray:
             column = model.names.index(f"{effect.label}.{parameter.name}")
             found[effect.obstacle + own * declared, column] = 1.0
     return found
+
+
+def surfaces_at(model: CableModel, p: FloatArray) -> tuple[Obstacle, ...]:
+    """All surfaces that the cable may touch, moved outwards as parameters p (n_parameters,) say."""
+    offsets = (outwards(model) @ p).tolist()
+    return tuple(x.grown(y) for x, y in zip(model.surfaces, offsets, strict=True))
 
 
 def forces_on_other_mesh(lam: FloatArray, model: CableModel, other: CableModel) -> FloatArray:

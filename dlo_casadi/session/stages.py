@@ -33,10 +33,9 @@ from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
 from dlo_casadi.model.clips import clip_rows
-from dlo_casadi.model.contact import outwards
+from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
 from dlo_casadi.rod.node import Frame
-from dlo_casadi.rod.obstacles import Obstacle
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import MASS, ReadingErrors, RestCurvatureEstimate, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
@@ -155,14 +154,8 @@ class _Model:
             tuple(item.pose.name for item in lost if item.held_out and item.readable),
             _reading_errors(measured, shapes, held_out=False),
             _reading_errors(measured, shapes, held_out=True),
-            surfaces=self._surfaces,
+            surfaces=surfaces_at(self.model, self.p),
         )
-
-    @property
-    def _surfaces(self) -> tuple[Obstacle, ...]:
-        """All that the cable may touch, with its offsets."""
-        offsets = (outwards(self.model) @ self.p).tolist()
-        return tuple(x.grown(y) for x, y in zip(self.model.surfaces, offsets, strict=True))
 
     def _told(
         self, item: MeasuredPose, known: Prediction, other: MeasuredBranch | None, shape: PoseShape
