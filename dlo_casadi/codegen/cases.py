@@ -39,9 +39,8 @@ def case_of(
 class Case:
     """Contents of the templates: the cable's numbers, and the parts of its kind.
 
-    `obstacles`: on how many it may lie. `name` begins the names of its templates;
-    `try_steps`: Newton steps for a part of a path, `iterations`: of a
-    descent.
+    `obstacles`: on how many it may lie. `name` begins the names of its templates; `try_steps`:
+    Newton steps for a part of a path, `iterations`: of a descent.
     """
 
     model: CableModel

@@ -371,7 +371,7 @@ class CompiledSolver:
         return _filled(self._records.shape, shape)
 
     def _call(self, name: str, *arguments: Any, obstacles: Sequence[Obstacle] | None = None) -> int:
-        """Status of a call into the library; all functions but the clearance take a workspace."""
+        """Status of a call into the library; those that solve take a workspace."""
         work, among = np.empty(self.workspace), self.obstacles if obstacles is None else obstacles
         given = [*arguments, work, work.size][: len(_ARGUMENTS[name])]
         if len(among) > self.most_obstacles:

@@ -198,9 +198,8 @@ class Varied:
         solved, lost = self._solved(z[:PAIRED], names)
         likely = {x: _crossing(sizes[x], slopes[x], bounds[x], z) for x in names}
         softer: dict[str, FloatArray] = dict.fromkeys(names, np.zeros(1))
-        if (
-            self.model.surfaces
-        ):  # draws sink in by as much as the predicted shape does, if solved so
+        if self.model.surfaces:
+            # Obstacles of draws are softer: they sink in as far as the predicted shape then does.
             (same, _) = self._solved(0 * z[:1], names)
             softer = {x: same[x] - sizes[x] for x in names}
         anew = {x: _beyond(solved[x] - softer[x], bounds[x]) | lost for x in names}
