@@ -16,6 +16,7 @@ from dlo_casadi.cable.curve import CableCurve, curves_of, without_camera
 from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.known_cable import KnownCable
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
+from dlo_casadi.cable.outlines import outlines, touching
 from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Clip, Obstacle
@@ -34,7 +35,7 @@ from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.rod import Held
 from dlo_casadi.export.targets import samples_of, target_of, write_rods
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
-from dlo_casadi.model.contact import Contact
+from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.show.text import html_table, millimetres
 
@@ -346,15 +347,22 @@ class Shape:
         return check_limits(self.cable, known, self.pose, found, limits, tolerances)
 
     def plot(self) -> Figure:
-        """The shape with the forces of the cable on its fixtures; in a plane with its band."""
+        """The shape with the forces of the cable on what it touches; in a plane with its band."""
         other, forces = self.other_side, {"start": self.start_force}
         state = "stable" if self.stable else "NOT stable"
         radius = millimetres(self.min_bend_radius)
         if self.pose.end is not None:
             forces["end"] = self.end_force
+        surfaces, length = surfaces_at(self.cable.model, self.cable.p), self.curve.length
+        stretches = [touching(one.start, one.end, length) for one in self.contacts]
         return draw_shape(
             self.points,
             forces,
+            obstacles=[line for one in surfaces for line in outlines(one, self.points, length)],
+            touching=[
+                (self.curve.at(s), one.force)
+                for s, one in zip(stretches, self.contacts, strict=True)
+            ],
             clips={k: (self.curve.at(np.array([x.at]))[0], x.force) for k, x in self.clips.items()},
             band=None if self.cable.model.in_space else self.band,
             other=None if other is None else other.points,

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray, chord_lengths
+from dlo_casadi.cable.outlines import outlines, touching
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
-from dlo_casadi.report.outlines import outlines
 from dlo_casadi.rod.obstacles import Obstacle
 from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.session.pose_shape import PoseShape
@@ -33,8 +33,6 @@ _MM = 1e3
 _IN_ROOM, _AT_END, _PULLING = 0.15, 1 / 5, 0.25
 # Other shares of it: an axis of a frame, the air above the floor, half of a cross.
 _AXIS, _AIR, _CROSS = 0.09, 0.06, 0.05
-# Half the least length of a stretch that touches something, so that a point is seen, too.
-_TOUCH = 0.006
 # Points of a measured line that are drawn beside others, about.
 _POINTS = 60
 
@@ -340,9 +338,7 @@ def contact_marks(scene: Scene, shape: PoseShape, length: float) -> list[Mark]:
     places = np.linspace(0.0, length, len(shape.curve))
     marks = []
     for one in shape.contacts:
-        middle, half = (one["from"] + one["to"]) / 2, (one["to"] - one["from"]) / 2
-        s = middle + max(half, _TOUCH * length) * np.linspace(-1.0, 1.0, 21)
-        s = np.clip(s, 0.0, length)
+        s = touching(one["from"], one["to"], length)
         points = scene.points(np.stack([np.interp(s, places, x) for x in shape.curve.T], axis=1))
         marks.append(Mark("contact", points))
         marks.append(scene.force(points[10], np.array(one["force"])))

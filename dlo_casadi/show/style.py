@@ -18,6 +18,9 @@ BLACK, GREY = "#1F2933", "#6B7280"
 ORANGE, BLUE, GREEN, VERMILLION = "#B35A00", "#0067A3", "#00805A", "#9E2A00"
 HELD_OUT = "#8C3B6C"  # poses that no fit saw
 FORCE = "#6A3D9A"
+# Lines of obstacles, and of the stretches of a cable that touch them.
+OBSTACLE: dict[str, Any] = {"color": "#A08A6A", "lw": 0.9}
+CONTACT: dict[str, Any] = {"color": "#C2571A", "lw": 4.0, "alpha": 0.6, "solid_capstyle": "butt"}
 STYLE: dict[Any, Any] = {
     "font.size": 10,
     "axes.titlesize": 10,

@@ -215,6 +215,28 @@ def test_a_prediction_is_drawn(tmp_path, end):
     assert drawn(tmp_path / "shape.png")[1] > 0.005
 
 
+def test_a_prediction_is_drawn_with_the_table_that_it_touches(tmp_path):
+    points = np.stack([np.linspace(0, 0.4, 21), np.zeros(21)], axis=1)
+    drawing = draw_shape(
+        points,
+        {"start": np.array([0.0, 0.5])},
+        clips={},
+        band=None,
+        other=None,
+        obstacles=[points - [0.0, 0.003]],
+        touching=[(points[6:15], np.array([0.0, -1.0]))],
+        title="rope: predicted shape",
+        remark="energy 1 J",
+        alarming=False,
+    )
+    save_figure(tmp_path / "shape.png", drawing)
+
+    (legend,) = drawing.legends
+    said = {text.get_text() for text in legend.get_texts()}
+    assert {"obstacle", "in contact", "force on fixtures and obstacles"} <= said
+    assert "1 N" in {text.get_text() for text in drawing.axes[0].texts}
+
+
 def with_readings(outcome):
     """The same with readings in three poses."""
     stage = outcome.stages[-1]

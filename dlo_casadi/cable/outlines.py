@@ -1,4 +1,4 @@
-"""Outlines of obstacles near a cable, as lines to be drawn."""
+"""Obstacles near a cable and stretches that touch them, as lines to be drawn."""
 
 import numpy as np
 
@@ -10,6 +10,16 @@ from dlo_casadi.rod.obstacles import Obstacle, Plane
 _CIRCLE, _STROKES, _NET = 33, 24, 7
 # How far surfaces are drawn beyond the cable, and length of a stroke, in lengths of the cable.
 _BEYOND, _STROKE = 0.06, 0.025
+
+# Half the least length of a stretch that touches something, so that a point is seen, too.
+_SEEN = 0.006
+
+
+def touching(start: float, end: float, length: float) -> FloatArray:
+    """Arc lengths (21,) [m] of the line that shows a contact from `start` to `end` [m]."""
+    middle, half = (start + end) / 2, (end - start) / 2
+    s = middle + max(half, _SEEN * length) * np.linspace(-1.0, 1.0, 21)
+    return np.clip(s, 0.0, length)
 
 
 def outlines(obstacle: Obstacle, points: FloatArray, length: float) -> list[FloatArray]:
