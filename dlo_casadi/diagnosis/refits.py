@@ -35,10 +35,11 @@ from dlo_casadi.diagnosis.screening import (
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.continuation import relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import carried_shapes, descend, refit
 from dlo_casadi.estimation.fit import FIRST_STD, misfits
 from dlo_casadi.estimation.problem import Priors, Problem, Values
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed, with_springs_in_place
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from
 from dlo_casadi.estimation.unknowns import Unknowns

@@ -257,8 +257,8 @@ def refit(
 def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shapes:
     """Shapes of a problem's poses from those of a fit, on the problem's mesh.
 
-    Poses that the fit did not need, because it carried no state, are predicted;
-    beside a relaxed fit they begin at a first guess.
+    Poses that the fit did not need, because it carried no state, are predicted; beside a relaxed
+    fit that predicts none they begin at a first guess.
 
     Raises
     ------
@@ -274,19 +274,18 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
             rows.append((own.x[k], own.lam[k], own.deviation[k]))
             continue
         pose = problem.history[index].pose
-        if relaxed:
-            guess = next(first_guesses(fit.model, fit.p, fit.rest, pose))
-            rows.append((*guess, np.zeros(len(fit.model.deviation_names))))
-            continue
+        deviation = np.zeros(len(fit.model.deviation_names))
         try:
             if pose.branch == "previous" and rows:
                 before = problem.history[index - 1].pose, rows[-1][0]
                 found = continued(fit.model, fit.p, fit.rest, pose, *before)
             else:
                 found = solve_equilibrium(fit.model, fit.p, fit.rest, pose)
+            rows.append((found.x, found.multipliers, deviation))
         except EquilibriumError as error:
-            raise EstimationError(error.message) from error
-        rows.append((found.x, found.multipliers, np.zeros(len(fit.model.deviation_names))))
+            if not relaxed:
+                raise EstimationError(error.message) from error
+            rows.append((*next(first_guesses(fit.model, fit.p, fit.rest, pose)), deviation))
     x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
     return on_other_mesh(Shapes(x, lam, deviation), fit.model, problem.unknowns.model)
 

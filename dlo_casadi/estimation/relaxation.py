@@ -19,7 +19,6 @@ Ramsay et al., Parameter estimation for differential equations: a generalized sm
 J. R. Statist. Soc. B 69 (2007).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -56,24 +55,31 @@ STEPS, CONVERGED = 20, 5e-3
 
 @dataclass(frozen=True)
 class _Linearized:
-    """Rows of a Gauss-Newton step by a pose's own unknowns, theta, and last their target.
+    """Rows of a Gauss-Newton step: by a pose's own unknowns, its state, theta, last their target.
 
     Parameters
     ----------
-    poses : list of (n_j, own + size + 1)
+    poses : list of (n_j, own + r + size + 1)
         Of each pose; the balance of forces first, its rows in the order of the unknowns.
+    states : list of (r, own + r + size + 1)
+        Change of each pose's state by the unknowns of the pose before; r is 0 without a state.
     prior : (size, size + 1)
     """
 
     poses: list[FloatArray]
+    states: list[FloatArray]
     prior: FloatArray
 
 
 @dataclass(frozen=True)
 class _Reduced:
-    """Triangles of a Gauss-Newton step: of each pose's own unknowns, and what is left for theta."""
+    """Triangles of a Gauss-Newton step: of each pose's own unknowns, and what is left for theta.
+
+    With the states by what is free, their target left out.
+    """
 
     own: list[FloatArray]
+    states: list[FloatArray]
     shared: FloatArray
 
 
@@ -81,8 +87,7 @@ class _Reduced:
 class Relaxation:
     """A batch problem whose balance of forces is a penalty of a softness [rad].
 
-    The problem has its weights. A state is carried from pose to pose as the shapes have it; how it
-    changes with them is left out of the derivatives.
+    The problem has its weights. A state, the rest strains, is carried from pose to pose.
     """
 
     problem: Problem
@@ -91,13 +96,14 @@ class Relaxation:
     # ---- sizes -------------------------------------------------------------------------------
 
     @cached_property
-    def _counts(self) -> tuple[int, int, int, int]:
-        """Numbers of a pose's node increments, of these and multipliers, with deviations, all."""
+    def _counts(self) -> tuple[int, int, int, int, int]:
+        """Numbers of a pose's increments, these and multipliers, and deviations, and state, all."""
         equilibria = self.problem.equilibria
-        a = equilibria.assembly
+        a, model = equilibria.assembly, self.problem.unknowns.model
         nodes = a.n * a.b
         own = nodes + a.k + len(equilibria.used_deviations)
-        return nodes, nodes + a.k, own, own + self.problem.unknowns.size
+        known = own + (model.chain.n_rests if model.has_state else 0)
+        return nodes, nodes + a.k, own, known, known + self.problem.unknowns.size
 
     def _stiffness(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Logarithms of the stiffnesses that scale the nodes' rows (n b,), and these by p.
@@ -190,25 +196,21 @@ class Relaxation:
         return Normal(rows[:, :-1].T @ rows[:, :-1], -rows[:, :-1].T @ rows[:, -1], [])
 
     def _along(self, values: Values, given: Inputs) -> Tangents:
-        """Every unknown of a pose on its own, then theta."""
+        """Every unknown of a pose on its own, then its state, then theta."""
         problem = self.problem
         unknowns, equilibria, model = problem.unknowns, problem.equilibria, problem.unknowns.model
         a, m = equilibria.assembly, equilibria.m
-        nodes, border, own, q = self._counts
+        nodes, border, own, known, q = self._counts
         unit = np.broadcast_to(np.eye(own, q), (m, own, q))
         deviation = np.zeros((m, len(model.deviation_names), q))
         deviation[:, equilibria.used_deviations] = unit[:, border:]
         p = np.zeros((m, len(model.parameters), q))
-        p[:, :, own:] = unknowns.slopes(values.theta)
+        p[:, :, known:] = unknowns.slopes(values.theta)
         rest = np.zeros((m, model.chain.n_rests, q))
-        rest[:, :, own:] = unknowns.rest_slopes
         if model.has_state:
-            after = a.state_after(values.shapes, given)
-            still = np.zeros((1, a.n, a.b, q))
-            for j in range(m - 1):
-                one = np.array([j])
-                slopes = tuple(part[one] for part in after)
-                rest[j + 1] = a.state_along(slopes, still, rest[one], p[one])[0]
+            rest[:, :, own:known] = np.eye(known - own)
+        else:
+            rest[:, :, known:] = unknowns.rest_slopes
         x = unit[:, :nodes].reshape((m, a.n, a.b, q))
         lam = unit[:, nodes:border] + self._forces(values)[:, :, None] * self._growth(values)
         return Tangents(x, lam, p, rest, deviation)
@@ -225,13 +227,25 @@ class Relaxation:
         unknowns = self.problem.unknowns
         bending = unknowns.model.stiffness_indices[0]
         slope = unknowns.slopes(values.theta)[bending] / unknowns.p(values.theta)[bending]
-        return np.concatenate([np.zeros(self._counts[2]), slope])
+        return np.concatenate([np.zeros(self._counts[3]), slope])
+
+    def _states(self, values: Values, given: Inputs, along: Tangents) -> list[FloatArray]:
+        """Change of each pose's state along the unknowns of the pose before, see `_Linearized`."""
+        problem = self.problem
+        own, known, q = self._counts[2:]
+        states = np.zeros((problem.equilibria.m, known - own, q + 1))
+        if problem.unknowns.model.has_state:
+            assembly = problem.equilibria.assembly
+            after = assembly.state_after(values.shapes, given)
+            states[0, :, known:-1] = problem.unknowns.rest_slopes
+            states[1:, :, :-1] = assembly.state_along(after, along.x, along.rest, along.p)[:-1]
+        return list(states)
 
     def _linearized(self, values: Values) -> _Linearized:
         """Derivatives and residuals of all that the objective holds."""
         problem = self.problem
-        equilibria, size = problem.equilibria, problem.unknowns.size
-        nodes, border, own, _ = self._counts
+        equilibria = problem.equilibria
+        nodes, border, _, known, q = self._counts
         state = problem.state(values)
         given = equilibria.given(*state)
         along = self._along(values, given)
@@ -247,10 +261,10 @@ class Relaxation:
         rows[:, at] *= by_gap[..., None]
         rows[:, at] += by_size[..., None] * along.lam[:, at.start - nodes :]
         scaled = self._stiffness(state[1])[1] @ problem.unknowns.slopes(values.theta)
-        rows[:, :nodes, own:] -= left[:, :nodes, None] * scaled
+        rows[:, :nodes, known:] -= left[:, :nodes, None] * scaled
         rows, left = rows * weights[:, None], left * weights
         std, used = problem.deviation_std, equilibria.used_deviations
-        prior = np.eye(len(std), own + size, border) / std[:, None]
+        prior = np.eye(len(std), q, border) / std[:, None]
         data = dict(zip(problem.used, self._data(values, along), strict=True))
         stacked = []
         for j in range(equilibria.m):
@@ -258,7 +272,8 @@ class Relaxation:
             parts += [data[j]] if j in data else []
             stacked.append(np.concatenate([np.column_stack([a, -e]) for a, e in parts]))
         root, gap = self._prior, values.theta - problem.mean
-        return _Linearized(stacked, np.column_stack([root, -root @ gap]))
+        states = self._states(values, given, along)
+        return _Linearized(stacked, states, np.column_stack([root, -root @ gap]))
 
     def _reduced(
         self,
@@ -266,27 +281,33 @@ class Relaxation:
         damping: float,
         fixed: BoolArray | None = None,
     ) -> _Reduced:
-        """Orthogonal elimination of the poses' own unknowns."""
-        nodes, border, own, q = self._counts
-        free = np.ones(q - own, dtype=bool) if fixed is None else ~fixed
-        kept = np.concatenate([np.ones(own, dtype=bool), free, [True]])
+        """Orthogonal elimination of the poses' own unknowns, and of their states: the last first.
+
+        What a pose leaves tells of its state, which is what the pose before has left behind.
+        """
+        nodes, border, own, known, q = self._counts
+        free = np.ones(q - known, dtype=bool) if fixed is None else ~fixed
+        kept = np.concatenate([np.ones(known, dtype=bool), free, [True]])
         model = self.problem.unknowns.model
         damped = np.eye(border, q + 1) * max(damping, NO_INFORMATION)
         damped[nodes:] *= NO_INFORMATION
         # A force of contact as its gap, in lengths: where neither holds nothing else bounds a step.
         of_contact = damping * gap_per_force(model, AT_A_DISTANCE) / model.cable.length
         damped[self._contacts, self._contacts] += of_contact * np.eye(border - nodes - model.n_lam)
-        triangles, shared = [], []
-        for rows in linearized.poses:
-            stacked = np.concatenate([rows, damped])[:, kept]
+        triangles: list[FloatArray] = []
+        states = [rows[:, kept] for rows in linearized.states]
+        later = np.zeros((0, int(kept.sum())))
+        for rows, state in zip(linearized.poses[::-1], states[::-1], strict=True):
+            stacked = np.concatenate([np.concatenate([rows, damped])[:, kept], later])
             triangle: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
-            triangles.append(triangle[:own])
-            shared.append(triangle[own:, own:])
-        shared.append(linearized.prior[:, np.append(free, True)])
-        more = OF_UNKNOWNS * damping * np.eye(int(free.sum()))
-        shared.append(np.column_stack([more, np.zeros(len(more))]))
+            triangles.insert(0, triangle[:own])
+            left = triangle[own:, own:]
+            later = left[:, : known - own] @ state
+            later[:, known:] += left[:, known - own :]
+        more = OF_UNKNOWNS * damping * np.eye(int(free.sum()), int(free.sum()) + 1)
+        shared = [later[:, known:], linearized.prior[:, np.append(free, True)], more]
         left_over: FloatArray = np.asarray(np.linalg.qr(np.concatenate(shared), mode="r"))
-        return _Reduced(triangles, left_over)
+        return _Reduced(triangles, [state[:, :-1] for state in states], left_over)
 
     def _data(self, values: Values, along: Tangents) -> list[tuple[FloatArray, FloatArray]]:
         """Whitened derivatives and residuals of each fitted pose."""
@@ -345,7 +366,10 @@ class Relaxation:
             more[:, at] = np.outer(rows[:, at] @ grown, growth)
             return rows + more
 
-        return _Linearized([changed(rows) for rows in linearized.poses], changed(linearized.prior))
+        poses, states = (
+            [changed(rows) for rows in part] for part in (linearized.poses, linearized.states)
+        )
+        return _Linearized(poses, states, changed(linearized.prior))
 
     def _stepped(
         self, values: Values, linearized: _Linearized, damping: float, fixed: BoolArray | None
@@ -353,7 +377,7 @@ class Relaxation:
         """Values after a damped step within reach."""
         problem, reduced = self.problem, self._reduced(linearized, damping, fixed)
         unknowns, equilibria = problem.unknowns, problem.equilibria
-        nodes, border, own, _ = self._counts
+        nodes, border, own, known, _ = self._counts
         free = np.ones(unknowns.size, dtype=bool) if fixed is None else ~fixed
         lower, upper = (end - values.theta for end in unknowns.reach(values.theta, LARGEST))
         # Steps of a stiffness are those of its compliance, in which the balance is linear.
@@ -363,16 +387,19 @@ class Relaxation:
         step[free] = _bounded(reduced.shared, lower[free], upper[free])
         m = equilibria.m
         change = np.zeros((m, own))
-        for j, triangle in enumerate(reduced.own):
-            right = triangle[:, -1] - triangle[:, own:-1] @ step[free]
+        before = np.zeros(known)
+        for j, (triangle, state) in enumerate(zip(reduced.own, reduced.states, strict=True)):
+            others = np.concatenate([state @ np.concatenate([before, step[free]]), step[free]])
+            right = triangle[:, -1] - triangle[:, own:-1] @ others
             change[j] = np.linalg.solve(triangle[:, :own], right)
+            before = np.concatenate([change[j], others[: known - own]])
         turned = change[:, :nodes]
         turned *= min(1.0, LONGEST / max(float(np.abs(turned).max()), 1e-300))
         x = turned.reshape((m, *values.shapes.x.shape[1:2], -1, 1))
         deviation = values.shapes.deviation.copy()
         deviation[:, equilibria.used_deviations] += change[:, border:]
         taken = np.where(stiff, -np.log1p(-np.where(stiff, step, 0.0)), step)
-        larger = float(np.exp(self._growth(values)[own:] @ taken))
+        larger = float(np.exp(self._growth(values)[known:] @ taken))
         forces = change[:, nodes:border]
         forces += (larger - 1) * (forces + values.shapes.lam) * unknowns.model.are_multipliers
         shapes = equilibria.moved(values.shapes, Vector(x, forces[:, :, None]))
@@ -391,29 +418,3 @@ def _bounded(rows: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArr
     low = np.minimum(lower, 0.0)
     high = np.maximum(np.maximum(upper, 0.0), low + 1e-12)
     return np.asarray(lsq_linear(rows[:, :-1], rows[:, -1], (low, high), method="bvls").x)
-
-
-def relaxed(
-    problem: Problem,
-    values: Values,
-    softness: Sequence[float] = SOFTNESS,
-    fixed: BoolArray | None = None,
-) -> Values:
-    """Follow the minimum of a relaxed problem from some values through falling softness."""
-    for soft in softness:
-        values = Relaxation(problem, soft).solve(values, fixed)
-    return values
-
-
-def with_springs_in_place(problem: Problem, values: Values) -> Values:
-    """Values whose springs, which need not pull yet, are where they hang on the cable."""
-    model = problem.unknowns.model
-    if not model.n_springs:
-        return values
-    places = functions_of(model).spring_places(problem.unknowns.p(values.theta))
-    lam, seen = values.shapes.lam.copy(), problem.observed(values)
-    for k, place in enumerate(np.array(places)):
-        names = [f"spring_{k}.place_{axis}" for axis in model.node.axes]
-        columns = [model.border_names.index(name) for name in names]
-        lam[:, columns] = [one.curve.at(place)[0] for one in seen]
-    return replace(values, shapes=replace(values.shapes, lam=lam))

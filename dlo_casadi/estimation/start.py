@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.estimation.continuation import relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Problem, Values
-from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation, relaxed, with_springs_in_place
+from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import END_ROLL
