@@ -10,6 +10,7 @@ from typing import Literal
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.from_data import from_data, likeliest, nearest, screened_from_data
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
 from dlo_casadi.diagnosis.refits import Confirmed, confirm_from_data
 from dlo_casadi.diagnosis.screening import Screened, survival
@@ -17,6 +18,7 @@ from dlo_casadi.diagnosis.selection import (
     AddedEffect,
     Found,
     Ranked,
+    added_by,
     as_complete,
     choose,
     p_values_of,
@@ -43,7 +45,6 @@ from dlo_casadi.thresholds import (
     DIFFERENT,
     LARGER_OF_TWO,
     LEFT,
-    NEAR_LEADER,
     REFITTED,
     SIGNIFICANCE,
     UNSEEN,
@@ -231,16 +232,16 @@ class Search:
         current, validation = self.declared, self.validation
         added: list[AddedEffect] = []
         ranked: list[Ranked] = []
-        for k in range(self.max_effects):
-            self.step("search for a missing effect", k, self.max_effects)
-            screened, p_values, tried, far = self._refitted(current, force if k == 0 else None)
+        while len(added) < self.max_effects:
+            self.step("search for a missing effect", len(added), self.max_effects)
+            screened, p_values, tried, far = self._refitted(current, force if not added else None)
             chosen, lost = choose(tried, current, validation, self.doubt)
             lost |= dict.fromkeys(far, NOT_NEAR)
             closed, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen
                 closed = as_complete(winner.fit)
-                p_value = p_values[winner.candidate.name]
+                p_value = max(p_values[item.candidate.name] for item in winner.each)
                 scatters = current.problem.priors.pose_scatter.std > 0
                 misfit = current.noise.source == "misfit"
                 if (scatters or not closed.errors_known) and not misfit:
@@ -250,7 +251,7 @@ class Search:
                 if p_value > self.significance:
                     names = [item.candidate.name for item in chosen]
                     lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
-            if k == 0:
+            if not ranked:
                 rows = ranking(screened, p_values, tried, current, validation)
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
             if p_value > self.significance:
@@ -260,7 +261,7 @@ class Search:
                 closed = self._fine(closed)
             current, before = closed, validation
             validation = cross_validate(current)
-            added.append(AddedEffect(winner.candidate, p_value, before, validation, tuple(rivals)))
+            added += added_by(winner, rivals, p_value, before, validation)
         self.step("search for a missing effect", self.max_effects, self.max_effects)
         return self._ended(*self._pruned(current, added), tuple(ranked))
 
@@ -270,8 +271,7 @@ class Search:
         """Candidates screened, their p-values, refits of the likely ones, and who stays far off."""
         far: list[str] = []
         if current.noise.source == "misfit" and force is None:
-            screened, tried, far = self._from_data(current)
-            return screened, p_values_of(screened), tried, far
+            return self._from_data(current)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:
@@ -346,26 +346,35 @@ class Search:
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         return list(map_in_order(self.executor, partial(refits.confirm, current), worthy))
 
-    def _from_data(self, current: Fit) -> tuple[list[Screened], list[Confirmed | None], list[str]]:
+    def _from_data(
+        self, current: Fit
+    ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
         Beside a misfit scores tell nothing, and a refit leads where the declared model has gone.
         Where the nearest does not explain the shapes other starts of it are tried, then of the
         next. Last: who stays far from them.
         """
-        near, softness = refits.from_data(current)
-        listed = candidates_of(near, self.center, self.exclude)
-        screened = refits.screened_from_data(near, softness, listed)
-        likely = [x for x in screened if x.score >= NEAR_LEADER * screened[0].score][:REFITTED]
-        kept, far = refits.nearest(near, likely, self.executor)
-        refit = partial(confirm_from_data, current, near)
+        near, softness = from_data(current)
+        screened = screened_from_data(
+            near, softness, candidates_of(near, self.center, self.exclude)
+        )
+        likely, among = likeliest(screened), (self.executor, self.center, self.exclude)
+        kept = nearest(near, softness, likely, *among)[:REFITTED]
+        refit = partial(confirm_from_data, current)
         tried = list(map_in_order(self.executor, partial(refit, starts=1), kept))
-        for k in sorted(range(len(kept)), key=lambda k: kept[k].left):
+        for k, start in enumerate(kept):
             if not refits.explains(tried[k]):
-                tried[k] = refit(kept[k])
+                tried[k] = refit(start)
             if refits.explains(tried[k]):
                 break
-        return screened, tried, far
+        p_values = p_values_of(screened)
+        for start in kept:
+            name, own = start.screened.candidate.name, sidak(start.screened.p_value, len(screened))
+            p_values[name] = min(own, p_values.get(name, 1.0))
+        near_names = set().union(*(start.names for start in kept))
+        far = [x.candidate.name for x in likely if x.candidate.name not in near_names]
+        return screened, p_values, tried, far
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.

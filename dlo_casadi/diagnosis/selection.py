@@ -196,19 +196,43 @@ def choose(
     Both gains have to be positive. Rivals are those that fall short by less than EVIDENCE_APART.
     """
     refits = [item for item in tried if item is not None]
-    why = {item.candidate.name: shortcoming(item, base, validation, doubt) for item in refits}
-    order = {x.candidate.name: support(x, base, validation) for x in refits}
-    better = [item for item in refits if not why[item.candidate.name]]
-    better.sort(key=lambda item: -order[item.candidate.name])
+    why = {item.name: shortcoming(item, base, validation, doubt) for item in refits}
+    order = {item.name: support(item, base, validation) for item in refits}
+    better = [item for item in refits if not why[item.name]]
+    better.sort(key=lambda item: -order[item.name])
     chosen = []
     for item in better:
-        behind = order[better[0].candidate.name] - order[item.candidate.name]
+        behind = order[better[0].name] - order[item.name]
         if behind < EVIDENCE_APART:
             chosen.append(item)
         else:
-            first = better[0].candidate.name
-            why[item.candidate.name] = f"log likelihood {behind:.3g} behind {first}"
+            why[item.name] = f"log likelihood {behind:.3g} behind {better[0].name}"
     return chosen, {name: reason for name, reason in why.items() if reason}
+
+
+def added_by(
+    winner: Confirmed,
+    rivals: Iterable[Confirmed],
+    p_value: float,
+    before: CrossValidation,
+    after: CrossValidation,
+) -> list[AddedEffect]:
+    """The effects of a refit; rivals of one are the refits that differ in it alone."""
+    others = [turned for rival in rivals for turned in rival.beside_others()]
+    return [
+        AddedEffect(
+            own.candidate,
+            p_value,
+            before,
+            after,
+            tuple(x for x in others if _names(x.beside) == _names(own.beside)),
+        )
+        for own in winner.beside_others()
+    ]
+
+
+def _names(screened: Iterable[Screened]) -> set[str]:
+    return {x.candidate.name for x in screened}
 
 
 def ranking(
@@ -219,7 +243,9 @@ def ranking(
     validation: CrossValidation,
 ) -> list[Ranked]:
     """All candidates: those refitted by `support`, the rest by score."""
-    refitted = {item.candidate.name: item for item in tried if item is not None}
+    refits = [x for item in tried if item is not None for x in item.beside_others()]
+    refits.sort(key=lambda item: support(item, base, validation))
+    refitted = {item.candidate.name: item for item in refits}
     order = {name: support(item, base, validation) for name, item in refitted.items()}
 
     def error(name: str) -> float | None:

@@ -7,12 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
-from dlo_casadi.diagnosis.refits import (
-    RelaxedStart,
-    confirm_from_data,
-    from_data,
-    screened_from_data,
-)
+from dlo_casadi.diagnosis.from_data import RelaxedStart, from_data, screened_from_data
+from dlo_casadi.diagnosis.refits import confirm_from_data
 from dlo_casadi.effects import BendingAnisotropy, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, misfits
@@ -82,7 +78,7 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
     assert first.p_value < 1e-9
     assert first.score > 1.2 * second.score
 
-    fit = confirm_from_data(base, near, RelaxedStart.of(near, first)).fit
+    fit = confirm_from_data(base, RelaxedStart.of(near, first)).fit
     assert fit.noise.std == NOISE
     assert fit.value("bending_anisotropy.ratio") == pytest.approx(RATIO, rel=0.03)
     assert fit.value("bending_anisotropy.angle") == pytest.approx(ANGLE, abs=0.03)
@@ -92,5 +88,5 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
 
 @pytest.mark.long
 def test_with_another_effect_the_misfit_stays(base, near, screened):
-    found = confirm_from_data(base, near, RelaxedStart.of(near, screened["stiffness_gradient"]))
+    found = confirm_from_data(base, RelaxedStart.of(near, screened["stiffness_gradient"]))
     assert found is None or found.fit.noise.source == "misfit"
