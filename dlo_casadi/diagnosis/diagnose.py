@@ -326,8 +326,10 @@ class Search:
                 continue
             needless = smaller.log_evidence > fit.log_evidence
             if not needless and effect is not added[-1]:
-                p_values = p_values_of(self._screened(smaller))
-                needless = p_values.get(effect.candidate.name, 0.0) > self.significance
+                gain = 2 * (smaller.point.objective - fit.point.objective)
+                single = survival(gain, len(effect.candidate.frees), noise_degrees(fit))
+                tried = len(candidates_of(smaller, self.center, self.exclude))
+                needless = sidak(single, tried) > self.significance
             if needless:
                 fit = settle(smaller)
                 added = [item for item in added if item is not effect]

@@ -8,7 +8,7 @@ none comes near alone, each is tried beside a second one, screened anew beside t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,8 +36,10 @@ from dlo_casadi.thresholds import NEAR_LEADER, REFITTED
 SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 # Softness [rad] through which candidates are relaxed before they are compared, and what one may
 # leave there of the objective, relative to the one that leaves least. In two sessions in space the
-# hidden effect left 3105 and 8250, its only rival 8051, and all others 27800 and more.
-COMPARED, NEAR_LEAST = SOFTNESS[:4], 3.0
+# hidden effect left 3105 and 8250, its only rival 8051, and all others 27800 and more. Where what is
+# left least is noise, the difference is twice that in log likelihood: a tenth of some hundreds is
+# beyond doubt.
+COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; of a
 # strict balance, relative to that of shapes that need not balance.
 REACHED = 1.5
@@ -197,20 +199,23 @@ def nearest(
     Of the candidates; where none of these comes to the noise that the relaxed shapes have, of two
     together if that leaves less by as much.
     """
-    begun = _near_least(list(map_in_order(executor, partial(RelaxedStart.of, near), likely)))
-    if not begun or begun[0].left < REACHED * near.point.data:
+    noise = REACHED * near.point.data
+    begun = _near_least(map_in_order(executor, partial(RelaxedStart.of, near), likely), noise)
+    if not begun or begun[0].left < noise:
         return begun
     second = partial(RelaxedStart.and_second, softness=softness, center=center, exclude=exclude)
     pairs = [x for found in map_in_order(executor, second, begun[:FIRST]) for x in found]
     own = {frozenset(x.names): x for x in sorted(pairs, key=lambda x: -x.left)}
-    pairs = _near_least(list(own.values()))
+    pairs = _near_least(own.values(), noise)
     return pairs if pairs and REACHED * pairs[0].left < begun[0].left else begun
 
 
-def _near_least(begun: Sequence[RelaxedStart]) -> list[RelaxedStart]:
+def _near_least(begun: Iterable[RelaxedStart], noise: float) -> list[RelaxedStart]:
     """Those that leave little more than the one that leaves least, nearest first."""
-    most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
-    return sorted((x for x in begun if x.left <= most), key=lambda x: x.left)
+    ordered = sorted(begun, key=lambda x: x.left)
+    least = ordered[0].left if ordered else np.inf
+    most = least * (NEAR_NOISE if least < noise else NEAR_LEAST)
+    return [start for start in ordered if start.left <= most]
 
 
 def _begun(near: Fit, model: CableModel, values: Mapping[str, float]) -> tuple[Problem, Values]:
