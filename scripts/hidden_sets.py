@@ -95,6 +95,18 @@ def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Gen
     }[name]()
 
 
+def _nearer_to_y(values: Values) -> Values:
+    """The same stiffnesses about both axes, EI that about the axis nearer to y: a fit's, too."""
+    ratio, angle = (values.get(f"bending_anisotropy.{name}", 0.0) for name in ("ratio", "angle"))
+    if abs(angle) <= np.pi / 4:
+        return values
+    return values | {
+        "bending_stiffness": values["bending_stiffness"] * ratio,
+        "bending_anisotropy.ratio": 1 / ratio,
+        "bending_anisotropy.angle": angle - np.copysign(np.pi / 2, angle),
+    }
+
+
 HIDDEN = {
     2: (
         "lumped_mass", "point_force", "tether", "gravity_tilt", "mass_error", "stiffness_gradient",
@@ -168,6 +180,7 @@ def _tried(
         model = model.with_effect(EFFECTS[name]())
         sizes = _sizes(name, cable, 4.0 / length, generator)
         values |= {f"{name}.{key}": value for key, value in sizes.items()}
+    values = _nearer_to_y(values)
     p = model.nominal.copy()
     for k, name in enumerate(model.names):
         p[k] = values.get(name, p[k])

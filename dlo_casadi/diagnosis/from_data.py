@@ -36,9 +36,8 @@ from dlo_casadi.thresholds import NEAR_LEADER, REFITTED
 SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 # Softness [rad] through which candidates are relaxed before they are compared, and what one may
 # leave there of the objective, relative to the one that leaves least. In two sessions in space the
-# hidden effect left 3105 and 8250, its only rival 8051, and all others 27800 and more. Where what is
-# left least is noise, the difference is twice that in log likelihood: a tenth of some hundreds is
-# beyond doubt.
+# hidden effect left 3105 and 8250, its only rival 8051, and all others 27800 and more. If the least
+# is noise, differences are those of log likelihoods, twice: a tenth of hundreds is beyond doubt.
 COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; of a
 # strict balance, relative to that of shapes that need not balance.
