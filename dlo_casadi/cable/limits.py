@@ -181,7 +181,7 @@ def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Li
         raise DloError(f"no limit is given, and the session declared none.\n  Try: {_TRY}")
     held = (model.start, model.end, *model.clips)
     avoided = any(not one.touch for one in model.obstacles)
-    if wrong := [*asked.problems(held, model.in_space, model.cable.length, avoided)]:
+    if wrong := [*asked.problems(held, model.node.twists, model.cable.length, avoided)]:
         raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
     return asked
 

@@ -395,7 +395,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
         [clip.at or 0.0, *clip.place, *(_frame(clip, model) if model.clamped_between else ())]
         for clip in pose.clips
     ]
-    ends = EndConditions.size(model.node) + int(model.in_space)
+    ends = EndConditions.size(model.node) + model.node.twists
     return np.concatenate([numbers[:ends], *clips])
 
 

@@ -124,12 +124,12 @@ class Limits(ConfigSection):
         return {name: value for name, value in values.items() if value is not None}
 
     def problems(
-        self, held: Sequence[str], in_space: bool, length: float, avoided: bool
+        self, held: Sequence[str], twists: bool, length: float, avoided: bool
     ) -> Iterator[ConfigProblem]:
         """Find limits that have no meaning for a cable.
 
-        `held` are the kinds of its ends and clips, `length` [m] is the cable's; `avoided`: whether
-        there are obstacles that it is not meant to touch.
+        `held` are the kinds of its ends and clips, `length` [m] is the cable's; `twists`: whether
+        it can, in space; `avoided`: whether there are obstacles that it is not meant to touch.
         """
         for name in ("bend_radius", "clearance"):
             value = self.given.get(name, 0.0)
@@ -142,7 +142,7 @@ class Limits(ConfigSection):
             text = "limits.clearance: there is no obstacle that the cable is not meant to touch"
             hint = "obstacles (experiment: obstacles, --obstacles FILE) without touch: allowed"
             yield ConfigProblem(("clearance",), f"{text}. Try: {hint}")
-        if self.twist is not None and not in_space:
+        if self.twist is not None and not twists:
             text = "limits.twist: a cable in a plane (two numbers of gravity) does not twist"
             yield ConfigProblem(("twist",), f"{text}. Try: leave it out")
         if self.moment is not None and not {"clamped", "swivel"} & {*held}:

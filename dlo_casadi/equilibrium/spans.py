@@ -127,7 +127,7 @@ def arches(
     """
     held = holders(model, p, pose)
     k = _insert(held, place[None])
-    up = 2 if model.in_space else 1
+    up = model.node.sides // 2
     sides = [tuple(up * (i == arch) for i in range(len(held) - 1)) for arch in (k - 1, k)]
     yield from _span_guesses(model, pose, held, _SLACK[:1], sides)
 
@@ -202,13 +202,14 @@ def _span_guesses(
     for share in shares:
         at = _arc_lengths(held, share)
         spans, border = spans_of(held, at), np.zeros(model.n_border)
+        chosen = sides or _sides(spans, model.node.sides)
         for k, row in model.sliding.items():
             border[row] = at[clips[k]]
         if model.node is Frame:
             edges = [(at[k], held[k].frame) for k in rolls]
-            found = _in_space(model, pose, spans, edges, sides or _sides(spans, 4))
+            found = _frames(model, pose, spans, edges, chosen)
         else:
-            found = _in_plane(model, spans, sides or _sides(spans, 2))
+            found = _joined_headings(model, spans, chosen)
         for x in found:
             yield x, border
 
@@ -246,7 +247,7 @@ def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
 # ---- in a plane ----------------------------------------------------------------------------------
 
 
-def _in_plane(
+def _joined_headings(
     model: CableModel, spans: Sequence[Span], combinations: Sequence[tuple[int, ...]]
 ) -> Iterator[FloatArray]:
     """Headings (n_nodes, 1) [rad]."""
@@ -304,7 +305,7 @@ def _joined(parts: list[tuple[FloatArray, FloatArray]], fixed: list[bool]) -> No
 # ---- in space ------------------------------------------------------------------------------------
 
 
-def _in_space(
+def _frames(
     model: CableModel,
     pose: HeldPose,
     spans: Sequence[Span],

@@ -119,7 +119,7 @@ def _either_way(problem: Problem, values: Values) -> Values:
     Where the end clamp is rolled by nearly half a turn and the pose does not tell its turns, the
     twist nearest to none may be either way round within what is known of the roll.
     """
-    if not problem.unknowns.model.in_space:
+    if not problem.unknowns.model.node.twists:
         return values
     twist = problem.unknowns.model.node.turning(values.shapes.x)
     apart = np.abs(twist) > EITHER_WAY

@@ -201,7 +201,7 @@ def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence
         *(f"compact mass of {m:.4g} kg at {s:.4g} m" for m, s in rod.lumps),
         f"{len(rod.masses)} links of {rod.h:.6g} m; a clamp holds the middle of one",
     ]
-    if not rod.in_space:
+    if not rod.node.twists:
         known.append(
             "measured in a plane, z = 0 here: GJ is taken as EI / 1.3, and out of the plane nothing"
             " is known"
