@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from dlo_casadi.cli.guard import BAD_INPUT, OK
+from dlo_casadi.cli import BAD_INPUT, OK
 from dlo_casadi.cli.options import CONFIG, SCHEDULER, Page, command, jobs, option
 from dlo_casadi.errors import counted
 from dlo_casadi.io.files import make_folder

@@ -27,8 +27,8 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
-from dlo_casadi.equilibrium.reach import out_of_reach
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spans import out_of_reach
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, tangent

@@ -16,7 +16,6 @@ from dlo_casadi.equilibrium.equilibrium import (
 )
 from dlo_casadi.equilibrium.minima import KEEPING_SIDE, Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
-from dlo_casadi.equilibrium.reach import no_equilibrium, out_of_reach
 from dlo_casadi.equilibrium.sides import (
     beside_bars,
     named_sides,
@@ -24,7 +23,13 @@ from dlo_casadi.equilibrium.sides import (
     on_other_side,
     touchdowns,
 )
-from dlo_casadi.equilibrium.spans import arches, border_of, first_guesses
+from dlo_casadi.equilibrium.spans import (
+    arches,
+    border_of,
+    first_guesses,
+    no_equilibrium,
+    out_of_reach,
+)
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel

@@ -80,18 +80,18 @@ class Node(ABC):
         """
 
     @staticmethod
-    @abstractmethod
     def excess(x: Any) -> Any:
         """Squares of the nodes' lengths less one, where length is no part of a node's state.
 
-        (..., 1) of nodes (..., coordinates) or, of an expression (coordinates, n), (n, 1); in a
-        plane there are none.
+        (..., 1) of nodes (..., coordinates) or, of an expression (coordinates, n), (n, 1); of
+        headings there are none.
         """
+        return type(x)(0, 1) if isinstance(x, _CASADI) else x[..., :0]
 
     @staticmethod
-    @abstractmethod
     def normalised(x: Any) -> Any:
         """Nodes of any length, as `excess` takes them, with that of a node; zeros stay zeros."""
+        return x
 
     @staticmethod
     @abstractmethod
@@ -104,9 +104,9 @@ class Node(ABC):
         """A node (coordinates,) as a pose declares the direction of a clamp."""
 
     @staticmethod
-    @abstractmethod
     def bend(curvatures: ca.SX) -> ca.SX:
         """Bend (1, k) [1/m] of k sections from its components: signed in a plane, else smooth."""
+        return curvatures
 
     @staticmethod
     @abstractmethod
@@ -173,16 +173,6 @@ class Heading(Node):
         return x + delta
 
     @staticmethod
-    def excess(x: Any) -> Any:
-        """None: an angle has no length."""
-        return type(x)(0, 1) if isinstance(x, _CASADI) else x[..., :0]
-
-    @staticmethod
-    def normalised(x: Any) -> Any:
-        """Angles as they are."""
-        return x
-
-    @staticmethod
     def rotations(x: FloatArray) -> Rotation:
         """Turned about z."""
         return Rotation.from_rotvec(x * [0.0, 0.0, 1.0])
@@ -191,11 +181,6 @@ class Heading(Node):
     def declared(x: FloatArray) -> float:
         """The angle [rad]."""
         return float(x[0])
-
-    @staticmethod
-    def bend(curvatures: ca.SX) -> ca.SX:
-        """The curvature itself."""
-        return curvatures
 
     @staticmethod
     def difference(x: Any, y: Any) -> Any:
