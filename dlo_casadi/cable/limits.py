@@ -339,15 +339,11 @@ def limit_checks(
     for use in shape.uses(limits):
         name = _size(use.quantity)
         chance, std = likely[name], likely[name].std / ratio[name]
+        std *= use.value**2 if use.quantity == "bend_radius" else 1.0
         out.append(
             LimitCheck(
                 **vars(use),
-                std=float(std * use.value**2 if use.quantity == "bend_radius" else std),
-                probability=chance.probability,
-                error=chance.error,
-                draws=chance.draws,
-                lost=chance.lost,
-                shares=chance.shares,
+                **(vars(chance) | {"std": float(std)}),
                 decided_by=_said(cable.model, uncertainty, chance),
             )
         )

@@ -74,8 +74,7 @@ def _run(arguments: list[str]) -> int:
             os.environ.setdefault(variable, "1")  # the matrices are small: threads would only cost
         module = import_module(f"dlo_casadi.cli.{COMMANDS[arguments[0]][0]}")
         name = arguments[0].replace("-", "_")
-        code: int = getattr(module, f"{name}_" if iskeyword(name) else name)(arguments[1:])
-        return code
+        return getattr(module, f"{name}_" if iskeyword(name) else name)(arguments[1:])
     if arguments[:1] in (["-h"], ["--help"]):
         print(_overview())
         return OK

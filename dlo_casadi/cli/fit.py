@@ -129,7 +129,7 @@ def fit_many(chosen: argparse.Namespace) -> int:
     dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast
     """
     from dlo_casadi.cli.watch import Counter
-    from dlo_casadi.fleet.overview import judge
+    from dlo_casadi.fleet.rows import judge
     from dlo_casadi.fleet.run import Options, find_sessions, fit_fleet
 
     base, sessions = find_sessions(chosen.where)

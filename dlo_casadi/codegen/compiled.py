@@ -385,8 +385,7 @@ class CompiledSolver:
             listed = self._table_of(among)
             given[_AMONG[name] : _AMONG[name]] = [listed, len(listed)]
         places = (a.ctypes.data if isinstance(a, np.ndarray) else a for a in given)
-        status: int = getattr(self._c, name)(*places)
-        return status
+        return getattr(self._c, name)(*places)
 
 
 def _shape(record: Any, status: int) -> CompiledShape:

@@ -12,7 +12,7 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray, cross
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.guesses import (
     arc_half_angle,
     arc_headings,
@@ -21,6 +21,7 @@ from dlo_casadi.equilibrium.guesses import (
     frames_along,
     guessed_frames,
     guesses,
+    sagging,
     smallest_turn,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -341,10 +342,7 @@ def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatAr
         fall = smallest_turn(first, down if np.any(down) else first).as_rotvec()
         return Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall).apply(first)
     along = span.chord / max(float(np.linalg.norm(span.chord)), 1e-12)
-    side = down - (down @ along) * along
-    if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
-        side = cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
+    turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(sagging(along, down))
     axes = arc_tangents(u, span.chord / span.length, turned)
     arc = arc_tangents(np.array([0.0, 1.0]), span.chord / span.length, turned)
     for end, own, decay in zip(ends, arc, ((1 - u) ** 5, u**5), strict=True):

@@ -345,6 +345,4 @@ def rms_distance(
         if prediction is None:
             return None
         squares.append(item.distances(prediction.curve) ** 2)
-    if not squares:
-        return None
-    return float(np.sqrt(np.concatenate(squares).mean()))
+    return float(np.sqrt(np.concatenate(squares).mean())) if squares else None

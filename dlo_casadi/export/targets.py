@@ -378,5 +378,4 @@ def _cable(cable: Held, values: Mapping[str, float], count: int) -> Held | None:
 def _root(covariance: FloatArray) -> FloatArray:
     """Matrix A with A A^T = the covariance, which rounding may have made indefinite."""
     values, vectors = np.linalg.eigh(covariance)
-    root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

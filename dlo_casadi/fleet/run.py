@@ -16,10 +16,10 @@ from dlo_casadi import __version__
 from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.errors import DloError, OutputError, well_formed
 from dlo_casadi.fleet import parquet_library
-from dlo_casadi.fleet.overview import overview_html
 from dlo_casadi.fleet.rows import (
     Row,
     empty_row,
+    overview_html,
     read_row,
     row_of,
     write_row,

@@ -11,19 +11,6 @@ from dlo_casadi.recordings.mocap import read_c3d, read_mocap_csv
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream, together
 from dlo_casadi.recordings.session import FREE, Imported, Wishes, make_session
 
-__all__ = [
-    "FORMATS",
-    "FREE",
-    "Cloud",
-    "CloudView",
-    "Imported",
-    "Recording",
-    "Stream",
-    "Wishes",
-    "make_session",
-    "read_recording",
-]
-
 WHOLE = CloudView()  # all points of clouds in metres
 
 # Ending of a name -> reader of a file.

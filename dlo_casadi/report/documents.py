@@ -94,8 +94,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "hidden_weight": weight and asdict(weight),
         "limits": [check.as_dict() for check in outcome.limits],
     }
-    plain: dict[str, Any] = finite(document)
-    return plain
+    return finite(document)
 
 
 def report_text(outcome: Outcome) -> str:
@@ -185,7 +184,7 @@ def check_dict(
     known = {item.name for item in inputs}
     left_out = [f"{item.name}: {item.reason}" for item in config.skipped if item.name not in known]
     mistakes = [*(item.message for item in found), *left_out, *unread]
-    rows: dict[str, Any] = finite(
+    return finite(
         {
             "config": config.name,
             "ok": not mistakes,
@@ -194,7 +193,6 @@ def check_dict(
             "poses": [_checked(config, item) for item in inputs],
         }
     )
-    return rows
 
 
 def _checked(config: Config, item: PoseInput) -> dict[str, Any]:
@@ -318,8 +316,7 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
             "hanging": uncertainty.repeat_std,
         },
     }
-    plain: dict[str, Any] = finite(document)
-    return plain
+    return finite(document)
 
 
 def final_rest(fit: Fit) -> FloatArray:

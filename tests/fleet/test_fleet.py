@@ -19,8 +19,7 @@ from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import fit, main
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.overview import judge, overview_html, robust_z
-from dlo_casadi.fleet.rows import COLUMNS, empty_row, row_of
+from dlo_casadi.fleet.rows import COLUMNS, empty_row, judge, overview_html, robust_z, row_of
 from dlo_casadi.fleet.run import digest_of, find_sessions, fit_fleet
 from dlo_casadi.io.files import only_run
 from dlo_casadi.runtime.executors import InProcess
