@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 
 _CASADI = (ca.SX, ca.MX, ca.DM)
 
@@ -256,8 +256,7 @@ class Frame(Node):
         if isinstance(x, _CASADI):
             scale = 1 / ca.sqrt(1 + sum((h * h for h in half), start=ca.SX(0)))
             return ca.vertcat(*turned) * scale
-        out = np.stack(np.broadcast_arrays(*turned), axis=-1)
-        return out / np.linalg.norm(out, axis=-1, keepdims=True)
+        return unit(np.stack(np.broadcast_arrays(*turned), axis=-1))
 
     @staticmethod
     def excess(x: Any) -> Any:
@@ -272,7 +271,7 @@ class Frame(Node):
         if isinstance(x, _CASADI):
             size: Any = ca.sqrt(ca.sum1(x**2))
             return x / ca.repmat(size, Frame.coordinates, 1)
-        return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-300)
+        return unit(x)
 
     @staticmethod
     def rotations(x: FloatArray) -> Rotation:
@@ -313,7 +312,7 @@ class Frame(Node):
         angle = np.maximum(np.arccos(cosine), 1e-12)
         weights = [np.sin((1 - u) * angle), np.sin(u * angle)]
         out = weights[0][..., None] * first + weights[1][..., None] * last
-        return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+        return unit(out)
 
     @staticmethod
     def tangent(x: ca.SX) -> ca.SX:
