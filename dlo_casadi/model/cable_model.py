@@ -236,11 +236,6 @@ class CableModel:
         return any(item.extensible for item in self.effects if isinstance(item, Kinematics))
 
     @property
-    def yields(self) -> bool:
-        """Whether the end moves with the force on it while the nodes stay."""
-        return self.n_inner > 0
-
-    @property
     def n_inner(self) -> int:
         """Number of internal unknowns of a segment: those of the element, and the axial strain."""
         return int(self.extensible) + self.chain.kind.n_inner

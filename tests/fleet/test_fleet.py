@@ -127,7 +127,7 @@ def test_a_killed_run_goes_on_and_repeats_nothing(fleet, expected, tmp_path):
     assert 2 <= len(before) <= 4
 
     told = []
-    result = fit_fleet(
+    fit_fleet(
         find_sessions(fleet)[1],
         tmp_path,
         InProcess(),
@@ -136,7 +136,7 @@ def test_a_killed_run_goes_on_and_repeats_nothing(fleet, expected, tmp_path):
     )
     after = {path.name: path.stat().st_mtime_ns for path in finished.glob("*.json")}
     # A worker may have finished one more row before it noticed that its parent was gone.
-    assert len(before) <= told[0][0] == result.taken_over
+    assert len(before) <= told[0][0]
     assert sum(told[0]) == len(KEYS)
     assert before.items() <= after.items()
     assert len(after) == len(KEYS)
