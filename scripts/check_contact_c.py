@@ -15,13 +15,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.codegen.compiled import CompiledSolver
-from dlo_casadi.codegen.shapes import Capsule, CompiledShape, HalfSpace, Obstacle
+from dlo_casadi.codegen.shapes import CompiledShape
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.rod import obstacles as rod
+from dlo_casadi.rod.obstacles import Capsule, Obstacle, Plane
 
 CABLES = 8
 # As in check_contact.py.
@@ -57,7 +57,8 @@ def random_obstacles(rng: np.random.Generator, hung: CompiledShape, kinds: str) 
         if kinds == "plane" or (k == 0 and rng.random() < 0.6):
             level = lowest + rng.uniform(0.05, 0.7) * (highest - lowest) - 0.006
             normal = np.array([*rng.normal(0, 0.1, d - 1), 1.0])
-            found.append(HalfSpace((*[0.0] * (d - 1), float(level)), tuple(normal.tolist())))
+            normal /= np.linalg.norm(normal)
+            found.append(Plane((*[0.0] * (d - 1), float(level)), tuple(normal.tolist())))
             continue
         place = hung.points[rng.integers(len(hung.points) // 5, 4 * len(hung.points) // 5)]
         place = place + rng.normal(0, 0.03, d)
@@ -68,19 +69,11 @@ def random_obstacles(rng: np.random.Generator, hung: CompiledShape, kinds: str) 
     return found
 
 
-def surface_of(obstacle: Obstacle) -> rod.Obstacle:
-    """An obstacle as Python's model has it."""
-    if isinstance(obstacle, HalfSpace):
-        normal = np.array(obstacle.normal) / np.linalg.norm(obstacle.normal)
-        return rod.Plane(obstacle.point, tuple(normal.tolist()))
-    return rod.Capsule(obstacle.a, obstacle.b, obstacle.radius)
-
-
 def compare(
     model: CableModel, pose: HeldPose, obstacles: list[Obstacle], shape: CompiledShape
 ) -> tuple[str, float]:
     """Whether Python ends in the same contacts, and C's energy minus Python's, as a share."""
-    full = replace(model, obstacles=tuple(map(surface_of, obstacles)))
+    full = replace(model, obstacles=tuple(obstacles))
     (eq,) = solve_equilibria(full, full.nominal, np.zeros(full.chain.n_rests), [pose], [None])
     scale = model.cable.mass * 9.81 * model.cable.length + model.cable.bending_stiffness
     if not isinstance(eq, Equilibrium) or not eq.stable:
@@ -143,7 +136,7 @@ def check(count: int, spatial: bool, beside: int, kinds: str, n: int, end: str, 
             whole = max(whole, -gap)
             if gap < 0:
                 first, last = 1, n + (end == "free")
-                for one in map(surface_of, obstacles):
+                for one in obstacles:
                     near = one.near(shape.points[first:last]).distance - model.cable.diameter / 2
                     depth = max(depth, -float(near.min()))
     told = {key: max(map(abs, row)) for key, row in apart.items()}

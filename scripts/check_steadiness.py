@@ -127,7 +127,7 @@ def run(config: Config) -> Row:
         stage.rmse_fit,
         any(f"than stage {stage.name}" in text for text in worse_than_simpler(outcome.stages)),
         outcome.measurement.std,
-        outcome.discretization.n,
+        outcome.fit.model.n,
     )
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.config.values import implausible_quaternion
 from dlo_casadi.errors import counted
-from dlo_casadi.fleet.overview import overview_html
+from dlo_casadi.fleet.rows import overview_html
 from dlo_casadi.paper.algorithm1 import Algorithm1Status, _message
 from dlo_casadi.runtime.parallel import Tally
 

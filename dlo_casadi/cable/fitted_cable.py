@@ -12,12 +12,10 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.curve import CableCurve, curves_of, without_camera
 from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
-from dlo_casadi.cable.known_cable import KnownCable
+from dlo_casadi.cable.known_cable import CableCurve, KnownCable, curves_of, without_camera
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
-from dlo_casadi.cable.outlines import outlines, touching
-from dlo_casadi.cable.picture import draw_shape
+from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Clip, Obstacle
 from dlo_casadi.equilibrium.equilibrium import Equilibrium

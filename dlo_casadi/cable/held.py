@@ -147,13 +147,13 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     DloError
         If the ends are not held as the cable's boundary asks, or are no finite numbers.
     """
-    name, spatial, branch = repr(model.cable.name), model.in_space, asked["branch"]
+    name, branch = repr(model.cable.name), asked["branch"]
     own, other = AXES[model.node.dimension], AXES[5 - model.node.dimension]
     kind, gravity = own.direction, f"{own.gravity} of gravity"
     given = {key: value for key, value in asked.items() if value is not None}
     if branch not in (None, *get_args(Branch)):
         raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
-    if branch is not None and spatial:
+    if branch not in (None, *model.node.branches):
         raise DloError(f"{name} is in space: a branch has no meaning")
     if model.end == "free" and "end" in given:
         raise DloError(f"the end of {name} is free: it cannot be held at {given['end']} m")
@@ -183,7 +183,7 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     for key, at in (("start", pose.start), ("end", pose.end)):
         if at is not None and len(at) != model.node.dimension:
             raise DloError(f"{key}: {own.place} belongs here ({gravity}), found {at}")
-    if pose.turns and not (spatial and model.start == model.end == "clamped"):
+    if pose.turns and not (model.node.twists and model.start == model.end == "clamped"):
         raise DloError(f"{name} has no turns: it is not in space and clamped at both ends")
     return replace(pose, name=model.cable.name or "cable")
 
@@ -200,13 +200,10 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
     DloError
         If there is no such file, or it has other columns or cells that are no numbers.
     """
-    axes, sides = model.node.axes, ("start", "end")
-    keys = {side: [f"{side}_{axis}_m" for axis in axes] for side in sides}
-    if model.in_space:
-        keys |= {f"{side}_orientation": [f"{side}_q{x}" for x in "xyzw"] for side in sides}
-        keys["turns"] = ["turns"]
-    else:
-        keys |= {f"{side}_heading": [f"{side}_heading_rad"] for side in sides}
+    node, sides = model.node, ("start", "end")
+    keys = {side: [f"{side}_{axis}_m" for axis in node.axes] for side in sides}
+    keys |= {f"{side}_{node.direction}": [f"{side}_{x}" for x in node.columns] for side in sides}
+    keys |= {"turns": ["turns"]} if node.twists else {}
     known = ["name", *(column for group in keys.values() for column in group)]
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:

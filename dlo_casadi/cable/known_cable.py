@@ -1,16 +1,26 @@
-"""A cable with what is known of it: its fitted values and their errors."""
+"""A cable with what is known of it: fitted values, their errors, and its curve in a pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
+import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
+from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
 from dlo_casadi.cable.limits import Asked
 from dlo_casadi.cable.placing import Aim, Placing, placed
+from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.symbolic import CasadiCable
-from dlo_casadi.errors import counted
+from dlo_casadi.errors import DloError, counted
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.node import Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,3 +97,68 @@ class KnownCable(CasadiCable):
             If the cable has no shape in a pose without clips.
         """
         return placed(self, self.metadata, count, poses, within, limits, aim)
+
+
+# Rounding error allowed in arc lengths beyond the ends, as a share of the length.
+_ROUNDING = 1e-9
+
+
+class CableCurve(NodeCurve):
+    """A cable from its start at s = 0 to its end at s = L = `length` [m]."""
+
+    def at(self, s: ArrayLike, derivative: int = 0) -> FloatArray:
+        """Positions (K, d) [m] at arc lengths s (K,) [m] in [0, L], or derivatives by s.
+
+        Raises
+        ------
+        DloError
+            If an arc length lies outside the cable.
+        """
+        try:
+            places = np.atleast_1d(np.asarray(s, dtype=float)).ravel()
+        except (TypeError, ValueError):
+            raise DloError(f"s: arc lengths [m] belong here, found {s!r}") from None
+        slack = _ROUNDING * self.length
+        outside = places[~((places >= -slack) & (places <= self.length + slack))]
+        if len(outside):
+            raise DloError(
+                f"s = {outside[0]:g} m is not on the cable: {len(outside)} of "
+                f"{counted(len(places), 'arc length')} lie outside 0 to {self.length:g} m.\n"
+                "  Try: arc lengths in metres from the start."
+            )
+        return super().at(np.clip(places, 0.0, self.length), derivative)
+
+    @classmethod
+    def at_rest(
+        cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
+    ) -> Self:
+        """The curve of a model in an equilibrium, as its camera sees it."""
+        given = Inputs.of(p, rest, pose.vector[None])
+        return cls.of(model.cable.length, assembly_of(model).curve(eq.shapes, given)[0])
+
+    def frames(self, s: FloatArray, places: FloatArray, x: FloatArray) -> FloatArray:
+        """Material frames (K, d, d) at s [m]: columns are the tangent and the section's axes.
+
+        In a plane the second column is to the left. In space the roll about the tangent is
+        interpolated between the nodes, whose states are `x` (N, coordinates) at `places` (N,) [m].
+        """
+        tangents = unit(self.at(s, 1))
+        if self.d == 2:
+            return np.stack([tangents, tangents[:, ::-1] * (-1.0, 1.0)], axis=2)
+        y = Rotation.from_quat(Frame.interpolated(s, places, x)).apply([0.0, 1.0, 0.0])
+        y = unit(y - (y * tangents).sum(axis=1, keepdims=True) * tangents)
+        return np.stack([tangents, y, np.cross(tangents, y)], axis=2)
+
+
+def curves_of(
+    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
+) -> tuple[CableCurve, CableCurve]:
+    """The cable itself in a pose, and as the session's camera measures it."""
+    models = (without_camera(model, p), (model, p))
+    true, seen = (CableCurve.at_rest(*one, rest, pose, eq) for one in models)
+    return true, seen
+
+
+def without_camera(model: CableModel, p: FloatArray) -> tuple[CableModel, FloatArray]:
+    """The model without the effects of the camera, and its part of `p`."""
+    return model.without_kind(MeasurementEffect, p)

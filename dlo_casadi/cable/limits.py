@@ -181,7 +181,7 @@ def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Li
         raise DloError(f"no limit is given, and the session declared none.\n  Try: {_TRY}")
     held = (model.start, model.end, *model.clips)
     avoided = any(not one.touch for one in model.obstacles)
-    if wrong := [*asked.problems(held, model.in_space, model.cable.length, avoided)]:
+    if wrong := [*asked.problems(held, model.node.twists, model.cable.length, avoided)]:
         raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
     return asked
 
@@ -339,15 +339,11 @@ def limit_checks(
     for use in shape.uses(limits):
         name = _size(use.quantity)
         chance, std = likely[name], likely[name].std / ratio[name]
+        std *= use.value**2 if use.quantity == "bend_radius" else 1.0
         out.append(
             LimitCheck(
                 **vars(use),
-                std=float(std * use.value**2 if use.quantity == "bend_radius" else std),
-                probability=chance.probability,
-                error=chance.error,
-                draws=chance.draws,
-                lost=chance.lost,
-                shares=chance.shares,
+                **(vars(chance) | {"std": float(std)}),
                 decided_by=_said(cable.model, uncertainty, chance),
             )
         )

@@ -1,4 +1,4 @@
-"""The picture of one shape: the cable, and what it does to its fixtures."""
+"""The picture of one shape: the cable, what it does to its fixtures, and obstacles as lines."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.rod.obstacles import Obstacle, Plane
 from dlo_casadi.show import style
 
 # Shares of a shape's extent: the longest arrow, how far a number stands from its arrow's tip, and
@@ -82,3 +83,95 @@ def draw_shape(
         axes.set_title(remark, color=style.VERMILLION if alarming else style.GREY)
         drawing.suptitle(title, fontsize=12)
     return drawing
+
+
+# Points of a circle; strokes of the hatching on the inner side of a planar surface; lines of the
+# net on a surface in space each way.
+_CIRCLE, _STROKES, _NET = 33, 24, 7
+# How far surfaces are drawn beyond the cable, and length of a stroke, in lengths of the cable.
+_BEYOND, _STROKE = 0.06, 0.025
+
+# Half the least length of a stretch that touches something, so that a point is seen, too.
+_SEEN = 0.006
+
+
+def touching(start: float, end: float, length: float) -> FloatArray:
+    """Arc lengths (21,) [m] of the line that shows a contact from `start` to `end` [m]."""
+    middle, half = (start + end) / 2, (end - start) / 2
+    s = middle + max(half, _SEEN * length) * np.linspace(-1.0, 1.0, 21)
+    return np.clip(s, 0.0, length)
+
+
+def outlines(obstacle: Obstacle, points: FloatArray, length: float) -> list[FloatArray]:
+    """Lines (K, d) [m] that show an obstacle beside points (n, d) [m] of a cable of a length [m].
+
+    Of a plane, and of a long bar, the part beside the cable.
+    """
+    if isinstance(obstacle, Plane):
+        return _plane(obstacle, points, length)
+    a, axis = np.array(obstacle.a), np.subtract(obstacle.b, obstacle.a)
+    size = float(np.linalg.norm(axis))
+    if len(a) == 2:
+        along = axis / size if size else np.array([1.0, 0.0])
+        half = np.linspace(-np.pi / 2, np.pi / 2, _CIRCLE)
+        caps = [
+            _arc(end, sign * along, sign * _turned(along), obstacle.radius, half)
+            for end, sign in ((obstacle.b, 1), (obstacle.a, -1))
+        ]
+        return [np.concatenate([*caps, caps[0][:1]])]
+    along = axis / size if size else np.eye(3)[2]
+    aside = np.eye(3)[np.abs(along).argmin()]
+    aside = np.cross(along, aside) / np.linalg.norm(np.cross(along, aside))
+    across = aside, np.cross(along, aside)
+    low, high = _extent(points - a, along, length)
+    ends = [a + np.clip(x, 0.0, size) * along for x in (low, high)]
+    round_, half = np.linspace(0, 2 * np.pi, _CIRCLE), np.linspace(-np.pi / 2, np.pi / 2, _CIRCLE)
+    lines = [_arc(end, *across, obstacle.radius, round_) for end in ends]
+    for x in (*across, *(-one for one in across)):
+        lines.append(np.stack([end + obstacle.radius * x for end in ends]))
+    for end, sign, shown in ((ends[1], 1, high > size), (ends[0], -1, low < 0)):
+        if shown:
+            lines += [_arc(end, sign * along, x, obstacle.radius, half) for x in across]
+    return lines
+
+
+def _plane(plane: Plane, points: FloatArray, length: float) -> list[FloatArray]:
+    """The part of a plane beside points: a hatched line, or a net in space."""
+    normal, foot = np.array(plane.normal), np.array(plane.point)
+    if len(normal) == 2:
+        along = _turned(normal)
+        low, high = _extent(points - foot, along, length)
+        at = foot + np.linspace(low, high, _STROKES)[:, None] * along
+        inside = at - _STROKE * length * (normal + along)
+        return [np.stack([at, inside, at], axis=1).reshape(-1, 2)]
+    level = np.cross(np.eye(3)[np.abs(normal).argmin()], normal)
+    axes = level / np.linalg.norm(level), np.cross(normal, level / np.linalg.norm(level))
+    ranges = [np.linspace(*_extent(points - foot, axis, length), _NET) for axis in axes]
+    lines = []
+    for k in (0, 1):
+        for x in ranges[k]:
+            ends = ranges[1 - k][[0, -1], None] * axes[1 - k]
+            lines.append(foot + x * axes[k] + ends)
+    return lines
+
+
+def _extent(points: FloatArray, axis: FloatArray, length: float) -> tuple[float, float]:
+    """From where to where [m] along an axis points (n, d) reach, and a little more."""
+    along, more = points @ axis, _BEYOND * length
+    return float(along.min()) - more, float(along.max()) + more
+
+
+def _turned(x: FloatArray) -> FloatArray:
+    """A vector (2,) turned by a quarter."""
+    return np.array([-x[1], x[0]])
+
+
+def _arc(
+    center: FloatArray | tuple[float, ...],
+    x: FloatArray,
+    y: FloatArray,
+    radius: float,
+    angles: FloatArray,
+) -> FloatArray:
+    """Points (k, d) of a circle at angles (k,) from the unit vector x toward y."""
+    return np.array(center) + radius * (np.outer(np.cos(angles), x) + np.outer(np.sin(angles), y))

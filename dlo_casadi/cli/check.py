@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from dlo_casadi.cli.guard import BAD_INPUT, OK
+from dlo_casadi.cli import BAD_INPUT, OK
 from dlo_casadi.cli.options import CONFIG, Page, command, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import Config

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from dlo_casadi.cli.guard import BAD_INPUT, OK
+from dlo_casadi.cli import BAD_INPUT, OK
 from dlo_casadi.cli.options import CONFIG, SCHEDULER, Page, command, jobs, option
 from dlo_casadi.errors import counted
 from dlo_casadi.io.files import make_folder
@@ -129,7 +129,7 @@ def fit_many(chosen: argparse.Namespace) -> int:
     dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast
     """
     from dlo_casadi.cli.watch import Counter
-    from dlo_casadi.fleet.overview import judge
+    from dlo_casadi.fleet.rows import judge
     from dlo_casadi.fleet.run import Options, find_sessions, fit_fleet
 
     base, sessions = find_sessions(chosen.where)

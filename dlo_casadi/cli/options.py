@@ -16,7 +16,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from dlo_casadi.cli.guard import OK
+from dlo_casadi.cli import OK
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError
 

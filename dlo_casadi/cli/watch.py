@@ -17,7 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from dlo_casadi.cli.guard import signals
+from dlo_casadi.cli import signals
 from dlo_casadi.errors import counted
 from dlo_casadi.runtime.parallel import Tally
 

@@ -5,11 +5,10 @@ from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import (
     QUANTITIES,
     STATUSES,
-    Capsule,
     CompiledShape,
     Gap,
-    HalfSpace,
     ShapePath,
     Slope,
     Usage,
 )
+from dlo_casadi.rod.obstacles import Capsule, Plane

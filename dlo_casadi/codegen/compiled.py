@@ -22,19 +22,17 @@ from dlo_casadi.codegen.shapes import (
     AnyPose,
     CompiledShape,
     Gap,
-    HalfSpace,
-    Obstacle,
     ShapePath,
     Slope,
     Usage,
     no_equilibrium,
-    obstacle_of,
     pose_table,
     records_of,
 )
 from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.obstacles import Obstacle, Plane
 
 # Poses, or rows of numbers laid out as dlo_pose in the C header.
 Poses = Sequence[AnyPose] | FloatArray
@@ -123,7 +121,7 @@ class CompiledSolver:
         self.source = generate(model, p, rest, obstacles=obstacles)
         known = Obstacles.of(model, np.asarray(p, float), obstacles)
         self.most_obstacles = known.most
-        self.obstacles: tuple[Obstacle, ...] = tuple(map(obstacle_of, known.declared))
+        self.obstacles = known.declared
         folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
@@ -351,12 +349,16 @@ class CompiledSolver:
         given = np.zeros(len(obstacles), self._records.obstacle)
         for row, obstacle in zip(given, obstacles, strict=True):
             if not isinstance(obstacle, Obstacle):
-                raise DloError(f"a Capsule or a HalfSpace belongs here, found {obstacle!r}")
-            if any(np.shape(place) != row["a"].shape for place in obstacle.ends):
+                raise DloError(f"a Capsule or a Plane belongs here, found {obstacle!r}")
+            if isinstance(obstacle, Plane):
+                first, second, radius = obstacle.point, obstacle.normal, 0.0
+            else:
+                first, second, radius = obstacle.a, obstacle.b, obstacle.radius
+            if any(np.shape(place) != row["a"].shape for place in (first, second)):
                 count = counted(self.model.node.dimension, "number")
                 raise DloError(f"places of an obstacle must have {count}, found {obstacle!r}")
-            row["kind"], row["radius"] = isinstance(obstacle, HalfSpace), obstacle.radius
-            row["a"], row["b"] = obstacle.ends
+            row["kind"], row["radius"] = isinstance(obstacle, Plane), radius
+            row["a"], row["b"] = first, second
         return given
 
     def _along(self, slope: Slope | None) -> Any:
@@ -383,8 +385,7 @@ class CompiledSolver:
             listed = self._table_of(among)
             given[_AMONG[name] : _AMONG[name]] = [listed, len(listed)]
         places = (a.ctypes.data if isinstance(a, np.ndarray) else a for a in given)
-        status: int = getattr(self._c, name)(*places)
-        return status
+        return getattr(self._c, name)(*places)
 
 
 def _shape(record: Any, status: int) -> CompiledShape:

@@ -143,7 +143,7 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
             "LENGTH": c_number(case.length),
             "DECLARED_LENGTH": c_number(model.cable.length),
             "RADIUS": c_number(model.cable.diameter / 2),
-            "ELASTIC": model.yields,
+            "ELASTIC": model.n_inner > 0,
             "STRETCHES": model.extensible,
             "SMOOTH": kind.smooth,
             "SPINS": model.may_spin and not case.rest.any(),

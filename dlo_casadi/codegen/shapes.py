@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
-from dlo_casadi.rod import obstacles
 from dlo_casadi.rod.ends import EndConditions
-
-Place = tuple[float, ...]
 
 # As in the header.
 STATUSES = (
@@ -172,44 +169,6 @@ class Slope:
     energy_by_at: FloatArray = field(default_factory=lambda: np.zeros(0))
     obstacle_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
     degenerate: int = 0
-
-
-@dataclass(frozen=True)
-class Capsule:
-    """All within `radius` [m] of the segment from `a` to `b` [m]; a sphere where they agree."""
-
-    a: Place
-    b: Place
-    radius: float
-
-    @property
-    def ends(self) -> tuple[Place, Place]:
-        """As the C solver takes it."""
-        return self.a, self.b
-
-
-@dataclass(frozen=True)
-class HalfSpace:
-    """All behind the plane through `point` [m] across `normal`, which points out of it."""
-
-    point: Place
-    normal: Place
-    radius: ClassVar[float] = 0.0
-
-    @property
-    def ends(self) -> tuple[Place, Place]:
-        """As the C solver takes it."""
-        return self.point, self.normal
-
-
-Obstacle = Capsule | HalfSpace
-
-
-def obstacle_of(surface: obstacles.Obstacle) -> Obstacle:
-    """A surface of a model as the C solver takes it."""
-    if isinstance(surface, obstacles.Plane):
-        return HalfSpace(surface.point, surface.normal)
-    return Capsule(surface.a, surface.b, surface.radius)
 
 
 @dataclass(frozen=True)
@@ -395,7 +354,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
         [clip.at or 0.0, *clip.place, *(_frame(clip, model) if model.clamped_between else ())]
         for clip in pose.clips
     ]
-    ends = EndConditions.size(model.node) + int(model.in_space)
+    ends = EndConditions.size(model.node) + model.node.twists
     return np.concatenate([numbers[:ends], *clips])
 
 

@@ -13,7 +13,14 @@ from dlo_casadi.config.load import (
     load_config,
     wrong_effects,
 )
-from dlo_casadi.config.measuring import Centerlines, DeclaredCamera, DeclaredTolerances, Images
-from dlo_casadi.config.options import DeclaredEffect, EstimationOptions, Limits
+from dlo_casadi.config.options import (
+    Centerlines,
+    DeclaredCamera,
+    DeclaredEffect,
+    DeclaredTolerances,
+    EstimationOptions,
+    Images,
+    Limits,
+)
 from dlo_casadi.config.sections import Cable, Config, Pose, SkippedPose
 from dlo_casadi.config.supports import Clip, Obstacle

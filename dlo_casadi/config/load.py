@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.measuring import DeclaredTolerances
-from dlo_casadi.config.options import DeclaredEffect
+from dlo_casadi.config.options import DeclaredEffect, DeclaredTolerances
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
 from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short

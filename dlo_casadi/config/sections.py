@@ -13,8 +13,15 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from dlo_casadi.config.document import dump_yaml
-from dlo_casadi.config.measuring import Centerlines, DeclaredTolerances, Images
-from dlo_casadi.config.options import DiagnosisOptions, EstimationOptions, Limits, ModelOptions
+from dlo_casadi.config.options import (
+    Centerlines,
+    DeclaredTolerances,
+    DiagnosisOptions,
+    EstimationOptions,
+    Images,
+    Limits,
+    ModelOptions,
+)
 from dlo_casadi.config.problems import PLACEHOLDER, ConfigProblem, Contradiction, show
 from dlo_casadi.config.supports import Clip, Obstacle
 from dlo_casadi.config.values import (

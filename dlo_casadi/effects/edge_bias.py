@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.effects.setup import Setup
 
@@ -36,12 +36,7 @@ class EdgeBias(MeasurementEffect):
     name = "edge_bias"
     dimensions = (2,)
     shown: ClassVar = False
-
-    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
-        """Declare two coefficients for each harmonic."""
-        return tuple(
-            Parameter(f"{kind}{k}", "m", scale=1e-4) for k in HARMONICS for kind in ("a", "b")
-        )
+    declared = tuple(Parameter(f"{x}{k}", "m", scale=1e-4) for k in HARMONICS for x in ("a", "b"))
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 
 
@@ -22,10 +22,7 @@ class ImageScale(MeasurementEffect):
     name = "image_scale"
     dimensions = (2,)
     tolerances: ClassVar = {"factor": "scale"}
-
-    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
-        """Declare the factor."""
-        return (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)
+    declared = (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)
 
     def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Scale about the start fixture."""

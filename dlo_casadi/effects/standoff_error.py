@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.effects.setup import Setup
 
@@ -34,10 +34,7 @@ class StandoffError(MeasurementEffect):
 
     name = "standoff_error"
     dimensions = (2,)
-
-    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
-        """Declare the distance."""
-        return (Parameter("distance", "m", scale=1e-3),)
+    declared = (Parameter("distance", "m", scale=1e-3),)
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:

@@ -256,9 +256,7 @@ def guessed_frames(
         bends = model.chain.curvatures(rest) * np.diff(model.chain.cells, axis=1).ravel()
         return _hanging_frames(u, clamps[0], down, bends)
     along = chord / max(float(np.linalg.norm(chord)), 1e-12)
-    side = down - (down @ along) * along
-    if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
-        side = cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    side = sagging(along, down)
     found: list[FloatArray] = []
     others: list[FloatArray] = []
     aimed = turns = 0.0 if None in clamps else pose.turns
@@ -288,6 +286,14 @@ def smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
         aside /= np.linalg.norm(aside, axis=-1, keepdims=True)
         axis, real = np.where(opposite, aside, axis), np.where(opposite, 0.0, real)
     return Rotation.from_quat(np.concatenate([axis, real], axis=-1))
+
+
+def sagging(along: FloatArray, down: FloatArray) -> FloatArray:
+    """Vector (3,) across a unit vector along which gravity pulls; any where it pulls along it."""
+    side = down - (down @ along) * along
+    if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
+        return cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    return side
 
 
 def arc_tangents(u: FloatArray, chord: FloatArray, side: FloatArray) -> FloatArray:

@@ -27,8 +27,8 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
-from dlo_casadi.equilibrium.reach import out_of_reach
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spans import out_of_reach
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, tangent
@@ -36,15 +36,13 @@ from dlo_casadi.rod.ends import EndConditions
 
 # Equilibria that a search keeps: an optimiser asks for value, gradient and Hessian of one pose.
 KEPT = 1024
-# Least length of a quaternion, as in the generated C.
-LEAST_FRAME = 1e-6
 
 
 def pose_size(model: CableModel) -> int:
     """Size of dlo_pose in the C header: both ends, in space `turns`, then the clips."""
     frame = model.node.coordinates * model.clamped_between
     clips = (1 + model.node.dimension + frame) * len(model.clips)
-    return EndConditions.size(model.node) + int(model.in_space) + clips
+    return EndConditions.size(model.node) + model.node.twists + clips
 
 
 def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> HeldPose:
@@ -53,17 +51,13 @@ def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None
     start, end, first, last, turns = np.split(numbers, np.cumsum([d, d, c, c]))
     held: dict[str, Any] = {}
     for side, frame in (("start", first), ("end", last)):
-        if getattr(model, side) != "clamped":
-            continue
-        if model.in_space:
-            held[f"{side}_orientation"] = tuple(frame.tolist())
-        else:
-            held[f"{side}_heading"] = float(frame[0])
+        if getattr(model, side) == "clamped":
+            held[f"{side}_{model.node.direction}"] = model.node.declared(frame)
     both = model.start == model.end == "clamped"
     return HeldPose(
         start=tuple(start.tolist()),
         end=None if model.end == "free" else tuple(end.tolist()),
-        turns=float(turns[0]) if model.in_space and both else 0.0,
+        turns=float(turns[0]) if model.node.twists and both else 0.0,
         branch=branch,
         **held,
     )
@@ -81,7 +75,7 @@ def symbols_of(
     for held, frame in ((model.start, first), (model.end, last)):
         if held != "clamped":
             frame = ca.MX(ca.DM(model.node.identity))
-        frames.append(frame / ca.norm_2(frame) if model.in_space else frame)
+        frames.append(model.node.normalised(frame))
     end = end if model.end != "free" else ca.MX.zeros(d)
     camera = ca.MX.zeros(model.n_pose - EndConditions.size(model.node))
     full = ca.vertcat(start, end, *frames, camera)
@@ -140,7 +134,7 @@ def _solved(
     pose = pose_of(model, numbers, branch)
     if not np.all(np.isfinite([*pose.vector, pose.turns, *p])):
         return 3
-    if model.in_space and not all(np.linalg.norm(frame) > LEAST_FRAME for frame in pose.frames):
+    if np.any(model.node.excess(np.array(pose.frames)) < -0.5):
         return 6
     if out_of_reach(model, p, pose) is not None:
         return 1

@@ -67,16 +67,14 @@ class HeldPose:
 
     @property
     def _direction_names(self) -> tuple[str, str]:
-        if self.node is Heading:
-            return "start_heading", "end_heading"
-        return "start_orientation", "end_orientation"
+        return f"start_{self.node.direction}", f"end_{self.node.direction}"
 
     @property
     def directions(self) -> dict[str, Any]:
         """Directions of the ends by their keys in a session."""
         known = {name: getattr(self, name) for name in self._direction_names}
         known = {name: list(x) if isinstance(x, tuple) else x for name, x in known.items()}
-        return known if self.node is Heading else {**known, "turns": self.turns}
+        return {**known, "turns": self.turns} if self.node.twists else known
 
     @property
     def ends(self) -> FloatArray:
@@ -93,15 +91,12 @@ class HeldPose:
     def frames(self) -> tuple[FloatArray, FloatArray]:
         """Frames (coordinates,) of both ends as nodes carry them: in a plane headings [rad]."""
         known = (getattr(self, name) or self.node.identity for name in self._direction_names)
-        first, last = (np.atleast_1d(np.array(x, dtype=float)) for x in known)
-        if self.node is Heading:
-            return first, last
-        least = 1e-300
-        return first / max(np.linalg.norm(first), least), last / max(np.linalg.norm(last), least)
+        first, last = (self.node.normalised(np.atleast_1d(np.array(x, dtype=float))) for x in known)
+        return first, last
 
     def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Self:
         """The same pose with other ends; what is free stays free."""
-        values = (float(x[0]) if self.node is Heading else tuple(x) for x in frames)
+        values = map(self.node.declared, frames)
         held: dict[str, Any] = dict(zip(self._direction_names, values, strict=True))
         end_place = None if self.end is None else tuple(end)
         return replace(self, start=tuple(start), end=end_place, **held)

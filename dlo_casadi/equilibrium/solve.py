@@ -16,7 +16,6 @@ from dlo_casadi.equilibrium.equilibrium import (
 )
 from dlo_casadi.equilibrium.minima import KEEPING_SIDE, Minima, by_ipopt, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
-from dlo_casadi.equilibrium.reach import no_equilibrium, out_of_reach
 from dlo_casadi.equilibrium.sides import (
     beside_bars,
     named_sides,
@@ -24,11 +23,17 @@ from dlo_casadi.equilibrium.sides import (
     on_other_side,
     touchdowns,
 )
-from dlo_casadi.equilibrium.spans import arches, border_of, first_guesses
+from dlo_casadi.equilibrium.spans import (
+    arches,
+    border_of,
+    first_guesses,
+    no_equilibrium,
+    out_of_reach,
+)
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.rod.node import Frame, Heading
+from dlo_casadi.rod.node import Frame
 
 # Largest move of an end in one step [lengths, rad], so that shapes are followed up to a fold.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
@@ -138,9 +143,14 @@ def solve_equilibria(
 
 def ways_of(model: CableModel, pose: HeldPose) -> list[HeldPose]:
     """Copies of a pose with each branch, or way round, that it may name; ccw first."""
-    if pose.node is Heading:
-        return [replace(pose, branch=name) for name in SIGNS]
-    return [replace(pose, turns=turns) for turns in WAYS_ROUND] if model.tipped_by else []
+    named = [replace(pose, branch=name) for name in SIGNS if name in pose.node.branches]
+    return named or ways_round(model, pose)
+
+
+def ways_round(model: CableModel, pose: HeldPose) -> list[HeldPose]:
+    """Copies of a pose with each way round of half a turn, if it may name them by its `turns`."""
+    twists = pose.node.twists and model.tipped_by is not None
+    return [replace(pose, turns=turns) for turns in WAYS_ROUND] if twists else []
 
 
 def _chosen(

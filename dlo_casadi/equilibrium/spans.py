@@ -2,7 +2,7 @@
 
 A span reaches from one holder to the next; bars whose sides a pose names count as holders here. In
 a plane the arc of a span turns either way; in space it bulges along gravity or is rotated about its
-chord by quarter turns.
+chord by quarter turns. The spans also tell whether a pose is in reach.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray, cross
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.guesses import (
     arc_half_angle,
     arc_headings,
@@ -21,12 +21,15 @@ from dlo_casadi.equilibrium.guesses import (
     frames_along,
     guessed_frames,
     guesses,
+    sagging,
     smallest_turn,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import named_sides
+from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import tangents
+from dlo_casadi.model.clips import clamped_nodes, tangents
+from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame
@@ -127,7 +130,7 @@ def arches(
     """
     held = holders(model, p, pose)
     k = _insert(held, place[None])
-    up = 2 if model.in_space else 1
+    up = model.node.sides // 2
     sides = [tuple(up * (i == arch) for i in range(len(held) - 1)) for arch in (k - 1, k)]
     yield from _span_guesses(model, pose, held, _SLACK[:1], sides)
 
@@ -202,13 +205,14 @@ def _span_guesses(
     for share in shares:
         at = _arc_lengths(held, share)
         spans, border = spans_of(held, at), np.zeros(model.n_border)
+        chosen = sides or _sides(spans, model.node.sides)
         for k, row in model.sliding.items():
             border[row] = at[clips[k]]
         if model.node is Frame:
             edges = [(at[k], held[k].frame) for k in rolls]
-            found = _in_space(model, pose, spans, edges, sides or _sides(spans, 4))
+            found = _frames(model, pose, spans, edges, chosen)
         else:
-            found = _in_plane(model, spans, sides or _sides(spans, 2))
+            found = _joined_headings(model, spans, chosen)
         for x in found:
             yield x, border
 
@@ -246,7 +250,7 @@ def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
 # ---- in a plane ----------------------------------------------------------------------------------
 
 
-def _in_plane(
+def _joined_headings(
     model: CableModel, spans: Sequence[Span], combinations: Sequence[tuple[int, ...]]
 ) -> Iterator[FloatArray]:
     """Headings (n_nodes, 1) [rad]."""
@@ -304,7 +308,7 @@ def _joined(parts: list[tuple[FloatArray, FloatArray]], fixed: list[bool]) -> No
 # ---- in space ------------------------------------------------------------------------------------
 
 
-def _in_space(
+def _frames(
     model: CableModel,
     pose: HeldPose,
     spans: Sequence[Span],
@@ -338,10 +342,7 @@ def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatAr
         fall = smallest_turn(first, down if np.any(down) else first).as_rotvec()
         return Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall).apply(first)
     along = span.chord / max(float(np.linalg.norm(span.chord)), 1e-12)
-    side = down - (down @ along) * along
-    if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
-        side = cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
+    turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(sagging(along, down))
     axes = arc_tangents(u, span.chord / span.length, turned)
     arc = arc_tangents(np.array([0.0, 1.0]), span.chord / span.length, turned)
     for end, own, decay in zip(ends, arc, ((1 - u) ** 5, u**5), strict=True):
@@ -349,3 +350,83 @@ def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatAr
             bend = smallest_turn(own, end).as_rotvec()
             axes = Rotation.from_rotvec(decay[:, None] * bend).apply(axes)
     return np.asarray(axes)
+
+
+# ---- whether a pose is in reach ------------------------------------------------------------------
+
+
+def no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
+    """The error of a pose: what is wrong, and what to try."""
+    return EquilibriumError(f"{what}.\n  Try: {hint}", pose.name, pose.end)
+
+
+def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
+    """Why a pose has no equilibrium: its end is missing or too far, or a number is not finite."""
+    if pose.end is None and model.end != "free":
+        what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
+        return no_equilibrium(pose, what, "Pose(start, end).")
+    if not np.all(np.isfinite(pose.vector)):
+        what = (
+            f"no equilibrium: a number of the pose is not finite: start {pose.start} m, end "
+            f"{pose.end} m, headings {pose.start_heading} and {pose.end_heading} rad"
+        )
+        return no_equilibrium(pose, what, "see where these numbers come from.")
+    if wrong := _wrong_clips(model, p, pose):
+        return no_equilibrium(pose, *wrong)
+    if wrong := _inside(model, p, pose):
+        return no_equilibrium(pose, *wrong)
+    if pose.end is None or model.extensible:
+        return None
+    ends, true_length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
+    start, end = np.array(ends).ravel()[: 2 * model.node.dimension].reshape(2, -1)
+    distance, length = float(np.linalg.norm(end - start)), float(true_length)
+    if distance < length:
+        return None
+    where = ", ".join(f"{x:.4f}" for x in pose.end)
+    what = (
+        f"no equilibrium: the end ({where}) m is {distance:.4f} m "
+        f"from the start, the cable is {length:.4f} m long"
+    )
+    return no_equilibrium(pose, what, "end in metres? cable.length?")
+
+
+def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
+    """Why obstacles leave no equilibrium, and what to try: a fixture is inside of one."""
+    held = [("start", pose.start), *((clip.name, clip.place) for clip in pose.clips)]
+    held += [("end", pose.end)] if pose.end is not None else []
+    surfaces = surfaces_at(model, p)
+    for name, place in held:
+        for obstacle in surfaces:
+            depth = -float(obstacle.near(np.array(place)).distance)
+            if depth > 0:
+                at = ", ".join(f"{x:.4f}" for x in place)
+                what = f"no equilibrium: the {name} ({at}) m is {depth:.4f} m inside"
+                return f"{what} {obstacle.name}", "the obstacle's place, or its normal."
+    return None
+
+
+def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
+    """Why clips leave no equilibrium, and what to try: other kinds, no room on the mesh or cable.
+
+    Eyelets are taken to be anywhere between the clips beside them.
+    """
+    if tuple(clip.kind for clip in pose.clips) != model.clips:
+        own, others = (", ".join(x) or "none" for x in ([c.kind for c in pose.clips], model.clips))
+        return f"no equilibrium: the pose has the clips {own}, the model {others}", "the same."
+    nodes = clamped_nodes(model.chain, pose.clips)
+    if len(set(nodes)) < len(nodes):
+        what = f"clamped clips are nearer to each other than an element, {model.chain.h:.4g} m"
+        return f"no equilibrium: {what}", "a finer mesh (model.n)."
+    held = holders(model, p, pose) if pose.clips and not model.extensible else []
+    names = ["the start", *(clip.name for clip in pose.clips), "the end"]
+    apart = chords(held)
+    true_length = float(lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1])
+    for low, high, declared in fixed_stretches(held):
+        length = declared * true_length / model.cable.length
+        if sum(apart[low:high]) >= length:
+            what = (
+                f"no equilibrium: {names[low]} and {names[high]} are {sum(apart[low:high]):.4f} m "
+                f"apart, with {length:.4f} m of cable between them"
+            )
+            return what, "places and arc lengths in metres, in the order along the cable?"
+    return None

@@ -131,8 +131,8 @@ def cause_of(model: CableModel, deviation: str) -> str:
 def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
     """Deviations or parameters of a model that a tolerance is about, by the tolerance's name."""
     places = {f"end_{axis}" for axis in model.node.axes}
-    turns = "rotation" if model.in_space else "heading"
-    named = [("end" if name in places else turns, name) for name in model.deviations]
+    turned = model.node.tolerance
+    named = [("end" if name in places else turned, name) for name in model.deviations]
     of_ends = {tolerance for tolerance, _ in named}
     for effect in model.effects:
         if not isinstance(effect, MeasurementEffect):

@@ -19,15 +19,14 @@ from dlo_casadi.equilibrium.implicit import (
     search_sizes,
     symbols_of,
 )
-from dlo_casadi.equilibrium.pose import SIGNS, Branch
+from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, shape
+from dlo_casadi.rod.node import STRAIGHT
 
-# Smallest curvature [1/m] that is told from none: the norm of two has no derivative at zero.
-STRAIGHT = 1e-8
 # Longest step of a node [rad] from a shape that counts as an equilibrium.
 FARTHEST = 1e-6
 
@@ -123,7 +122,7 @@ class CasadiCable:
         inputs, p = self._inputs(parameters)
         pose = inputs["pose"]
         if search is None:
-            if branch is not None and (self.model.in_space or branch not in SIGNS):
+            if branch not in (None, *self.model.node.branches):
                 raise DloError(f"branch must be 'ccw', 'cw' (in a plane) or None, found {branch!r}")
             found = detached(search_of(self.model, self.rest.tobytes(), branch))(pose, p)
         else:
@@ -177,11 +176,8 @@ class CasadiCable:
         (inputs, p), node, k = self._inputs(parameters), self.model.node, self.model.n_border
         x = ca.MX.sym("x", node.coordinates, self.model.chain.n_nodes)
         multipliers = ca.MX.sym("multipliers", k)
-        unit, lengths = x, ca.MX(0, 1)
-        if self.model.in_space:
-            squares = ca.sum1(x**2)
-            unit, lengths = x / ca.repmat(ca.sqrt(squares), node.coordinates, 1), squares.T - 1
-        symbols = symbols_of(self.model, self.rest, unit, multipliers, inputs["pose"], p)
+        unit, pose, lengths = node.normalised(x), inputs["pose"], node.excess(x)
+        symbols = symbols_of(self.model, self.rest, unit, multipliers, pose, p)
         rows = balance(self.model, symbols)
         outputs = {
             "residual": ca.vertcat(rows, lengths),
@@ -286,7 +282,7 @@ def _curvature(model: CableModel) -> ca.Function:
     widths = np.diff(model.chain.cells, axis=1).ravel()
     strains = ca.SX.sym("strains", len(model.node.strains), len(widths))
     bends = strains[-len(model.node.curvatures) :, :]
-    in_cells = ca.sqrt(ca.sum1(bends**2) + STRAIGHT**2) if model.in_space else bends
+    in_cells = model.node.bend(bends)
     ends = []
     for outer, inner in ((0, 1), (-1, -2)) if len(widths) > 1 else ():
         share = widths[outer] / (widths[outer] + widths[inner])

@@ -17,7 +17,6 @@ It has the same minimum as `descent.descend`, by another route: nothing is elimi
 Hessian is exact.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -34,28 +33,11 @@ from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, r
 
 # Projections that move less than this share of the noise between solves have converged.
 SHIFT_TOLERANCE = 1e-3
+# Largest number of solves, each with new projections.
+MOST_SOLVES = 4
 
 
-@dataclass(frozen=True)
-class BatchSolution:
-    """Minimum of the batch NLP.
-
-    Parameters
-    ----------
-    point : Point
-    solves, iterations : int
-        IPOPT runs (projections updates) and their iterations in all.
-    residual : float
-        Largest violation of a constraint in scaled units at the end.
-    """
-
-    point: Point
-    solves: int
-    iterations: int
-    residual: float
-
-
-def solve_batch(problem: Problem, start: Point, max_solves: int = 4) -> BatchSolution:
+def solve_batch(problem: Problem, start: Point) -> tuple[Point, float]:
     """Solve the batch NLP by IPOPT from a point near its minimum.
 
     Parameters
@@ -64,18 +46,21 @@ def solve_batch(problem: Problem, start: Point, max_solves: int = 4) -> BatchSol
     start : Point
         For example of `fit_model`.
 
+    Returns
+    -------
+    Point, float
+        The minimum, and the largest violation of a constraint there in scaled units.
+
     Raises
     ------
     EstimationError
         If IPOPT does not converge.
     """
     nlp = _BatchNlp(problem, problem.unknowns.p(start.theta))
-    point, iterations, solves = start, 0, 0
-    while True:
+    point = start
+    for _ in range(MOST_SOLVES):
         rows, targets = zip(*_compressed(problem, point), strict=True)
         vector, stats, residual = nlp.solve(point, rows, targets)
-        iterations += int(stats["iter_count"])
-        solves += 1
         if not stats["success"]:
             raise EstimationError(
                 f"the batch problem of {counted(len(problem.used), 'pose')} was not solved (IPOPT: "
@@ -90,8 +75,9 @@ def solve_batch(problem: Problem, start: Point, max_solves: int = 4) -> BatchSol
             for new, old in zip(moved.projections, point.projections, strict=True)
         )
         point = moved
-        if shift < SHIFT_TOLERANCE * problem.noise.std or solves == max_solves:
-            return BatchSolution(point, solves, iterations, residual)
+        if shift < SHIFT_TOLERANCE * problem.noise.std:
+            break
+    return point, residual
 
 
 def _compressed(problem: Problem, point: Point) -> list[tuple[FloatArray, FloatArray]]:

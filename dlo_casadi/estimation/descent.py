@@ -65,7 +65,7 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
         model, before = curvature.added(normal), damping
         trial = _ahead(problem, point, lin, model, damping, limit, WATCHED)
         least = least_decrease(problem, point, tolerance)
-        if trial is None and _promised(normal) < least:
+        if trial is None and normal.promised < least:
             return Fit(problem, point, converged=True)
         while trial is None:
             damping = max(10 * damping, 1e-4)
@@ -144,13 +144,6 @@ def least_decrease(problem: Problem, point: Point, tolerance: float = CONVERGED)
     Where the residual exceeds the noise, so does a standard deviation's decrease.
     """
     return tolerance * max(1.0, point.data / max(problem.n_residuals, 1))
-
-
-def _promised(normal: Normal) -> float:
-    """Decrease of the objective that an undamped step promises."""
-    matrix = normal.hessian + NO_INFORMATION * np.eye(len(normal.hessian))
-    shared = normal.gradient @ np.linalg.solve(matrix, normal.gradient)
-    return float(shared) / 2 + normal.by_deviations
 
 
 def _ahead(

@@ -110,11 +110,10 @@ def fit_model(
         noise = fit.noise if std is not None and fit.noise.source == "estimated" else noise
         loose = replace(problem, noise=noise, priors=replace(priors, pose_scatter=scatter))
         near = fit_from(*begin(loose, theta))
-        try:
-            others = [refine(near, first=True)] if near and _scatters(near) else []
-        except EstimationError:
-            return fit
-        return max([fit, *others], key=lambda found: found.log_evidence)
+        with suppress(EstimationError):
+            # What a point leaves must differ from repeat to repeat, and not as their shapes do.
+            if near and errors_of(near, estimated=not near.noise.known, repeats=False)[1].std > 0:
+                return max(fit, refine(near, first=True), key=lambda found: found.log_evidence)
     return fit
 
 
@@ -132,11 +131,6 @@ def at_random(fit: Fit) -> Fit | None:
         near = refine(fit.reweighed(known, priors), first=True)
         return near if near.chi2_per_dof < EXPLAINED else None
     return None
-
-
-def _scatters(fit: Fit) -> bool:
-    """Whether what a point leaves differs from repeat to repeat, and not as their shapes do."""
-    return errors_of(fit, estimated=not fit.noise.known, repeats=False)[1].std > 0
 
 
 def _searched(problem: Problem, theta: FloatArray) -> Fit:

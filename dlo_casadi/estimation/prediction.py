@@ -11,7 +11,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.equilibrium.guesses import line_nodes
 from dlo_casadi.equilibrium.pose import HeldPose, PoseBranch
-from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of
+from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of, ways_round
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
@@ -243,8 +243,8 @@ def _along_line(model: CableModel, p: FloatArray, line: MeasuredPose) -> list[Fl
     pose = line.pose
     if END_ROLL in model.names:
         pose = pose.rolled(float(p[model.names.index(END_ROLL)]))
-    either = model.in_space and not pose.turns and not model.has_state
-    ways = (ways_of(model, pose) if either else []) or [pose]
+    told = pose.turns or model.has_state
+    ways = ([] if told else ways_round(model, pose)) or [pose]
     places = line.places(model.cable.length)
     return [line_nodes(line.points, way, model.chain, places) for way in ways]
 
@@ -345,6 +345,4 @@ def rms_distance(
         if prediction is None:
             return None
         squares.append(item.distances(prediction.curve) ** 2)
-    if not squares:
-        return None
-    return float(np.sqrt(np.concatenate(squares).mean()))
+    return float(np.sqrt(np.concatenate(squares).mean())) if squares else None

@@ -130,10 +130,12 @@ class Normal:
         return out
 
     @property
-    def by_deviations(self) -> float:
-        """Decrease of the objective that a step of the deviations alone promises."""
-        steps = (slope @ np.linalg.solve(block, slope) for block, _, slope in self.inner)
-        return float(sum(steps)) / 2
+    def promised(self) -> float:
+        """Decrease of the objective that an undamped step promises, with the deviations' own."""
+        matrix = self.hessian + NO_INFORMATION * np.eye(len(self.hessian))
+        shared = self.gradient @ np.linalg.solve(matrix, self.gradient)
+        own = (slope @ np.linalg.solve(block, slope) for block, _, slope in self.inner)
+        return float(shared) / 2 + float(sum(own)) / 2
 
 
 @dataclass(frozen=True, eq=False)

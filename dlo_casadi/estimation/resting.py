@@ -5,8 +5,8 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import Setup
 from dlo_casadi.effects.setup import height_of
-from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Problem
+from dlo_casadi.estimation.start import measured_shapes
 from dlo_casadi.thresholds import RESTING_APART, RESTING_NOISE
 
 

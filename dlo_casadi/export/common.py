@@ -16,8 +16,7 @@ PATIENCE = 60.0
 
 def rounded(values: FloatArray) -> list:
     """Numbers as lists, to 12 digits."""
-    plain: list = np.vectorize(lambda x: float(f"{x:.12g}"))(values).tolist()
-    return plain
+    return np.vectorize(lambda x: float(f"{x:.12g}"))(values).tolist()
 
 
 def array(values: FloatArray) -> str:

@@ -5,7 +5,7 @@ No plugin: `mujoco.elasticity.cable` knows one stiffness for a whole cable, take
 read by MuJoCo 3 and 4 and by MJX.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,11 +13,17 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.export.common import Relaxed, relax
 from dlo_casadi.export.rod import Fixture, Rod
+from dlo_casadi.rod.node import Frame, Heading
 
 # Time step [s]; damping of a joint over its stiffness [s], not measured.
 STEP, DAMPING = 0.002, 0.03
 # Moduli [Pa] in bending and twist of the cable that comes with MuJoCo 3 (model/plugin/elasticity).
 DEFAULT = (4e6, 1e7)
+# By the axes about which the cable turns: the joint of a pin, and its position in a frame.
+_PINS: dict[tuple[str, ...], tuple[str, Callable[[Rotation], FloatArray]]] = {
+    Heading.about: ('type="hinge" axis="0 0 1"', lambda frame: frame.as_rotvec()[2:]),
+    Frame.about: ('type="ball"', lambda frame: np.roll(frame.as_quat(), 1)),
+}
 
 
 def write(rod: Rod, head: Sequence[str]) -> str:
@@ -117,8 +123,7 @@ def principal(rod: Rod) -> tuple[FloatArray, Rotation]:
 def _pin(rod: Rod) -> str:
     """A pin at the start: damped as a joint is, so that nothing spins for ever."""
     damping = DAMPING * float(np.linalg.eigvalsh(rod.bending[0])[0]) / rod.h
-    kind = 'type="ball"' if rod.in_space else 'type="hinge" axis="0 0 1"'
-    return f'<joint name="start_pin" {kind} damping="{damping:.9g}"/>'
+    return f'<joint name="start_pin" {_PINS[rod.node.about][0]} damping="{damping:.9g}"/>'
 
 
 def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: FloatArray) -> str:
@@ -130,7 +135,7 @@ def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: Float
     about = dict(zip("xyz", axes.as_matrix().T, strict=True))
     text = ""
     for name, value, angle in zip(_order(k), stiffness, rest, strict=True):
-        if rod.in_space or name == "z":
+        if name in rod.node.about:
             text += (
                 f'<joint name="{name}_{k}" axis="{_row(about[name])}" stiffness="{value:.9g}" '
                 f'springref="{angle:.9g}" damping="{DAMPING * value:.9g}" '
@@ -168,14 +173,11 @@ solimp="0.9999 0.9999 0.001"/>
 
 def _angles(rod: Rod) -> FloatArray:
     """Positions of all joints in the pose."""
+    about = rod.node.about
+    start = _PINS[about][1](rod.frames[0]) if rod.start.kind == "pinned" else np.zeros(0)
     angles = _in_axes(rod.turns, principal(rod)[1])
-    if not rod.in_space:
-        angles = rod.turns.as_rotvec()[:, 2]
-    first = rod.frames[0]
-    start = np.zeros(0)
-    if rod.start.kind == "pinned":
-        start = np.roll(first.as_quat(), 1) if rod.in_space else first.as_rotvec()[2:]
-    return np.concatenate([start, angles.ravel()])
+    free = np.array([[name in about for name in _order(k + 1)] for k in range(len(angles))])
+    return np.concatenate([start, angles[free]])
 
 
 def settle(text: str, rod: Rod) -> Relaxed:

@@ -103,8 +103,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
 def _held(fixture: Fixture, first: int, second: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Nodes and elements that a fixture holds."""
     kinds: dict[str, Any] = {"clamped": ((first, second), (first,)), "pinned": ((first,), ())}
-    found: tuple[tuple[int, ...], tuple[int, ...]] = kinds.get(fixture.kind, ((), ()))
-    return found
+    return kinds.get(fixture.kind, ((), ()))
 
 
 def settle(text: str, rod: Rod) -> Relaxed:

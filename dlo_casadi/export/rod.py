@@ -31,7 +31,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import node_places
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.element import Cell
-from dlo_casadi.rod.node import Heading
+from dlo_casadi.rod.node import Node
 
 # What a target may be able to carry, beyond a straight uniform round cable with its weight.
 Feature = Literal[
@@ -117,8 +117,9 @@ class Rod:
     Parameters
     ----------
     name : str
-    in_space : bool
-        False where the cable stayed in the plane z = 0 and nothing is known of the rest.
+    node : type[Node]
+        The kind of the model's nodes; of headings the cable stayed in the plane z = 0, and nothing
+        is known of the rest.
     s : (n + 1,) [m]
         Arc lengths of the nodes; those inside clamps lie beyond [0, L].
     nodes : (n + 1, 3) [m]
@@ -142,7 +143,7 @@ class Rod:
     """
 
     name: str
-    in_space: bool
+    node: type[Node]
     h: float
     s: FloatArray
     nodes: FloatArray
@@ -185,7 +186,7 @@ class Rod:
         features |= {"obstacles": ()} if model.surfaces else {}
         return cls(
             name=model.cable.name,
-            in_space=model.in_space,
+            node=model.node,
             h=h * stretch,
             s=s,
             nodes=nodes,
@@ -339,13 +340,6 @@ def _spatial(vector: FloatArray) -> FloatArray:
     return out
 
 
-def _frame(state: FloatArray) -> Rotation:
-    """Frames of nodes (..., coordinates): of headings [rad] those that turn about z."""
-    if state.shape[-1] == Heading.coordinates:
-        return Rotation.from_rotvec(state * [0.0, 0.0, 1.0])
-    return Rotation.from_quat(state)
-
-
 def _fixtures(
     model: CableModel, pose: HeldPose, true: FloatArray, curve: NodeCurve
 ) -> tuple[Fixture, Fixture]:
@@ -356,7 +350,7 @@ def _fixtures(
     out = []
     for k, kind in enumerate((model.start, model.end)):
         (place, frame), (cable_place, cable_frame) = (
-            (_spatial(part[k]), _frame(part[2 + k])) for part in parts
+            (_spatial(part[k]), model.node.rotations(part[2 + k])) for part in parts
         )
         if kind != "clamped":
             frame = cable_frame = Rotation.identity()
@@ -374,7 +368,7 @@ def _segments(
     model, length = cable.model, cable.model.cable.length
     middles = np.clip((s[:-1] + s[1:]) / 2, 0.0, length)
     places = node_places(model.chain, cable.pose.clips)
-    frames = _frame(model.node.interpolated(middles, places, cable.x))
+    frames = model.node.rotations(model.node.interpolated(middles, places, cable.x))
     ways = np.diff(_spatial(cable.curve.at(np.clip(s, 0.0, length))), axis=0)
     first, last = start.cable_place, end.cable_place
     held = [k for k, side in ((0, start), (-1, end)) if side.kind == "clamped"]
@@ -431,7 +425,7 @@ def _stiffness(
     factor, bending, torsion = _numbers(
         terms, p, pose, ca.vertcat(*along), section.bending, section.torsion
     )
-    if not model.in_space:
+    if not model.node.twists:
         bending, torsion = bending * np.eye(2), bending * ROUND
     return factor[:, None, None] * bending, factor * torsion
 
@@ -441,9 +435,9 @@ def _rest(model: CableModel, rest: FloatArray, s: FloatArray, h: float) -> Float
     chain, out = model.chain, np.zeros((len(s), 3))
     edges = np.append(chain.cells[:, 0], chain.cells[-1, 1])
     low, high = (np.clip(s + side * h / 2, *edges[[0, -1]]) for side in (-1, 1))
-    for k, means in enumerate(np.split(rest, len(model.node.strains))):
+    about = model.node.about
+    for axis, means in zip(about, np.split(rest, len(about)), strict=True):
         turned = np.append(0.0, np.cumsum(means * np.diff(edges)))
         angle = CubicSpline(edges, turned)
-        column = k if model.in_space else 2
-        out[:, column] = (angle(high) - angle(low)) / (high - low)
+        out[:, "xyz".index(axis)] = (angle(high) - angle(low)) / (high - low)
     return out

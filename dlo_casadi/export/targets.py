@@ -201,7 +201,7 @@ def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence
         *(f"compact mass of {m:.4g} kg at {s:.4g} m" for m, s in rod.lumps),
         f"{len(rod.masses)} links of {rod.h:.6g} m; a clamp holds the middle of one",
     ]
-    if not rod.in_space:
+    if not rod.node.twists:
         known.append(
             "measured in a plane, z = 0 here: GJ is taken as EI / 1.3, and out of the plane nothing"
             " is known"
@@ -378,5 +378,4 @@ def _cable(cable: Held, values: Mapping[str, float], count: int) -> Held | None:
 def _root(covariance: FloatArray) -> FloatArray:
     """Matrix A with A A^T = the covariance, which rounding may have made indefinite."""
     values, vectors = np.linalg.eigh(covariance)
-    root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

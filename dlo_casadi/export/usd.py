@@ -37,7 +37,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     doc = """{doc}"""
     kilogramsPerUnit = 1
     metersPerUnit = 1
-    upAxis = "{"Z" if rod.in_space else "Y"}"
+    upAxis = "{rod.node.axes[-1].upper()}"
 )
 
 def Xform "World"

@@ -16,10 +16,10 @@ from dlo_casadi import __version__
 from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.errors import DloError, OutputError, well_formed
 from dlo_casadi.fleet import parquet_library
-from dlo_casadi.fleet.overview import overview_html
 from dlo_casadi.fleet.rows import (
     Row,
     empty_row,
+    overview_html,
     read_row,
     row_of,
     write_row,
@@ -166,14 +166,9 @@ class FleetResult:
     ----------
     rows : tuple of dict
         One per session, in the order of their keys.
-    taken_over : int
-        Number of rows of an earlier run.
-    output : Path
     """
 
     rows: tuple[Row, ...]
-    taken_over: int
-    output: Path
 
     @property
     def failed(self) -> tuple[Row, ...]:
@@ -245,8 +240,7 @@ def fit_fleet(
             else:
                 jobs.append(job)
                 make_folder(job.folder.parent)
-        taken_over = len(rows)
-        begin(taken_over, len(jobs))
+        begin(len(rows), len(jobs))
         try:
             for done in map_as_completed(executor, fit_one, jobs, progress=progress):
                 key, row = done.item.session.key, done.result
@@ -258,7 +252,7 @@ def fit_fleet(
                     fold()
         finally:
             fold()
-    return FleetResult(tuple(rows[key] for key in sorted(rows)), taken_over, output)
+    return FleetResult(tuple(rows[key] for key in sorted(rows)))
 
 
 @dataclass(frozen=True)

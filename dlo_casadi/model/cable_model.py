@@ -23,7 +23,7 @@ from dlo_casadi.model.clips import CLAMPS, ClipKind, clip_size
 from dlo_casadi.model.rest_curvature import RestCurvature
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
 from dlo_casadi.rod.ends import EndConditions, deviation_names
-from dlo_casadi.rod.node import Node
+from dlo_casadi.rod.node import NODES, Node
 from dlo_casadi.rod.obstacles import Capsule, Obstacle
 
 StartKind = Literal["pinned", "clamped"]
@@ -120,7 +120,7 @@ class CableModel:
     def chain(self) -> Chain:
         """The chain of n elements."""
         held = (self.start == "clamped", self.end == "clamped")
-        return Chain(self.cable.length, self.n, self.element, *held, in_space=self.in_space)
+        return Chain(self.cable.length, self.n, self.element, *held, node=self.node)
 
     @property
     def in_space(self) -> bool:
@@ -130,7 +130,7 @@ class CableModel:
     @property
     def node(self) -> type[Node]:
         """The kind of its nodes."""
-        return self.chain.kind.node
+        return NODES[len(self.gravity)]
 
     @property
     def n_pose(self) -> int:
@@ -236,11 +236,6 @@ class CableModel:
         return any(item.extensible for item in self.effects if isinstance(item, Kinematics))
 
     @property
-    def yields(self) -> bool:
-        """Whether the end moves with the force on it while the nodes stay."""
-        return self.n_inner > 0
-
-    @property
     def n_inner(self) -> int:
         """Number of internal unknowns of a segment: those of the element, and the axial strain."""
         return int(self.extensible) + self.chain.kind.n_inner
@@ -258,8 +253,7 @@ class CableModel:
         """
         held = "clamped" in (self.start, self.end, *self.clips)
         laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
-        twists = "twist" in self.node.strains
-        return twists and not held and all(law.isotropic for law in laws)
+        return self.node.twists and not held and all(law.isotropic for law in laws)
 
     @property
     def coarse(self) -> Self:
@@ -435,8 +429,7 @@ class Tolerances:
     def deviation(self, model: CableModel) -> FloatArray:
         """Standard deviations of a model's `deviation_names`; infinite for unknown forces."""
         node = model.node
-        turn = self.heading if node.increment == 1 else self.rotation
-        sizes = (self.end, turn, np.inf, self.clip)
+        sizes = (self.end, getattr(self, node.tolerance), np.inf, self.clip)
         d = node.dimension
         counts = (d, 2 * node.increment, d, d * len(model.clips))
         return np.repeat(sizes, counts)

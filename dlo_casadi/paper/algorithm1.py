@@ -30,7 +30,7 @@ from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.equilibrium.minima import ipopt, run_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.reach import out_of_reach
+from dlo_casadi.equilibrium.spans import out_of_reach
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.chain import Chain

@@ -14,9 +14,15 @@ from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.recordings.grippers import Gripper, along_cable, find_gripper
 from dlo_casadi.recordings.recording import Recording
-from dlo_casadi.recordings.stills import Still, align_clocks, find_stills
+from dlo_casadi.recordings.stills import (
+    Gripper,
+    Still,
+    align_clocks,
+    along_cable,
+    find_gripper,
+    find_stills,
+)
 
 FREE = "free"
 _COLUMNS = 98  # of a comment

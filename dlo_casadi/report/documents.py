@@ -28,7 +28,6 @@ from dlo_casadi.session.hypotheses import Suspicion
 from dlo_casadi.session.outcome import (
     Outcome,
     PoseInput,
-    Repeatability,
     RestCurvatureEstimate,
     Stage,
     StageName,
@@ -47,7 +46,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
     names: list[StageName] = [*ALWAYS]
     if outcome.stage("closed") is not None:
         names.append("closed")
-    repeats, mesh, weight = outcome.repeatability, outcome.discretization, outcome.hidden_weight
+    repeats, model, weight = outcome.repeatability, outcome.fit.model, outcome.hidden_weight
     document = {
         "schema": "dlo-report/1",
         "config": outcome.config.name,
@@ -62,13 +61,13 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         },
         "stages": [_stage(name, outcome) for name in names],
         "repeatability": {
-            "rest_curvature_std": repeats.scatter.rest_std,
-            "from_pose_to_pose": _scatter(repeats),
+            "rest_curvature_std": outcome.fit.problem.priors.pose_scatter.rest_std,
+            "from_pose_to_pose": _scatter(outcome.fit),
             "expected_spread_m": repeats.expected_spread,
             "source": repeats.source,
             "held_out_inside_90": outcome.inside_band,
         },
-        "discretization": {"n": mesh.n, "element": mesh.element, "error_m": mesh.error},
+        "discretization": {**fields_of(model, "n", "element"), "error_m": outcome.mesh_error},
         "effects": [
             asdict(effect)
             | {"parameters": {k: fields_of(x, *_OF_EFFECT) for k, x in effect.parameters.items()}}
@@ -94,8 +93,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "hidden_weight": weight and asdict(weight),
         "limits": [check.as_dict() for check in outcome.limits],
     }
-    plain: dict[str, Any] = finite(document)
-    return plain
+    return finite(document)
 
 
 def report_text(outcome: Outcome) -> str:
@@ -185,7 +183,7 @@ def check_dict(
     known = {item.name for item in inputs}
     left_out = [f"{item.name}: {item.reason}" for item in config.skipped if item.name not in known]
     mistakes = [*(item.message for item in found), *left_out, *unread]
-    rows: dict[str, Any] = finite(
+    return finite(
         {
             "config": config.name,
             "ok": not mistakes,
@@ -194,7 +192,6 @@ def check_dict(
             "poses": [_checked(config, item) for item in inputs],
         }
     )
-    return rows
 
 
 def _checked(config: Config, item: PoseInput) -> dict[str, Any]:
@@ -261,13 +258,13 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
     return document
 
 
-def _scatter(repeats: Repeatability) -> dict[str, Any] | None:
+def _scatter(fit: Fit) -> dict[str, Any] | None:
     """What differs from pose to pose, and what cannot be distinguished from it."""
-    found = repeats.scatter
+    found = fit.problem.priors.pose_scatter
     if not found.std:
         return None
     others = [other.source for other in found.rivals]
-    return {"source": found.source, "std": found.std, "unit": repeats.unit, "or": others}
+    return {**fields_of(found, "source", "std"), "unit": found.unit(fit.model), "or": others}
 
 
 def fit_dict(fit: Fit) -> dict[str, Any]:
@@ -318,8 +315,7 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
             "hanging": uncertainty.repeat_std,
         },
     }
-    plain: dict[str, Any] = finite(document)
-    return plain
+    return finite(document)
 
 
 def final_rest(fit: Fit) -> FloatArray:

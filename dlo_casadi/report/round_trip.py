@@ -36,8 +36,7 @@ def summary(rows: Sequence[Relaxation]) -> dict[str, Any]:
             "force_to_measured": _rms([(a, c) for a, _, c in forces if c is not None]),
             "problems": [f"{row.pose}: {row.problem}" for row in own if row.problem],
         }
-    plain: dict[str, Any] = finite(out)
-    return plain
+    return finite(out)
 
 
 def _over(distances: Sequence[Distance | None]) -> dict[str, float] | None:
@@ -61,8 +60,7 @@ def round_trip_dict(rows: Sequence[Relaxation]) -> dict[str, Any]:
         *("force", "predicted_force", "measured_force"),
     )
     listed = [{key: _plain(getattr(row, key)) for key in kept} for row in rows]
-    plain: dict[str, Any] = finite({"summary": summary(rows), "poses": listed})
-    return plain
+    return finite({"summary": summary(rows), "poses": listed})
 
 
 def _plain(value: Any) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray, chord_lengths
-from dlo_casadi.cable.outlines import outlines, touching
+from dlo_casadi.cable.picture import outlines, touching
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
 from dlo_casadi.rod.obstacles import Obstacle

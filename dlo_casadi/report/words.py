@@ -113,8 +113,8 @@ def predicted_share(outcome: Outcome, stage: Stage) -> str:
 
 def mesh_text(outcome: Outcome) -> str:
     """Elements of the model, and the error of this mesh."""
-    mesh = outcome.discretization
-    return f"{counted(mesh.n, mesh.element)}, mesh error {millimetres(mesh.error)}"
+    model, error = outcome.fit.model, millimetres(outcome.mesh_error)
+    return f"{counted(model.n, model.element)}, mesh error {error}"
 
 
 def branch_text(found: BranchShape) -> str:

@@ -9,9 +9,11 @@ from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.element import Element, Layout
 from dlo_casadi.rod.elements import Arc, Helix, Link, Quadratic, QuadraticHelix
+from dlo_casadi.rod.node import Frame, Heading, Node
 
 ELEMENTS: dict[str, Element] = {element.name: element for element in (Quadratic(), Arc(), Link())}
 ELEMENTS_IN_SPACE: dict[str, Element] = {kind.name: kind for kind in (QuadraticHelix(), Helix())}
+_BY_NODE = {Heading: ELEMENTS, Frame: ELEMENTS_IN_SPACE}
 DEFAULT_ELEMENT = "quadratic"
 
 
@@ -28,7 +30,7 @@ class Chain:
     element : str
         A name of ELEMENTS, or of ELEMENTS_IN_SPACE.
     start_clamped, end_clamped : bool
-    in_space : bool
+    node : type[Node]
     """
 
     length: float
@@ -36,20 +38,19 @@ class Chain:
     element: str = DEFAULT_ELEMENT
     start_clamped: bool = False
     end_clamped: bool = False
-    in_space: bool = False
+    node: type[Node] = Heading
 
     def __post_init__(self) -> None:
         if self.n < 2:
             raise DloError(f"a chain needs at least 2 elements, got n = {self.n}")
-        known = tuple(ELEMENTS_IN_SPACE if self.in_space else ELEMENTS)
+        known, where = tuple(_BY_NODE[self.node]), self.node.where
         if self.element not in known:
-            where = "in space" if self.in_space else "in a plane"
             raise DloError(f"element {self.element!r} is not known {where}; use one of {known}")
 
     @property
     def kind(self) -> Element:
         """The kind of its elements."""
-        return (ELEMENTS_IN_SPACE if self.in_space else ELEMENTS)[self.element]
+        return _BY_NODE[self.node][self.element]
 
     @property
     def h(self) -> float:

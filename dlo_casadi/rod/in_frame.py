@@ -149,7 +149,7 @@ class SegmentInFrame:
         by_force = ca.reshape(by_force, body.shape)
         pairs = list(zip(ca.horzsplit(by_force), ca.horzsplit(body), strict=True))
         # A turn mu of the frame turns the forces by -mu: c + c x mu + (c x mu) x mu / 2.
-        by_mu = _crossed(by_force, body)
+        by_mu = sum((ca.cross(a, b) for a, b in pairs), start=ca.SX.zeros(3))
         form = sum((a @ b.T for a, b in pairs), start=ca.SX.zeros(3, 3))
         turned = ca.vertcat(*(ca.skew(b) for b in ca.horzsplit(body)))
         force_phi, force_inner = mixed[:, :3], mixed[:, 3:]
@@ -262,12 +262,6 @@ def _rotation(q: ca.SX) -> ca.SX:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     return ca.vertcat(*(ca.horzcat(*row) for row in rows))
-
-
-def _crossed(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Sum (3,) of the cross products of columns (3, m)."""
-    pairs = zip(ca.horzsplit(a), ca.horzsplit(b), strict=True)
-    return sum((ca.cross(one, other) for one, other in pairs), start=ca.SX.zeros(3))
 
 
 def _second_order(moved: _Kinematics, by_mu: ca.SX, by_phi: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -9,12 +9,15 @@ import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, unit
 
 _CASADI = (ca.SX, ca.MX, ca.DM)
 
 # Coefficients of sin(x) / x in powers of x^2: error 2e-15 at x = 0.65, 3e-14 at pi/4.
 SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
+
+# Smallest curvature [1/m] that is told from none: the norm of two has no derivative at zero.
+STRAIGHT = 1e-8
 
 
 class Node(ABC):
@@ -31,8 +34,24 @@ class Node(ABC):
     strains, curvatures : tuple of str
         Names of the components of a strain, each with a rest value; the last of them are the
         curvatures.
+    about : tuple of str
+        Axes of the section about which a joint turns, one for each strain.
     identity : tuple of float
         Coordinates of the node whose tangent is the world's x axis.
+    where : str
+        Where such a cable lies.
+    direction, tolerance : str
+        What a session calls the direction of a clamp, and how well it is known.
+    columns : tuple of str
+        Ends of the names of a table's columns with that direction.
+    branches : tuple of str
+        Branches that a pose may name: which way the cable turns from start to end.
+    twists : bool
+        Whether the cable twists. Frames of clamps leave open how often: a pose tells it by a
+        number of its own, `turns`.
+    sides : int
+        Number of directions, evenly around the chord, to which a first guess of a span bulges; the
+        first is along gravity.
     """
 
     coordinates: ClassVar[int]
@@ -42,7 +61,15 @@ class Node(ABC):
     turns: ClassVar[tuple[str, ...]]
     strains: ClassVar[tuple[str, ...]]
     curvatures: ClassVar[tuple[str, ...]]
+    about: ClassVar[tuple[str, ...]]
     identity: ClassVar[tuple[float, ...]]
+    where: ClassVar[str]
+    direction: ClassVar[str]
+    tolerance: ClassVar[str]
+    columns: ClassVar[tuple[str, ...]]
+    branches: ClassVar[tuple[str, ...]]
+    twists: ClassVar[bool]
+    sides: ClassVar[int]
 
     @staticmethod
     @abstractmethod
@@ -51,6 +78,35 @@ class Node(ABC):
 
         Arrays, or expressions of one node; the same holds for `difference` and `to_world`.
         """
+
+    @staticmethod
+    def excess(x: Any) -> Any:
+        """Squares of the nodes' lengths less one, where length is no part of a node's state.
+
+        (..., 1) of nodes (..., coordinates) or, of an expression (coordinates, n), (n, 1); of
+        headings there are none.
+        """
+        return type(x)(0, 1) if isinstance(x, _CASADI) else x[..., :0]
+
+    @staticmethod
+    def normalised(x: Any) -> Any:
+        """Nodes of any length, as `excess` takes them, with that of a node; zeros stay zeros."""
+        return x
+
+    @staticmethod
+    @abstractmethod
+    def rotations(x: FloatArray) -> Rotation:
+        """Material frames of nodes (..., coordinates): of headings, turned about z."""
+
+    @staticmethod
+    @abstractmethod
+    def declared(x: FloatArray) -> Any:
+        """A node (coordinates,) as a pose declares the direction of a clamp."""
+
+    @staticmethod
+    def bend(curvatures: ca.SX) -> ca.SX:
+        """Bend (1, k) [1/m] of k sections from its components: signed in a plane, else smooth."""
+        return curvatures
 
     @staticmethod
     @abstractmethod
@@ -101,12 +157,30 @@ class Heading(Node):
     turns = ("heading",)
     strains = ("k",)
     curvatures = ("k",)
+    about = ("z",)
     identity = (0.0,)
+    where = "in a plane"
+    direction = "heading"
+    tolerance = "heading"
+    columns = ("heading_rad",)
+    branches = ("ccw", "cw")
+    twists = False
+    sides = 2
 
     @staticmethod
     def moved(x: Any, delta: Any) -> Any:
         """Add the angles."""
         return x + delta
+
+    @staticmethod
+    def rotations(x: FloatArray) -> Rotation:
+        """Turned about z."""
+        return Rotation.from_rotvec(x * [0.0, 0.0, 1.0])
+
+    @staticmethod
+    def declared(x: FloatArray) -> float:
+        """The angle [rad]."""
+        return float(x[0])
 
     @staticmethod
     def difference(x: Any, y: Any) -> Any:
@@ -164,7 +238,15 @@ class Frame(Node):
     turns = ("rotation_x", "rotation_y", "rotation_z")
     strains = ("twist", "k_y", "k_z")
     curvatures = ("k_y", "k_z")
+    about = ("x", "y", "z")
     identity = (0.0, 0.0, 0.0, 1.0)
+    where = "in space"
+    direction = "orientation"
+    tolerance = "rotation"
+    columns = ("qx", "qy", "qz", "qw")
+    branches = ()
+    twists = True
+    sides = 4
 
     @staticmethod
     def moved(x: Any, delta: Any) -> Any:
@@ -174,8 +256,37 @@ class Frame(Node):
         if isinstance(x, _CASADI):
             scale = 1 / ca.sqrt(1 + sum((h * h for h in half), start=ca.SX(0)))
             return ca.vertcat(*turned) * scale
-        out = np.stack(np.broadcast_arrays(*turned), axis=-1)
-        return out / np.linalg.norm(out, axis=-1, keepdims=True)
+        return unit(np.stack(np.broadcast_arrays(*turned), axis=-1))
+
+    @staticmethod
+    def excess(x: Any) -> Any:
+        """Of the quaternions."""
+        if isinstance(x, _CASADI):
+            return ca.sum1(x**2).T - 1
+        return (x**2).sum(axis=-1, keepdims=True) - 1
+
+    @staticmethod
+    def normalised(x: Any) -> Any:
+        """Unit quaternions."""
+        if isinstance(x, _CASADI):
+            size: Any = ca.sqrt(ca.sum1(x**2))
+            return x / ca.repmat(size, Frame.coordinates, 1)
+        return unit(x)
+
+    @staticmethod
+    def rotations(x: FloatArray) -> Rotation:
+        """The frames themselves."""
+        return Rotation.from_quat(x)
+
+    @staticmethod
+    def declared(x: FloatArray) -> tuple[float, ...]:
+        """The quaternion (x, y, z, w)."""
+        return tuple(x.tolist())
+
+    @staticmethod
+    def bend(curvatures: ca.SX) -> ca.SX:
+        """Length of the components, rounded off below STRAIGHT."""
+        return ca.sqrt(ca.sum1(curvatures**2) + STRAIGHT**2)
 
     @staticmethod
     def difference(x: Any, y: Any) -> Any:
@@ -201,7 +312,7 @@ class Frame(Node):
         angle = np.maximum(np.arccos(cosine), 1e-12)
         weights = [np.sin((1 - u) * angle), np.sin(u * angle)]
         out = weights[0][..., None] * first + weights[1][..., None] * last
-        return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
+        return unit(out)
 
     @staticmethod
     def tangent(x: ca.SX) -> ca.SX:
@@ -226,6 +337,9 @@ class Frame(Node):
         gap = cls.difference(x, y)
         gap[:, 0] -= gap[:, 0].mean()
         return bool(np.abs(gap).max() < tolerance)
+
+
+NODES: dict[int, type[Node]] = {node.dimension: node for node in (Heading, Frame)}
 
 
 def components(x: Any) -> Any:

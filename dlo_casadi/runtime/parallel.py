@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar, cast
 import numpy as np
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.runtime.executors import one_thread, open_executor, worker_log, worker_name
+from dlo_casadi.runtime.executors import one_thread, open_executor, worker_log
 
 __all__ = [
     "Finished",
@@ -58,8 +58,6 @@ class Finished(Generic[Item, Result]):
         Exception of the function, or a `LostTaskError`.
     seconds : float
         Duration on the worker.
-    worker : str
-        Machine and process; empty if it was lost.
     """
 
     index: int
@@ -67,7 +65,6 @@ class Finished(Generic[Item, Result]):
     result: Result | None
     error: BaseException | None
     seconds: float
-    worker: str
 
     @property
     def value(self) -> Result:
@@ -206,7 +203,7 @@ def map_as_completed(
                             f"task {index} was lost {times}: its worker was killed.\n"
                             "  Try: more memory; see the workers' logs."
                         )
-                    task = Finished(index, None, None, error, 0.0, "")
+                    task = Finished(index, None, None, error, 0.0)
                 yield ended(item, task)
     finally:
         for future in under_way:
@@ -276,7 +273,7 @@ def _run(
         seconds = time.perf_counter() - begin
         if failure is None:
             log.info("task %d done in %.3f s", index, seconds)
-        return Finished(index, None, result, failure, seconds, worker_name())
+        return Finished(index, None, result, failure, seconds)
 
 
 def _remaining(

@@ -215,7 +215,7 @@ def minimum_by_ipopt(fit: Fit) -> Minimum:
         return Minimum(searched=False)
     began = time.perf_counter()
     try:
-        point = solve_batch(fit.problem, fit.point).point
+        point = solve_batch(fit.problem, fit.point)[0]
     except EstimationError:
         point = None
     return Minimum(point, time.perf_counter() - began)

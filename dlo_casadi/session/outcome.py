@@ -2,8 +2,9 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,7 +21,6 @@ from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
-from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.obstacles import Obstacle
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
@@ -239,10 +239,6 @@ class Repeatability:
 
     Parameters
     ----------
-    scatter : PoseScatter
-        What each repeat has of its own; of no size where nothing was found.
-    unit : str
-        Of its size.
     expected_spread : float [m]
         RMS distance of two repeats of a pose, at the measured points.
     source : "repeats", "poses" or None
@@ -251,29 +247,8 @@ class Repeatability:
         in common; None where it could not be estimated.
     """
 
-    scatter: PoseScatter
-    unit: str
     expected_spread: float
     source: Literal["repeats", "poses"] | None
-
-    @classmethod
-    def of(cls, fit: Fit) -> Self:
-        """What a fit has found."""
-        scatter = fit.problem.priors.pose_scatter
-        unit = scatter.unit(fit.model)
-        if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
-            return cls(scatter, unit, float(np.sqrt(2) * fit.repeat_error), "poses")
-        spread = repeatability(fit.problem.history, fit.model.cable.length)
-        return cls(scatter, unit, spread or 0.0, None if spread is None else "repeats")
-
-
-@dataclass(frozen=True)
-class Discretization:
-    """Mesh of the model and the largest shape error [m] it causes, from two meshes."""
-
-    n: int
-    element: str
-    error: float
 
 
 @dataclass(frozen=True)
@@ -357,6 +332,8 @@ class Outcome:
         Tests of the residual before and after.
     cross_validated : float or None [m]
         Error of the declared model where nothing was added and every left-out pose is predicted.
+    mesh_error : float [m]
+        Largest error of a shape that the mesh of the last fit causes, from two meshes.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
     hidden_weight : HiddenWeight or None
@@ -369,8 +346,7 @@ class Outcome:
     poses: tuple[PoseInput, ...]
     measurement: MeasurementSummary
     stages: tuple[Stage, ...]
-    discretization: Discretization
-    repeatability: Repeatability
+    mesh_error: float
     timing: dict[str, float]
     fit: Fit
     verdict: Verdict | None = None
@@ -385,6 +361,15 @@ class Outcome:
     hidden_weight: HiddenWeight | None = None
     limits: tuple[LimitCheck, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def repeatability(self) -> Repeatability:
+        """How well the cable comes back to the same shape."""
+        history, length = self.fit.problem.history, self.fit.model.cable.length
+        if different_poses(history, length) >= DIFFERENT:
+            return Repeatability(float(np.sqrt(2) * self.fit.repeat_error), "poses")
+        spread = repeatability(history, length)
+        return Repeatability(spread or 0.0, None if spread is None else "repeats")
 
     def stage(self, name: StageName) -> Stage | None:
         """Return the stage of that name, or None."""

@@ -30,11 +30,9 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.measure import Step, measured_poses, nobody, read_session
 from dlo_casadi.session.outcome import (
-    Discretization,
     MeasurementSummary,
     Outcome,
     PoseInput,
-    Repeatability,
     Stage,
     found_effects,
 )
@@ -170,8 +168,7 @@ def fit_session(
             poses=tuple(inputs),
             measurement=_summary(config, inputs, measured, fit),
             stages=tuple(stages),
-            discretization=Discretization(fit.model.n, fit.model.element, error),
-            repeatability=Repeatability.of(fit),
+            mesh_error=error,
             timing=clock.total(),
             fit=fit,
             warnings=tuple(warnings),
@@ -187,7 +184,7 @@ def judged(outcome: Outcome) -> Outcome:
     fit, stages, verdict = outcome.fit, outcome.stages, outcome.verdict
     doubts = remarks.doubts_of(stages, outcome.poses, fit)
     declared = outcome.config.experiment.measurement.std
-    said = remarks.fit_warnings(fit, outcome.discretization.error, declared)
+    said = remarks.fit_warnings(fit, outcome.mesh_error, declared)
     said += remarks.worse_than_simpler(stages)
     if outcome.hidden_weight is not None:
         said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))

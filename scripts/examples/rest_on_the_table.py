@@ -11,13 +11,12 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-from dlo_casadi.codegen import CompiledSolver
-from dlo_casadi.codegen.shapes import Capsule, CompiledShape, HalfSpace
+from dlo_casadi.codegen import Capsule, CompiledShape, CompiledSolver, Plane
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 
-TABLE = HalfSpace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+TABLE = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 PLATE = Capsule((0.45, 0.17, 0.0), (0.45, 0.29, 0.0), 0.04)  # m, its upper half above the table
 GAP = 0.01  # m between the cable and the plate
 

@@ -77,7 +77,7 @@ def case(poses: int, n: int) -> dict[str, Any]:
     wall, cpu = perf_counter(), process_time()
     fit = fit_model(model, measured, Tolerances())
     fitted = process_time()
-    found = solve_batch(fit.problem, fit.point)
+    found, _ = solve_batch(fit.problem, fit.point)
     return {
         "poses": poses,
         "n": n,
@@ -88,7 +88,7 @@ def case(poses: int, n: int) -> dict[str, Any]:
         "gigabytes": peak(),
         "gigabytes_before": before,
         "converged": fit.converged,
-        "bending_stiffness": float(fit.problem.unknowns.p(found.point.theta)[0]),
+        "bending_stiffness": float(fit.problem.unknowns.p(found.theta)[0]),
     }
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from dlo_casadi.codegen import Capsule, HalfSpace, generate
+from dlo_casadi.codegen import Capsule, Plane, generate
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError
@@ -73,11 +73,14 @@ def read_scene(path: Path) -> Scene:
     return scene
 
 
-def obstacles_of(scene: Scene, dimension: int) -> list[Capsule | HalfSpace]:
+def obstacles_of(scene: Scene, dimension: int) -> list[Capsule | Plane]:
     """Capsules and half-spaces of a scene."""
     d = dimension
     capsules = [Capsule(tuple(o[:d]), tuple(o[d : 2 * d]), o[-1]) for o in scene.get("capsule", [])]
-    halves = [HalfSpace(tuple(o[:d]), tuple(o[d:])) for o in scene.get("half_space", [])]
+    halves = [
+        Plane(tuple(o[:d]), tuple((np.array(o[d:]) / np.linalg.norm(o[d:])).tolist()))
+        for o in scene.get("half_space", [])
+    ]
     return [*capsules, *halves]
 
 
@@ -101,18 +104,8 @@ def _dense(points: FloatArray) -> FloatArray:
 
 def clearance(points: FloatArray, radius: float, scene: Scene) -> float:
     """Smallest distance of a cable's surface from obstacles [m]: of a spline through its nodes."""
-    places = _dense(points)
-    least = np.inf
-    for obstacle in obstacles_of(scene, points.shape[1]):
-        a, b = (np.array(end) for end in obstacle.ends)
-        if isinstance(obstacle, HalfSpace):
-            gaps = (places - a) @ b / np.linalg.norm(b)
-        else:
-            size = (b - a) @ (b - a)
-            share = np.clip((places - a) @ (b - a) / size, 0.0, 1.0) if size else np.zeros(1)
-            gaps = np.linalg.norm(places - a - share[:, None] * (b - a), axis=1) - obstacle.radius
-        least = min(least, float(gaps.min()) - radius)
-    return least
+    places, known = _dense(points), obstacles_of(scene, points.shape[1])
+    return min((float(one.near(places).distance.min()) - radius for one in known), default=np.inf)
 
 
 def _tube(axes: plt.Axes, obstacle: Capsule) -> None:
@@ -145,7 +138,7 @@ def draw(shapes: FloatArray, scene: Scene, path: Path) -> None:
         if isinstance(obstacle, Capsule) and d == 3:
             _tube(axes, obstacle)
         elif isinstance(obstacle, Capsule):
-            line = np.array(obstacle.ends).T
+            line = np.array([obstacle.a, obstacle.b]).T
             axes.add_patch(plt.Circle(obstacle.a, obstacle.radius, color="0.75"))
             axes.add_patch(plt.Circle(obstacle.b, obstacle.radius, color="0.75"))
             axes.plot(*line, color="0.75")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.codegen import Capsule, CompiledSolver, HalfSpace
+from dlo_casadi.codegen import Capsule, CompiledSolver, Plane
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
@@ -23,7 +23,7 @@ POSE = HeldPose(
 )
 BALL = Capsule((0.2, 0.3, -0.1), (0.2, 0.3, -0.1), 0.05)
 ROD = Capsule((0.1, -0.2, -0.2), (0.3, -0.2, 0.2), 0.02)
-FLOOR = HalfSpace((0.0, 0.0, -0.3), (0.0, 0.0, 2.0))
+FLOOR = Plane((0.0, 0.0, -0.3), (0.0, 0.0, 2.0))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_distance_is_that_of_many_points_and_its_gradient_central_differences(sp
     shape = space.solve(POSE)
     gap = space.clearance(shape, [obstacle], space.sensitivity(shape, POSE))
     points = fine(shape)
-    if isinstance(obstacle, HalfSpace):
+    if isinstance(obstacle, Plane):
         away = points[:, 2] + 0.3
     else:
         a, b = np.array(obstacle.a), np.array(obstacle.b)
@@ -85,7 +85,7 @@ def test_the_nearest_of_many_obstacles_is_told_and_a_cut_is_negative(space):
         space.clearance(shape, [])
     with pytest.raises(DloError, match="not_finite"):
         space.clearance(shape, [replace(BALL, radius=np.nan)])
-    with pytest.raises(DloError, match="a Capsule or a HalfSpace belongs here, found 1"):
+    with pytest.raises(DloError, match="a Capsule or a Plane belongs here, found 1"):
         space.clearance(shape, [1])
     with pytest.raises(DloError, match="must have 3 numbers"):
         space.clearance(shape, [replace(BALL, a=(0.2, 0.3))])
@@ -105,14 +105,13 @@ def test_in_a_plane(element):
 
     shape = solved(pose)
     slope = solver.sensitivity(shape, posed(pose))
-    ball, floor = Capsule((0.3, 0.4), (0.3, 0.4), 0.05), HalfSpace((0.0, -0.5), (0.0, 1.0))
+    ball, floor = Capsule((0.3, 0.4), (0.3, 0.4), 0.05), Plane((0.0, -0.5), (0.0, 1.0))
     for obstacle in (ball, floor):
         gap = solver.clearance(shape, [obstacle], slope)
         # Links are straight; a node is a place of the cable, but seldom the nearest one.
-        nodes = shape.points - np.array(obstacle.ends[0])
-        near = np.linalg.norm(nodes, axis=1) if obstacle is ball else nodes[:, 1]
-        assert gap.distance <= near.min() - obstacle.radius - 0.005 + 1e-12
-        assert gap.distance > near.min() - obstacle.radius - 0.005 - 0.01
+        near = obstacle.near(shape.points).distance
+        assert gap.distance <= near.min() - 0.005 + 1e-12
+        assert gap.distance > near.min() - 0.005 - 0.01
         for column in range(3):
             by = 1e-6 * np.eye(3)[column]
             ahead, behind = (

@@ -8,7 +8,6 @@ import pytest
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import CompiledSolver, compile_library
-from dlo_casadi.codegen.shapes import Capsule, HalfSpace
 from dlo_casadi.effects import CableData, ContactPlane, ObstacleOffset
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -141,7 +140,7 @@ def test_derivatives_through_contacts(own, what):
     name, solver = "disc" if d == 2 else "ball", compiled(own[1].model, *NODES)
     listed = solver.obstacles
     if what == "round":
-        listed = (Capsule(ROUND[name].a, ROUND[name].b, ROUND[name].radius),)
+        listed = (ROUND[name],)
     pose = pose_of(model)
     shape = solver.solve(pose, obstacles=listed)
     assert shape.obstacle_forces.any()
@@ -188,7 +187,7 @@ def test_refusals(own):
     d = model.node.dimension
     low = replace(pose_of(model), start=(*[0.0] * (d - 1), -0.1899))
     assert solver.solve(low, throw=False).status == "no_room"
-    flat = HalfSpace((0.0,) * d, (0.0,) * d)
+    flat = rod.Plane((0.0,) * d, (0.0,) * d)
     assert solver.solve(pose_of(model), throw=False, obstacles=[flat]).status == "bad_argument"
     with pytest.raises(DloError, match="3 obstacles, the solver knows at most 2"):
         solver.solve(pose_of(model), obstacles=solver.obstacles * 3)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.codegen import QUANTITIES, Capsule, HalfSpace
+from dlo_casadi.codegen import QUANTITIES, Capsule, Plane
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
@@ -57,7 +57,7 @@ def ball_beside(shape):
     d = shape.points.shape[1]
     middle = tuple(shape.points[len(shape.points) // 2] + 0.1)
     down = tuple(np.eye(d)[-1])
-    return [Capsule(middle, middle, 0.03), HalfSpace(tuple(-0.6 * np.array(down)), down)]
+    return [Capsule(middle, middle, 0.03), Plane(tuple(-0.6 * np.array(down)), down)]
 
 
 @pytest.mark.parametrize("case", CASES)

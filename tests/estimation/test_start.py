@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 from test_relaxation import ROLL, problem_of
 
-from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
-from dlo_casadi.estimation.start import _either_way
+from dlo_casadi.estimation.start import _either_way, measured_shapes
 from dlo_casadi.model.cable_model import END_ROLL
 from dlo_casadi.sensing.noise import NoiseModel
 

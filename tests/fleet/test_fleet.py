@@ -19,8 +19,7 @@ from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import fit, main
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.overview import judge, overview_html, robust_z
-from dlo_casadi.fleet.rows import COLUMNS, empty_row, row_of
+from dlo_casadi.fleet.rows import COLUMNS, empty_row, judge, overview_html, robust_z, row_of
 from dlo_casadi.fleet.run import digest_of, find_sessions, fit_fleet
 from dlo_casadi.io.files import only_run
 from dlo_casadi.runtime.executors import InProcess
@@ -128,7 +127,7 @@ def test_a_killed_run_goes_on_and_repeats_nothing(fleet, expected, tmp_path):
     assert 2 <= len(before) <= 4
 
     told = []
-    result = fit_fleet(
+    fit_fleet(
         find_sessions(fleet)[1],
         tmp_path,
         InProcess(),
@@ -137,7 +136,7 @@ def test_a_killed_run_goes_on_and_repeats_nothing(fleet, expected, tmp_path):
     )
     after = {path.name: path.stat().st_mtime_ns for path in finished.glob("*.json")}
     # A worker may have finished one more row before it noticed that its parent was gone.
-    assert len(before) <= told[0][0] == result.taken_over
+    assert len(before) <= told[0][0]
     assert sum(told[0]) == len(KEYS)
     assert before.items() <= after.items()
     assert len(after) == len(KEYS)

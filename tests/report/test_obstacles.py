@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.cable.outlines import outlines
+from dlo_casadi.cable.picture import outlines
 from dlo_casadi.report.scene import Plane as Board
 from dlo_casadi.report.scene import contact_marks, obstacle_marks
 from dlo_casadi.rod.obstacles import Capsule, Plane

@@ -4,8 +4,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.rod.node import Heading, Node
+from dlo_casadi.rod.node import NODES, Heading, Node
 
 # Some node of each kind; all others are reached from there.
 SOME: dict[type[Node], list[float]] = {Heading: [0.3]}
@@ -74,3 +75,58 @@ def test_headings_count_whole_turns():
     x, y = np.array([[0.2]]), np.array([[0.2 - 2 * np.pi]])
     np.testing.assert_allclose(Heading.difference(x, y), -2 * np.pi)
     np.testing.assert_allclose(Heading.tangent(ca.DM(np.pi / 2)), [[0.0], [1.0]], atol=ROUNDING)
+
+
+BOTH = pytest.mark.parametrize("kind", NODES.values(), ids=lambda kind: kind.__name__)
+
+
+def some(kind: type[Node]) -> np.ndarray:
+    """Nodes (5, coordinates), up to a radian from the world's axes."""
+    way = np.random.default_rng(3).uniform(-1.0, 1.0, size=(5, kind.increment))
+    return kind.moved(np.broadcast_to(kind.identity, (5, kind.coordinates)), way)
+
+
+@BOTH
+def test_nodes_of_any_length_become_nodes_again(kind):
+    """A length that is part of no node, a quaternion's, is lost; an angle stays."""
+    x, factor = some(kind), 3.0 if kind.coordinates > kind.increment else 1.0
+    np.testing.assert_allclose(kind.normalised(factor * x), x, atol=ROUNDING)
+    symbolic = np.array(kind.normalised(ca.DM(factor * x.T))).T
+    np.testing.assert_allclose(symbolic, x, atol=ROUNDING)
+    excess = kind.excess(factor * x)
+    assert excess.shape == (5, kind.coordinates - kind.increment)
+    np.testing.assert_allclose(excess, factor**2 - 1, atol=3 * factor**2 * ROUNDING)
+    np.testing.assert_allclose(np.array(kind.excess(ca.DM(factor * x.T))).ravel(), excess.ravel())
+
+
+@BOTH
+def test_the_frame_of_a_node_has_its_tangent_as_x_and_turns_about_its_axes(kind):
+    d, step = kind.dimension, 1e-6
+    for x in some(kind):
+        frame = kind.rotations(x)
+        tangent = np.array(kind.tangent(ca.DM(x))).ravel()
+        np.testing.assert_allclose(frame.apply([1.0, 0.0, 0.0])[:d], tangent, atol=ROUNDING)
+        for k, axis in enumerate(kind.about):
+            ahead = kind.rotations(kind.moved(x, step * np.eye(kind.increment)[k]))
+            turned = (frame.inv() * ahead).as_rotvec() / step
+            np.testing.assert_allclose(turned, np.eye(3)["xyz".index(axis)], atol=1e-9)
+
+
+@BOTH
+def test_a_pose_declares_clamps_as_the_node_says(kind):
+    first, last = some(kind)[:2]
+    held = {f"start_{kind.direction}": kind.declared(first)}
+    held |= {f"end_{kind.direction}": kind.declared(last)}
+    pose = HeldPose((0.0,) * kind.dimension, (0.5,) * kind.dimension, **held)
+    assert pose.node is kind
+    np.testing.assert_allclose(pose.frames, [first, last], atol=ROUNDING)
+    assert ("turns" in pose.directions) is kind.twists
+    assert len(kind.columns) == kind.coordinates
+    assert len(kind.about) == len(kind.strains) == kind.increment
+
+
+@BOTH
+def test_bends_are_the_length_of_the_curvatures(kind):
+    curvatures = np.random.default_rng(4).uniform(-2.0, 2.0, size=(len(kind.curvatures), 6))
+    bend = np.abs(np.array(ca.DM(kind.bend(ca.DM(curvatures))))).ravel()
+    np.testing.assert_allclose(bend, np.linalg.norm(curvatures, axis=0), atol=1e-12)

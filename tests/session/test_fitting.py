@@ -29,9 +29,9 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
         update={"model": coarse, "estimation": estimation, "diagnosis": diagnosis}
     )
     outcome = run_session(config)
-    assert outcome.discretization.n == 6
+    assert outcome.fit.model.n == 6
     (warning,) = [text for text in outcome.warnings if "mesh" in text]
-    assert f"{1e3 * outcome.discretization.error:.3g} mm" in warning
+    assert f"{1e3 * outcome.mesh_error:.3g} mm" in warning
     assert "the mesh of 6 elements" in warning
 
 
