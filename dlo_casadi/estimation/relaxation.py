@@ -203,7 +203,9 @@ class Relaxation:
         nodes, border, own, known, q = self._counts
         unit = np.broadcast_to(np.eye(own, q), (m, own, q))
         deviation = np.zeros((m, len(model.deviation_names), q))
-        deviation[:, equilibria.used_deviations] = unit[:, border:]
+        used = equilibria.used_deviations
+        grown = values.shapes.deviation[:, used] * self._are_forces
+        deviation[:, used] = unit[:, border:] + grown[:, :, None] * self._growth(values)
         p = np.zeros((m, len(model.parameters), q))
         p[:, :, known:] = unknowns.slopes(values.theta)
         rest = np.zeros((m, model.chain.n_rests, q))
@@ -218,6 +220,13 @@ class Relaxation:
     def _forces(self, values: Values) -> FloatArray:
         """Multipliers (m, k), which grow with the stiffness; zero in the columns of places."""
         return values.shapes.lam * self.problem.unknowns.model.are_multipliers
+
+    @cached_property
+    def _are_forces(self) -> BoolArray:
+        """Which deviations (used,) are forces on the cable, and grow likewise."""
+        model, used = self.problem.unknowns.model, self.problem.equilibria.used_deviations
+        names = {name for effect in model.effects for name in effect.per_pose(model.cable)}
+        return np.array([model.deviation_names[k] in names for k in used], dtype=bool)
 
     def _growth(self, values: Values) -> FloatArray:
         """Change (q,) of the logarithm of the bending stiffness along a pose's unknowns and theta.
@@ -245,7 +254,7 @@ class Relaxation:
         """Derivatives and residuals of all that the objective holds."""
         problem = self.problem
         equilibria = problem.equilibria
-        nodes, border, _, known, q = self._counts
+        nodes, _, _, known, _ = self._counts
         state = problem.state(values)
         given = equilibria.given(*state)
         along = self._along(values, given)
@@ -264,11 +273,11 @@ class Relaxation:
         rows[:, :nodes, known:] -= left[:, :nodes, None] * scaled
         rows, left = rows * weights[:, None], left * weights
         std, used = problem.deviation_std, equilibria.used_deviations
-        prior = np.eye(len(std), q, border) / std[:, None]
+        priors = along.deviation[:, used] / std[:, None]
         data = dict(zip(problem.used, self._data(values, along), strict=True))
         stacked = []
         for j in range(equilibria.m):
-            parts = [(rows[j], left[j]), (prior, values.shapes.deviation[j, used] / std)]
+            parts = [(rows[j], left[j]), (priors[j], values.shapes.deviation[j, used] / std)]
             parts += [data[j]] if j in data else []
             stacked.append(np.concatenate([np.column_stack([a, -e]) for a, e in parts]))
         root, gap = self._prior, values.theta - problem.mean
@@ -397,11 +406,13 @@ class Relaxation:
         turned *= min(1.0, LONGEST / max(float(np.abs(turned).max()), 1e-300))
         x = turned.reshape((m, *values.shapes.x.shape[1:2], -1, 1))
         deviation = values.shapes.deviation.copy()
-        deviation[:, equilibria.used_deviations] += change[:, border:]
         taken = np.where(stiff, -np.log1p(-np.where(stiff, step, 0.0)), step)
         larger = float(np.exp(self._growth(values)[known:] @ taken))
         forces = change[:, nodes:border]
         forces += (larger - 1) * (forces + values.shapes.lam) * unknowns.model.are_multipliers
+        of_pose = deviation[:, equilibria.used_deviations] + change[:, border:]
+        of_pose[:, self._are_forces] *= larger
+        deviation[:, equilibria.used_deviations] = of_pose
         shapes = equilibria.moved(values.shapes, Vector(x, forces[:, :, None]))
         shapes = replace(shapes, deviation=deviation)
         theta = values.theta + taken
