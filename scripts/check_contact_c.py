@@ -1,9 +1,10 @@
 """Contact in the generated C solver: python scripts/check_contact_c.py [--count N] [--python M].
 
 Random cables in random poses among one to three obstacles near where they hang without: how many
-have a shape, how deep nodes and whole cables are in obstacles, the sign of the forces, and the
-processor time beside that of the same poses without obstacles. Of the first poses the energy beside
-Python's, as a share of m g L + EI/L.
+have a shape, how deep nodes and whole cables are in obstacles, the sign of the forces, how many are
+no strict minimum when they are evaluated again (without derivatives), and the processor time beside
+that of the same poses without obstacles. Of the first poses the energy beside Python's, as a share
+of m g L + EI/L.
 """
 
 import argparse
@@ -20,6 +21,7 @@ from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
+from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.obstacles import Capsule, Obstacle, Plane
 
@@ -131,6 +133,10 @@ def check(count: int, spatial: bool, beside: int, kinds: str, n: int, end: str, 
                 found["touching"] += 1
                 times[0], times[1] = times[0] + without, times[1] + spent
                 steps.append((hung.iterations, shape.iterations))
+                try:
+                    solver.sensitivity(shape, pose, obstacles=obstacles)
+                except DloError:
+                    found["without derivatives"] += 1  # no strict minimum
             lowest = min(lowest, float(touched.min()))
             gap = solver.clearance(shape, obstacles).distance
             whole = max(whole, -gap)

@@ -244,7 +244,7 @@ class _PlaneCase(Case):
             held += (self.border - 2) * count + 2 * self.held_doubles
         if spans := len(model.clips) and len(model.clips) + 1:
             guesses = (2**spans if spans <= 4 else spans + 2) * (3 if model.sliding else 1)
-        landings = 1 + 2 * guesses * (1 + 2 * self.obstacles) if self.obstacles else 0
+        landings = 2 + 4 * (guesses + self.obstacles) if self.obstacles else 0
         return {
             "WORKSPACE": self.doubles * (count + 1) + held,
             "EXAMPLE_CLIPS": self.example_clips,

@@ -47,8 +47,8 @@ class Obstacles:
         rows, columns = model.node.increment * nodes + border, (1 + d) * n
         # Both points of a plane, columns with their block, sums and forces; as in the template.
         size = (2 if d == 2 else 1) * ((3 + d) * slots + d * (3 * n + 2))
-        size += columns * (4 * d + 4 + 2 * rows) + columns * (columns + 1) + columns
-        size += d * (d + 1) // 2 * n + d * n + (5 + 3 * d) * slots
+        size += columns * (4 * d + 5 + 2 * rows) + columns * (columns + 1) + columns
+        size += d * (d + 1) // 2 * n + d * n + (7 + 3 * d) * slots
         return {
             "OBSTACLES": self.most,
             "DECLARED": len(self.declared),
@@ -85,8 +85,8 @@ _MARKS = (
 _SAID = """\
  *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie. Where
  *                   the status is DLO_OK the whole cable, its radius and its fixtures are outside
- *                   of them but for 1e-6 of its length. Places at which it touches stay on the
- *                   cable in derivatives. Along a path it touches down and lifts off without a jump
+ *                   of them but for 1e-6 of its length. Places at which it touches slide along
+ *                   it in derivatives. Along a path it touches down and lifts off without a jump
  *   n_obstacles in  at most DLO_OBSTACLES
 """
 

@@ -257,6 +257,20 @@ def test_clips_that_cannot_be(two, first, status):
     assert not found.points.any()
 
 
+@pytest.mark.parametrize("obstacles", [0, 1])
+def test_a_saddle_at_the_first_node_has_no_equilibrium_as_in_python(obstacles):
+    """Nothing turns between the clamped start and a saddle one element behind it."""
+    model = CableModel(FLAT, 12, start="clamped", end="clamped", clips=("clamped",), n_rest=0)
+    rest = np.zeros(model.chain.n_rests)
+    ends = {"start_heading": 0.0, "end_heading": 0.0}
+    clip = HeldClip("clamped", (0.06, 0.0), 0.083, heading=0.0)
+    pose = HeldPose((0.0, 0.0), (0.7, 0.1), clips=(clip,), **ends)
+    solver = CompiledSolver(model, model.nominal, rest, flags=("-O1",), obstacles=obstacles)
+    assert solver.solve(pose, throw=False).status == "iteration_limit"
+    with pytest.raises(DloError, match="no equilibrium found"):
+        solve_equilibrium(model, model.nominal, rest, pose)
+
+
 def test_a_cable_with_clips_is_the_same_cable(two):
     solver, p, rest = two
     bare = CasadiCable(loom(0), p, rest)

@@ -97,6 +97,33 @@ def test_whole_cable_is_outside(own):
     assert np.all((places > 0.2) & (places < 0.9))
 
 
+def test_a_place_slides_to_where_the_cable_is_lowest(own):
+    """Where it touches between nodes: nothing is deeper beside."""
+    model, solver = own
+    shape = solver.solve(pose_of(model))
+    touched = np.flatnonzero(shape.contact_forces[0])
+    between = touched[touched % 4 != 3]
+    assert len(between), "it touches between its nodes"
+    assert solver.clearance(shape, solver.obstacles).distance == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("mass", [0.05, 0.5])
+def test_cables_in_the_plane_land_on_tables(mass):
+    """Also heavy ones, whose mesh is coarse: they slide until they lie."""
+    model = replace(cable(2), cable=CableData(1.0, mass, 0.008, 0.01))
+    solver, found = compiled(model, "-O2"), []
+    for level in np.linspace(-0.25, -0.05, 21):
+        for tilt in (-0.2, 0.0, 0.2):
+            normal = HalfSpace((0.0, float(level)), (tilt, 1.0))
+            pose = HeldPose((0.0, 0.0), (0.7, 0.02), start_heading=0.3, end_heading=-0.2)
+            shape = solver.solve(pose, throw=False, obstacles=[normal])
+            if shape.status != "no_room":
+                found.append(shape.status)
+                assert shape.contact_forces.min() >= 0.0
+    assert len(found) > 40
+    assert set(found) == {"ok"}
+
+
 def test_no_obstacles_are_as_a_solver_without(own):
     model, solver = own
     found = solver.solve(pose_of(model), obstacles=())
@@ -132,12 +159,13 @@ def moved(pose: HeldPose, column: int, step: float, d: int) -> HeldPose:
     return replace(pose, **{key: tuple(frame)})
 
 
+@pytest.mark.parametrize("flags", [NODES, STRICT], ids=["nodes", "between"])
 @pytest.mark.parametrize("what", ["table", "round"])
-def test_derivatives_through_contacts(own, what):
+def test_derivatives_through_contacts(own, what, flags):
     """Of forces, moments, points and the force on the obstacle, by central differences."""
     model, _ = own
     d = model.node.dimension
-    name, solver = "disc" if d == 2 else "ball", compiled(own[1].model, *NODES)
+    name, solver = "disc" if d == 2 else "ball", compiled(own[1].model, *flags)
     listed = solver.obstacles
     if what == "round":
         listed = (ROUND[name],)
