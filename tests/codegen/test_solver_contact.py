@@ -114,7 +114,7 @@ def test_cables_in_the_plane_land_on_tables(mass):
     solver, found = compiled(model, "-O2"), []
     for level in np.linspace(-0.25, -0.05, 21):
         for tilt in (-0.2, 0.0, 0.2):
-            normal = HalfSpace((0.0, float(level)), (tilt, 1.0))
+            normal = Plane((0.0, float(level)), (tilt, 1.0))
             pose = HeldPose((0.0, 0.0), (0.7, 0.02), start_heading=0.3, end_heading=-0.2)
             shape = solver.solve(pose, throw=False, obstacles=[normal])
             if shape.status != "no_room":
