@@ -114,9 +114,10 @@ def test_cables_in_the_plane_land_on_tables(mass):
     solver, found = compiled(model, "-O2"), []
     for level in np.linspace(-0.25, -0.05, 21):
         for tilt in (-0.2, 0.0, 0.2):
-            normal = Plane((0.0, float(level)), (tilt, 1.0))
+            normal = (-np.sin(tilt), np.cos(tilt))
+            plane = rod.Plane((0.0, float(level)), normal)
             pose = HeldPose((0.0, 0.0), (0.7, 0.02), start_heading=0.3, end_heading=-0.2)
-            shape = solver.solve(pose, throw=False, obstacles=[normal])
+            shape = solver.solve(pose, throw=False, obstacles=[plane])
             if shape.status != "no_room":
                 found.append(shape.status)
                 assert shape.contact_forces.min() >= 0.0
