@@ -257,7 +257,10 @@ def close_the_loop(
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
     next_pose = separating_pose(diagnosis.after, diagnosis.added)
-    if diagnosis.added or diagnosis.unexplained:
+    if diagnosis.unexplained or (declared.noise.source == "misfit" and diagnosis.added):
+        # A model that does not come to its points has no intervals.
+        stages[-1] = _told(stages[-1], explains=False)
+    elif diagnosis.added:
         parameters = fitted_parameters(declared, profile_intervals(declared), reported)
         stages[-1] = replace(stages[-1], parameters=parameters)
     else:
