@@ -20,7 +20,8 @@ of which one or two effects are not declared, with both the same in space: see h
 it is counted how often that is named. With --table two poses to all touch a table that is not
 declared. Of hidden effects those count that the data show: that make the declared model less likely
 by e^15 when both are fitted from the truth. How often each is named, alone or among what cannot be
-told from it, is counted, and how often a wrong one is.
+told from it, is counted, how often a wrong one is, and how often a stiffness lies in its interval
+where all that is hidden shows and is named.
 """
 
 from __future__ import annotations
@@ -198,7 +199,9 @@ def summary(rows: list[dict]) -> str:
     shown = sum(len(row["shown"]) for row in rows)
     named = shown - sum(len(row["missed"]) for row in rows)
     wrong = sum(bool(row["wrong"]) for row in rows)
-    right = [row for row in rows if not (row["missed"] or row["wrong"] or row["refused"])]
+    # An effect that the data do not show may move a stiffness, and nothing can tell.
+    known = [row for row in rows if len(row["shown"]) == len(row["hidden"])]
+    right = [row for row in known if not (row["missed"] or row["wrong"] or row["refused"])]
     seconds = [row["cpu_seconds"] for row in rows]
     said = [f"{len(rows)} sets"]
     if shown:

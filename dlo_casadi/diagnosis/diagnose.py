@@ -147,6 +147,8 @@ class Search:
     step: Callable[[str, int, int], None]
     executor: Executor
     finest: int | None = None
+    from_shapes: bool = False
+    """Whether the first candidates are tried at the measured shapes."""
 
     @cached_property
     def validation(self) -> CrossValidation:
@@ -189,6 +191,8 @@ class Search:
         """What the search finds, without effects that explain too little."""
         fit, found, force = self.declared, self.run(), None
         found = found.or_better(self.of_simpler_effects(found))
+        if found.unexplained and self.several and fit.noise.source != "misfit":
+            found = found.or_better(replace(self, from_shapes=True).run())
         near = self.at_random(found)
         if near is not None:
             return replace(self, declared=near).closed()
@@ -243,7 +247,7 @@ class Search:
                 closed = as_complete(winner.fit)
                 p_value = max(p_values[item.candidate.name] for item in winner.each)
                 scatters = current.problem.priors.pose_scatter.std > 0
-                misfit = current.noise.source == "misfit"
+                misfit = self._astray(current)
                 if (scatters or not closed.errors_known) and not misfit:
                     again = p_with_closed_noise(current, closed, winner, len(screened))
                     # A scatter from pose to pose may be nothing but the effect.
@@ -256,7 +260,7 @@ class Search:
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
             if p_value > self.significance:
                 break
-            if current.noise.source == "misfit":
+            if self._astray(current) and force is None:
                 # The mesh of a misfit is coarse, and its error would look like the next effect.
                 closed = self._fine(closed)
             current, before = closed, validation
@@ -270,7 +274,7 @@ class Search:
     ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
         """Candidates screened, their p-values, refits of the likely ones, and who stays far off."""
         far: list[str] = []
-        if current.noise.source == "misfit" and force is None:
+        if self._astray(current) and force is None:
             return self._from_data(current)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
@@ -283,6 +287,11 @@ class Search:
                 single = survival(item.gain, dof, noise_degrees(current))
                 p_values[item.candidate.name] = sidak(single, len(screened))
         return screened, p_values, tried, far
+
+    def _astray(self, current: Fit) -> bool:
+        """Whether candidates are tried at the measured shapes, not where a fit has gone."""
+        first = self.from_shapes and current is self.declared
+        return first or current.noise.source == "misfit"
 
     def of_simpler_effects(self, found: Found) -> Found | None:
         """Search among effects of fewer parameters each, if the larger of two may be one of them.

@@ -57,7 +57,7 @@ def from_data(base: Fit) -> tuple[Fit, float]:
     """
     model, alone = base.model, replace(NoiseModel(FIRST_STD), readings=base.noise.readings)
     model = model.with_mesh(min(max(SearchSettings.of(model).mesh, model.coarse.n), model.n))
-    known: NoiseModel = base.noise.before or alone
+    known: NoiseModel = base.noise.before or (base.noise if base.noise.known else alone)
     problem = replace(_beside(base, model), noise=known, weights=None)
     p = np.where(problem.unknowns.free, model.nominal, problem.unknowns.fixed)
     start = problem.unknowns.pack(p, np.zeros(model.n_coefficients))
