@@ -209,6 +209,10 @@ def _tried(
         p, hidden = np.append(p, height), (*hidden, ContactPlane.name)
         values["contact_plane.height"] = height
         shapes = predict_poses(model, p, rest, true) if height < 0 else [None]
+        # Some poses lie lower without a table than in the equilibrium that they have with it.
+        resting = height + cable.diameter / 2 + 1e-3 * length
+        if all(shapes) and (_lowest(shapes, length) < resting).sum() < 2:
+            return None
     if any(shape is None or not shape.equilibrium.stable for shape in shapes):
         return None
     marked, read = generator.random() < 0.5, "mass_error" in hidden
@@ -246,9 +250,7 @@ def _table_under(
 ) -> float:
     """Height [m] of a table that fitted poses touch and no fixture; 0 where that cannot be."""
     radius, up = model.cable.diameter / 2, len(model.gravity) - 1
-    s = np.linspace(0.0, model.cable.length, 201)
-    fitted = [shape for k, shape in enumerate(shapes) if not _held_out(k)]
-    lowest = np.sort([shape.curve.at(s)[:, up].min() for shape in fitted])
+    lowest = np.sort(_lowest(shapes, model.cable.length))
     most = min(min(pose.start[up], pose.end[up]) for pose in poses) - 0.02 * model.cable.length
     touching = int(np.searchsorted(lowest, most))
     if touching < 2:
@@ -256,6 +258,13 @@ def _table_under(
     k = int(generator.integers(2, touching + 1))
     above = min(lowest[k], most) if k < len(lowest) else most
     return float(lowest[k - 1] + generator.uniform(0.2, 0.8) * (above - lowest[k - 1]) - radius)
+
+
+def _lowest(shapes: Sequence[Prediction], length: float) -> NDArray[np.floating]:
+    """Height [m] of the lowest point of the middle line in each fitted pose."""
+    s = np.linspace(0.0, length, 201)
+    fitted = [shape for k, shape in enumerate(shapes) if not _held_out(k)]
+    return np.array([shape.curve.at(s)[:, -1].min() for shape in fitted])
 
 
 def _held_out(k: int) -> bool:
