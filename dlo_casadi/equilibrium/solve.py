@@ -370,6 +370,25 @@ def _holds(twist: FloatArray, turns: FloatArray | float) -> BoolArray:
     return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
 
 
+def solve_after(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    pose: HeldPose,
+    before: tuple[HeldPose, FloatArray] | None,
+) -> Equilibrium:
+    """Shape in a pose, continued from that of the pose before, its nodes known, where it says so.
+
+    Raises
+    ------
+    EquilibriumError
+        As `solve_equilibrium` and `continued` do.
+    """
+    if pose.branch == "previous" and before is not None:
+        return continued(model, p, rest, pose, *before)
+    return solve_equilibrium(model, p, rest, pose)
+
+
 def continued(
     model: CableModel,
     p: FloatArray,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray
-from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.solve import solve_after
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
@@ -38,9 +38,10 @@ def with_unseen_predicted(problem: Problem, values: Values) -> Values:
     p, rest = problem.unknowns.p(values.theta), problem.unknowns.rest(values.theta)
     x, lam = shapes.x.copy(), shapes.lam.copy()
     for j in sorted(set(range(len(x))) - set(problem.used)):
-        before = problem.equilibria.rests(replace(shapes, x=x, lam=lam), p, rest)[j]
+        own = problem.equilibria.rests(replace(shapes, x=x, lam=lam), p, rest)[j]
+        before = (problem.measured[j - 1].pose, x[j - 1]) if j else None
         with suppress(EquilibriumError):
-            found = solve_equilibrium(model, p, before, problem.measured[j].pose)
+            found = solve_after(model, p, own, problem.measured[j].pose, before)
             x[j], lam[j] = found.x, found.multipliers
     return replace(values, shapes=replace(shapes, x=x, lam=lam))
 

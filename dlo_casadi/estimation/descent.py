@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
+from dlo_casadi.equilibrium.solve import solve_after
 from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.problem import (
@@ -269,11 +269,8 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
         pose = problem.history[index].pose
         deviation = np.zeros(len(fit.model.deviation_names))
         try:
-            if pose.branch == "previous" and rows:
-                before = problem.history[index - 1].pose, rows[-1][0]
-                found = continued(fit.model, fit.p, fit.rest, pose, *before)
-            else:
-                found = solve_equilibrium(fit.model, fit.p, fit.rest, pose)
+            before = (problem.history[index - 1].pose, rows[-1][0]) if rows else None
+            found = solve_after(fit.model, fit.p, fit.rest, pose, before)
             rows.append((found.x, found.multipliers, deviation))
         except EquilibriumError as error:
             if not relaxed:
