@@ -97,7 +97,7 @@ def two():
     return compiled(loom())
 
 
-def agree(shape, eq):
+def assert_agree(shape, eq):
     """Energies to some N times the distance at which the solver stops, of about 1e-11 m."""
     assert shape.energy == pytest.approx(eq.energy, abs=1e-10)
     assert shape.start_force == pytest.approx(eq.start_force, abs=1e-9)
@@ -114,7 +114,7 @@ def agree(shape, eq):
 def test_two_clips(two):
     solver, p, rest = two
     shape = solver.solve(POSE)
-    agree(shape, solve_equilibrium(solver.model, p, rest, POSE))
+    assert_agree(shape, solve_equilibrium(solver.model, p, rest, POSE))
 
 
 @pytest.mark.parametrize("held", [{}, {"start": "pinned", "end": "pinned"}, {"end": "free"}])
@@ -122,13 +122,13 @@ def test_clips_in_a_plane(held):
     for clips in (FLAT_CLIPS, (FLAT_SADDLE, FLAT_EYELET)):
         model, pose = flat(*clips, **held)
         solver, p, rest = compiled(model)
-        agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+        assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
 def test_a_cable_in_a_plane_that_stretches():
     model, pose = flat(FLAT_SADDLE, FLAT_CLIPS[1], effects=(AxialStretch(),))
     solver, p, rest = compiled(model, {"axial_stretch.compliance": 2e-3})
-    agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_saddles_and_eyelets_in_space(clips, held):
         free = held["end"] == "free"
         pose = replace(pose, end_orientation=None, end=None if free else pose.end)
     solver, p, rest = compiled(model)
-    agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
 def moves_of(model, pose):
@@ -298,7 +298,7 @@ def test_a_tether_beside_a_clip_that_has_moved():
     values = TETHER | {"clip_offset.dx": 0.01, "clip_slip.ds": 0.02}
     solver, p, rest = compiled(model, values)
     pose = replace(POSE, clips=CLIPS[:1])
-    agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
 @pytest.mark.parametrize("stiffness", [0.0, pytest.param(40.0, marks=pytest.mark.long)])
@@ -306,7 +306,7 @@ def test_a_tether_to_a_cable_with_a_free_end(stiffness):
     model = loom(0, (Tether(),), end="free")
     solver, p, rest = compiled(model, TETHER | {"tether.stiffness": stiffness})
     pose = replace(POSE, end=None, end_orientation=None, clips=())
-    agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
 @pytest.mark.parametrize("clips", [(), CLIPS[:1]])
@@ -317,7 +317,7 @@ def test_clamps_in_space_that_give_way(clips):
     solver, p, rest = compiled(model, values)
     pose = replace(POSE, clips=clips)
     shape = solver.solve(pose)
-    agree(shape, solve_equilibrium(model, p, rest, pose))
+    assert_agree(shape, solve_equilibrium(model, p, rest, pose))
     slope, step = solver.sensitivity(shape, pose), 1e-5
     for side, column in (("start", 3), ("end", 9)):
         frame = Rotation.from_quat(getattr(pose, f"{side}_orientation"))
@@ -341,7 +341,7 @@ def test_a_tether_in_a_plane(element, position):
     values = {name: x for name, x in TETHER.items() if not name.endswith("_z")}
     values["tether.position"] = position
     solver, p, rest = compiled(model, values)
-    agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
 def test_a_tether_to_links():
