@@ -238,7 +238,8 @@ class Search:
         ranked: list[Ranked] = []
         while len(added) < self.max_effects:
             self.step("search for a missing effect", len(added), self.max_effects)
-            screened, p_values, tried, far = self._refitted(current, force if not added else None)
+            first = force if not added else None
+            screened, p_values, tried, far = self._refitted(current, first, len(added))
             chosen, lost = choose(tried, current, validation, self.doubt)
             lost |= dict.fromkeys(far, NOT_NEAR)
             closed, p_value = current, 1.0
@@ -270,12 +271,12 @@ class Search:
         return self._ended(*self._pruned(current, added), tuple(ranked))
 
     def _refitted(
-        self, current: Fit, force: UnknownForce | None
+        self, current: Fit, force: UnknownForce | None, added: int
     ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
         """Candidates screened, their p-values, refits of the likely ones, and who stays far off."""
         far: list[str] = []
         if self._astray(current) and force is None:
-            return self._from_data(current)
+            return self._from_data(current, added)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:
@@ -358,7 +359,7 @@ class Search:
         return list(map_in_order(self.executor, partial(refits.confirm, current), worthy))
 
     def _from_data(
-        self, current: Fit
+        self, current: Fit, added: int
     ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
@@ -371,7 +372,8 @@ class Search:
             near, softness, candidates_of(near, self.center, self.exclude)
         )
         likely, among = likeliest(screened), (self.executor, self.center, self.exclude)
-        kept = nearest(near, softness, likely, *among)[:REFITTED]
+        pairs = added + 2 <= self.max_effects
+        kept = nearest(near, softness, likely, *among, pairs=pairs)[:REFITTED]
         refit = partial(confirm_from_data, current)
         tried = list(map_in_order(self.executor, partial(refit, starts=1), kept))
         for k, start in enumerate(kept):

@@ -42,7 +42,8 @@ COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; of a
 # strict balance, relative to that of shapes that need not balance.
 REACHED = 1.5
-# Candidates beside each of which a second one is tried, and number of second ones.
+# Candidates beside each of which a second one is tried, and number of second ones: of a drift and a
+# force hidden together the drift left second least, and the force scored highest beside it.
 FIRST, SECOND = 3, 3
 # Gauss-Newton steps of a fit that is a candidate's score.
 SHORT = 5
@@ -192,21 +193,23 @@ def nearest(
     executor: Executor,
     center: tuple[float, float] | None = None,
     exclude: Sequence[str] = (),
+    *,
+    pairs: bool = True,
 ) -> list[RelaxedStart]:
     """Starts that leave little more than the one that leaves least, nearest first.
 
     Of the candidates; where none of these comes to the noise that the relaxed shapes have, of two
-    together if that leaves less by as much.
+    together if `pairs` may be added and REACHED times what they leave is less.
     """
     noise = REACHED * near.point.data
     begun = _near_least(map_in_order(executor, partial(RelaxedStart.of, near), likely), noise)
-    if not begun or begun[0].left < noise:
+    if not pairs or not begun or begun[0].left < noise:
         return begun
     second = partial(RelaxedStart.and_second, softness=softness, center=center, exclude=exclude)
-    pairs = [x for found in map_in_order(executor, second, begun[:FIRST]) for x in found]
-    own = {frozenset(x.names): x for x in sorted(pairs, key=lambda x: -x.left)}
-    pairs = _near_least(own.values(), noise)
-    return pairs if pairs and REACHED * pairs[0].left < begun[0].left else begun
+    both = [x for found in map_in_order(executor, second, begun[:FIRST]) for x in found]
+    own = {frozenset(x.names): x for x in sorted(both, key=lambda x: -x.left)}
+    kept = _near_least(own.values(), noise)
+    return kept if kept and REACHED * kept[0].left < begun[0].left else begun
 
 
 def _near_least(begun: Iterable[RelaxedStart], noise: float) -> list[RelaxedStart]:

@@ -7,13 +7,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
-from dlo_casadi.diagnosis.from_data import RelaxedStart, from_data, screened_from_data
+from dlo_casadi.diagnosis.from_data import (
+    RelaxedStart,
+    from_data,
+    nearest,
+    screened_from_data,
+)
 from dlo_casadi.diagnosis.refits import confirm_from_data
 from dlo_casadi.effects import BendingAnisotropy, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, misfits
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 TRUE = CableData(1.0, 0.08, 0.007, bending_stiffness=0.018, torsional_stiffness=0.007)
@@ -90,3 +96,14 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
 def test_with_another_effect_the_misfit_stays(base, near, screened):
     found = confirm_from_data(base, RelaxedStart.of(near, screened["stiffness_gradient"]))
     assert found is None or found.fit.noise.source == "misfit"
+
+
+def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypatch):
+    near, softness = from_data(base)
+    asked = []
+    monkeypatch.setattr(RelaxedStart, "and_second", lambda start, **_: asked.append(start) or [])
+    wrong = [screened["stiffness_gradient"]]
+    for pairs in (False, True):
+        found = nearest(near, softness, wrong, InProcess(), pairs=pairs)
+        assert [start.names for start in found] == [{"stiffness_gradient"}]
+        assert bool(asked) == pairs
