@@ -18,15 +18,15 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order, survival
-from dlo_casadi.estimation.continuation import relaxed, with_springs_in_place
+from dlo_casadi.estimation.continuation import loosely_relaxed, relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.fit import FIRST_STD
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, fit_from
+from dlo_casadi.estimation.start import begin, fit_from, measured_shapes
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import NEAR_LEADER, REFITTED
@@ -52,12 +52,24 @@ SHORT = 5
 def from_data(base: Fit) -> tuple[Fit, float]:
     """A base that lacks something, relaxed at the measured shapes; no equilibrium.
 
-    At its known noise, or that of the shapes alone, on the mesh of a search, and from nominal
-    parameters: those of the base fit what it lacks. Its softness [rad] is the least of SCORED at
-    which the shapes are still those measured.
+    At its known noise, or that of the shapes alone, on the mesh of a search, or a finer one where
+    points are better known than that can follow, and from nominal parameters: those of the base
+    fit what it lacks. Its softness [rad] is the least of SCORED at which the shapes are still those
+    measured.
     """
-    model, alone = base.model, replace(NoiseModel(FIRST_STD), readings=base.noise.readings)
-    model = model.with_mesh(min(max(SearchSettings.of(model).mesh, model.coarse.n), model.n))
+    model = base.model
+    mesh = max(SearchSettings.of(model).mesh, model.coarse.n)
+    near, softness = _from_data_on(base, min(mesh, model.n))
+    followed = near.point.data < near.problem.n_residuals
+    if base.noise.source == "misfit" and near.noise.source == "declared" and not followed:
+        return _from_data_on(base, 3 * mesh // 2)
+    return near, softness
+
+
+def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
+    """As `from_data`, on a mesh."""
+    alone = replace(NoiseModel(FIRST_STD), readings=base.noise.readings)
+    model = base.model.with_mesh(mesh)
     known: NoiseModel = base.noise.before or (base.noise if base.noise.known else alone)
     problem = replace(_beside(base, model), noise=known, weights=None)
     p = np.where(problem.unknowns.free, model.nominal, problem.unknowns.fixed)
@@ -128,14 +140,17 @@ class RelaxedStart:
 
     @classmethod
     def of(cls, near: Fit, screened: Screened, beside: tuple[Screened, ...] = ()) -> RelaxedStart:
-        """From the relaxed shapes, the candidate not there yet.
+        """From the measured shapes, the candidate not there yet.
 
         In parameters in which it is linear: an anchor is nowhere while its tether does not pull.
+        Relaxed shapes and their parameters stand for what the model without it lacks.
         """
         candidate = screened.candidate
-        scan = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
-        linear, begun = _begun(near, candidate.add_linear_to(near.model), scan)
-        values = relaxed(linear, begun, COMPARED[:1], _places(linear, candidate))
+        known = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
+        for x in beside:
+            known |= {name: near.value(name) for name in x.candidate.frees}
+        linear, begun = _as_measured(near, candidate.add_linear_to(near.model), known)
+        values = loosely_relaxed(linear, begun, _places(linear, candidate))
         values = relaxed(linear, values, COMPARED[1:-1])
         problem, values = _in_own_parameters(near, candidate, linear, values)
         values = relaxed(problem, values, COMPARED[-1:])
@@ -227,6 +242,25 @@ def _begun(near: Fit, model: CableModel, values: Mapping[str, float]) -> tuple[P
     shapes = carried_shapes(problem, near, relaxed=True)
     begun = Values(problem.unknowns.off_bounds(theta), shapes, near.point.projections)
     return problem, with_springs_in_place(problem, begun)
+
+
+def _as_measured(
+    near: Fit, model: CableModel, known: Mapping[str, float]
+) -> tuple[Problem, Values]:
+    """A model at the measured shapes, with parameters that are known, others nominal.
+
+    The shapes are rolled in their end clamps as the relaxed ones.
+    """
+    problem = _beside(near, model)
+    names, free = model.names, problem.unknowns.free
+    known = {**known, **({END_ROLL: near.value(END_ROLL)} if END_ROLL in names else {})}
+    p = np.where(free, model.nominal, problem.unknowns.fixed)
+    for name, value in known.items():
+        p[names.index(name)] = value
+    theta = problem.unknowns.pack(p, np.zeros(model.n_coefficients))
+    theta = problem.unknowns.off_bounds(theta)
+    found = Values(theta, *measured_shapes(problem, known.get(END_ROLL, 0.0)))
+    return problem, with_springs_in_place(problem, found)
 
 
 def _anew(near: Fit, screened: Screened) -> Fit | None:

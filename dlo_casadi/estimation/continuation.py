@@ -13,6 +13,9 @@ from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.model.functions import functions_of
 
+# Standard deviation of points, over the length, from which the strict ones are approached.
+LOOSE = 3e-3
+
 
 def relaxed(
     problem: Problem,
@@ -24,6 +27,22 @@ def relaxed(
     for soft in softness:
         values = Relaxation(problem, soft).solve(with_unseen_predicted(problem, values), fixed)
     return values
+
+
+def loosened(problem: Problem, values: Values) -> Problem:
+    """The problem, its points taken for less sure than they are.
+
+    Between points known to a fraction of a millimetre every turn of a node that matters bends the
+    others off them by more: steps were refused, and the descent ended where it began.
+    """
+    noise = problem.noise.doubted(LOOSE * problem.unknowns.model.cable.length)
+    return replace(problem, noise=noise, weights=None).weighed(values)
+
+
+def loosely_relaxed(problem: Problem, values: Values, fixed: BoolArray | None = None) -> Values:
+    """The first minimum of a relaxed problem, approached by that of the loosened one."""
+    values = relaxed(loosened(problem, values), values, SOFTNESS[:1], fixed)
+    return relaxed(problem, values, SOFTNESS[:1], fixed)
 
 
 def with_unseen_predicted(problem: Problem, values: Values) -> Values:

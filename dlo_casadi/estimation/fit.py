@@ -152,6 +152,10 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
         fits.append(fit_from(*begin(loose, first)))
     best = min((fit for fit in fits if fit), key=lambda fit: fit.point.objective, default=None)
     if best is None:
+        # A model that lacks something is led to any stiffness: begin along equilibria of its own.
+        held = np.ones(len(theta), dtype=bool)
+        best = fit_from(*begin(loose, problem.unknowns.off_bounds(theta), held), fixed=held)
+    if best is None:
         raise EstimationError(
             "no equilibria were found near the measured shapes; their balance of forces led to a "
             f"bending stiffness of {problem.unknowns.p(begun.theta)[0]:.3g} N m^2.\n"
@@ -246,7 +250,11 @@ def fine_enough(
         if fit.noise.source == "misfit":
             return fit, mesh_error(fit)
         if n != fit.model.n:
-            fit = refine_mesh(fit, n, modes)
+            try:
+                fit = refine_mesh(fit, n, modes)
+            except EstimationError:
+                # Its parameters have no equilibria near the measured shapes on a finer mesh.
+                return fit, mesh_error(fit)
         error = mesh_error(fit)
         largest = finest if np.isfinite(error) else SEARCH_MESH
         allowed = allowed_mesh_error(fit)

@@ -105,23 +105,23 @@ class Relaxation:
         known = own + (model.chain.n_rests if model.has_state else 0)
         return nodes, nodes + a.k, own, known, known + self.problem.unknowns.size
 
-    def _stiffness(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _stiffness(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Logarithms of the stiffnesses that scale the nodes' rows (n b,), and these by p.
 
         Torsional, or bending as it is at one turn per length: where the section softens its
         stiffness at rest may be anything.
         """
-        model = self.problem.unknowns.model
-        log, by_p = (np.array(x).ravel() for x in functions_of(model).bent_stiffness(p))
+        model, p = self.problem.unknowns.model, self.problem.unknowns.p(theta)
+        log, by_p = self._bent(theta)
         torsion = model.stiffness_indices[-1]
         twists = np.eye(len(p))[torsion] / p[torsion]
         bent = np.array([name in model.node.curvatures for name in model.node.strains])
         rows = np.where(bent, log, np.log(p[torsion])), np.where(bent[:, None], by_p, twists)
         return np.tile(rows[0], model.chain.n_nodes), np.tile(rows[1], (model.chain.n_nodes, 1))
 
-    def _weights(self, p: FloatArray) -> FloatArray:
-        """Weights (n b + k,) of the rows of F at these parameters."""
-        model = self.problem.unknowns.model
+    def _weights(self, theta: FloatArray) -> FloatArray:
+        """Weights (n b + k,) of the rows of F at these unknowns."""
+        model, p = self.problem.unknowns.model, self.problem.unknowns.p(theta)
         cable = model.cable
         force = cable.mass * float(np.linalg.norm(model.gravity)) + p[0] / cable.length**2
         border = []
@@ -130,7 +130,7 @@ class Relaxation:
                 border.append(1 / force)
             else:  # a multiplier's is its condition
                 border.append(1 / END / (cable.length if kind == "distance" else 1.0))
-        moments = model.chain.h / np.exp(self._stiffness(p)[0])
+        moments = model.chain.h / np.exp(self._stiffness(theta)[0])
         return np.concatenate([moments, border]) / self.softness
 
     # ---- contact -----------------------------------------------------------------------------
@@ -175,7 +175,7 @@ class Relaxation:
         given = problem.equilibria.given(*state)
         left = self._assembly.imbalance(shapes, given).rows[:, :, 0]
         left[:, self._contacts] = self._complementarity(left, shapes)[0]
-        left *= self._weights(p)
+        left *= self._weights(values.theta)
         own = shapes.deviation[:, problem.equilibria.used_deviations] / problem.deviation_std
         each = (left**2).sum(axis=1) + (own**2).sum(axis=1)
         seen = problem.observed(values)
@@ -231,12 +231,18 @@ class Relaxation:
     def _growth(self, values: Values) -> FloatArray:
         """Change (q,) of the logarithm of the bending stiffness along a pose's unknowns and theta.
 
-        All forces grow with it, so that the balance of what is measured stays as it is.
+        All forces grow with it, so that the balance of what is measured stays as it is. It is the
+        stiffness of a bent section: where that softens, EI may grow and its moments stay.
         """
         unknowns = self.problem.unknowns
-        bending = unknowns.model.stiffness_indices[0]
-        slope = unknowns.slopes(values.theta)[bending] / unknowns.p(values.theta)[bending]
+        slope = self._bent(values.theta)[1] @ unknowns.slopes(values.theta)
         return np.concatenate([np.zeros(self._counts[3]), slope])
+
+    def _bent(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """Logarithm of the bending stiffness at one turn per length, and its derivatives by p."""
+        unknowns = self.problem.unknowns
+        log, by_p = functions_of(unknowns.model).bent_stiffness(unknowns.p(theta))
+        return float(log), np.array(by_p).ravel()
 
     def _states(self, values: Values, given: Inputs, along: Tangents) -> list[FloatArray]:
         """Change of each pose's state along the unknowns of the pose before, see `_Linearized`."""
@@ -264,12 +270,12 @@ class Relaxation:
         tangent = matrix.dense()
         rows[:, :, :nodes] += tangent[:, :, :nodes]
         rows += tangent[:, :, nodes:] @ along.lam
-        weights, left = self._weights(state[1]), force.rows[:, :, 0]
+        weights, left = self._weights(values.theta), force.rows[:, :, 0]
         at = self._contacts
         left[:, at], by_gap, by_size = self._complementarity(left, values.shapes)
         rows[:, at] *= by_gap[..., None]
         rows[:, at] += by_size[..., None] * along.lam[:, at.start - nodes :]
-        scaled = self._stiffness(state[1])[1] @ problem.unknowns.slopes(values.theta)
+        scaled = self._stiffness(values.theta)[1] @ problem.unknowns.slopes(values.theta)
         rows[:, :nodes, known:] -= left[:, :nodes, None] * scaled
         rows, left = rows * weights[:, None], left * weights
         std, used = problem.deviation_std, equilibria.used_deviations
@@ -407,7 +413,8 @@ class Relaxation:
         x = turned.reshape((m, *values.shapes.x.shape[1:2], -1, 1))
         deviation = values.shapes.deviation.copy()
         taken = np.where(stiff, -np.log1p(-np.where(stiff, step, 0.0)), step)
-        larger = float(np.exp(self._growth(values)[known:] @ taken))
+        begun, ended = (self._bent(at)[0] for at in (values.theta, np.clip(values.theta + taken, *unknowns.bounds)))
+        larger = float(np.exp(ended - begun))
         forces = change[:, nodes:border]
         forces += (larger - 1) * (forces + values.shapes.lam) * unknowns.model.are_multipliers
         of_pose = deviation[:, equilibria.used_deviations] + change[:, border:]

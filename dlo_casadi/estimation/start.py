@@ -16,7 +16,7 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.guesses import line_nodes
 from dlo_casadi.equilibrium.spans import first_guesses
-from dlo_casadi.estimation.continuation import relaxed, with_springs_in_place
+from dlo_casadi.estimation.continuation import loosened, relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
@@ -76,7 +76,8 @@ def _along_lines(
     """As `begin`, from rolls beside that of theta."""
     names, unknowns = problem.unknowns.names, problem.unknowns
     own = names.index(END_ROLL) if END_ROLL in names else None
-    relaxation = Relaxation(problem, SOFTNESS[0])
+    loose = loosened(problem, Values(theta, *measured_shapes(problem)))
+    relaxation = Relaxation(loose, SOFTNESS[0])
     begun: list[tuple[float, Values]] = []
     for roll in rolls if own is not None else ROLLS[:1]:
         rolled = theta.copy()
@@ -88,8 +89,9 @@ def _along_lines(
         values = _first_solved(relaxation, values, fixed)
         begun.append((relaxation.objective(values), values))
     likely = sorted(begun, key=lambda start: start[0])[:FOLLOWED]
-    found = [relaxation.solve(values, fixed) for _, values in likely]
-    return problem, _either_way(problem, min(found, key=relaxation.objective))
+    strict = Relaxation(problem, SOFTNESS[0])
+    found = [strict.solve(relaxation.solve(values, fixed), fixed) for _, values in likely]
+    return problem, _either_way(problem, min(found, key=strict.objective))
 
 
 def _roll(problem: Problem, theta: FloatArray) -> float:

@@ -33,7 +33,7 @@ TRIED = ("bending_anisotropy", "stiffness_gradient", "point_force", "tether")
 @pytest.fixture(scope="module")
 def base():
     """The round cable that is declared, fitted to poses of one that is flat."""
-    flat = CableModel(TRUE, 6, "quadratic", n_rest=2, effects=(BendingAnisotropy(),), **HELD)
+    flat = CableModel(TRUE, 24, "quadratic", n_rest=2, effects=(BendingAnisotropy(),), **HELD)
     p = flat.nominal.copy()
     p[flat.names.index("bending_anisotropy.ratio")] = RATIO
     p[flat.names.index("bending_anisotropy.angle")] = ANGLE
