@@ -45,8 +45,9 @@ REACHED = 1.5
 # Candidates beside each of which a second one is tried, and number of second ones: of a drift and a
 # force hidden together the drift left second least, and the force scored highest beside it.
 FIRST, SECOND = 3, 3
-# Gauss-Newton steps of a fit that is a candidate's score.
-SHORT = 5
+# Bending stiffnesses from which a contact is tried, in weights times the length squared: from where
+# a weight bends cables much on, down to chains.
+STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
 
 
 def from_data(base: Fit) -> tuple[Fit, float]:
@@ -85,17 +86,17 @@ def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) 
     """Score tests in a relaxed model, best first."""
     gradual = [x for x in listed if x.effect.gradual]
     found = RelaxedScreen(near, gradual, softness).run(np.inf) if gradual else []
-    found += [_scored(near, softness, x) for x in listed if not x.effect.gradual]
+    found += [_scored(near, x) for x in listed if not x.effect.gradual]
     return in_order(found)
 
 
-def _scored(near: Fit, softness: float, candidate: Candidate) -> Screened:
-    """Test of a candidate that has no derivative where it vanishes, in a relaxed model."""
-    problem, begun = _begun(near, candidate.add_to(near.model), candidate.scans[0])
-    values = Relaxation(problem, softness).solve(begun, steps=SHORT)
-    before = Relaxation(near.problem, softness).objective(near.point)
-    gain = max(before - Relaxation(problem, softness).objective(values), 0.0)
-    p = dict(zip(problem.unknowns.model.names, problem.unknowns.p(values.theta), strict=True))
+def _scored(near: Fit, candidate: Candidate) -> Screened:
+    """Test of a candidate that has no derivative where it vanishes: its gain, nearly strict."""
+    found = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, dict(candidate.scans[0])))
+    without = relaxed(near.problem, near.point, COMPARED)
+    gain = max(Relaxation(near.problem, COMPARED[-1]).objective(without) - found.left, 0.0)
+    unknowns = found.problem.unknowns
+    p = dict(zip(unknowns.model.names, unknowns.p(found.values.theta), strict=True))
     start = {name: float(p[name]) for name in candidate.frees}
     return Screened(candidate, gain, survival(gain, len(start), np.inf), start)
 
@@ -128,6 +129,18 @@ class RelaxedStart:
 
     @classmethod
     def of(cls, near: Fit, screened: Screened, beside: tuple[Screened, ...] = ()) -> RelaxedStart:
+        """From the relaxed shapes; of a contact also from some stiffnesses, what leaves least.
+
+        The stiffer a cable the less a soft balance tells of what pushes it up: without the contact
+        the stiffness may have run up a hundredfold, and with it there is no way back.
+        """
+        if screened.candidate.effect.gradual:
+            return cls._followed(near, screened, beside)
+        begun = [cls._followed(one, screened, beside) for one in (near, *_at_stiffnesses(near))]
+        return min(begun, key=lambda x: x.left)
+
+    @classmethod
+    def _followed(cls, near: Fit, screened: Screened, beside: tuple[Screened, ...]) -> RelaxedStart:
         """From the relaxed shapes, the candidate not there yet.
 
         In parameters in which it is linear: an anchor is nowhere while its tether does not pull.
@@ -182,8 +195,13 @@ class RelaxedStart:
 
 
 def likeliest(screened: Sequence[Screened]) -> list[Screened]:
-    """Candidates whose score at the measured shapes comes near the leading one."""
-    return [x for x in screened if x.score >= NEAR_LEADER * screened[0].score][:REFITTED]
+    """Candidates whose score at the measured shapes comes near the leading one.
+
+    And those without derivative where they vanish, which are scored at a balance that is stricter.
+    """
+    gradual = [x for x in screened if x.candidate.effect.gradual]
+    near = [x for x in gradual if x.score >= NEAR_LEADER * gradual[0].score][:REFITTED]
+    return [*(x for x in screened if not x.candidate.effect.gradual and x.score > 0), *near]
 
 
 def nearest(
@@ -227,6 +245,22 @@ def _begun(near: Fit, model: CableModel, values: Mapping[str, float]) -> tuple[P
     shapes = carried_shapes(problem, near, relaxed=True)
     begun = Values(problem.unknowns.off_bounds(theta), shapes, near.point.projections)
     return problem, with_springs_in_place(problem, begun)
+
+
+def _at_stiffnesses(near: Fit) -> list[Fit]:
+    """A relaxed fit with each of STIFFNESSES_OF_CONTACT instead of its own, straight at rest."""
+    model, problem, found = near.model, near.problem, []
+    typical = model.cable.mass * float(np.linalg.norm(model.gravity)) * model.cable.length**2
+    for size in STIFFNESSES_OF_CONTACT:
+        p = near.p.copy()
+        p[model.stiffness_indices] *= size * typical / p[0]
+        p = np.where(problem.unknowns.free, p, problem.unknowns.fixed)
+        theta = problem.unknowns.pack(p, np.zeros(model.n_coefficients))
+        values = Values(
+            problem.unknowns.off_bounds(theta), near.point.shapes, near.point.projections
+        )
+        found.append(Fit(problem, problem.evaluate(values)))
+    return found
 
 
 def _anew(near: Fit, screened: Screened) -> Fit | None:

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.diagnosis.candidates import candidates, setup_of
+from dlo_casadi.diagnosis.candidates import candidates, candidates_of, setup_of
 from dlo_casadi.diagnosis.from_data import (
     RelaxedStart,
     from_data,
+    likeliest,
     nearest,
     screened_from_data,
 )
 from dlo_casadi.diagnosis.refits import confirm_from_data
-from dlo_casadi.effects import BendingAnisotropy, CableData
+from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, misfits
 from dlo_casadi.estimation.prediction import predict_poses
@@ -107,3 +108,40 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypa
         found = nearest(near, softness, wrong, InProcess(), pairs=pairs)
         assert [start.names for start in found] == [{"stiffness_gradient"}]
         assert bool(asked) == pairs
+
+
+TABLE = -0.25
+
+
+@pytest.fixture(scope="module")
+def near_a_table():
+    """A cable of which half the poses lie on a table that is not declared, relaxed without it."""
+    true = CableData(0.8, 0.08, 0.006, bending_stiffness=0.02)
+    model = CableModel(true, 20, n_rest=6, effects=(ContactPlane(),))
+    p = model.nominal.copy()
+    p[model.names.index("contact_plane.height")] = TABLE
+    rng, s = np.random.default_rng(2), np.linspace(0.02, 0.98, 12) * true.length
+    rest = model.rest_basis @ rng.normal(scale=1.0, size=6)
+    measured = []
+    for _ in range(6):
+        way, span = rng.uniform(-0.7, 0.7), rng.uniform(0.45, 0.65)
+        pose = HeldPose((0.0, 0.0), (span * np.cos(way), span * np.sin(way)))
+        (shape,) = predict_poses(model, p, rest, [pose])
+        points = shape.curve.at(s) + rng.normal(scale=3e-4, size=(len(s), 2))
+        measured.append(MeasuredPose.of_points(pose, points, s=s))
+    declared = CableModel(replace(true, bending_stiffness=0.06), 20, n_rest=6)
+    return from_data(fit_model(declared, measured, Tolerances(), 3e-4))
+
+
+def test_a_table_is_found_where_without_it_the_stiffness_runs_away(near_a_table):
+    near, softness = near_a_table
+    assert near.p[0] > 100 * 0.02
+
+    listed = [x for x in candidates_of(near, None, ()) if x.name in ("contact_plane", "tether")]
+    likely = {x.candidate.name: x for x in likeliest(screened_from_data(near, softness, listed))}
+    table = likely["contact_plane"]
+    assert table.p_value < 1e-9
+    fit = RelaxedStart.of(near, table).fit(starts=1)
+    assert fit.chi2_per_dof < 1.3
+    assert fit.value("bending_stiffness") == pytest.approx(0.02, rel=0.03)
+    assert fit.value("contact_plane.height") == pytest.approx(TABLE, abs=5e-4)
