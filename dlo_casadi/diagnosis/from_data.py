@@ -17,7 +17,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
-from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order, survival
+from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.continuation import relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.fit import FIRST_STD
@@ -83,22 +83,15 @@ def _beside(base: Fit, model: CableModel) -> Problem:
 
 
 def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) -> list[Screened]:
-    """Score tests in a relaxed model, best first."""
+    """Score tests in a relaxed model, best first.
+
+    Of those without derivative where they vanish a soft balance tells less than a fit does: last,
+    without a score.
+    """
     gradual = [x for x in listed if x.effect.gradual]
     found = RelaxedScreen(near, gradual, softness).run(np.inf) if gradual else []
-    found += [_scored(near, x) for x in listed if not x.effect.gradual]
-    return in_order(found)
-
-
-def _scored(near: Fit, candidate: Candidate) -> Screened:
-    """Test of a candidate that has no derivative where it vanishes: its gain, nearly strict."""
-    found = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, dict(candidate.scans[0])))
-    without = relaxed(near.problem, near.point, COMPARED)
-    gain = max(Relaxation(near.problem, COMPARED[-1]).objective(without) - found.left, 0.0)
-    unknowns = found.problem.unknowns
-    p = dict(zip(unknowns.model.names, unknowns.p(found.values.theta), strict=True))
-    start = {name: float(p[name]) for name in candidate.frees}
-    return Screened(candidate, gain, survival(gain, len(start), np.inf), start)
+    others = (x for x in listed if not x.effect.gradual)
+    return [*in_order(found), *(Screened(x, 0.0, 1.0, dict(x.scans[0])) for x in others)]
 
 
 @dataclass(frozen=True)
@@ -195,13 +188,9 @@ class RelaxedStart:
 
 
 def likeliest(screened: Sequence[Screened]) -> list[Screened]:
-    """Candidates whose score at the measured shapes comes near the leading one.
-
-    And those without derivative where they vanish, which are scored at a balance that is stricter.
-    """
-    gradual = [x for x in screened if x.candidate.effect.gradual]
-    near = [x for x in gradual if x.score >= NEAR_LEADER * gradual[0].score][:REFITTED]
-    return [*(x for x in screened if not x.candidate.effect.gradual and x.score > 0), *near]
+    """Candidates whose score at the measured shapes comes near the leading one."""
+    scored = [x for x in screened if x.candidate.effect.gradual]
+    return [x for x in scored if x.score >= NEAR_LEADER * scored[0].score][:REFITTED]
 
 
 def nearest(

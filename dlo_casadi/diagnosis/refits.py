@@ -183,6 +183,21 @@ def confirm_from_data(base: Fit, start: RelaxedStart, *, starts: int = 3) -> Con
     return None
 
 
+def confirm_contact(base: Fit, near: Fit, noise_dof: float, screened: Screened) -> Confirmed | None:
+    """`confirm_from_data` of a candidate without derivative where it vanishes, scored by its gain.
+
+    Under the noise of the base, which may hold what the base lacks: it gains that much at least.
+    """
+    item = confirm_from_data(base, RelaxedStart.of(near, screened), starts=1)
+    if item is None:
+        return None
+    fit = item.fit.reweighed(base.noise, base.problem.priors)
+    gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
+    start = {name: item.fit.value(name) for name in screened.candidate.frees}
+    p_value = survival(gain, len(start), noise_dof)
+    return replace(item, screened=Screened(screened.candidate, gain, p_value, start))
+
+
 def _followed(
     start: Fit, model: CableModel, values: Mapping[str, float], steps: int = 40
 ) -> Fit | None:

@@ -147,6 +147,11 @@ def fit_session(
     best = _confirmed(fit, confirming, clock)
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])
+    own = own if fit is best else staged(fit)
+    if fitting.no_nearer(fit, [*stages, own]):
+        fit = fitting.nearest_to_poses(fit, stages)
+        own = staged(fit)
+    shown = fit
     if not config.diagnosis.enabled:
         near = at_random(fit)
         if near is not None:
@@ -154,7 +159,7 @@ def fit_session(
             if not config.model.n:
                 fit, error = fine_enough(near, near.model.n)
         fit = as_measured(fit)
-    stages = [*stages, own if fit is best else staged(fit)]
+    stages = [*stages, own if fit is shown else staged(fit)]
     step("compare with simpler fits", 1, 1)
     clock.lap("fit")
     found: dict[str, Any] = {}
