@@ -377,7 +377,7 @@ class Search:
             near, softness, candidates_of(near, self.center, self.exclude)
         )
         likely, among = likeliest(screened), (self.executor, self.center, self.exclude)
-        touching = self._touching(current, near, screened)
+        touching = refits.confirm_contacts(current, near, screened, self.executor)
         explained = any(map(refits.explains, touching))
         pairs = added + 2 <= self.max_effects and not explained
         kept = nearest(near, softness, likely, *among, pairs=pairs)[:REFITTED]
@@ -397,12 +397,6 @@ class Search:
         near_names = set().union(*(start.names for start in kept))
         far = [x.candidate.name for x in likely if x.candidate.name not in near_names]
         return screened, p_values, [*touching, *tried], far
-
-    def _touching(self, current: Fit, near: Fit, screened: Sequence[Screened]) -> list[Confirmed]:
-        """Fits from the measured shapes of what has no derivative where it vanishes: contacts."""
-        starts = [x for x in screened if not x.candidate.effect.gradual]
-        refit = partial(refits.confirm_contact, current, near, noise_degrees(current))
-        return [item for item in map_in_order(self.executor, refit, starts) if item is not None]
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.

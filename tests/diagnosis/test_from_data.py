@@ -13,7 +13,7 @@ from dlo_casadi.diagnosis.from_data import (
     nearest,
     screened_from_data,
 )
-from dlo_casadi.diagnosis.refits import confirm_contact, confirm_from_data, explains
+from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data, explains
 from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
@@ -138,8 +138,9 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
     assert near.p[0] > 100 * 0.02
 
     listed = [x for x in candidates_of(near, None, ()) if x.name in ("contact_plane", "tether")]
-    screened = {x.candidate.name: x for x in screened_from_data(near, softness, listed)}
-    found = confirm_contact(on_a_table, near, np.inf, screened["contact_plane"])
+    screened = screened_from_data(near, softness, listed)
+    (found,) = confirm_contacts(on_a_table, near, screened, InProcess())
+    assert found.name == "contact_plane"
     assert explains(found)
     assert found.screened.p_value < 1e-9
     assert found.fit.value("bending_stiffness") == pytest.approx(0.02, rel=0.03)
