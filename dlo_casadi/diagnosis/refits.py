@@ -30,7 +30,6 @@ from dlo_casadi.diagnosis.screening import (
     in_order,
     survival,
 )
-from dlo_casadi.diagnosis.structure import noise_degrees
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
@@ -206,7 +205,7 @@ def _confirm_contact(base: Fit, near: Fit, screened: Screened) -> Confirmed | No
     fit = item.fit.reweighed(base.noise, base.problem.priors)
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
     start = {name: item.fit.value(name) for name in screened.candidate.frees}
-    p_value = survival(gain, len(start), noise_degrees(base))
+    p_value = survival(gain, len(start), np.inf)
     return replace(item, screened=Screened(screened.candidate, gain, p_value, start))
 
 
