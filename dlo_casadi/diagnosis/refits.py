@@ -199,10 +199,11 @@ def confirm_contacts(
 
 
 def _confirm_contact(base: Fit, near: Fit, screened: Screened) -> Confirmed | None:
-    item = confirm_from_data(base, RelaxedStart.of(near, screened), starts=1)
+    item = confirm_from_data(base, RelaxedStart.of(near, screened))
     if item is None:
         return None
-    fit = item.fit.reweighed(base.noise, base.problem.priors)
+    same = item.fit.reweighed(base.noise, base.problem.priors)
+    fit = _followed(same, same.model, {}, MOST_STEPS) or same
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
     start = {name: item.fit.value(name) for name in screened.candidate.frees}
     p_value = survival(gain, len(start), np.inf)

@@ -126,7 +126,8 @@ def on_a_table():
     for _ in range(6):
         way, span = rng.uniform(-0.7, 0.7), rng.uniform(0.45, 0.65)
         pose = HeldPose((0.0, 0.0), (span * np.cos(way), span * np.sin(way)))
-        (shape,) = predict_poses(model, p, rest, [pose])
+        moved = replace(pose, end=(pose.end[0] + 4e-4, pose.end[1]))
+        (shape,) = predict_poses(model, p, rest, [moved])
         points = shape.curve.at(s) + rng.normal(scale=3e-4, size=(len(s), 2))
         measured.append(MeasuredPose.of_points(pose, points, s=s))
     declared = CableModel(replace(true, bending_stiffness=0.06), 20, n_rest=6)
