@@ -236,8 +236,7 @@ def run_random(
         row["refused"] = error.message.splitlines()[0]
         result = None
     row["cpu_seconds"] = time.process_time() - begin
-    # No score tells of a table: all count that two poses touch.
-    row["shown"] = list(found.hidden) if table else shown_by(found)
+    row["shown"] = shown_by(found)
     row["missed"] = []
     if result is None:
         row["missed"] = [*row["shown"], *([random] if random else [])]
@@ -273,11 +272,12 @@ def shown_by(found: Simulated) -> list[str]:
     measured = measured_poses(session, read_inputs(session))
     declared, readings = declared_model(session), declared_setup(session).readings
     base = declared.model.with_mesh(SEARCH_MESH // (4 if declared.model.in_space else 2))
+    known = {"n_poses": len(measured), "readings": readings, "resting": 0.0}
 
     def fitted_with(names: Sequence[str]) -> CableModel:
         model = base
         for name in names:
-            listed = candidates(model, setup_of(model, n_poses=len(measured), readings=readings))
+            listed = candidates(model, setup_of(model, **known))
             model = next(item for item in listed if item.name == name).add_to(model)
         return model
 

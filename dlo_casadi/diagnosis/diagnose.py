@@ -10,10 +10,15 @@ from typing import Literal
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.from_data import from_data, likeliest, nearest, screened_from_data
+from dlo_casadi.diagnosis.from_data import (
+    from_data,
+    likeliest,
+    nearest,
+    screened_from_data,
+)
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
 from dlo_casadi.diagnosis.refits import Confirmed, confirm_from_data
-from dlo_casadi.diagnosis.screening import Screened, survival
+from dlo_casadi.diagnosis.screening import Screened, in_order, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
     Found,
@@ -372,22 +377,26 @@ class Search:
             near, softness, candidates_of(near, self.center, self.exclude)
         )
         likely, among = likeliest(screened), (self.executor, self.center, self.exclude)
-        pairs = added + 2 <= self.max_effects
+        touching = refits.confirm_contacts(current, near, screened, self.executor)
+        explained = any(map(refits.explains, touching))
+        pairs = added + 2 <= self.max_effects and not explained
         kept = nearest(near, softness, likely, *among, pairs=pairs)[:REFITTED]
         refit = partial(confirm_from_data, current)
         tried = list(map_in_order(self.executor, partial(refit, starts=1), kept))
-        for k, start in enumerate(kept):
+        for k, start in () if explained else enumerate(kept):
             if not refits.explains(tried[k]):
                 tried[k] = refit(start)
             if refits.explains(tried[k]):
                 break
+        scored = {item.name: item.screened for item in touching}
+        screened = in_order([scored.get(x.candidate.name, x) for x in screened])
         p_values = p_values_of(screened)
         for start in kept:
             name, own = start.screened.candidate.name, sidak(start.screened.p_value, len(screened))
             p_values[name] = min(own, p_values.get(name, 1.0))
         near_names = set().union(*(start.names for start in kept))
         far = [x.candidate.name for x in likely if x.candidate.name not in near_names]
-        return screened, p_values, tried, far
+        return screened, p_values, [*touching, *tried], far
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.

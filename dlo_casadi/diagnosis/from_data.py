@@ -17,7 +17,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
-from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order, survival
+from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.continuation import loosely_relaxed, relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.fit import FIRST_STD
@@ -45,8 +45,9 @@ REACHED = 1.5
 # Candidates beside each of which a second one is tried, and number of second ones: of a drift and a
 # force hidden together the drift left second least, and the force scored highest beside it.
 FIRST, SECOND = 3, 3
-# Gauss-Newton steps of a fit that is a candidate's score.
-SHORT = 5
+# Bending stiffnesses from which a contact is tried, in weights times the length squared: from where
+# a weight bends cables much on, down to chains.
+STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
 
 
 def from_data(base: Fit) -> tuple[Fit, float]:
@@ -94,22 +95,15 @@ def _beside(base: Fit, model: CableModel) -> Problem:
 
 
 def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) -> list[Screened]:
-    """Score tests in a relaxed model, best first."""
+    """Score tests in a relaxed model, best first.
+
+    Of those without derivative where they vanish a soft balance tells less than a fit does: last,
+    without a score.
+    """
     gradual = [x for x in listed if x.effect.gradual]
     found = RelaxedScreen(near, gradual, softness).run(np.inf) if gradual else []
-    found += [_scored(near, softness, x) for x in listed if not x.effect.gradual]
-    return in_order(found)
-
-
-def _scored(near: Fit, softness: float, candidate: Candidate) -> Screened:
-    """Test of a candidate that has no derivative where it vanishes, in a relaxed model."""
-    problem, begun = _begun(near, candidate.add_to(near.model), candidate.scans[0])
-    values = Relaxation(problem, softness).solve(begun, steps=SHORT)
-    before = Relaxation(near.problem, softness).objective(near.point)
-    gain = max(before - Relaxation(problem, softness).objective(values), 0.0)
-    p = dict(zip(problem.unknowns.model.names, problem.unknowns.p(values.theta), strict=True))
-    start = {name: float(p[name]) for name in candidate.frees}
-    return Screened(candidate, gain, survival(gain, len(start), np.inf), start)
+    others = (x for x in listed if not x.effect.gradual)
+    return [*in_order(found), *(Screened(x, 0.0, 1.0, dict(x.scans[0])) for x in others)]
 
 
 @dataclass(frozen=True)
@@ -140,22 +134,41 @@ class RelaxedStart:
 
     @classmethod
     def of(cls, near: Fit, screened: Screened, beside: tuple[Screened, ...] = ()) -> RelaxedStart:
-        """From the measured shapes, the candidate not there yet.
+        """From the measured shapes; of a contact also from some stiffnesses, what leaves least.
+
+        The stiffer a cable the less a soft balance tells of what pushes it up: with a contact
+        there is no way back from a stiffness that has run up a hundredfold.
+        """
+        known: list[dict[str, float]] = [{}]
+        if not screened.candidate.effect.gradual:
+            known += _stiffnesses(near.model)
+        begun = [cls._followed(near, screened, beside, values) for values in known]
+        return min(begun, key=lambda x: x.left)
+
+    @classmethod
+    def _followed(
+        cls,
+        near: Fit,
+        screened: Screened,
+        beside: tuple[Screened, ...],
+        known: Mapping[str, float],
+    ) -> RelaxedStart:
+        """From the measured shapes and what is known, the candidate not there yet.
 
         In parameters in which it is linear: an anchor is nowhere while its tether does not pull.
         Relaxed shapes and their parameters stand for what the model without it lacks.
         """
         candidate = screened.candidate
-        known = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
-        for x in beside:
-            known |= {name: near.value(name) for name in x.candidate.frees}
-        linear, begun = _as_measured(near, candidate.add_linear_to(near.model), known)
-        values = loosely_relaxed(linear, begun, _places(linear, candidate))
-        values = relaxed(linear, values, COMPARED[1:-1])
-        problem, values = _in_own_parameters(near, candidate, linear, values)
-        values = relaxed(problem, values, COMPARED[-1:])
-        left = Relaxation(problem, COMPARED[-1]).objective(values)
-        return cls(near, screened, problem, begun, values, left, beside)
+        scan = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
+        others = {name: near.value(name) for x in beside for name in x.candidate.frees}
+        values = {**others, **scan, **known}
+        linear, begun = _as_measured(near, candidate.add_linear_to(near.model), values)
+        reached = loosely_relaxed(linear, begun, _places(linear, candidate))
+        reached = relaxed(linear, reached, COMPARED[1:-1])
+        problem, reached = _in_own_parameters(near, candidate, linear, reached)
+        reached = relaxed(problem, reached, COMPARED[-1:])
+        left = Relaxation(problem, COMPARED[-1]).objective(reached)
+        return cls(near, screened, problem, begun, reached, left, beside)
 
     @property
     def names(self) -> set[str]:
@@ -198,7 +211,8 @@ class RelaxedStart:
 
 def likeliest(screened: Sequence[Screened]) -> list[Screened]:
     """Candidates whose score at the measured shapes comes near the leading one."""
-    return [x for x in screened if x.score >= NEAR_LEADER * screened[0].score][:REFITTED]
+    scored = [x for x in screened if x.candidate.effect.gradual]
+    return [x for x in scored if x.score >= NEAR_LEADER * scored[0].score][:REFITTED]
 
 
 def nearest(
@@ -256,11 +270,23 @@ def _as_measured(
     known = {**known, **({END_ROLL: near.value(END_ROLL)} if END_ROLL in names else {})}
     p = np.where(free, model.nominal, problem.unknowns.fixed)
     for name, value in known.items():
-        p[names.index(name)] = value
+        k = names.index(name)
+        p[k] = value if free[k] else p[k]
     theta = problem.unknowns.pack(p, np.zeros(model.n_coefficients))
     theta = problem.unknowns.off_bounds(theta)
     found = Values(theta, *measured_shapes(problem, known.get(END_ROLL, 0.0)))
     return problem, with_springs_in_place(problem, found)
+
+
+def _stiffnesses(model: CableModel) -> list[dict[str, float]]:
+    """Parameters by name for each of STIFFNESSES_OF_CONTACT, in their declared ratio."""
+    typical = model.cable.mass * float(np.linalg.norm(model.gravity)) * model.cable.length**2
+    own = model.nominal[model.stiffness_indices]
+    names = [model.names[k] for k in model.stiffness_indices]
+    return [
+        dict(zip(names, (size * typical / own[0] * own).tolist(), strict=True))
+        for size in STIFFNESSES_OF_CONTACT
+    ]
 
 
 def _anew(near: Fit, screened: Screened) -> Fit | None:

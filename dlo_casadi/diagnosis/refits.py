@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -38,6 +39,7 @@ from dlo_casadi.estimation.problem import Priors
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
 
 # Shares of the one-step estimate from which a refit is tried.
@@ -181,6 +183,31 @@ def confirm_from_data(base: Fit, start: RelaxedStart, *, starts: int = 3) -> Con
             fit = _at_noise(fit, start.problem.noise)
         return Confirmed.of(start.screened, base, fit, start.beside)
     return None
+
+
+def confirm_contacts(
+    base: Fit, near: Fit, screened: Sequence[Screened], executor: Executor
+) -> list[Confirmed]:
+    """`confirm_from_data` of those without derivative where they vanish, scored by their gains.
+
+    Of a contact a soft balance tells less than a fit does. Gains are those under the noise of the
+    base, which may hold what the base lacks: a fit gains that much at least.
+    """
+    contacts = [x for x in screened if not x.candidate.effect.gradual]
+    found = map_in_order(executor, partial(_confirm_contact, base, near), contacts)
+    return [item for item in found if item is not None]
+
+
+def _confirm_contact(base: Fit, near: Fit, screened: Screened) -> Confirmed | None:
+    item = confirm_from_data(base, RelaxedStart.of(near, screened))
+    if item is None:
+        return None
+    same = item.fit.reweighed(base.noise, base.problem.priors)
+    fit = _followed(same, same.model, {}, MOST_STEPS) or same
+    gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
+    start = {name: item.fit.value(name) for name in screened.candidate.frees}
+    p_value = survival(gain, len(start), np.inf)
+    return replace(item, screened=Screened(screened.candidate, gain, p_value, start))
 
 
 def _followed(

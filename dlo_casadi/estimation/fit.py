@@ -163,7 +163,7 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
             "of the poses."
         )
     if misfits(best):
-        return _fit_to_misfit(best.reweighed(problem.noise))
+        return fit_to_misfit(best.reweighed(problem.noise))
     return refine(best.reweighed(problem.noise), first=True)
 
 
@@ -172,7 +172,7 @@ def misfits(fit: Fit) -> bool:
     return fit.residual_rms > SearchSettings.of(fit.model).misfit * fit.model.cable.length
 
 
-def _fit_to_misfit(near: Fit) -> Fit:
+def fit_to_misfit(near: Fit) -> Fit:
     """Fit a model that lacks something, its points taken for no surer than it can meet them.
 
     Where an effect is missing, a fit to a fraction of a millimetre bends all that it may bend and

@@ -25,6 +25,7 @@ from scipy.linalg import solve_triangular
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -402,7 +403,7 @@ class Problem:
             block = b.T @ b + precision
             cross = b.T @ a
             slope = b.T @ e + precision @ point.shapes.deviation[j, columns]
-            solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+            solved = _solved(block, np.column_stack([cross, slope]))
             hessian -= cross.T @ solved[:, :-1]
             gradient -= cross.T @ solved[:, -1]
             inner.append((block, cross, slope))
@@ -419,7 +420,7 @@ class Problem:
         precision = np.tile(1 / self.deviation_std**2, len(self.used))
         own = point.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)].ravel()
         block, cross, slope = b.T @ b + np.diag(precision), b.T @ a, b.T @ e + precision * own
-        solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+        solved = _solved(block, np.column_stack([cross, slope]))
         hessian = self.precision + a.T @ a - cross.T @ solved[:, :-1]
         gradient = self.precision @ (point.theta - self.mean) + a.T @ e - cross.T @ solved[:, -1]
         return Normal(hessian, gradient, [(block, cross, slope)])
@@ -436,3 +437,11 @@ class Problem:
         deviation = np.zeros((len(own), len(self.unknowns.model.deviation_names)))
         deviation[:, self.equilibria.used_deviations] = own
         return shapes, deviation
+
+
+def _solved(block: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution of normal equations; an `EstimationError` at a fold, where shapes have no slope."""
+    try:
+        return np.asarray(np.linalg.solve(block, right))
+    except np.linalg.LinAlgError as error:
+        raise EstimationError("a pose of the fit has come to a fold of its equilibria") from error

@@ -171,8 +171,8 @@ class Relaxation:
     def objectives(self, values: Values) -> tuple[FloatArray, float]:
         """Twice the objective: what each pose (m,) has in it, and the prior."""
         problem = self.problem
-        shapes, p, _ = state = problem.state(values)
-        given = problem.equilibria.given(*state)
+        shapes = values.shapes
+        given = problem.equilibria.given(*problem.state(values))
         left = self._assembly.imbalance(shapes, given).rows[:, :, 0]
         left[:, self._contacts] = self._complementarity(left, shapes)[0]
         left *= self._weights(values.theta)
@@ -413,8 +413,8 @@ class Relaxation:
         x = turned.reshape((m, *values.shapes.x.shape[1:2], -1, 1))
         deviation = values.shapes.deviation.copy()
         taken = np.where(stiff, -np.log1p(-np.where(stiff, step, 0.0)), step)
-        begun, ended = (self._bent(at)[0] for at in (values.theta, np.clip(values.theta + taken, *unknowns.bounds)))
-        larger = float(np.exp(ended - begun))
+        reached = np.clip(values.theta + taken, *unknowns.bounds)
+        larger = float(np.exp(self._bent(reached)[0] - self._bent(values.theta)[0]))
         forces = change[:, nodes:border]
         forces += (larger - 1) * (forces + values.shapes.lam) * unknowns.model.are_multipliers
         of_pose = deviation[:, equilibria.used_deviations] + change[:, border:]

@@ -14,7 +14,14 @@ from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError, EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import CONVERGED, descend, least_decrease
-from dlo_casadi.estimation.fit import fine_enough, fit_model, mesh_error, refine_mesh
+from dlo_casadi.estimation.fit import (
+    EXPLAINED,
+    fine_enough,
+    fit_model,
+    fit_to_misfit,
+    mesh_error,
+    refine_mesh,
+)
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
@@ -339,6 +346,39 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
             better = not fit.converged or _off(stage) < _off(own)
             found = _from_simpler(fit, stage.parameters[BENDING_STIFFNESS].value, better)
             best = max(best, found, key=lambda item: item.log_evidence)
+    return best
+
+
+def no_nearer(fit: Fit, stages: Sequence[Stage]) -> bool:
+    """Whether a fit that lacks something comes no nearer to its poses than a simpler one.
+
+    By more than chance where all it leaves may be what differs from pose to pose.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+        As in `not_worse`.
+    """
+    *others, own = stages
+    lacks, scatters = fit.chi2_per_dof > EXPLAINED, fit.problem.priors.pose_scatter.std > 0
+    if fit.noise.source == "misfit" or not (lacks or scatters):
+        return False
+    chance = 0.0 if lacks else 1 / np.sqrt(2 * len(fit.problem.used))
+    simpler = min((_off(stage) for stage in others if stage.name in SIMPLER), default=np.inf)
+    return bool(simpler * (1 + chance) < _off(own))
+
+
+def nearest_to_poses(fit: Fit, stages: Sequence[Stage]) -> Fit:
+    """The fit to its misfit, from itself or a simpler one, that comes nearest to the fit poses.
+
+    A fit that trusts each point to its noise bends ends and rest shape to whatever the model
+    lacks, and may predict the poses worse than a straight cable.
+    """
+    best = fit_to_misfit(fit)
+    for stage in stages:
+        if stage.name in SIMPLER and BENDING_STIFFNESS in stage.parameters:
+            found = _from_simpler(best, stage.parameters[BENDING_STIFFNESS].value, better=True)
+            best = min(best, found, key=lambda item: item.point.objective)
     return best
 
 

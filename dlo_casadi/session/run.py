@@ -154,14 +154,21 @@ def fit_session(
             if not config.model.n:
                 fit, error = fine_enough(near, near.model.n)
         fit = as_measured(fit)
-    stages = [*stages, own if fit is best else staged(fit)]
+    own = own if fit is best else staged(fit)
+    nearest = fit
+    if fitting.no_nearer(fit, [*stages, own]):
+        nearest = fitting.nearest_to_poses(fit, stages)
+        own = staged(nearest)
+    stages = [*stages, own]
     step("compare with simpler fits", 1, 1)
     clock.lap("fit")
     found: dict[str, Any] = {}
     if config.diagnosis.enabled:
         fit, error, found = close_the_loop(
-            config, fit, stages, measured, reported, center, clock, step, executor
+            config, fit, nearest, stages, measured, reported, center, clock, step, executor
         )
+    elif nearest is not fit:
+        fit, error = nearest, mesh_error(nearest)
     return judged(
         Outcome(
             config=config,
@@ -211,6 +218,7 @@ def _told(stage: Stage, explains: bool) -> Stage:
 def close_the_loop(
     config: Config,
     declared: Fit,
+    nearest: Fit,
     stages: list[Stage],
     measured: Sequence[MeasuredPose],
     reported: Sequence[str],
@@ -225,6 +233,9 @@ def close_the_loop(
     ----------
     declared : Fit
         Of the declared model.
+    nearest : Fit
+        The same; or to its misfit, where that comes nearer to the poses: what is reported unless
+        effects are found, or nothing is missing.
     stages : list of Stage
         Its stage, the last one, gets its intervals; another one follows where effects are added.
     reported : sequence of str
@@ -250,14 +261,15 @@ def close_the_loop(
         executor=executor,
         finest=None if kept_mesh else SEARCH_MESH,
     )
-    fit = diagnosis.after
+    unknown = diagnosis.unexplained and not diagnosis.added
+    fit = nearest if unknown and nearest is not declared else diagnosis.after
     if kept_mesh:
         error = mesh_error(fit)
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
     confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
     next_pose = separating_pose(diagnosis.after, diagnosis.added)
-    if diagnosis.unexplained or (declared.noise.source == "misfit" and diagnosis.added):
+    if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
         # A model that does not come to its points has no intervals.
         stages[-1] = _told(stages[-1], explains=False)
     elif diagnosis.added:

@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.diagnosis.candidates import candidates, setup_of
+from dlo_casadi.diagnosis.candidates import candidates, candidates_of, setup_of
 from dlo_casadi.diagnosis.from_data import (
     RelaxedStart,
     from_data,
     nearest,
     screened_from_data,
 )
-from dlo_casadi.diagnosis.refits import confirm_from_data
-from dlo_casadi.effects import BendingAnisotropy, CableData
+from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data, explains
+from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model, misfits
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -107,3 +108,48 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypa
         found = nearest(near, softness, wrong, InProcess(), pairs=pairs)
         assert [start.names for start in found] == [{"stiffness_gradient"}]
         assert bool(asked) == pairs
+
+
+TABLE = -0.25
+
+
+@pytest.fixture(scope="module")
+def on_a_table():
+    """Fit of a cable that lies in most poses on a table that is not declared."""
+    true = CableData(0.8, 0.08, 0.006, bending_stiffness=0.02)
+    model = CableModel(true, 20, n_rest=6, effects=(ContactPlane(),))
+    p = model.nominal.copy()
+    p[model.names.index("contact_plane.height")] = TABLE
+    rng, s = np.random.default_rng(2), np.linspace(0.02, 0.98, 12) * true.length
+    rest = model.rest_basis @ rng.normal(scale=1.0, size=6)
+    measured = []
+    for _ in range(6):
+        way, span = rng.uniform(-0.7, 0.7), rng.uniform(0.45, 0.65)
+        pose = HeldPose((0.0, 0.0), (span * np.cos(way), span * np.sin(way)))
+        moved = replace(pose, end=(pose.end[0] + 4e-4, pose.end[1]))
+        (shape,) = predict_poses(model, p, rest, [moved])
+        points = shape.curve.at(s) + rng.normal(scale=3e-4, size=(len(s), 2))
+        measured.append(MeasuredPose.of_points(pose, points, s=s))
+    declared = CableModel(replace(true, bending_stiffness=0.06), 20, n_rest=6)
+    return fit_model(declared, measured, Tolerances(), 3e-4)
+
+
+def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
+    near, softness = from_data(on_a_table)
+    assert near.p[0] > 100 * 0.02
+
+    listed = [x for x in candidates_of(near, None, ()) if x.name in ("contact_plane", "tether")]
+    screened = screened_from_data(near, softness, listed)
+    (found,) = confirm_contacts(on_a_table, near, screened, InProcess())
+    assert found.name == "contact_plane"
+    assert explains(found)
+    assert found.screened.p_value < 1e-9
+    assert found.fit.value("bending_stiffness") == pytest.approx(0.02, rel=0.03)
+    assert found.fit.value("contact_plane.height") == pytest.approx(TABLE, abs=5e-4)
+
+
+def test_a_pose_at_a_fold_ends_a_fit_with_an_error_that_says_so(on_a_table):
+    lin = on_a_table.linearization
+    beyond = [np.full_like(b, 1e27) for b in lin.by_deviation]
+    with pytest.raises(EstimationError, match="fold"):
+        on_a_table.problem.normal_equations(on_a_table.point, replace(lin, by_deviation=beyond))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import (
@@ -15,7 +15,7 @@ from dlo_casadi.estimation.prediction import (
 )
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.fitting import not_worse
+from dlo_casadi.session.fitting import nearest_to_poses, no_nearer, not_worse
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
 from dlo_casadi.session.stages import fit_stage, initial_stage, pose_shape
@@ -156,6 +156,33 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
     again = not_worse(stopped, [stages[0], stage])
     assert again.point.objective < 1.01 * fit.point.objective
     assert again.converged
+
+
+def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable():
+    """On a table that is not declared: fitted to 0.3 mm, rest shape and clamps bend to it."""
+    held = {"start": "clamped", "end": "clamped"}
+    model = CableModel(CableData(0.8, 0.08, 0.006, bending_stiffness=0.06), 20, n_rest=4, **held)
+    table = model.with_effect(ContactPlane())
+    p = table.nominal.copy()
+    p[table.names.index("contact_plane.height")] = -0.2
+    rng, s = np.random.default_rng(2), np.linspace(0.02, 0.98, 12) * model.cable.length
+    poses = []
+    for _ in range(6):
+        way, span = rng.uniform(-0.5, 0.5), rng.uniform(0.5, 0.65)
+        first, last = rng.uniform(-0.6, 0.6, 2)
+        ends = (0.0, 0.0), (span * np.cos(way), span * np.sin(way))
+        pose = HeldPose(*ends, start_heading=first, end_heading=last, name=f"{len(poses)}")
+        (shape,) = predict_poses(table, p, np.zeros(table.chain.n_rests), [pose])
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 2))
+        poses.append(MeasuredPose.of_points(pose, points, s=s))
+    fit = fit_model(model, poses, Tolerances(), NOISE)
+    stages = [initial_stage(model, poses), fit_stage("batch", fit, poses, {})]
+    assert no_nearer(not_worse(fit, stages), stages)
+
+    nearest = nearest_to_poses(fit, stages[:1])
+    stages[-1] = fit_stage("batch", nearest, poses, {})
+    assert stages[-1].rmse_fit_measured_branch < stages[0].rmse_fit_measured_branch
+    assert not no_nearer(nearest, stages)
 
 
 def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():
