@@ -48,16 +48,16 @@ CABLES = {
 }
 # Number of poses, clips, how ends are held, and elements.
 KINDS: dict[str, tuple[int, tuple[ClipKind, ...], dict[str, object]]] = {
-    "plane, pins": (4, (), {"n": 20}),
+    "plane, pins": (5, (), {"n": 20}),
     "plane, clamps, two pinned clips": (
-        4,
+        5,
         ("pinned", "pinned"),
         {"n": 24, "start": "clamped", "end": "clamped"},
     ),
-    "plane, pins, a saddle and an eyelet": (4, ("clamped", "eyelet"), {"n": 24}),
-    "space": (3, (), {"n": 16, **SPACE}),
-    "space, two pinned clips": (3, ("pinned", "pinned"), {"n": 15, **SPACE}),
-    "space, a saddle and a pinned clip": (3, ("clamped", "pinned"), {"n": 15, **SPACE}),
+    "plane, pins, a saddle and an eyelet": (5, ("clamped", "eyelet"), {"n": 24}),
+    "space": (2, (), {"n": 12, **SPACE}),
+    "space, two pinned clips": (2, ("pinned", "pinned"), {"n": 9, **SPACE}),
+    "space, a saddle and a pinned clip": (2, ("clamped", "pinned"), {"n": 9, **SPACE}),
 }
 # Standard deviations: relative ones of EI, GJ and mass, the correlation of EI and mass, a length
 # [m], rest curvatures [1/m], the roll of an end [rad].

@@ -27,7 +27,7 @@ from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
 
 # Draws that are solved to see if first order suffices, and where it does not; draws of the
 # linearised shapes, which cost next to nothing; and shapes that are solved at a time.
-PAIRED, DRAWN, LINEAR, CHUNK = 300, 2000, 4000, 500
+PAIRED, DRAWN, LINEAR, CHUNK = 600, 2000, 4000, 500
 # Probabilities of first order between which solved draws decide if a limit is kept.
 IN_DOUBT = SAFE / 10, SAFE + FIRST_ORDER
 # Largest step [rad] of a node at which a draw counts as solved: draws are counted, not measured.
