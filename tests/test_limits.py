@@ -15,7 +15,7 @@ from dlo_casadi.cli import main
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Limits, dump_yaml, load_config, read_yaml
 from dlo_casadi.effects import CableData
-from dlo_casadi.equilibrium.limits import _crossing
+from dlo_casadi.equilibrium.limits import _counted, _crossing
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty
@@ -63,6 +63,24 @@ def test_several_places_exceed_together_as_closed_forms_say(slopes, bound, exact
     slopes = np.array(slopes)
     found = _crossing(np.zeros(len(slopes)), slopes, bound, draws(2))
     assert found == pytest.approx(exact, rel=0.01)
+
+
+def test_a_count_is_corrected_by_the_same_draws_to_first_order():
+    """P(z + w > 1.5) with z known to first order and w not: errors are as told, and smaller."""
+    estimates, told = [], []
+    for seed in range(200):
+        z, w = np.random.default_rng(seed).standard_normal((2, 500)) * [[1.0], [0.1]]
+        chance, error = _counted(z + w > 1.5, z > 1.5, norm.sf(1.5))
+        estimates.append(chance)
+        told.append(error)
+    exact = norm.sf(1.5 / np.hypot(1.0, 0.1))
+    spread = np.std(estimates)
+    assert np.mean(estimates) == pytest.approx(exact, abs=3 * spread / np.sqrt(200))
+    assert np.mean(told) == pytest.approx(spread, rel=0.2)  # a fifth: four errors of 200 draws
+    assert spread < 0.5 * np.sqrt(exact * (1 - exact) / 500)
+    nothing = np.zeros(5, dtype=bool)
+    assert _counted(nothing, nothing, 0.0) == (0.0, 0.0)
+    assert _counted(~nothing, nothing, 0.0) == (1.0, 0.0)
 
 
 def test_a_stiff_cantilever_bends_as_its_stiffness_lets_it():
@@ -275,6 +293,21 @@ def test_a_clip_is_a_fixture_like_the_ends(fitted):
     force = np.linalg.norm(shape.clips["eye"].force)
     assert (item.holder, item.verdict) == ("eye", "fail")
     assert (item.value, item.at) == pytest.approx((force, shape.clips["eye"].at))
+
+
+def test_a_tolerance_of_clips_is_about_their_places_that_of_headings_is_not(fitted):
+    from dlo_casadi import load
+
+    clip = {"name": "hook", "kind": "pinned", "at": 0.25, "place": [0.2, -0.1]}
+    shape = load(fitted).solve((0.4, -0.05), clips=[clip])
+    (near,) = shape.check({"force": 1.0}, tolerances={"clip": 1e-5})
+    (loose,) = shape.check({"force": 1.0}, tolerances={"clip": 0.01})
+    assert loose.std > 1.5 * near.std
+    assert loose.decided_by.startswith("10 mm at a clip")
+    with pytest.raises(DloError, match="2 m for a cable of"):
+        shape.check({"force": 1.0}, tolerances={"clip": 2.0})
+    with pytest.raises(DloError, match="does not depend on it"):  # of pins and a pinned clip
+        shape.check({"force": 1.0}, tolerances={"heading": 0.01})
 
 
 def test_from_python_limits_are_a_mapping(fitted):

@@ -334,7 +334,7 @@ class Shape:
         """Whether a new repeat of the pose keeps limits, by default the session's.
 
         `tolerances` are standard deviations of other fixtures than the session's, by its keys:
-        `end`, `length` [m], `heading`, `rotation`, `roll` [rad].
+        `end`, `length`, `clip`, `slip` [m], `heading`, `rotation`, `roll` [rad].
 
         Raises
         ------

@@ -203,7 +203,9 @@ def check_limits(
         text = f"tolerances.{strange[0]}: the shape of this cable does not depend on it"
         raise DloError(f"{text}.\n  Try: {', '.join(possible)}")
     length = cable.model.cable.length
-    if large := [x for x in ("end", "length") if stds.get(x, 0.0) > _LOOSE * length]:
+    if large := [
+        x for x in ("end", "length", "clip", "slip") if stds.get(x, 0.0) > _LOOSE * length
+    ]:
         text = f"tolerances.{large[0]}: {stds[large[0]]:g} m for a cable of {length:g} m"
         raise DloError(f"{text}.\n  Try: metres, such as {stds[large[0]] / 1e3:g}")
     uncertainty = known.uncertainty.installed(cable.model, stds)
@@ -313,8 +315,8 @@ def limit_checks(
 ) -> tuple[LimitCheck, ...]:
     """Checks of one predicted shape, one for each limit, in their order.
 
-    A bend is measured on a mesh that resolves it, see `resolved`; draws are solved on one of
-    elements twice as long.
+    A bend is measured on a mesh that resolves it, see `resolved`. Draws are solved there, too: how
+    places compete for the sharpest bend depends on the mesh.
 
     Parameters
     ----------
@@ -324,7 +326,7 @@ def limit_checks(
         With a meaning for this cable, see `Limits.problems`.
     """
     shape, bounds = _Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
-    drawn, near = shape.meshes[-2:][0]
+    drawn, near = shape.meshes[-1]
     # What a size is on the mesh of the draws, over what it is.
     ratio = {
         _size(x): shape.sizes(drawn, near, x).max() / shape.sizes(*shape.on(x), x).max()

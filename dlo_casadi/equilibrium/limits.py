@@ -27,7 +27,7 @@ from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
 
 # Draws that are solved to see if first order suffices, and where it does not; draws of the
 # linearised shapes, which cost next to nothing; and shapes that are solved at a time.
-PAIRED, DRAWN, LINEAR, CHUNK = 300, 2000, 4000, 500
+PAIRED, DRAWN, LINEAR, CHUNK = 600, 2000, 4000, 500
 # Probabilities of first order between which solved draws decide if a limit is kept.
 IN_DOUBT = SAFE / 10, SAFE + FIRST_ORDER
 # Largest step [rad] of a node at which a draw counts as solved: draws are counted, not measured.
@@ -139,7 +139,7 @@ class Exceedance:
     probability, error : float
         That a size exceeds its bound, and the standard error of that; 0 to first order.
     draws : int
-        Shapes of which the probability is the share; 0 where it is of first order.
+        Shapes among which it was counted; 0 where it is of first order.
     lost : int
         Those of them at which the cable has no stable shape near the predicted one: it snaps.
         They count as exceeding.
@@ -185,11 +185,13 @@ class Varied:
         over z across the direction of the likeliest place; on its line, g stays within the bound
         between t_low and t_high. Draws that are solved anew tell whether that suffices: where they
         give a probability that differs by more than `thresholds.FIRST_ORDER`, two standard errors
-        included, or where the verdict hangs on it, the probability is their share, of more draws.
+        included, or where the verdict hangs on it, it is their share, of more draws, corrected by
+        what the same draws give to first order (`_counted`).
 
         References
         ----------
         Koutsourelakis, Pradlwarter, Schueller, Probab. Eng. Mech. 19 (2004): line sampling.
+        Glasserman, Monte Carlo Methods in Financial Engineering, 2003, 4.1: control variates.
         """
         names = tuple(bounds)
         causes = self.uncertainty.causes_in(self.model)
@@ -203,9 +205,9 @@ class Varied:
             (same, _) = self._solved(0 * z[:1], names)
             softer = {x: same[x] - sizes[x] for x in names}
         anew = {x: _beyond(solved[x] - softer[x], bounds[x]) | lost for x in names}
+        linear = {x: _beyond(sizes[x] + z[:DRAWN] @ slopes[x].T, bounds[x]) for x in names}
         enough = {
-            x: not IN_DOUBT[0] < likely[x] < IN_DOUBT[1]
-            and _agree(anew[x], _beyond(sizes[x] + z[:PAIRED] @ slopes[x].T, bounds[x]))
+            x: not IN_DOUBT[0] < likely[x] < IN_DOUBT[1] and _agree(anew[x], linear[x][:PAIRED])
             for x in names
         }
         if not all(enough.values()):
@@ -217,8 +219,8 @@ class Varied:
         for name in names:
             chance, error, draws = likely[name], 0.0, 0
             if not enough[name]:
-                chance, draws = float(anew[name].mean()), len(lost)
-                error = float(np.sqrt(chance * (1 - chance) / draws))
+                chance, error = _counted(anew[name], linear[name], chance)
+                draws = len(lost)
             parts = slopes[name][sizes[name].argmax()] ** 2
             total = float(parts.sum())
             shares = {
@@ -320,6 +322,19 @@ def _agree(anew: BoolArray, linear: BoolArray) -> bool:
     apart = anew.astype(float) - linear
     error = float(np.sqrt((apart**2).mean() / len(apart)))
     return bool(abs(apart.mean()) + 2 * error <= FIRST_ORDER)
+
+
+def _counted(anew: BoolArray, linear: BoolArray, expected: float) -> tuple[float, float]:
+    """Probability counted among draws (m,) solved anew, and its standard error.
+
+        P = mean(anew) + b (expected - mean(linear)),   b = cov(anew, linear) / var(linear)
+
+    The same draws to first order are a control variate, of which the expectation is known.
+    """
+    a, c = anew - anew.mean(), linear - linear.mean()
+    b = float(a @ c / max(c @ c, 1e-300))
+    chance = float(anew.mean() + b * (expected - linear.mean()))
+    return min(max(chance, 0.0), 1.0), float(np.linalg.norm(a - b * c) / len(a))
 
 
 def resolved(

@@ -130,9 +130,9 @@ def cause_of(model: CableModel, deviation: str) -> str:
 
 def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
     """Deviations or parameters of a model that a tolerance is about, by the tolerance's name."""
-    places = {f"end_{axis}" for axis in model.node.axes}
+    places = {"end": "end"} | {f"clip_{k}": "clip" for k in range(len(model.clips))}
     turned = model.node.tolerance
-    named = [("end" if name in places else turned, name) for name in model.deviations]
+    named = [(places.get(cause_of(model, name), turned), name) for name in model.deviations]
     of_ends = {tolerance for tolerance, _ in named}
     for effect in model.effects:
         if not isinstance(effect, MeasurementEffect):
