@@ -1,9 +1,9 @@
 """Candidates tried at the measured shapes, where the declared model's equilibria lead astray.
 
 The fit begins with the balance of forces relaxed, which needs no equilibrium, see
-`estimation.relaxation`. The imbalance tells which effect is missing: of each likely candidate it is
-followed until it is nearly strict, and what is left then tells how near the candidate comes. Where
-none comes near alone, each is tried beside a second one, screened anew beside the first.
+`estimation.relaxation`. The imbalance tells which effect is missing: with each likely candidate the
+fit begins at the measured shapes again, until the balance is nearly strict, and what is left then
+tells how near the candidate comes. Where none comes near alone, each is tried beside a second one, screened anew beside the first.
 """
 
 from __future__ import annotations

@@ -13,7 +13,9 @@ from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.model.functions import functions_of
 
-# Standard deviation of points, over the length, from which the strict ones are approached.
+# Standard deviation of points, over the length, from which the strict ones are approached. Of a
+# strong softening hidden in poses of 12 markers of 0.3 mm the strict search left 4464 or 6497, from
+# two starts; through 1e-3 or 3e-3 it leaves 529 from both, in a third of the time.
 LOOSE = 3e-3
 
 
