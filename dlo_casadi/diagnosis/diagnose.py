@@ -369,7 +369,7 @@ class Search:
         """Fits from the measured shapes of the candidates that come nearest to them.
 
         Beside a misfit scores tell nothing, and a refit leads where the declared model has gone.
-        Where the nearest does not explain the shapes other starts of it are tried, then of the
+        Where the nearest does not explain the shapes its end is rolled anew, then that of the
         next. Last: who stays far from them.
         """
         near, softness = from_data(current)
@@ -381,11 +381,10 @@ class Search:
         explained = any(map(refits.explains, touching))
         pairs = added + 2 <= self.max_effects and not explained
         kept = nearest(near, softness, likely, *among, pairs=pairs)[:REFITTED]
-        refit = partial(confirm_from_data, current)
-        tried = list(map_in_order(self.executor, partial(refit, starts=1), kept))
+        tried = list(map_in_order(self.executor, partial(confirm_from_data, current), kept))
         for k, start in () if explained else enumerate(kept):
             if not refits.explains(tried[k]):
-                tried[k] = refit(start)
+                tried[k] = refits.confirm_rolled(current, start, tried[k])
             if refits.explains(tried[k]):
                 break
         scored = {item.name: item.screened for item in touching}

@@ -3,12 +3,13 @@
 The fit begins with the balance of forces relaxed, which needs no equilibrium, see
 `estimation.relaxation`. The imbalance tells which effect is missing: with each likely candidate the
 fit begins at the measured shapes again, until the balance is nearly strict, and what is left then
-tells how near the candidate comes. Where none comes near alone, each is tried beside a second one, screened anew beside the first.
+tells how near the candidate comes. Where none comes near alone, each is tried beside a second one,
+screened anew beside the first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +20,6 @@ from dlo_casadi.arrays import BoolArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.continuation import loosely_relaxed, relaxed, with_springs_in_place
-from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.fit import FIRST_STD
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
@@ -152,6 +152,8 @@ class RelaxedStart:
         screened: Screened,
         beside: tuple[Screened, ...],
         known: Mapping[str, float],
+        *,
+        rolls: bool = False,
     ) -> RelaxedStart:
         """From the measured shapes and what is known, the candidate not there yet.
 
@@ -163,7 +165,10 @@ class RelaxedStart:
         others = {name: near.value(name) for x in beside for name in x.candidate.frees}
         values = {**others, **scan, **known}
         linear, begun = _as_measured(near, candidate.add_linear_to(near.model), values)
-        reached = loosely_relaxed(linear, begun, _places(linear, candidate))
+        fixed = _places(linear, candidate)
+        if rolls:
+            linear, begun = begin(linear, begun.theta, fixed)
+        reached = loosely_relaxed(linear, begun, fixed)
         reached = relaxed(linear, reached, COMPARED[1:-1])
         problem, reached = _in_own_parameters(near, candidate, linear, reached)
         reached = relaxed(problem, reached, COMPARED[-1:])
@@ -185,28 +190,19 @@ class RelaxedStart:
         likely = likeliest(screened_from_data(near, softness, listed))[:SECOND]
         return [RelaxedStart.of(near, x, (*self.beside, self.screened)) for x in likely]
 
-    def fit(self, starts: int) -> Fit | None:
-        """The fit that it leads to, from the first start that succeeds, so many at most.
-
-        Starts: the relaxed shapes with the candidate not there yet; the measured shapes anew, in
-        parameters in which the candidate is linear; the relaxed shapes with its one-step estimate.
-        A pose that turns into another equilibrium on the way of one rarely does so on the others'.
-        """
-        screened, own, best = self.screened, self.problem.unknowns.model, None
+    def fit(self) -> Fit | None:
+        """The fit that it leads to; None if some pose has no equilibrium there."""
         left = SOFTNESS[len(COMPARED) :]
-        ways: tuple[Callable[[], Fit | None], ...] = (
-            partial(fit_from, self.problem, self.begun, left, followed=self.values),
-            partial(_anew, self.near, screened),
-            lambda: fit_from(*_begun(self.near, own, screened.start), SOFTNESS),
-        )
-        for way in ways[:starts]:
-            fit = way()
-            if fit and (best is None or fit.point.objective < best.point.objective):
-                best = fit
-            near_noise = best and best.point.data < REACHED * best.problem.n_residuals
-            if best and best.converged and near_noise:
-                break
-        return best
+        return fit_from(self.problem, self.begun, left, followed=self.values)
+
+    def rolled(self) -> RelaxedStart | None:
+        """The same with the end rolled anew; None where lines tell how it is turned.
+
+        The relaxed shapes without the candidate may be turned otherwise.
+        """
+        if END_ROLL not in self.problem.unknowns.names:
+            return None
+        return self._followed(self.near, self.screened, self.beside, {}, rolls=True)
 
 
 def likeliest(screened: Sequence[Screened]) -> list[Screened]:
@@ -249,15 +245,6 @@ def _near_least(begun: Iterable[RelaxedStart], noise: float) -> list[RelaxedStar
     return [start for start in ordered if start.left <= most]
 
 
-def _begun(near: Fit, model: CableModel, values: Mapping[str, float]) -> tuple[Problem, Values]:
-    """A model with a candidate at relaxed shapes, its parameters at values or nominal."""
-    problem = _beside(near, model)
-    theta = problem.unknowns.pack(near.values_in(model, values), near.coefficients)
-    shapes = carried_shapes(problem, near, relaxed=True)
-    begun = Values(problem.unknowns.off_bounds(theta), shapes, near.point.projections)
-    return problem, with_springs_in_place(problem, begun)
-
-
 def _as_measured(
     near: Fit, model: CableModel, known: Mapping[str, float]
 ) -> tuple[Problem, Values]:
@@ -287,22 +274,6 @@ def _stiffnesses(model: CableModel) -> list[dict[str, float]]:
         dict(zip(names, (size * typical / own[0] * own).tolist(), strict=True))
         for size in STIFFNESSES_OF_CONTACT
     ]
-
-
-def _anew(near: Fit, screened: Screened) -> Fit | None:
-    """Fit with a candidate from the measured shapes and nominal parameters, at its best place."""
-    candidate = screened.candidate
-    linear = candidate.add_linear_to(near.model)
-    problem = _beside(near, linear)
-    known = dict(zip(linear.names, linear.nominal.tolist(), strict=True))
-    known |= {name: screened.start[name] for name in candidate.scans[0] if name in screened.start}
-    begun = np.array([known[name] for name in linear.names])
-    p = np.where(problem.unknowns.free, begun, problem.unknowns.fixed)
-    theta = problem.unknowns.pack(p, np.zeros(linear.n_coefficients))
-    theta, fixed = problem.unknowns.off_bounds(theta), _places(problem, candidate)
-    problem, found = begin(problem, theta, fixed)
-    found = relaxed(problem, found, SOFTNESS[1:3])
-    return fit_from(*_in_own_parameters(near, candidate, problem, found), SOFTNESS[2:])
 
 
 def _places(problem: Problem, candidate: Candidate) -> BoolArray:

@@ -1,9 +1,9 @@
 """From a candidate to a fit with it: where it starts, the refit, and how it compares.
 
 A refit starts from the candidate's one-step estimate at the minimum without it. Where the shapes
-there are too far from the measured ones to follow any effect, it starts in two other ways.
+there are too far from the measured ones to follow any effect, it starts in another way.
 
-An unknown force has found shapes that fit, and in every pose a force f_j at one place r_j of the
+An unknown force may fit the shapes, with a force f_j in every pose at one place r_j of the
 cable; a load is its cause if its own law gives these forces. All are linear in their parameters
 once the place is known (a tether in k and k a: f = k a - k r): least squares tell where to start.
 
@@ -127,7 +127,7 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
     if base.beyond_noise or not base.noise.known:
         near, _ = from_data(base)
-        fit = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start)).fit(starts=3)
+        fit = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start)).fit()
         if fit is not None:
             fit = fit.reweighed(base.noise, base.problem.priors)
             fits.append(_followed(fit, candidate.add_to(base.model), {}, MOST_STEPS))
@@ -169,20 +169,27 @@ def _at_noise(fit: Fit, noise: NoiseModel) -> Fit:
     return refine(fit.reweighed(noise, priors), first=True)
 
 
-def confirm_from_data(base: Fit, start: RelaxedStart, *, starts: int = 3) -> Confirmed | None:
+def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
     """Fit with a candidate added, from the relaxed base; None if that leads to no equilibrium.
 
-    From so many starts at most. Weighed as the base where the candidate does not bring it to the
-    noise of the points.
+    Weighed as the base where the candidate does not bring it to the noise of the points.
     """
     with suppress(EstimationError):
-        fit = start.fit(starts)
+        fit = start.fit()
         if fit is not None and misfits(fit):
             fit = descend(fit.reweighed(base.noise, base.problem.priors))
         if fit is not None and not misfits(fit):
             fit = _at_noise(fit, start.problem.noise)
         return Confirmed.of(start.screened, base, fit, start.beside)
     return None
+
+
+def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
+    """The likelier one of `found` and a fit from the start with its end rolled anew."""
+    rolled = start.rolled()
+    other = confirm_from_data(base, rolled) if rolled else None
+    both = [item for item in (found, other) if item is not None]
+    return max(both, key=lambda item: (explains(item), item.fit.log_evidence), default=None)
 
 
 def confirm_contacts(
