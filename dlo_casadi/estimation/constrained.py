@@ -86,11 +86,14 @@ def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
     return (student_95(fit, name) + np.sqrt(square)) ** 2 * fit.inflation**2
 
 
+def profiled(fit: Fit) -> list[str]:
+    """The stiffnesses and the mass's factor, as far as they are estimated."""
+    return [name for name in (*STIFFNESSES, MASS_FACTOR) if name in fit.problem.unknowns.names]
+
+
 def profile_intervals(fit: Fit) -> dict[str, Interval]:
-    """Intervals of the stiffnesses and of the mass's factor, as far as they are estimated."""
-    wanted = (*STIFFNESSES, MASS_FACTOR)
-    free = [name for name in wanted if name in fit.problem.unknowns.names]
-    return {name: profile_interval(fit, name) for name in free}
+    """Intervals of what is `profiled`."""
+    return {name: profile_interval(fit, name) for name in profiled(fit)}
 
 
 def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:

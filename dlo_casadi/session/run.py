@@ -12,7 +12,7 @@ from dlo_casadi.config import Config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
-from dlo_casadi.estimation.constrained import as_measured, profile_intervals
+from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
 from dlo_casadi.estimation.fit import (
     SEARCH_MESH,
     at_random,
@@ -135,8 +135,9 @@ def fit_session(
     reported = _parameters_of({item.name for item in config.model.effects}, fit.model)
 
     def staged(fit: Fit) -> Stage:
-        # A diagnosis that finds nothing replaces this stage; intervals are taken after it.
-        intervals = {} if config.diagnosis.enabled else profile_intervals(fit)
+        # Intervals are taken after a diagnosis: a model that does not come to its points has none.
+        diagnosed = config.diagnosis.enabled
+        intervals = dict.fromkeys(profiled(fit)) if diagnosed else profile_intervals(fit)
         return fit_stage("batch", fit, measured, intervals, reported)
 
     own = staged(fit)
@@ -270,7 +271,6 @@ def close_the_loop(
     confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
     next_pose = separating_pose(diagnosis.after, diagnosis.added)
     if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
-        # A model that does not come to its points has no intervals.
         stages[-1] = _told(stages[-1], explains=False)
     elif diagnosis.added:
         parameters = fitted_parameters(declared, profile_intervals(declared), reported)

@@ -333,7 +333,7 @@ def fit_stage(
     name: StageName,
     fit: Fit,
     measured: Sequence[MeasuredPose],
-    intervals: Mapping[str, Interval],
+    intervals: Mapping[str, Interval | None],
     reported: Sequence[str] = (),
 ) -> Stage:
     """A fit of the batch problem.
@@ -341,7 +341,7 @@ def fit_stage(
     Parameters
     ----------
     intervals : mapping
-        Of the stiffnesses and of the mass's factor, by name.
+        Of the stiffnesses and of the mass's factor, by name; None where none is to be told.
     reported : sequence of str
         Qualified names of the parameters that are effects, not nuisances.
     """
@@ -357,7 +357,7 @@ def fit_stage(
 
 
 def fitted_parameters(
-    fit: Fit, intervals: Mapping[str, Interval], reported: Sequence[str] = ()
+    fit: Fit, intervals: Mapping[str, Interval | None], reported: Sequence[str] = ()
 ) -> dict[str, Estimate]:
     """What a fit says of its parameters; see `fit_stage`."""
     model = fit.model
@@ -366,13 +366,14 @@ def fitted_parameters(
         key, unit, size = full, "N m^2", 1.0
         if full == MASS_FACTOR:
             key, unit, size = MASS, "kg", model.cable.mass
-        ends = tuple(None if end is None else size * end for end in (interval.low, interval.high))
+        bounds = (interval.low, interval.high) if interval else ()
+        ends = [None if end is None else size * end for end in bounds]
         parameters[key] = Estimate(
             size * fit.value(full),
             size * fit.std(full),
             unit,
-            (ends[0], ends[1]),
-            interval.identifiable,
+            (ends[0], ends[1]) if ends else None,
+            interval.identifiable if interval else None,
             fixed=full not in fit.problem.unknowns.names,
         )
     roll = [END_ROLL] if END_ROLL in model.names else []

@@ -65,6 +65,14 @@ def test_an_undeclared_effect_is_found_and_the_error_falls(report, session, name
     assert after["rmse_held_out"] <= limit * found["measurement"]["std"]
 
 
+def test_a_model_that_lacks_an_effect_is_told_without_intervals(report):
+    batch = stage(report("overhang"), "batch")
+    stiffness = batch["parameters"]["bending_stiffness"]
+    assert batch["explains"] is False
+    assert stiffness["value"] > 0
+    assert stiffness["interval_95"] is None
+
+
 @pytest.mark.long
 def test_every_stage_is_in_the_report_of_photographs(report):
     found = report("connector")
