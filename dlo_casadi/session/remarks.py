@@ -132,7 +132,7 @@ def weight_warning(weight: HiddenWeight, expected: float) -> str:
         return text
     far = weight.difference > UNSEEN * expected
     return text + (
-        f"{', or a pose' if far else '. No pose would: even'} with start_heading "
+        f"{', or add a pose: with' if far else '. No pose would tell: even with'} start_heading "
         f"{weight.heading:.2f} the shapes differ by {1e3 * weight.difference:.2g} mm RMS, "
         f"and a pose is measured {1e3 * expected:.2g} mm from its prediction"
     )

@@ -46,7 +46,7 @@ def test_a_weight_that_fits_as_well_as_none_widens_the_interval_of_the_stiffness
     assert weight.difference < fit.expected_error
     said = weight_warning(weight, fit.expected_error)
     assert "measure the force on the start, which differs by up to" in said
-    assert ". No pose would: even with start_heading" in said
+    assert ". No pose would tell: even with start_heading" in said
 
     force = next(c for c in candidates(MODEL, setup_of(MODEL)) if c.name == "point_force")
     model = force.add_to(MODEL)
