@@ -11,6 +11,7 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
+    REACHED,
     from_data,
     likeliest,
     nearest,
@@ -52,7 +53,6 @@ from dlo_casadi.thresholds import (
     LEFT,
     REFITTED,
     SIGNIFICANCE,
-    UNSEEN,
     WORTH,
 )
 
@@ -194,10 +194,7 @@ class Search:
 
     def closed(self) -> Diagnosis:
         """What the search finds, without effects that explain too little."""
-        fit, found, force = self.declared, self.run(), None
-        found = found.or_better(self.of_simpler_effects(found))
-        if found.unexplained and self.several and fit.noise.source != "misfit":
-            found = found.or_better(replace(self, from_shapes=True).run())
+        fit, found, force = self.declared, self._searched(), None
         near = self.at_random(found)
         if near is not None:
             return replace(self, declared=near).closed()
@@ -228,6 +225,20 @@ class Search:
             pull=force if found.unexplained else None,
             weight=None if found.unexplained else hidden_weight(found.fit, self.exclude),
         )
+
+    def _searched(self) -> Found:
+        """From the measured shapes first where the fit leaves far more than noise, else last."""
+        # From such a fit a first effect bends to what two explain, and others to what it leaves.
+        of_shapes = replace(self, from_shapes=True)
+        may_be_far = self.several and self.declared.noise.source != "misfit"
+        first = of_shapes.run() if may_be_far and self.declared.chi2_per_dof > REACHED else None
+        if first is not None and not first.unexplained:
+            return first
+        found = self.run()
+        found = found.or_better(self.of_simpler_effects(found))
+        if found.unexplained and may_be_far:
+            found = found.or_better(first or of_shapes.run())
+        return found
 
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
@@ -424,14 +435,7 @@ class Search:
         return fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)[0] if self.finest else fit
 
     def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
-        validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
-        limit = UNSEEN * max(fit.expected_error, validation.expected)
-        # From one pose alone another one is not predicted to first order of the covariance.
-        told = bool(added) or len(self.declared.problem.used) > 2
-        unpredicted = told and validation.error_of_most > limit
-        unexplained = structure.p_noise < self.significance or unpredicted
-        unexplained |= fit.noise.source == "misfit"
-        return Found(fit, tuple(added), ranked, validation, structure, unexplained)
+        return Found.of(fit, added, ranked, len(self.declared.problem.used), self.significance)
 
     def without_wrong_causes(self, found: Found) -> Found:
         """Withdraw effects that do not explain nearly all of what the declared model lacks.

@@ -8,15 +8,15 @@ from typing import Self
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
-from dlo_casadi.diagnosis.crossval import CrossValidation
+from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
-from dlo_casadi.diagnosis.structure import Structure
+from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of, settle
-from dlo_casadi.thresholds import EVIDENCE_APART, LEAST_NOISE_DEGREES
+from dlo_casadi.thresholds import EVIDENCE_APART, LEAST_NOISE_DEGREES, UNSEEN
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,25 @@ class Found:
     validation: CrossValidation
     structure: Structure
     unexplained: bool
+
+    @classmethod
+    def of(
+        cls,
+        fit: Fit,
+        added: Sequence[AddedEffect],
+        ranked: tuple[Ranked, ...],
+        poses: int,
+        significance: float,
+    ) -> Self:
+        """A fit with effects, and whether it explains what was measured in so many poses."""
+        validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
+        limit = UNSEEN * max(fit.expected_error, validation.expected)
+        # From one pose alone another one is not predicted to first order of the covariance.
+        told = bool(added) or poses > 2
+        unpredicted = told and validation.error_of_most > limit
+        unexplained = structure.p_noise < significance or unpredicted
+        unexplained |= fit.noise.source == "misfit"
+        return cls(fit, tuple(added), ranked, validation, structure, unexplained)
 
     def or_better(self, other: Self | None) -> Self:
         """Itself, or what another search has found if only that explains the data, or it better."""
