@@ -382,6 +382,11 @@ def nearest_to_poses(fit: Fit, stages: Sequence[Stage]) -> Fit:
     return best
 
 
+def is_nearer(stage: Stage, other: Stage) -> bool:
+    """Whether a stage predicts every fit pose, and comes nearer to them than another."""
+    return _off(stage) < _off(other)
+
+
 def _off(stage: Stage) -> float:
     """Error [m] of the fit poses, each on the branch where it was measured."""
     error = stage.rmse_fit_measured_branch

@@ -158,8 +158,10 @@ def fit_session(
     own = own if fit is best else staged(fit)
     nearest = fit
     if fitting.no_nearer(fit, [*stages, own]):
-        nearest = fitting.nearest_to_poses(fit, stages)
-        own = staged(nearest)
+        other = fitting.nearest_to_poses(fit, stages)
+        stage = staged(other)
+        if fitting.is_nearer(stage, own):
+            nearest, own = other, stage
     stages = [*stages, own]
     step("compare with simpler fits", 1, 1)
     clock.lap("fit")
