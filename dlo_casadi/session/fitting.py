@@ -1,7 +1,7 @@
 """The declared model of a configuration, its fit, and the simpler fits beside it."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple
 
@@ -344,47 +344,46 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
     for stage in others:
         if stage.name in SIMPLER:
             better = not fit.converged or _off(stage) < _off(own)
-            found = _from_simpler(fit, stage.parameters[BENDING_STIFFNESS].value, better)
-            best = max(best, found, key=lambda item: item.log_evidence)
+            found = _from_simpler(fit, stage, better)
+            if found is not None and found.point.objective <= fit.point.objective - CONVERGED:
+                found = found if fit.noise.source == "misfit" else refine(found)
+                best = max(best, found, key=lambda item: item.log_evidence)
     return best
 
 
-def no_nearer(fit: Fit, stages: Sequence[Stage]) -> bool:
-    """Whether a fit that lacks something comes no nearer to its poses than a simpler one.
+def nearest_to_poses(
+    fit: Fit, stages: Sequence[Stage], staged: Callable[[Fit], Stage]
+) -> tuple[Fit, Stage]:
+    """A fit and its stage; of one that lacks something the nearest to the fit poses, if need be.
 
-    By more than chance where all it leaves may be what differs from pose to pose.
+    A fit that trusts each point to its noise bends ends and rest shape to whatever the model
+    lacks, and may predict the poses worse than a straight cable. Then it is fitted to its misfit,
+    too, from itself and from each simpler fit: what predicts the poses best is taken.
 
     Parameters
     ----------
     stages : sequence of Stage
         As in `not_worse`.
+    staged : callable
+        Stage of a fit.
     """
     *others, own = stages
-    lacks, scatters = fit.chi2_per_dof > EXPLAINED, fit.problem.priors.pose_scatter.std > 0
-    if fit.noise.source == "misfit" or not (lacks or scatters):
-        return False
-    chance = 0.0 if lacks else 1 / np.sqrt(2 * len(fit.problem.used))
-    simpler = min((_off(stage) for stage in others if stage.name in SIMPLER), default=np.inf)
-    return bool(simpler * (1 + chance) < _off(own))
-
-
-def nearest_to_poses(fit: Fit, stages: Sequence[Stage]) -> Fit:
-    """The fit to its misfit, from itself or a simpler one, that comes nearest to the fit poses.
-
-    A fit that trusts each point to its noise bends ends and rest shape to whatever the model
-    lacks, and may predict the poses worse than a straight cable.
-    """
-    best = fit_to_misfit(fit)
-    for stage in stages:
-        if stage.name in SIMPLER and BENDING_STIFFNESS in stage.parameters:
-            found = _from_simpler(best, stage.parameters[BENDING_STIFFNESS].value, better=True)
-            best = min(best, found, key=lambda item: item.point.objective)
-    return best
-
-
-def is_nearer(stage: Stage, other: Stage) -> bool:
-    """Whether a stage predicts every fit pose, and comes nearer to them than another."""
-    return _off(stage) < _off(other)
+    simpler = [stage for stage in others if stage.name in SIMPLER]
+    least = min(map(_off, simpler), default=np.inf)
+    misfit, lacks = fit.noise.source == "misfit", fit.chi2_per_dof > EXPLAINED
+    if not misfit and not lacks:
+        if not fit.problem.priors.pose_scatter.std:
+            return fit, own
+        # By more than chance where all that is left may be what differs from pose to pose.
+        least *= 1 + 1 / np.sqrt(2 * len(fit.problem.used))
+    if _off(own) <= least:
+        return fit, own
+    first = fit if misfit else fit_to_misfit(fit)
+    found = [None if misfit else first, *(_from_simpler(first, stage, True) for stage in simpler)]
+    return min(
+        [(fit, own), *((other, staged(other)) for other in found if other is not None)],
+        key=lambda pair: _off(pair[1]),
+    )
 
 
 def _off(stage: Stage) -> float:
@@ -393,19 +392,16 @@ def _off(stage: Stage) -> float:
     return np.inf if error is None else error
 
 
-def _from_simpler(fit: Fit, stiffness: float, better: bool) -> Fit:
-    """What a straight cable of a stiffness leads to if it is `better` or lower; else the fit."""
+def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> Fit | None:
+    """What a straight cable of a stage's stiffness leads to if it is `better` or lower."""
     problem, model = fit.problem, fit.model
     values = model.nominal.copy()
-    values[model.stiffness_indices] *= stiffness / values[0]
+    values[model.stiffness_indices] *= simpler.parameters[BENDING_STIFFNESS].value / values[0]
     theta = problem.unknowns.pack(values, np.zeros(model.n_coefficients))
     start = replace(fit.point, theta=theta)
     point = problem.balanced(start)
     if point is None and better:
         point = problem.balanced(replace(start, shapes=predicted_shapes(problem, start)))
     if point is None or (not better and point.objective >= fit.point.objective):
-        return fit
-    found = descend(Fit(problem, point))
-    if found.point.objective > fit.point.objective - CONVERGED:
-        return fit
-    return found if fit.noise.source == "misfit" else refine(found)
+        return None
+    return descend(Fit(problem, point))

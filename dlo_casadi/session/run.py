@@ -156,12 +156,7 @@ def fit_session(
                 fit, error = fine_enough(near, near.model.n)
         fit = as_measured(fit)
     own = own if fit is best else staged(fit)
-    nearest = fit
-    if fitting.no_nearer(fit, [*stages, own]):
-        other = fitting.nearest_to_poses(fit, stages)
-        stage = staged(other)
-        if fitting.is_nearer(stage, own):
-            nearest, own = other, stage
+    nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged)
     stages = [*stages, own]
     step("compare with simpler fits", 1, 1)
     clock.lap("fit")

@@ -15,7 +15,7 @@ from dlo_casadi.estimation.prediction import (
 )
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.fitting import nearest_to_poses, no_nearer, not_worse
+from dlo_casadi.session.fitting import nearest_to_poses, not_worse
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
 from dlo_casadi.session.stages import fit_stage, initial_stage, pose_shape
@@ -177,12 +177,15 @@ def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable():
         poses.append(MeasuredPose.of_points(pose, points, s=s))
     fit = fit_model(model, poses, Tolerances(), NOISE)
     stages = [initial_stage(model, poses), fit_stage("batch", fit, poses, {})]
-    assert no_nearer(not_worse(fit, stages), stages)
+    assert stages[0].rmse_fit_measured_branch < stages[1].rmse_fit_measured_branch
 
-    nearest = nearest_to_poses(fit, stages[:1])
-    stages[-1] = fit_stage("batch", nearest, poses, {})
-    assert stages[-1].rmse_fit_measured_branch < stages[0].rmse_fit_measured_branch
-    assert not no_nearer(nearest, stages)
+    def staged(found):
+        return fit_stage("batch", found, poses, {})
+
+    nearest, stage = nearest_to_poses(fit, stages, staged)
+    assert nearest.noise.source == "misfit"
+    assert stage.rmse_fit_measured_branch < stages[0].rmse_fit_measured_branch
+    assert nearest_to_poses(nearest, [stages[0], stage], staged) == (nearest, stage)
 
 
 def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():
