@@ -29,7 +29,6 @@ from scipy.special import chdtrc, fdtrc
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
-from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.estimation.continuation import with_springs_in_place
 from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.problem import NO_INFORMATION, Linearization, Point, Problem, Values
@@ -102,23 +101,16 @@ class _Moving:
     def by_names(self, fit: Fit, scan: Mapping[str, float]) -> list[FloatArray]:
         """Whitened derivatives (R_j, names) of each pose's residuals, at a scan."""
         problem, unknowns = self.problem, self.problem.unknowns
-        p = fit.values_in(unknowns.model, scan)
-        theta = unknowns.pack(p, fit.coefficients)
-        rest = unknowns.rest(theta)
+        theta = unknowns.pack(fit.values_in(unknowns.model, scan), fit.coefficients)
         columns = [unknowns.names.index(name) for name in self.names]
+        values = Values(theta, self.shapes, fit.point.projections)
+        values = with_springs_in_place(problem, values)
         slopes = unknowns.slopes(theta)[:, columns]
-        still = np.zeros((len(rest), len(columns)))
-        shapes = with_springs(problem.equilibria, self.shapes, p, rest)
-        along = problem.equilibria.directions(shapes, p, rest, slopes, still, deviations=False)
-        moved = problem.residuals(Values(theta, shapes, fit.point.projections), along)
+        still = np.zeros((len(unknowns.rest(theta)), len(columns)))
+        state = problem.state(values)
+        along = problem.equilibria.directions(*state, slopes, still, deviations=False)
+        moved = problem.residuals(values, along)
         return [white @ change for white, (_, change) in zip(problem.whitening, moved, strict=True)]
-
-
-def with_springs(
-    equilibria: BatchEquilibrium, shapes: Shapes, p: FloatArray, rest: FloatArray
-) -> Shapes:
-    """Shapes in which springs that do not pull yet are where they hang on the cable."""
-    return equilibria.solve(shapes, p, rest)[0] if equilibria.model.n_springs else shapes
 
 
 def _scan(active: Sequence[Candidate], k: int) -> dict[str, float]:
@@ -203,9 +195,8 @@ class Screen:
         unknowns = Unknowns(self.model, free, p)
         larger = replace(problem, unknowns=unknowns)
         theta = unknowns.pack(p, self.fit.coefficients)
-        shapes = carried_shapes(larger, self.fit)
-        shapes = with_springs(larger.equilibria, shapes, p, unknowns.rest(theta))
-        point = replace(self.fit.point, theta=theta, shapes=shapes)
+        point = replace(self.fit.point, theta=theta, shapes=carried_shapes(larger, self.fit))
+        point = replace(point, shapes=with_springs_in_place(larger, point).shapes)
         return larger, point, larger.linearize(point)
 
     def run(self, noise_dof: float, executor: Executor | None = None) -> list[Screened]:
@@ -296,18 +287,23 @@ class RelaxedScreen(Screen):
 
     def normals(self, executor: Executor) -> Iterator[AtScan]:
         """Normal equations at each scan, everything of a pose's own eliminated."""
-        fit, unknowns = self.fit, Unknowns(self.model, self.fit.free_in(self.model), self.p)
-        problem = replace(fit.problem, unknowns=unknowns)
-        shapes = carried_shapes(problem, fit, relaxed=True)
+        fit, begun = self.fit, dict[tuple[str, ...], tuple[Problem, Shapes]]()
         n_scans = max(len(candidate.scans) for candidate in self.listed)
         # Only which candidates come nearest is asked: every second place tells that.
         for k in range(0, n_scans, 2):
             active = [c for c in self.listed if k < len(c.scans)]
-            p = fit.values_in(self.model, _scan(active, k))
-            theta = unknowns.pack(p, fit.coefficients)
+            names = tuple(candidate.name for candidate in active)
+            if names not in begun:
+                model = extended(fit, active)
+                unknowns = Unknowns(model, fit.free_in(model), fit.values_in(model))
+                larger = replace(fit.problem, unknowns=unknowns)
+                begun[names] = larger, carried_shapes(larger, fit, relaxed=True)
+            problem, shapes = begun[names]
+            p = fit.values_in(problem.unknowns.model, _scan(active, k))
+            theta = problem.unknowns.pack(p, fit.coefficients)
             values = with_springs_in_place(problem, Values(theta, shapes, fit.point.projections))
             normal = Relaxation(problem, self.softness).normal(values)
-            yield AtScan(active, k, normal.hessian, normal.gradient, unknowns.names)
+            yield AtScan(active, k, normal.hessian, normal.gradient, problem.unknowns.names)
 
 
 def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, FloatArray, int]:
