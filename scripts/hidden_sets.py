@@ -34,6 +34,9 @@ MARKERS = (12, 3e-4)
 # Noise of readings [N], [N m].
 FORCE_STD, MOMENT_STD = 0.01, 0.001
 ELEMENTS = {2: 40, 3: 24}
+# Most that half the size of the elements may move a pose [m, RMS], a tenth of the markers' noise;
+# times that they are halved for it: a cable in space that softens may need 96.
+FINE, HALVED = 0.1 * MARKERS[1], 2
 # Sizes of what differs from pose to pose, by EI [N m^2] and length [m]: each moves the cable by
 # several times the noise.
 RANDOM_SIZES = {
@@ -186,7 +189,8 @@ def _tried(
         p[k] = values.get(name, p[k])
     ends = [_ends(generator, dimension, length, held, k) for k in range(POSES)]
     true = [_moved(generator, pose) for pose in ends]
-    rest = _rest(generator, model)
+    waves = generator.normal(0.0, 0.1, (len(model.node.curvatures), 3))
+    rest = _rest(waves, model)
     if random:
         size = RANDOM_SIZES[random](bending, length) * generator.uniform(0.5, 1.5)
         scatter = PoseScatter(size, source=random)
@@ -202,7 +206,8 @@ def _tried(
         ]
         values[f"random.{random}"] = size
     else:
-        shapes = predict_poses(model, p, rest, true)
+        model, shapes = _finely(model, p, waves, true)
+        rest = _rest(waves, model)
     if table and all(shapes):
         height = _table_under(generator, model, true, shapes)
         model = model.with_effect(ContactPlane())
@@ -242,6 +247,28 @@ def _tried(
     return Simulated(session, hidden, values)
 
 
+def _finely(
+    model: CableModel,
+    p: NDArray[np.floating],
+    waves: NDArray[np.floating],
+    poses: Sequence[HeldPose],
+) -> tuple[CableModel, list[Prediction | None]]:
+    """The model on a mesh that is fine enough, and its shapes; without shapes if none is."""
+    shapes = predict_poses(model, p, _rest(waves, model), poses)
+    s = np.linspace(0.0, model.cable.length, 201)
+    for _ in range(HALVED + 1):
+        finer = model.with_mesh(2 * model.n)
+        others = predict_poses(finer, p, _rest(waves, finer), poses)
+        if not (all(shapes) and all(others)):
+            break
+        pairs = zip(shapes, others, strict=True)
+        moved = (np.linalg.norm(a.curve.at(s) - b.curve.at(s), axis=1) for a, b in pairs)
+        if max(np.sqrt((gap**2).mean()) for gap in moved) < FINE:
+            return model, shapes
+        model, shapes = finer, others
+    return model, [None]
+
+
 def _table_under(
     generator: np.random.Generator,
     model: CableModel,
@@ -272,13 +299,14 @@ def _held_out(k: int) -> bool:
     return k % 5 == 4
 
 
-def _rest(generator: np.random.Generator, model: CableModel) -> NDArray[np.floating]:
-    """A smooth rest curvature [1/m], three waves about each axis."""
-    length, node = model.cable.length, model.node
-    places = model.chain.cells.mean(axis=1) / length
-    waves = np.cos(np.pi * np.arange(3)[:, None] * places)
-    bends = generator.normal(0.0, 0.1, (len(node.curvatures), 3)) @ waves * 2 * np.pi / length
-    twist = np.zeros((len(node.strains) - len(bends), len(places)))
+def _rest(waves: NDArray[np.floating], model: CableModel) -> NDArray[np.floating]:
+    """A smooth rest curvature [1/m], three waves (axes, 3) about each axis."""
+    length, node, k = model.cable.length, model.node, np.arange(3)[:, None]
+    cells = model.chain.cells / length
+    # Means over the cells.
+    cosines = np.cos(np.pi * k * cells.mean(axis=1)) * np.sinc(k * np.diff(cells)[:, 0] / 2)
+    bends = waves @ cosines * 2 * np.pi / length
+    twist = np.zeros((len(node.strains) - len(bends), len(cells)))
     return np.concatenate([*twist, *bends])
 
 
