@@ -179,6 +179,7 @@ def test_a_configuration_cannot_be_changed(tmp_path):
         ("  mass", "  gravity: 0\n  mass", 4, "'gravity' in cable; it belongs into experiment"),
         ("  mass", "  colour: red\n  mass", 4, "'colour' in cable; known here: .*diameter, length"),
         ("  mass", "  length: 1\n  mass", 4, "key 'length' occurs twice, first in line 3"),
+        ("role: held_out", "clips: [{plase: 1}]", 14, r"'plase' in pose 3 .*mean 'place'"),
         ("role: held_out", "rol: fit", 14, r"unknown key 'rol' in pose 3 \(c.csv\);.*'role'"),
         ("std: 3e-4", "board: {}", 10, "'board' in experiment.measurement; .*kind: images"),
         # numbers

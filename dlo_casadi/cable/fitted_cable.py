@@ -117,7 +117,7 @@ class FittedCable(KnownCable):
         asked = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        beside = {"clips": list(clips), "over": over}
+        beside = {"clips": clips, "over": over}
         pose = held_pose(self.model, self.metadata.fixtures, asked | beside)
         held = self.with_clips([clip.kind for clip in pose.clips])
         if obstacles or over is not None:
@@ -128,13 +128,14 @@ class FittedCable(KnownCable):
         try:
             eq = solve_equilibrium(self.model, self.p, self.rest, pose)
         except EquilibriumError as error:
-            # The solver's advice is about a configuration, and there is none here.
-            happened = error.message.partition("\n  Try:")[0]
-            other = "headings or branch" if pose.node is Heading else "orientations, fewer turns"
-            raise EquilibriumError(
-                f"{happened}\n  Try: an end in metres, nearer to the start; other {other}.",
-                p_des=error.p_des,
-            ) from None
+            happened, _, advice = error.message.partition("\n  Try: ")
+            # There is no configuration here whose keys could be changed.
+            if "cable.length" in advice or "model.n" in advice:
+                other = (
+                    "headings or branch" if pose.node is Heading else "orientations, fewer turns"
+                )
+                advice = f"an end in metres, nearer to the start; other {other}."
+            raise EquilibriumError(f"{happened}\n  Try: {advice}", p_des=error.p_des) from None
         beyond, known = eq.other_side, self.metadata.uncertainty
         if beyond is None:
             return self.shape_in(pose, eq)

@@ -302,6 +302,8 @@ class CompiledSolver:
         if status:
             count = counted(len(obstacles), "obstacle")
             raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
+        if slope is None:
+            out["gradient"] = np.nan
         return Gap(**_values(out[0]))
 
     def limits(
@@ -340,6 +342,8 @@ class CompiledSolver:
         status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
         if status:
             raise DloError(f"no limits ({STATUSES[status]}): the shape is {shape.status!r}")
+        if slope is None:
+            out["gradient"] = np.nan
         found = {name: Usage(**_values(row)) for name, row in zip(QUANTITIES, out, strict=True)}
         first = QUANTITIES[tightest[0]]
         return {first: found[first]} | found

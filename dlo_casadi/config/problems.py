@@ -70,6 +70,8 @@ def _sections(model: type[BaseModel], at: Place = (), name: str = "") -> _Sectio
         for inner in _models(field.annotation):
             kind = inner.model_fields.get("kind")
             kinds = () if kind is None else get_args(kind.annotation)
+            # A class of several kinds is chosen by its key alone.
+            kinds = kinds if len(kinds) == 1 else ()
             named = f"{name}.{key}".lstrip(".") + "".join(f" (kind: {kind})" for kind in kinds)
             found |= _sections(inner, (*at, key, *kinds), named)
     return found
