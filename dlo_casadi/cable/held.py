@@ -129,7 +129,8 @@ def among(
     DloError
         If one cannot be so.
     """
-    listed = _Obstacles(obstacles=obstacles).obstacles
+    given: dict[str, Any] = {"obstacles": obstacles}
+    listed = _Obstacles(**given).obstacles
     if wrong := [x.message for x in obstacle_problems(listed, model.gravity, [over])]:
         raise DloError("; ".join(wrong))
     surfaces = tuple(item.surface(k) for k, item in enumerate(listed, start=1))
