@@ -216,8 +216,9 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = list(csv.DictReader(stream, skipinitialspace=True))
     except (OSError, UnicodeError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
         raise DloError(
-            f"{path}: {error}\n  Try: a CSV with the columns {', '.join(known)}"
+            f"{path} cannot be read: {reason}.\n  Try: a CSV with the columns {', '.join(known)}"
         ) from None
     if not rows or (strange := [x for x in rows[0] if x not in known]):
         said = f"unknown columns {strange}" if rows else "no poses"
