@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable, curves_of, without_camera
 from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
-from dlo_casadi.cable.known_cable import CableCurve, KnownCable, curves_of, without_camera
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.codegen import CompiledSolver
@@ -42,7 +42,7 @@ _POINTS = 101
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FittedCable(KnownCable):
+class FittedCable(EstimatedCable):
     """A fitted cable: its model with the fitted values, and what is known of their errors.
 
     From `Result.cable`, or `dlo_casadi.load` of a folder of results. Its `function` and `equations`
