@@ -132,6 +132,11 @@ class CompiledSolver:
         self._records = records_of(model, self.most_obstacles)
         self.workspace = self.source.workspace
 
+    def __repr__(self) -> str:
+        model = self.model
+        mesh = counted(model.n, f"{model.element} element")
+        return f"<CompiledSolver {model.cable.name!r}: {model.cable.length:g} m, {mesh}>"
+
     def solve(
         self,
         pose: AnyPose,
