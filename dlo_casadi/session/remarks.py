@@ -288,7 +288,7 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
             "mm by noise alone). Try: measure the ends in each pose"
         )
     if not fit.converged and not fit.failed:
-        lines.append("the fit crept to its minimum: it stopped within a standard deviation of it")
+        lines.append("the fit is slow: it stopped within a standard deviation of its minimum")
     unstable = [
         item.pose.name
         for item, ok in zip(fit.problem.measured, fit.stable, strict=True)
