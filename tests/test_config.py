@@ -173,11 +173,13 @@ def test_a_configuration_cannot_be_changed(tmp_path):
         # keys
         ("length: 0.8", "lenght: 0.8", 3, "unknown key 'lenght' in cable; did you mean 'length'?"),
         ("  length: 0.8\n", "", 1, r"'length' is missing in cable: .* \[m\]"),
-        ("  gravity: [0, -9.81]\n", "", 7, "'gravity' is missing in experiment"),
+        ("  gravity: [0, -9.81]\n", "", 7, "'gravity' is missing in experiment: .* in space$"),
+        ("experiment:", "experiment:\n  limits: {}", 8, "it belongs into the top of the file"),
         ("cable:", "kable:", 1, "unknown key 'kable' in the top .* did you mean 'cable'?"),
         ("  mass", "  gravity: 0\n  mass", 4, "'gravity' in cable; it belongs into experiment"),
         ("  mass", "  colour: red\n  mass", 4, "'colour' in cable; known here: .*diameter, length"),
         ("  mass", "  length: 1\n  mass", 4, "key 'length' occurs twice, first in line 3"),
+        ("role: held_out", "clips: [{plase: 1}]", 14, r"'plase' in pose 3 .*mean 'place'"),
         ("role: held_out", "rol: fit", 14, r"unknown key 'rol' in pose 3 \(c.csv\);.*'role'"),
         ("std: 3e-4", "board: {}", 10, "'board' in experiment.measurement; .*kind: images"),
         # numbers
@@ -195,6 +197,7 @@ def test_a_configuration_cannot_be_changed(tmp_path):
         ("[0.5, 0.1]", "[0.5]", 12, r"pose 1 \(a.csv\).end: two numbers \[x, y\] belong here"),
         ("[0.5, 0.1]", "[0.5, x]", 12, r"pose 1 \(a.csv\).end\[1\]: a number belongs here"),
         ("[0, -9.81]", "-9.81", 8, "gravity: two numbers"),
+        ("[0, -9.81]", "[0, 0, -9.81]", 12, r"start: \[x, y, z\] belongs here \(three numbers"),
         # units
         ("length: 0.8", "length: 812.5", 3, "812.5 m: units are SI, did you mean 0.8125?"),
         ("mass: 0.23", "mass: 230", 4, "230 kg for 0.8 m: units are SI, did you mean 0.23?"),

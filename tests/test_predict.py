@@ -188,6 +188,31 @@ def test_folders_of_results_are_suggested_not_configurations(pinned, tmp_path):
         predict(bare, end=(0.3, -0.1))
 
 
+PLANE = {"kind": "plane", "point": (0.0, -0.2), "normal": (0.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("held", "message"),
+    [
+        ({"obstacles": [PLANE | {"kind": "plan"}]}, r"obstacles\[0\]\.kind: allowed are 'plane'"),
+        ({"obstacles": [PLANE, PLANE | {"pont": 1}]}, r"'pont' in obstacles\[1\]; .*'point'"),
+        ({"obstacles": PLANE}, "obstacles: a list belongs here, found a mapping"),
+        ({"clips": {"kind": "eyelet"}}, "clips: a list belongs here, found a mapping"),
+        (
+            {"obstacles": [PLANE | {"point": (0.0, 0.1)}]},
+            r"inside obstacle_1\.\n  Try: the obstacle's place, or its normal\.",
+        ),
+        (
+            {"clips": [{"kind": "pinned", "at": 0.1, "place": (0.2, 0.0)}]},
+            r"clip_1 are 0\.2000 m apart.*\n  Try: places and arc lengths in metres",
+        ),
+    ],
+)
+def test_what_is_wrong_between_the_ends_is_named(pinned, held, message):
+    with pytest.raises(DloError, match=message):
+        predict(pinned, end=(0.3, -0.1), **held)
+
+
 def test_a_free_end_hangs(overhang):
     shape = predict(overhang, start_heading=0.0)
 

@@ -236,9 +236,11 @@ def load(path: str | Path) -> FittedCable:
     data = document.data
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         found = data.get("schema") if isinstance(data, dict) else type(data).__name__
+        remedy = "the parameters.yaml in the results folder of a fit."
+        if isinstance(data, dict) and "experiment" in data:
+            remedy = f"dlo fit {source}, or dlo_casadi.fit: this is a configuration, not a fit."
         raise ConfigError(
-            f"no fitted parameters: schema {SCHEMA!r} expected, {found!r} found.\n"
-            "  Try: the parameters.yaml in the results folder of a fit.",
+            f"no fitted parameters: schema {SCHEMA!r} expected, {found!r} found.\n  Try: {remedy}",
             source,
         )
     file = document.checked(ParametersFile, _DAMAGED, _REMEDY)

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable, curves_of, without_camera
 from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
-from dlo_casadi.cable.known_cable import CableCurve, KnownCable, curves_of, without_camera
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.codegen import CompiledSolver
@@ -42,7 +42,7 @@ _POINTS = 101
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FittedCable(KnownCable):
+class FittedCable(EstimatedCable):
     """A fitted cable: its model with the fitted values, and what is known of their errors.
 
     From `Result.cable`, or `dlo_casadi.load` of a folder of results. Its `function` and `equations`
@@ -117,7 +117,7 @@ class FittedCable(KnownCable):
         asked = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        beside = {"clips": list(clips), "over": over}
+        beside = {"clips": clips, "over": over}
         pose = held_pose(self.model, self.metadata.fixtures, asked | beside)
         held = self.with_clips([clip.kind for clip in pose.clips])
         if obstacles or over is not None:
@@ -128,13 +128,14 @@ class FittedCable(KnownCable):
         try:
             eq = solve_equilibrium(self.model, self.p, self.rest, pose)
         except EquilibriumError as error:
-            # The solver's advice is about a configuration, and there is none here.
-            happened = error.message.partition("\n  Try:")[0]
-            other = "headings or branch" if pose.node is Heading else "orientations, fewer turns"
-            raise EquilibriumError(
-                f"{happened}\n  Try: an end in metres, nearer to the start; other {other}.",
-                p_des=error.p_des,
-            ) from None
+            happened, _, advice = error.message.partition("\n  Try: ")
+            # There is no configuration here whose keys could be changed.
+            if "cable.length" in advice or "model.n" in advice:
+                other = (
+                    "headings or branch" if pose.node is Heading else "orientations, fewer turns"
+                )
+                advice = f"an end in metres, nearer to the start; other {other}."
+            raise EquilibriumError(f"{happened}\n  Try: {advice}", p_des=error.p_des) from None
         beyond, known = eq.other_side, self.metadata.uncertainty
         if beyond is None:
             return self.shape_in(pose, eq)

@@ -12,7 +12,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.config.supports import Obstacle, Sides, clip_problems, obstacle_problems
-from dlo_casadi.config.values import AXES, MESH
+from dlo_casadi.config.values import AXES, MESH, ConfigSection
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
@@ -86,10 +86,10 @@ def contact_texts(contacts: Sequence[Contact]) -> list[tuple[str, str]]:
     """Where a cable touches obstacles, and its forces on them, as text."""
     rows = []
     for one in contacts:
-        where = (
-            f"from {one.start:.4g} to {one.end:.4g}" if one.end > one.start else f"{one.start:.4g}"
-        )
-        said = f"{vector(one.force, '.4g', 'N')} at {where} m of the cable"
+        where = f"at {one.start:.4g}"
+        if one.end > one.start:
+            where = f"from {one.start:.4g} to {one.end:.4g}"
+        said = f"{vector(one.force, '.4g', 'N')} {where} m of the cable"
         rows.append((f"force of the cable on {one.obstacle}", said))
     return rows
 
@@ -105,6 +105,12 @@ def reaction_texts(
         kind = getattr(model, side)
         rows += fixture_texts(side, kind, at, reached, force, np.asarray(moment))
     return rows + clip_texts(pose.clips, found.clips) + contact_texts(found.contacts)
+
+
+class _Obstacles(ConfigSection):
+    """Obstacles of a call, so that messages name them by their places in the list."""
+
+    obstacles: tuple[Obstacle, ...]
 
 
 def among(
@@ -123,7 +129,8 @@ def among(
     DloError
         If one cannot be so.
     """
-    listed = [x if isinstance(x, Obstacle) else Obstacle(**x) for x in obstacles]
+    given: dict[str, Any] = {"obstacles": obstacles}
+    listed = _Obstacles(**given).obstacles
     if wrong := [x.message for x in obstacle_problems(listed, model.gravity, [over])]:
         raise DloError("; ".join(wrong))
     surfaces = tuple(item.surface(k) for k, item in enumerate(listed, start=1))
@@ -209,8 +216,9 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = list(csv.DictReader(stream, skipinitialspace=True))
     except (OSError, UnicodeError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
         raise DloError(
-            f"{path}: {error}\n  Try: a CSV with the columns {', '.join(known)}"
+            f"{path} cannot be read: {reason}.\n  Try: a CSV with the columns {', '.join(known)}"
         ) from None
     if not rows or (strange := [x for x in rows[0] if x not in known]):
         said = f"unknown columns {strange}" if rows else "no poses"

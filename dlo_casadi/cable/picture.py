@@ -12,7 +12,7 @@ from dlo_casadi.show import style
 
 # Shares of a shape's extent: the longest arrow, how far a number stands from its arrow's tip, and
 # the half width of a band that can be seen beside the line.
-_LONGEST, _BEYOND, _VISIBLE = 0.25, 0.1, 0.008
+_LONGEST, _NUMBER, _VISIBLE = 0.25, 0.1, 0.008
 
 
 def draw_shape(
@@ -64,7 +64,7 @@ def draw_shape(
             if size <= 1e-3 * largest or largest == 0:
                 continue
             axes.plot(*style.arrow(at, reach * force).T, color=style.VERMILLION, lw=1.8)
-            tip, along = at + reach * force, _BEYOND * extent * force / size
+            tip, along = at + reach * force, _NUMBER * extent * force / size
             paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5}
             number = axes.text(
                 *(tip + along), f"{size:.3g} N", ha="center", va="center", bbox=paper

@@ -71,7 +71,8 @@ def new(chosen: argparse.Namespace) -> None:
     page.data({"files": [str(path) for path in written], "poses": len(files)})
     left = text.count("FILL_IN") - 1  # one is in a comment
     places = f"{counted(left, 'place')} to fill in, each marked FILL_IN"
-    page.say(f"{target}: {counted(len(files), 'pose')}, {places}\nthen: dlo check {target}")
+    poses = counted(len(files), "pose") if files else "a pose to copy"
+    page.say(f"{target}: {poses}, {places}\nthen: dlo check {target}")
 
 
 def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list[str]:

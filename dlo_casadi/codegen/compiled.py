@@ -132,6 +132,11 @@ class CompiledSolver:
         self._records = records_of(model, self.most_obstacles)
         self.workspace = self.source.workspace
 
+    def __repr__(self) -> str:
+        model = self.model
+        mesh = counted(model.n, f"{model.element} element")
+        return f"<CompiledSolver {model.cable.name!r}: {model.cable.length:g} m, {mesh}>"
+
     def solve(
         self,
         pose: AnyPose,
@@ -302,6 +307,8 @@ class CompiledSolver:
         if status:
             count = counted(len(obstacles), "obstacle")
             raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
+        if slope is None:
+            out["gradient"] = np.nan
         return Gap(**_values(out[0]))
 
     def limits(
@@ -340,6 +347,8 @@ class CompiledSolver:
         status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
         if status:
             raise DloError(f"no limits ({STATUSES[status]}): the shape is {shape.status!r}")
+        if slope is None:
+            out["gradient"] = np.nan
         found = {name: Usage(**_values(row)) for name, row in zip(QUANTITIES, out, strict=True)}
         first = QUANTITIES[tightest[0]]
         return {first: found[first]} | found

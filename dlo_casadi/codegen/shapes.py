@@ -184,7 +184,7 @@ class Gap:
     point, normal : (dimension,)
         Of the cable's axis there [m], and away from the obstacle.
     gradient : (4,) or (12,)
-        Of the distance by the columns of the slope; zeros without one.
+        Of the distance by the columns of the slope; NaN without one.
     obstacle : int
         Index of the nearest obstacle.
     """
@@ -216,7 +216,7 @@ class Usage:
     at : float [m]
         Arc length of the tightest place from the start.
     gradient : (k,)
-        Of the value by the columns of the slope; zeros without one.
+        Of the value by the columns of the slope; NaN without one.
     which : int
         Of forces and moments the fixture: 0 the start, 1 the end, 2 the first clip. Of a clearance
         the obstacle.

@@ -378,7 +378,8 @@ def declared_setup(config: Config) -> Setup:
     """How the cable is held and measured, as far as a configuration tells."""
     cable, experiment = config.cable, config.experiment
     measurement = experiment.measurement
-    starts = [pose.start for pose in experiment.poses] or [(0.0,) * len(experiment.gravity)]
+    d = len(experiment.gravity)
+    starts = [pose.start for pose in experiment.poses if len(pose.start) == d] or [(0.0,) * d]
     return Setup(
         cable=CableData(
             length=cable.length,

@@ -70,6 +70,8 @@ def _sections(model: type[BaseModel], at: Place = (), name: str = "") -> _Sectio
         for inner in _models(field.annotation):
             kind = inner.model_fields.get("kind")
             kinds = () if kind is None else get_args(kind.annotation)
+            # A class of several kinds is chosen by its key alone.
+            kinds = kinds if len(kinds) == 1 else ()
             named = f"{name}.{key}".lstrip(".") + "".join(f" (kind: {kind})" for kind in kinds)
             found |= _sections(inner, (*at, key, *kinds), named)
     return found
@@ -175,7 +177,8 @@ class Arguments(Source):
 def _help(section: type[BaseModel], key: object) -> str:
     """Help on a key, where the section knows it."""
     field = section.model_fields.get(str(key))
-    return f": {field.description.rstrip('.')}" if field and field.description else ""
+    description = " ".join((field.description or "").split()) if field else ""
+    return f": {description.rstrip('.')}" if description else ""
 
 
 def _about_number(value: object) -> str:
@@ -253,7 +256,7 @@ def explain(
             names = source.names if at_top else tuple(section.model_fields)
             hint = did_you_mean(str(key), names)
             homes = [
-                source.inside(str(key), name) if name else "the top"
+                source.inside(str(key), name) if name else source.top
                 for inner, name in sections.values()
                 if str(key) in inner.model_fields
             ]

@@ -126,11 +126,13 @@ class NodeCurve:
     ) -> FloatArray:
         """Arc lengths (K,) [m] after Newton steps from a guess, within [0, L].
 
-        No step is longer than half an element; the last is below `tolerance` times the length.
+        No step is longer than half an element; the last is below `tolerance` times the length. On
+        a curve that is not finite, as a fit may try one, the guess stays.
         """
         s, limit = guess.copy(), 0.5 * self.length / self.n
         for _ in range(_NEWTON_STEPS):
-            new = np.clip(s + np.clip(step(s), -limit, limit), 0.0, self.length)
+            change = np.nan_to_num(np.clip(step(s), -limit, limit))
+            new = np.clip(s + change, 0.0, self.length)
             done = np.abs(new - s).max() < tolerance * self.length
             s = new
             if done:

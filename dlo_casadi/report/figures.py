@@ -84,7 +84,7 @@ def errors_figure(outcome: Outcome) -> Figure:
     for k, stage in enumerate(outcome.stages):
         values = (stage.rmse_fit, validated.get(stage.name), stage.rmse_held_out)
         known = dict(zip(_KINDS, values, strict=True))
-        own = [kind for kind in shown if kind != "cross-validated" or stage.name in validated]
+        own = [kind for kind in shown if kind != "cross-validated" or known[kind] is not None]
         rows += [(k, kind, known[kind]) for kind in own]
     places = [-(i + 0.8 * k) for i, (k, *_) in enumerate(rows)]
     height = 1.6 + 0.2 * len(rows) + 0.2 * len(outcome.stages)

@@ -28,7 +28,7 @@ from dlo_casadi.report.scene import (
     scenes_of,
     seen,
 )
-from dlo_casadi.report.words import ComparedStage, branch_text, compared
+from dlo_casadi.report.words import ON_BRANCH, ComparedStage, compared
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput
 from dlo_casadi.session.pose_shape import PoseShape
@@ -292,7 +292,9 @@ def _picture(
         if not shape.stable:
             facts.append((kind, label, "not stable"))
         if shape.measured_branch is not None:
-            facts.append((kind, label, branch_text(shape.measured_branch)))
+            branch = shape.measured_branch
+            said = f"with {branch.chosen_by}" if branch.chosen_by else ON_BRANCH
+            facts.append((kind, said, millimetres(branch.rmse)))
     ends = drawn[-1][:1], drawn[-1][-1:]
     if not lines:
         held = behind.points(held_places(declared))

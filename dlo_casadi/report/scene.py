@@ -122,7 +122,8 @@ class Room:
 
     def ground(self) -> list[Mark]:
         """The floor with its squares, the world's axes and gravity."""
-        reach = self.square * np.floor(0.75 * self.radius / self.square)
+        # From no side do its corners, with the letters there, leave the window: sqrt(2) 0.68 < 1.
+        reach = self.square * np.floor(0.68 * self.radius / self.square)
         across = np.arange(-reach, reach + 0.5 * self.square, self.square)
         lines = np.array(
             [[[x, -reach], [x, reach]][:: 1 if k % 2 else -1] for k, x in enumerate(across)]

@@ -128,7 +128,7 @@ def footnotes(outcome: Outcome) -> list[str]:
         weight = outcome.fit.mass * math.hypot(*gravity)
         ratio = f" EI over weight is {stiffness.value / weight:.4g} m^2." if weight else ""
         lines.append(
-            f"Shapes give the ratio of stiffness to weight: {known} as good as the declared mass."
+            f"Shapes give the ratio of stiffness to weight: {known} as exact as the declared mass."
             f"{ratio}"
         )
         lines += _best_reading(outcome)
@@ -158,8 +158,8 @@ def _best_reading(outcome: Outcome) -> list[str]:
         return []
     (pose, side), force = max(forces.items(), key=lambda item: item[1])
     return [
-        f"One reading of {side}_force as in {pose}, {force:.3g} N, would tell it: to 1 % if noise "
-        f"and offset of the sensor are below {force / 100:.2g} N."
+        f"A measurement of {side}_force in {pose}, about {force:.3g} N, would check that mass: to "
+        f"1 % if noise and offset of the sensor are below {force / 100:.2g} N."
     ]
 
 

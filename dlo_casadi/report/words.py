@@ -10,7 +10,7 @@ from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted
 from dlo_casadi.session.outcome import FoundEffect, Outcome, PoseInput, Stage, StageName
-from dlo_casadi.session.pose_shape import BranchShape, EitherSide
+from dlo_casadi.session.pose_shape import EitherSide
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import APART, NOTABLE
 
@@ -31,7 +31,6 @@ STAGE_LABELS: dict[StageName, str] = {
 }
 # What the residual may depend on, by the name of its normal score.
 DEPENDENCES = {
-    "runs_z": "runs along the cable",
     "order_z": "the order of the poses",
     "span_z": "the distance of the ends",
     "position_z": "the place in the {plane}",
@@ -117,19 +116,19 @@ def mesh_text(outcome: Outcome) -> str:
     return f"{counted(model.n, model.element)}, mesh error {error}"
 
 
-def branch_text(found: BranchShape) -> str:
-    """Error of a pose in the equilibrium in which it was measured, and how to choose that one."""
-    return f"{ON_BRANCH} {millimetres(found.rmse)} ({found.chosen_by or 'no branch chooses it'})"
-
-
 def all_warnings(outcome: Outcome) -> list[str]:
-    """Warnings of the run, why a stage lacks a number, and what sits on a bound."""
+    """Warnings of the run, why a stage lacks a number, and what sits on a bound.
+
+    Algorithm 1 is a baseline: that it does not apply stands beside it, and is no warning.
+    """
     lines = list(outcome.warnings)
     held_out = outcome.measurement.poses_held_out > 0
     for name in ALWAYS:
         stage = outcome.stage(name)
         if stage is None:
             lines.append(f"stage {name} did not run")
+        elif name == "algorithm1" and not stage.shapes:
+            continue
         elif stage.rmse_fit is None or (held_out and stage.rmse_held_out is None):
             lines.append(f"stage {name}: {stage.note or 'some poses could not be predicted'}")
     for key, estimate in outcome.stages[-1].parameters.items() if outcome.stages else ():
@@ -212,7 +211,7 @@ def _either_side(name: str, found: EitherSide) -> str:
 
 
 def structure_lines(outcome: Outcome) -> list[str]:
-    """What the declared model's residual depends on, where it is not noise."""
+    """What shows that the declared model's residual is not noise."""
     if outcome.structure is None or outcome.verdict == "complete":
         return []
     before, _ = outcome.structure
@@ -221,11 +220,15 @@ def structure_lines(outcome: Outcome) -> list[str]:
     for key, text in DEPENDENCES.items():
         z = getattr(before, key)
         score = f"z = {z:+.1f}"
-        if key != "runs_z" and abs(z) >= 0.999 * LARGEST_SCORE:  # beyond what its test tells
+        if abs(z) >= 0.999 * LARGEST_SCORE:  # beyond what its test tells
             score = "z > 7" if z > 0 else "z < -7"
         if abs(z) > NOTABLE:
             found.append(f"{text.format(plane=plane)} ({score})")
-    return [f"  The declared model's residual depends on {', '.join(found)}."] if found else []
+    said = [f"depends on {', '.join(found)}"] if found else []
+    if abs(before.runs_z) > NOTABLE:
+        often, z = "less" if before.runs_z < 0 else "more", before.runs_z
+        said.insert(0, f"changes its sign along the cable {often} often than noise (z = {z:+.1f})")
+    return [f"  The declared model's residual {', and '.join(said)}."] if said else []
 
 
 def _effect_lines(effect: FoundEffect) -> list[str]:

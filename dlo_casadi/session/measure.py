@@ -340,8 +340,6 @@ def calibrated(config: Config, step: Step = nobody) -> Config:
         return config
     try:
         found = calibrate_session(config, step)
-        if found.focal_uncertainty > _UNKNOWN:
-            raise MeasurementError("; ".join(found.advice))
     except MeasurementError as error:
         raise MeasurementError(
             f"measurement.camera is missing, photographs of a cable {why} need it, and they "
@@ -360,7 +358,8 @@ def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration
     Raises
     ------
     MeasurementError
-        If the session has no photographs of a board, or too few that show it.
+        If the session has no photographs of a board, too few that show it, or if they leave the
+        focal length unknown.
     """
     measurement = config.experiment.measurement
     if measurement.kind != "images" or measurement.board is None:
@@ -383,6 +382,8 @@ def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration
             continue
     found = vision.calibrate_camera(images, board_of(measurement))
     step("calibrate", len(paths), len(paths))
+    if found.focal_uncertainty > _UNKNOWN:
+        raise MeasurementError("; ".join(found.advice))
     return found
 
 

@@ -67,10 +67,11 @@ def held_out_missing(
 def branch_warnings(stages: Sequence[Stage]) -> list[str]:
     """Poses measured in another stable equilibrium than the one of lowest energy.
 
-    Held-out poses on the other side are told with the verdict.
+    Of the last stage: what the model before lacked is no longer a mistake. Held-out poses on the
+    other side are told with the verdict.
     """
     lines = []
-    for stage in stages:
+    for stage in stages[-1:]:
         if stage.name not in ("batch", "closed"):
             continue
         either = {name: shape.either_side for name, shape in stage.shapes.items()}
@@ -139,12 +140,12 @@ def weight_warning(weight: HiddenWeight, expected: float) -> str:
 
 
 def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
-    """Simpler stages that come nearer to the fit poses than the batch estimate.
+    """Simpler stages that come nearer to the fit poses than the last one, if that is a fit.
 
     By more than chance: the root mean square of K points is known to 1/sqrt(2 K) of it.
     """
     lines = []
-    for batch in stages:
+    for batch in stages[-1:]:
         if batch.name not in ("batch", "closed") or batch.rmse_fit is None:
             continue
         count = sum(len(shape.s) for shape in batch.shapes.values())
@@ -282,13 +283,12 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
     if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor:
         apart = float(np.hypot(fit.fixture_error, floor))
         lines.append(
-            f"the fixtures are not quite where they are declared, {_scatter(fit)} in each pose: a "
-            f"pose that is not fitted is measured {1e3 * apart:.2g} mm from its prediction, "
-            f"however good the model (noise alone gives {1e3 * floor:.2g} mm); ends measured "
-            "pose by pose would help"
+            f"fixtures vary from pose to pose, by about {_scatter(fit)}: a new pose is measured "
+            f"{1e3 * apart:.2g} mm from its prediction, however good the model ({1e3 * floor:.2g} "
+            "mm by noise alone). Try: measure the ends in each pose"
         )
     if not fit.converged and not fit.failed:
-        lines.append("the fit crept to its minimum: it stopped within a standard deviation of it")
+        lines.append("the fit is slow: it stopped within a standard deviation of its minimum")
     unstable = [
         item.pose.name
         for item, ok in zip(fit.problem.measured, fit.stable, strict=True)

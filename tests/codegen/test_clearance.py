@@ -78,6 +78,8 @@ def test_the_nearest_of_many_obstacles_is_told_and_a_cut_is_negative(space):
     far = [space.clearance(shape, [one]).distance for one in (BALL, ROD, FLOOR)]
     gap = space.clearance(shape, [BALL, ROD, FLOOR])
     assert gap.obstacle == int(np.argmin(far))
+    assert np.isnan(gap.gradient).all()  # no slope is given
+    assert repr(space).startswith("<CompiledSolver ")
     assert gap.distance == min(far)
     inside = Capsule(tuple(shape.points[6]), tuple(shape.points[6]), 0.05)
     assert space.clearance(shape, [inside]).distance == pytest.approx(-0.052, abs=1e-7)

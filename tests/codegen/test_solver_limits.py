@@ -99,6 +99,8 @@ def test_a_clearance_is_that_of_dlo_clearance():
     assert own.at == gap.place * model.cable.length
     assert own.margin == pytest.approx(gap.distance / 0.02 - 1)
     assert np.array_equal(own.gradient, gap.gradient)
+    without = solver.limits(shape, {"clearance": 0.02}, obstacles)
+    assert all(np.isnan(usage.gradient).all() for usage in without.values())
 
 
 @pytest.mark.parametrize(

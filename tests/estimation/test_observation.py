@@ -133,6 +133,13 @@ def test_feet_stay_on_the_curve():
     assert 0.0 <= curve.nearest(after)[0] <= LENGTH
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_feet_stay_where_they_are_on_a_curve_that_is_not_finite(value):
+    curve = replace(circle(10), nodes=np.full((11, 2), value))
+    with np.errstate(invalid="ignore"):
+        assert curve.projections(np.zeros((1, 2)), np.array([0.05])) == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize("gap", [False, True])
 def test_first_places_along_the_chords(gap):
     """Dense noisy points of a circle: places within a hundredth of the length."""

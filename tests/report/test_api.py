@@ -22,6 +22,7 @@ import dlo_casadi as dlo
 from dlo_casadi import api
 from dlo_casadi.cli import main
 from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.effects.edge_bias import EdgeBias
 from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
 from dlo_casadi.session import Outcome
@@ -218,6 +219,12 @@ def test_cables_and_covariances_are_short(result):
     fitted = [name for name, found in result.cable.params.items() if not found.fixed]
     assert len(repr(result.cable).splitlines()) == 1 + len(fitted)
     assert len(repr(result.covariance).splitlines()) == 1 + len(result.covariance.names)
+    cable, value = result.cable, dlo.Estimate(1e-5, 1e-6, "m")
+    params = cable.metadata.params | {"edge_bias.a1": value}  # a nuisance that is not shown
+    metadata = dataclasses.replace(cable.metadata, params=params)
+    model = cable.model.with_effect(EdgeBias())
+    seen = dataclasses.replace(cable, model=model, metadata=metadata)
+    assert repr(seen) == repr(cable)
 
 
 def test_a_number_is_no_executor(outcome):

@@ -366,5 +366,5 @@ def test_a_missing_file_is_a_clear_error(tmp_path):
 
 
 def test_a_configuration_is_no_parameter_file():
-    with pytest.raises(ConfigError, match=r"the parameters\.yaml in the results folder of a fit"):
+    with pytest.raises(ConfigError, match=r"Try: dlo fit .*session\.yaml.* a configuration"):
         load(Path(small("short_clean").path))

@@ -61,6 +61,8 @@ def test_rooms_hold_their_cables_from_wherever_they_are_seen(in_room):
         assert curve[:, 2].min() > room.floor
         tip = room.force(curve[-1], shape.forces[1]).points[1]
         assert np.linalg.norm(tip) <= room.radius
+        for mark in room.ground():
+            assert np.hypot(*mark.points[:, :2].T).max() < room.window[0] / 2
 
 
 def test_the_forces_at_the_ends_carry_the_weight(in_room):

@@ -65,6 +65,8 @@ def test_a_pose_measured_on_another_branch_is_named_with_its_error_there():
     (said,) = branch_warnings([replace(stage, name="batch")])
     assert said.startswith("stage batch: 0, 2: the equilibrium of lowest energy")
     assert "`branch: cw` in these poses chooses it" in said
+    later = replace(stage, name="closed", shapes={})
+    assert branch_warnings([replace(stage, name="batch"), later]) == []
     assert branch_warnings([stage]) == []  # of a first guess nobody expects the branch
 
 

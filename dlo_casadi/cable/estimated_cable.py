@@ -1,4 +1,4 @@
-"""A cable with what is known of it: fitted values, their errors, and its curve in a pose."""
+"""A fitted cable without its shapes: values, their errors, and its curve in a pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from dlo_casadi.rod.node import Frame
 
 
 @dataclass(frozen=True, eq=False)
-class KnownCable(CasadiCable):
+class EstimatedCable(CasadiCable):
     """The model of a cable with its fitted values, and what is known of their errors.
 
     Parameters
@@ -36,7 +36,12 @@ class KnownCable(CasadiCable):
 
     def __repr__(self) -> str:
         mesh = counted(self.model.n, f"{self.model.element} element")
-        rows = (f"  {name}: {x}" for name, x in self.params.items() if not x.fixed)
+        hidden = tuple(f"{effect.label}." for effect in self.model.effects if not effect.shown)
+        rows = (
+            f"  {name}: {x}"
+            for name, x in self.params.items()
+            if not (x.fixed or name.startswith(hidden))
+        )
         return "\n".join([f"<FittedCable {self.name!r}: {self.length:g} m, {mesh}>", *rows])
 
     @property
@@ -68,11 +73,11 @@ class KnownCable(CasadiCable):
         *,
         aim: Aim = "margin",
     ) -> Placing:
-        """Find arc lengths and places of pinned clips that suit all of some poses of the ends.
+        """Find arc lengths and places of pinned clips that keep limits in several poses.
 
-        The least of what limits leave in any pose is made as large as it can be, or the greatest
-        force on all fixtures and clips as small as limits allow. The shapes are the stable ones of
-        lowest energy. From several first guesses the best is taken: others may be better still.
+        Maximizes the least margin of all limits in all poses, or minimizes the greatest force on
+        fixtures and clips within the limits. The shapes are the stable ones of lowest energy. The
+        optimum is local, the best of those found from several first guesses.
 
         Parameters
         ----------
@@ -86,7 +91,7 @@ class KnownCable(CasadiCable):
         limits : Limits or mapping, optional
             As of `Shape.check`; the session's by default.
         aim : "margin" or "force"
-            What is sought; for "force" there may be no limits.
+            What is optimized; "force" needs no limits.
 
         Raises
         ------
