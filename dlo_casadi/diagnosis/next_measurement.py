@@ -91,7 +91,7 @@ def _place(fit: Fit, weight: Candidate) -> float:
     """Arc length [m] at which a weight makes the stiffness most uncertain."""
     _, position = weight.frees
     variances = []
-    for normal in Screen(fit, [weight]).normals(InProcess()):
+    for normal in Screen(fit, [weight]).normals(InProcess(), range(len(weight.scans))):
         hessian, names = normal.hessian, normal.names
         kept = [k for k, name in enumerate(names) if name != position]
         covariance = np.linalg.pinv(hessian[np.ix_(kept, kept)], hermitian=True)

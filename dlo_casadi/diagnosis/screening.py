@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,10 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
+
+# Scans are tried two apart: neighbouring ones are correlated, see SCANS_PER_TEST. Those between are
+# tried next to a candidate's best where its p-value is below LIKELY, which is far from significant.
+APART, LIKELY = 2, 0.05
 
 
 @dataclass(frozen=True)
@@ -121,16 +125,15 @@ def _scan(active: Sequence[Candidate], k: int) -> dict[str, float]:
 def _derivatives(
     fit: Fit, listed: Sequence[Candidate], scans: Sequence[int]
 ) -> list[dict[tuple[str, ...], list[FloatArray]]]:
-    """For each of the scans beyond the first: derivatives by candidates, by their names."""
+    """For each of the scans: derivatives by candidates, by their names; none at the first."""
     moving: dict[tuple[str, ...], _Moving] = {}
     out = []
     for k in scans:
         found = {}
         # What a pose leaves behind acts through all later ones, at a cost.
         for state in (False, True):
-            active = [
-                c for c in listed if k < len(c.scans) and isinstance(c.effect, StateEffect) == state
-            ]
+            moved = [c for c in listed if 0 < k < len(c.scans)]
+            active = [c for c in moved if isinstance(c.effect, StateEffect) == state]
             key = tuple(candidate.name for candidate in active)
             if not key:
                 continue
@@ -155,30 +158,34 @@ class AtScan:
 class Screen:
     """All candidates in one model, evaluated at a fit."""
 
+    # Whether scans between those first tried are, too, next to the best of a likely candidate.
+    between = True
+
     def __init__(self, fit: Fit, listed: Sequence[Candidate]) -> None:
         self.fit = fit
         self.listed = list(listed)
         self.model = extended(fit, listed)
         self.p = fit.values_in(self.model)
 
-    def normals(self, executor: Executor) -> Iterator[AtScan]:
-        """Normal equations at each scan.
+    @property
+    def n_scans(self) -> int:
+        """Largest number of scans of a candidate."""
+        return max(len(candidate.scans) for candidate in self.listed)
 
-        The scans are dealt out in as many parts as there are workers, for what a part needs is
-        made once.
+    def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
+        """Normal equations at scans.
+
+        The first scan comes first. They are dealt out in as many parts as there are workers, for
+        what a part needs is made once.
         """
-        n_scans = max(len(candidate.scans) for candidate in self.listed)
-        workers = max(1, min(getattr(executor, "workers", 1), n_scans - 1))
-        parts = [range(1 + i, n_scans, workers) for i in range(workers)]
+        workers = max(1, min(getattr(executor, "workers", 1), len(scans)))
+        parts = [scans[i::workers] for i in range(workers)]
         begun = [begin(executor, _derivatives, self.fit, self.listed, part) for part in parts[1:]]
-        problem, point, lin = self._linearized()
+        problem, point, lin = self._linearized
         names = problem.unknowns.names
-        normal = problem.normal_equations(point, lin)
-        yield AtScan(self.listed, 0, normal.hessian, normal.gradient, names)
         moved = [_derivatives(self.fit, self.listed, parts[0]), *(found() for found in begun)]
-        for k in range(1, n_scans):
-            part, at = (k - 1) % workers, (k - 1) // workers
-            for own, found in moved[part][at].items():
+        for i, k in enumerate(scans):
+            for own, found in moved[i % workers][i // workers].items():
                 columns = [names.index(name) for name in own]
                 for by_theta, change in zip(lin.by_theta, found, strict=True):
                     by_theta[:, columns] = change
@@ -186,6 +193,7 @@ class Screen:
             active = [c for c in self.listed if k < len(c.scans)]
             yield AtScan(active, k, normal.hessian, normal.gradient, names)
 
+    @cached_property
     def _linearized(self) -> tuple[Problem, Point, Linearization]:
         """The fit's model with candidates at their nominal values, linearised at the fit."""
         problem = self.fit.problem
@@ -209,14 +217,22 @@ class Screen:
         executor : Executor, optional
             Where scans are done; in this process by default.
         """
-        best: dict[str, Screened] = {}
-        for normal in self.normals(executor or InProcess()):
-            for candidate in normal.active:
-                tried = self._score(candidate, normal, noise_dof)
-                known = best.get(candidate.name)
-                if known is None or tried.score > known.score:
-                    best[candidate.name] = tried
-        return in_order(best.values())
+        best: dict[str, tuple[Screened, int]] = {}
+
+        def improved(scans: Sequence[int]) -> None:
+            for normal in self.normals(executor or InProcess(), scans) if scans else ():
+                for candidate in normal.active:
+                    tried = self._score(candidate, normal, noise_dof)
+                    known = best.get(candidate.name)
+                    if known is None or tried.score > known[0].score:
+                        best[candidate.name] = tried, normal.k
+
+        first = range(0, self.n_scans, APART)
+        improved(first)
+        likely = [(x, k) for x, k in best.values() if x.p_value < LIKELY and self.between]
+        near = {j for x, k in likely for j in (k - 1, k + 1) if j < len(x.candidate.scans)}
+        improved(sorted(near & {*range(1, self.n_scans)} - {*first}))
+        return in_order(item for item, _ in best.values())
 
     def _score(self, candidate: Candidate, normal: AtScan, noise_dof: float) -> Screened:
         hessian, gradient, names = normal.hessian, normal.gradient, normal.names
@@ -285,12 +301,12 @@ class RelaxedScreen(Screen):
         super().__init__(near, listed)
         self.softness = softness
 
-    def normals(self, executor: Executor) -> Iterator[AtScan]:
-        """Normal equations at each scan, everything of a pose's own eliminated."""
+    between = False  # Only which candidates come nearest is asked.
+
+    def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
+        """Normal equations at scans, everything of a pose's own eliminated."""
         fit, begun = self.fit, dict[tuple[str, ...], tuple[Problem, Shapes]]()
-        n_scans = max(len(candidate.scans) for candidate in self.listed)
-        # Only which candidates come nearest is asked: every second place tells that.
-        for k in range(0, n_scans, 2):
+        for k in scans:
             active = [c for c in self.listed if k < len(c.scans)]
             names = tuple(candidate.name for candidate in active)
             if names not in begun:
