@@ -47,14 +47,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
-from dlo_casadi.thresholds import (
-    DIFFERENT,
-    LARGER_OF_TWO,
-    LEFT,
-    REFITTED,
-    SIGNIFICANCE,
-    WORTH,
-)
+from dlo_casadi.thresholds import DIFFERENT, LARGER_OF_TWO, LEFT, REFITTED, SIGNIFICANCE, WORTH
 
 Verdict = Literal["complete", "effect_found", "unexplained"]
 NOT_NEAR = "does not come near the measured shapes"
@@ -198,11 +191,8 @@ class Search:
         near = self.at_random(found)
         if near is not None:
             return replace(self, declared=near).closed()
-        # Where left-out poses are not even reached refits may have begun too far from the effect.
-        lost = fit.noise.source != "misfit" and not self.validation.complete
-        if found.unexplained or (lost and self.several):
-            force = estimate_unknown_force(fit if found.added else found.fit, self.executor)
-            found = found.or_better(self.of_causes(force))
+        if found.unexplained:
+            found, force = self._or_causes(found)
         if found.unexplained and found.added:
             found = self.without_wrong_causes(found)
             if found.added or not fit.errors_known:
@@ -237,8 +227,10 @@ class Search:
         found = self.run()
         found = found.or_better(self.of_simpler_effects(found))
         if found.unexplained and may_be_far:
-            found = found.or_better(first or of_shapes.run())
-        return found
+            return found.or_better(first or of_shapes.run())
+        # Where left-out poses are not even reached refits may have begun too far from the effect.
+        lost = may_be_far and not self.validation.complete
+        return self._or_causes(found)[0] if lost else found
 
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
@@ -326,9 +318,12 @@ class Search:
             return None
         return replace(self, exclude=[*self.exclude, *others]).run()
 
-    def of_causes(self, force: UnknownForce | None) -> Found | None:
-        """Search that begins with the causes of a force, if there is one that may have some."""
-        return self.run(force) if force is not None and self.several else None
+    def _or_causes(self, found: Found) -> tuple[Found, UnknownForce | None]:
+        """What has been found, or causes of an unknown force if these are better; and the force."""
+        start = self.declared if found.added else found.fit
+        force = estimate_unknown_force(start, self.executor)
+        causes = self.run(force) if force is not None and self.several else None
+        return found.or_better(causes), force
 
     def at_random(self, found: Found) -> Fit | None:
         """The declared model with random effects, if it misfits and they explain more."""
