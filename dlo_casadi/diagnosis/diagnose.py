@@ -12,6 +12,7 @@ from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
     REACHED,
+    RelaxedStart,
     from_data,
     likeliest,
     nearest,
@@ -383,10 +384,13 @@ class Search:
             near, softness, candidates_of(near, self.center, self.exclude)
         )
         likely, among = likeliest(screened), (self.executor, self.center, self.exclude)
-        touching = refits.confirm_contacts(current, near, screened, self.executor)
+        contacts = [x for x in screened if not x.candidate.effect.gradual]
+        begun = list(map_in_order(self.executor, partial(RelaxedStart.of, near), contacts))
+        touching = refits.confirm_contacts(current, begun, self.executor)
         explained = any(map(refits.explains, touching))
+        least = min(start.left for start in begun) if explained else float("inf")
         pairs = added + 2 <= self.max_effects and not explained
-        kept = nearest(near, softness, likely, *among, pairs=pairs)[:REFITTED]
+        kept = nearest(near, softness, likely, *among, pairs=pairs, least=least)[:REFITTED]
         tried = list(map_in_order(self.executor, partial(confirm_from_data, current), kept))
         for k, start in () if explained else enumerate(kept):
             if not refits.explains(tried[k]):

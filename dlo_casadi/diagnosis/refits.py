@@ -193,28 +193,27 @@ def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> C
 
 
 def confirm_contacts(
-    base: Fit, near: Fit, screened: Sequence[Screened], executor: Executor
+    base: Fit, begun: Sequence[RelaxedStart], executor: Executor
 ) -> list[Confirmed]:
     """`confirm_from_data` of those without derivative where they vanish, scored by their gains.
 
     Of a contact a soft balance tells less than a fit does. Gains are those under the noise of the
     base, which may hold what the base lacks: a fit gains that much at least.
     """
-    contacts = [x for x in screened if not x.candidate.effect.gradual]
-    found = map_in_order(executor, partial(_confirm_contact, base, near), contacts)
+    found = map_in_order(executor, partial(_confirm_contact, base), begun)
     return [item for item in found if item is not None]
 
 
-def _confirm_contact(base: Fit, near: Fit, screened: Screened) -> Confirmed | None:
-    item = confirm_from_data(base, RelaxedStart.of(near, screened))
+def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
+    item, screened = confirm_from_data(base, start), start.screened
     if item is None:
         return None
     same = item.fit.reweighed(base.noise, base.problem.priors)
     fit = _followed(same, same.model, {}, MOST_STEPS) or same
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
-    start = {name: item.fit.value(name) for name in screened.candidate.frees}
-    p_value = survival(gain, len(start), np.inf)
-    return replace(item, screened=Screened(screened.candidate, gain, p_value, start))
+    values = {name: item.fit.value(name) for name in screened.candidate.frees}
+    p_value = survival(gain, len(values), np.inf)
+    return replace(item, screened=Screened(screened.candidate, gain, p_value, values))
 
 
 def _followed(
