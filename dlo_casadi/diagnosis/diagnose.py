@@ -1,5 +1,7 @@
 """From a residual to the effects that are missing: screen, confirm, add, until it is noise."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
@@ -10,16 +12,10 @@ from typing import Literal
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.from_data import (
-    REACHED,
-    from_data,
-    likeliest,
-    nearest,
-    screened_from_data,
-)
+from dlo_casadi.diagnosis.from_data import REACHED
 from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
-from dlo_casadi.diagnosis.refits import Confirmed, confirm_from_data
-from dlo_casadi.diagnosis.screening import Screened, in_order, survival
+from dlo_casadi.diagnosis.refits import Confirmed
+from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
     Found,
@@ -47,14 +43,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
-from dlo_casadi.thresholds import (
-    DIFFERENT,
-    LARGER_OF_TWO,
-    LEFT,
-    REFITTED,
-    SIGNIFICANCE,
-    WORTH,
-)
+from dlo_casadi.thresholds import DIFFERENT, LARGER_OF_TWO, LEFT, REFITTED, SIGNIFICANCE, WORTH
 
 Verdict = Literal["complete", "effect_found", "unexplained"]
 NOT_NEAR = "does not come near the measured shapes"
@@ -154,6 +143,8 @@ class Search:
     finest: int | None = None
     from_shapes: bool = False
     """Whether the first candidates are tried at the measured shapes."""
+    wider: Search | None = None
+    """Of the same fit among more candidates, whose tests and refits hold here, too."""
 
     @cached_property
     def validation(self) -> CrossValidation:
@@ -180,7 +171,14 @@ class Search:
     @cached_property
     def first(self) -> list[Screened]:
         """Score tests in the declared model."""
+        if self.wider is not None:
+            return [x for x in self.wider.first if x.candidate.name not in self.exclude]
         return self._screened(self.declared)
+
+    @cached_property
+    def refitted(self) -> dict[str, Confirmed | None]:
+        """Refits of the declared model with a candidate, as far as they were needed, by names."""
+        return self.wider.refitted if self.wider is not None else {}
 
     def _screened(self, current: Fit) -> list[Screened]:
         """Score tests of all `candidates_of` a fit, best first."""
@@ -198,11 +196,8 @@ class Search:
         near = self.at_random(found)
         if near is not None:
             return replace(self, declared=near).closed()
-        # Where left-out poses are not even reached refits may have begun too far from the effect.
-        lost = fit.noise.source != "misfit" and not self.validation.complete
-        if found.unexplained or (lost and self.several):
-            force = estimate_unknown_force(fit if found.added else found.fit, self.executor)
-            found = found.or_better(self.of_causes(force))
+        if found.unexplained:
+            found, force = self._or_causes(found)
         if found.unexplained and found.added:
             found = self.without_wrong_causes(found)
             if found.added or not fit.errors_known:
@@ -237,8 +232,10 @@ class Search:
         found = self.run()
         found = found.or_better(self.of_simpler_effects(found))
         if found.unexplained and may_be_far:
-            found = found.or_better(first or of_shapes.run())
-        return found
+            return found.or_better(first or of_shapes.run())
+        # Where left-out poses are not even reached refits may have begun too far from the effect.
+        lost = may_be_far and not self.validation.complete
+        return self._or_causes(found)[0] if lost else found
 
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
@@ -324,11 +321,14 @@ class Search:
         best = max((scores[name] for name in scores.keys() - others), default=0.0)
         if best < LARGER_OF_TWO * scores[winner.name]:
             return None
-        return replace(self, exclude=[*self.exclude, *others]).run()
+        return replace(self, exclude=[*self.exclude, *others], wider=self).run()
 
-    def of_causes(self, force: UnknownForce | None) -> Found | None:
-        """Search that begins with the causes of a force, if there is one that may have some."""
-        return self.run(force) if force is not None and self.several else None
+    def _or_causes(self, found: Found) -> tuple[Found, UnknownForce | None]:
+        """What has been found, or causes of an unknown force if these are better; and the force."""
+        start = self.declared if found.added else found.fit
+        force = estimate_unknown_force(start, self.executor)
+        causes = self.run(force) if force is not None and self.several else None
+        return found.or_better(causes), force
 
     def at_random(self, found: Found) -> Fit | None:
         """The declared model with random effects, if it misfits and they explain more."""
@@ -372,41 +372,24 @@ class Search:
         ]
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
-        return list(map_in_order(self.executor, partial(refits.confirm, current), worthy))
+        known = self.refitted if current is self.declared else {}
+        new = [item for item in worthy if item.candidate.name not in known]
+        found = map_in_order(self.executor, partial(refits.confirm, current), new)
+        known.update(zip((item.candidate.name for item in new), found, strict=True))
+        return [known[item.candidate.name] for item in worthy]
 
     def _from_data(
         self, current: Fit, added: int
     ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
-        """Fits from the measured shapes of the candidates that come nearest to them.
-
-        Beside a misfit scores tell nothing, and a refit leads where the declared model has gone.
-        Where the nearest does not explain the shapes its end is rolled anew, then that of the
-        next. Last: who stays far from them.
-        """
-        near, softness = from_data(current)
-        screened = screened_from_data(
-            near, softness, candidates_of(near, self.center, self.exclude)
-        )
-        likely, among = likeliest(screened), (self.executor, self.center, self.exclude)
-        touching = refits.confirm_contacts(current, near, screened, self.executor)
-        explained = any(map(refits.explains, touching))
-        pairs = added + 2 <= self.max_effects and not explained
-        kept = nearest(near, softness, likely, *among, pairs=pairs)[:REFITTED]
-        tried = list(map_in_order(self.executor, partial(confirm_from_data, current), kept))
-        for k, start in () if explained else enumerate(kept):
-            if not refits.explains(tried[k]):
-                tried[k] = refits.confirm_rolled(current, start, tried[k])
-            if refits.explains(tried[k]):
-                break
-        scored = {item.name: item.screened for item in touching}
-        screened = in_order([scored.get(x.candidate.name, x) for x in screened])
-        p_values = p_values_of(screened)
-        for start in kept:
-            name, own = start.screened.candidate.name, sidak(start.screened.p_value, len(screened))
-            p_values[name] = min(own, p_values.get(name, 1.0))
-        near_names = set().union(*(start.names for start in kept))
-        far = [x.candidate.name for x in likely if x.candidate.name not in near_names]
-        return screened, p_values, [*touching, *tried], far
+        """As `_refitted`, from the measured shapes."""
+        pairs = added + 2 <= self.max_effects
+        found = refits.near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
+        p_values = p_values_of(found.screened)
+        for item in found.nearest:
+            single = sidak(item.p_value, len(found.screened))
+            name = item.candidate.name
+            p_values[name] = min(single, p_values.get(name, 1.0))
+        return found.screened, p_values, found.tried, found.far
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
         """Refits of all loads at one place, whatever their scores, that explain the forces.

@@ -220,14 +220,17 @@ def nearest(
     exclude: Sequence[str] = (),
     *,
     pairs: bool = True,
+    least: float = np.inf,
 ) -> list[RelaxedStart]:
     """Starts that leave little more than the one that leaves least, nearest first.
 
-    Of the candidates; where none of these comes to the noise that the relaxed shapes have, of two
-    together if `pairs` may be added and REACHED times what they leave is less.
+    Of the candidates, beside another start that leaves `least`; where none of these comes to the
+    noise that the relaxed shapes have, of two together if `pairs` may be added and REACHED times
+    what they leave is less.
     """
     noise = REACHED * near.point.data
-    begun = _near_least(map_in_order(executor, partial(RelaxedStart.of, near), likely), noise)
+    alone = map_in_order(executor, partial(RelaxedStart.of, near), likely)
+    begun = _near_least(alone, noise, least)
     if not pairs or not begun or begun[0].left < noise:
         return begun
     second = partial(RelaxedStart.and_second, softness=softness, center=center, exclude=exclude)
@@ -237,10 +240,12 @@ def nearest(
     return kept if kept and REACHED * kept[0].left < begun[0].left else begun
 
 
-def _near_least(begun: Iterable[RelaxedStart], noise: float) -> list[RelaxedStart]:
+def _near_least(
+    begun: Iterable[RelaxedStart], noise: float, least: float = np.inf
+) -> list[RelaxedStart]:
     """Those that leave little more than the one that leaves least, nearest first."""
     ordered = sorted(begun, key=lambda x: x.left)
-    least = ordered[0].left if ordered else np.inf
+    least = min([least, *(x.left for x in ordered[:1])])
     most = least * (NEAR_NOISE if least < noise else NEAR_LEAST)
     return [start for start in ordered if start.left <= most]
 

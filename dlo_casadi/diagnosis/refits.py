@@ -21,9 +21,16 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.from_data import REACHED, RelaxedStart, from_data
+from dlo_casadi.diagnosis.from_data import (
+    REACHED,
+    RelaxedStart,
+    from_data,
+    likeliest,
+    nearest,
+    screened_from_data,
+)
 from dlo_casadi.diagnosis.screening import (
     Screen,
     Screened,
@@ -41,6 +48,7 @@ from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.thresholds import REFITTED
 
 # Shares of the one-step estimate from which a refit is tried.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -105,6 +113,28 @@ class Confirmed:
             replace(self, screened=x, beside=tuple(y for y in self.each if y is not x))
             for x in self.each
         ]
+
+
+@dataclass(frozen=True)
+class NearData:
+    """Candidates tried at the measured shapes.
+
+    Parameters
+    ----------
+    screened : list of Screened
+        All, best first.
+    nearest : list of Screened
+        Those that came nearest to the shapes; of pairs the second.
+    tried : list of Confirmed or None
+        Their fits, and those of contacts.
+    far : list of str
+        Names of likely ones that stayed far from the shapes.
+    """
+
+    screened: list[Screened]
+    nearest: list[Screened]
+    tried: list[Confirmed | None]
+    far: list[str]
 
 
 def scored(
@@ -184,6 +214,42 @@ def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
     return None
 
 
+def near_data(
+    base: Fit,
+    executor: Executor,
+    center: tuple[float, float] | None,
+    exclude: Sequence[str],
+    *,
+    pairs: bool,
+) -> NearData:
+    """Fits from the measured shapes of the candidates, or `pairs`, that come nearest to them.
+
+    Beside a misfit scores tell nothing, and a refit leads where the declared model has gone. Where
+    the nearest does not explain the shapes its end is rolled anew, then that of the next.
+    """
+    near, softness = from_data(base)
+    screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
+    likely = likeliest(screened)
+    contacts = [x for x in screened if not x.candidate.effect.gradual]
+    begun = list(map_in_order(executor, partial(RelaxedStart.of, near), contacts))
+    touching = confirm_contacts(base, begun, executor)
+    explained = any(map(explains, touching))
+    least = min(start.left for start in begun) if explained else np.inf
+    among, pairs = (executor, center, exclude), pairs and not explained
+    kept = nearest(near, softness, likely, *among, pairs=pairs, least=least)[:REFITTED]
+    tried = list(map_in_order(executor, partial(confirm_from_data, base), kept))
+    for k, start in () if explained else enumerate(kept):
+        if not explains(tried[k]):
+            tried[k] = confirm_rolled(base, start, tried[k])
+        if explains(tried[k]):
+            break
+    fitted = {item.name: item.screened for item in touching}
+    screened = in_order([fitted.get(x.candidate.name, x) for x in screened])
+    names = set().union(*(start.names for start in kept))
+    far = [x.candidate.name for x in likely if x.candidate.name not in names]
+    return NearData(screened, [start.screened for start in kept], [*touching, *tried], far)
+
+
 def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
     """The likelier one of `found` and a fit from the start with its end rolled anew."""
     rolled = start.rolled()
@@ -193,28 +259,27 @@ def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> C
 
 
 def confirm_contacts(
-    base: Fit, near: Fit, screened: Sequence[Screened], executor: Executor
+    base: Fit, begun: Sequence[RelaxedStart], executor: Executor
 ) -> list[Confirmed]:
     """`confirm_from_data` of those without derivative where they vanish, scored by their gains.
 
     Of a contact a soft balance tells less than a fit does. Gains are those under the noise of the
     base, which may hold what the base lacks: a fit gains that much at least.
     """
-    contacts = [x for x in screened if not x.candidate.effect.gradual]
-    found = map_in_order(executor, partial(_confirm_contact, base, near), contacts)
+    found = map_in_order(executor, partial(_confirm_contact, base), begun)
     return [item for item in found if item is not None]
 
 
-def _confirm_contact(base: Fit, near: Fit, screened: Screened) -> Confirmed | None:
-    item = confirm_from_data(base, RelaxedStart.of(near, screened))
+def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
+    item, screened = confirm_from_data(base, start), start.screened
     if item is None:
         return None
     same = item.fit.reweighed(base.noise, base.problem.priors)
     fit = _followed(same, same.model, {}, MOST_STEPS) or same
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
-    start = {name: item.fit.value(name) for name in screened.candidate.frees}
-    p_value = survival(gain, len(start), np.inf)
-    return replace(item, screened=Screened(screened.candidate, gain, p_value, start))
+    values = {name: item.fit.value(name) for name in screened.candidate.frees}
+    p_value = survival(gain, len(values), np.inf)
+    return replace(item, screened=Screened(screened.candidate, gain, p_value, values))
 
 
 def _followed(

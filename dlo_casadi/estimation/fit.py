@@ -227,7 +227,7 @@ def mesh_error(fit: Fit) -> float:
     equilibria = BatchEquilibrium(model, [item.pose for item in fit.problem.measured])
     state = fit.p, model.rest_basis @ fit.coefficients
     start = on_other_mesh(fit.point.shapes, fit.model, model)
-    shapes, converged = equilibria.solve(start, *state)
+    shapes, converged = equilibria.solve_or_descend(start, *state)
     if not converged.all():
         return float("inf")
     fine = equilibria.seen(shapes, *state)

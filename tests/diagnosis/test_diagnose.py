@@ -12,8 +12,9 @@ from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.diagnosis.diagnose import Search, diagnose
 from dlo_casadi.diagnosis.screening import Screen
+from dlo_casadi.diagnosis.selection import Found
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
 from dlo_casadi.effects import EFFECTS, BendingSoftening, LumpedMass
 from dlo_casadi.estimation.batch import solve_batch
@@ -126,6 +127,23 @@ def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypa
     assert found.added == ()
     assert found.validation_after.rmse == pytest.approx(found.validation_before.rmse)
     assert all(row.rmse_cross_validated for row in found.ranked)  # all were refitted
+
+
+@pytest.mark.parametrize("from_shapes", [True, False])
+def test_no_force_is_asked_for_where_shapes_lead_to_an_explanation(
+    found, fit, monkeypatch, from_shapes
+):
+    """Left-out poses are not reached: only refits that began at the declared model are in doubt."""
+    asked = []
+    monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: asked.append(1))
+    monkeypatch.setattr(module, "REACHED", 0.0 if from_shapes else np.inf)
+    explained = Found.of(found.after, found.added, found.ranked, 12, 0.005)
+    monkeypatch.setattr(Search, "run", lambda *_: explained)
+    monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
+    lost = replace(cross_validate(fit), complete=False)
+    monkeypatch.setattr(module, "cross_validate", lambda _: lost)
+    assert diagnose(fit).verdict == "effect_found"
+    assert bool(asked) != from_shapes
 
 
 def test_the_score_predicts_the_gain_of_a_refit(session):
