@@ -9,7 +9,7 @@ A draw is solved by Newton's method from the predicted shape, not from the linea
 values are those of an `Equilibrium`; it is followed in steps where that fails.
 
 Exit code 1 if a probability of first order is more than 2 percentage points off, or a counted one
-more than three standard errors of both counts.
+more than four standard errors of both counts.
 """
 
 import argparse
@@ -74,8 +74,9 @@ MOVED = 0.02
 ROOM = 0.93
 # Solved at a time; steps in which draws are followed that Newton's method loses; its last step.
 CHUNK, STEPS, TOLERANCE = 1000, 4, 1e-6
-# Points that first order, and standard errors that a count may be off.
-POINTS, ERRORS = 0.02, 3.0
+# Points that first order, and standard errors that a count may be off: of sixty limits one is
+# beyond three in every sixth run. One was (84.62 % for 83.34); of 40,000 draws 83.98 % violated it.
+POINTS, ERRORS = 0.02, 4.0
 
 
 @dataclass(frozen=True)
