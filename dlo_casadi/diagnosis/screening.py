@@ -39,11 +39,7 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin
-from dlo_casadi.thresholds import COLLINEAR, SCANS_PER_TEST
-
-# Scans are tried two apart: neighbouring ones are correlated, see SCANS_PER_TEST. Those between are
-# tried next to a candidate's best where its p-value is below LIKELY, which is far from significant.
-APART, LIKELY = 2, 0.05
+from dlo_casadi.thresholds import COLLINEAR, IN_QUESTION, SCANS_APART, SCANS_PER_TEST
 
 
 @dataclass(frozen=True)
@@ -227,9 +223,9 @@ class Screen:
                     if known is None or tried.score > known[0].score:
                         best[candidate.name] = tried, normal.k
 
-        first = range(0, self.n_scans, APART)
+        first = range(0, self.n_scans, SCANS_APART)
         improved(first)
-        likely = [(x, k) for x, k in best.values() if x.p_value < LIKELY and self.between]
+        likely = [(x, k) for x, k in best.values() if x.p_value < IN_QUESTION and self.between]
         near = {j for x, k in likely for j in (k - 1, k + 1) if j < len(x.candidate.scans)}
         improved(sorted(near & {*range(1, self.n_scans)} - {*first}))
         return in_order(item for item, _ in best.values())
