@@ -17,7 +17,7 @@ COLLINEAR = 1e-7
 SCANS_PER_TEST = 3
 # How far apart the scans are that are tried first. Those between are tried next to a candidate's
 # best where its p-value, over its places, is below IN_QUESTION, ten times the significance: a
-# fifth more of a score of 8 lowers it from 0.05 to 0.02. Scores of the leading candidates of two
+# fifth more of a score of 7.4 lowers it from 0.05 to 0.02. Scores of the leading candidates of two
 # sessions in space, 23 places each, were those of all scans.
 SCANS_APART, IN_QUESTION = 2, 0.05
 # Fewest degrees of freedom assumed for an estimated noise: with 4 or less F has no variance. The
