@@ -124,6 +124,7 @@ def test_nothing_about_it_is_uncertain(cable, held, pose):
     assert (violated.std, violated.probability, violated.verdict) == (0.0, 1.0, "fail")
     assert (violated.method, violated.chance) == ("exact", "100 %")
     assert str(kept).endswith("mm); nothing is uncertain")
+    assert "±" not in str(kept) + kept.text(kept.value, kept.std)
     assert kept.as_dict()["shares"] == {}
 
 

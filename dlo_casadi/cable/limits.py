@@ -74,7 +74,8 @@ class LimitUse:
         return f"s = {self.at:.3f} m{self.holder and f', {self.holder}'}"
 
     def text(self, *values: float) -> str:
-        """A value of the quantity with its unit, and its standard deviation if it is given."""
+        """A value of the quantity with its unit, and its standard deviation if there is one."""
+        values = values if any(values[1:]) else values[:1]
         unit = UNITS[self.quantity]
         unit, size = ("mm", 1e3) if unit == "m" else (unit, 1.0)
         forms = zip(values, (".4g", ".2g"), strict=False)
