@@ -31,7 +31,6 @@ from dlo_casadi.config import (
     Pose,
     any_photographs,
     checked_config,
-    declared_setup,
     known_config,
     load_as,
 )
@@ -43,7 +42,7 @@ from dlo_casadi.report.figures_poses import outcome_figure
 from dlo_casadi.report.tables import estimates_of, outcome_html, outcome_text, summary_text
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
-from dlo_casadi.session.fitting import exact_model
+from dlo_casadi.session.fitting import declared_model
 
 Kind = TypeVar("Kind")
 
@@ -358,8 +357,7 @@ def known_cable(
     given |= _given(rest_curvature=rest_curvature) | {"cable": cable} | unknown
     names = tuple(signature(known_cable).parameters)[:-1]
     config, coefficients = known_config(given, names)
-    exact = exact_model(config, declared_setup(config))
-    return exact_cable(exact, coefficients, config.limits)
+    return exact_cable(declared_model(config, exact=True), coefficients, config.limits)
 
 
 def predict(

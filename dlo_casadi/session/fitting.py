@@ -10,7 +10,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, EstimationOptions, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
-from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS, Setup
+from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.errors import ConfigError, EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import CONVERGED, descend, least_decrease
@@ -96,6 +96,8 @@ def declared_model(
     config: Config,
     center: tuple[float, float] | None = None,
     pixel: float | None = None,
+    *,
+    exact: bool = False,
 ) -> Declared:
     """Build the declared model.
 
@@ -105,6 +107,8 @@ def declared_model(
         Middle of the photographs in the board frame.
     pixel : float, optional [m]
         Size of a pixel on the board, for photographs.
+    exact : bool
+        Whether all is exactly as declared: without nuisances.
 
     Raises
     ------
@@ -114,21 +118,6 @@ def declared_model(
     if problems := wrong_effects(config):
         raise ConfigError("; ".join(problem.message for problem in problems), config.path)
     setup = replace(declared_setup(config), center=center)
-    exact = exact_model(config, setup)
-    model, tolerances = exact.model, exact.tolerances
-    if END_ROLL in model.names:
-        model = replace(model, priors={END_ROLL: config.experiment.tolerances.roll})
-    if config.cable.mass is None:
-        model = model.with_effect(UNKNOWN_MASS())
-    model = nuisances(model, tolerances, pixel, setup.readings)
-    known = dict(zip(exact.model.names, exact.start, strict=True))
-    start = np.array([known.get(q.name, q.nominal) for q in model.parameters])
-    kept = {*exact.model.names} - {*exact.free}
-    return Declared(model, start, [name for name in model.names if name not in kept], tolerances)
-
-
-def exact_model(config: Config, setup: Setup) -> Declared:
-    """Build the model of what is declared alone: nothing in it is known within a tolerance."""
     experiment, options = config.experiment, config.model
     coefficients = config.estimation.rest_curvature_coefficients
     model = CableModel(
@@ -142,15 +131,22 @@ def exact_model(config: Config, setup: Setup) -> Declared:
         clips=experiment.clips,
         obstacles=experiment.surfaces,
     )
+    if END_ROLL in model.names and not exact:
+        model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
     for item in options.effects:
         model = model.with_effect(EFFECTS[item.name].made_for(setup))
+    if config.cable.mass is None:
+        model = model.with_effect(UNKNOWN_MASS())
+    tolerances = Tolerances(**setup.tolerances)
+    if not exact:
+        model = nuisances(model, tolerances, pixel, setup.readings)
     start, free = model.nominal.copy(), list(model.names)
     for item in options.effects:
         for name, parameter in item.parameters.items():
             start[model.names.index(f"{item.name}.{name}")] = parameter.value
             if parameter.fixed:
                 free.remove(f"{item.name}.{name}")
-    return Declared(model, start, free, Tolerances(**setup.tolerances))
+    return Declared(model, start, free, tolerances)
 
 
 def straight(model: CableModel) -> CableModel:
