@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from dlo_casadi.api import Result as Result
     from dlo_casadi.api import Session as Session
     from dlo_casadi.api import fit as fit
+    from dlo_casadi.api import known_cable as known_cable
     from dlo_casadi.api import predict as predict
     from dlo_casadi.cable.estimate import Covariance as Covariance
     from dlo_casadi.cable.estimate import Estimate as Estimate
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 # Module -> its public names. They are imported when they are first asked for, so that the command
 # answers at once and an interrupt finds it ready.
 _PUBLIC = {
-    "api": "Result Session fit predict",
+    "api": "Result Session fit known_cable predict",
     "cable.estimate": "Covariance Estimate",
     "cable.file": "load",
     "cable.fitted_cable": "FittedCable Shape",

@@ -31,16 +31,18 @@ from dlo_casadi.config import (
     Pose,
     any_photographs,
     checked_config,
+    known_config,
     load_as,
 )
 from dlo_casadi.config.problems import Arguments
 from dlo_casadi.config.values import plain
 from dlo_casadi.errors import DloError, library
-from dlo_casadi.report.documents import fitted_cable
+from dlo_casadi.report.documents import exact_cable, fitted_cable
 from dlo_casadi.report.figures_poses import outcome_figure
 from dlo_casadi.report.tables import estimates_of, outcome_html, outcome_text, summary_text
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
+from dlo_casadi.session.fitting import declared_model
 
 Kind = TypeVar("Kind")
 
@@ -310,6 +312,52 @@ def fit(path: str | Path, **options: Any) -> Result:
         As `Session.fit`.
     """
     return Session.load(path).fit(**options)
+
+
+def known_cable(
+    cable: Cable,
+    *,
+    gravity: ArrayLike | None = None,
+    boundary: Sequence[str] | None = None,
+    rest_curvature: ArrayLike | None = None,
+    model: Mapping[str, Any] | None = None,
+    limits: Mapping[str, float] | None = None,
+    **unknown: Any,
+) -> FittedCable:
+    """A cable of which everything is known, without poses and without a fit.
+
+    It is what a fit returns, with standard deviations of zero.
+
+    Parameters
+    ----------
+    cable : Cable
+        Its stiffnesses and its mass are taken as they are, no first guesses; in space it needs a
+        torsional stiffness.
+    gravity, boundary
+        As of `Session`.
+    rest_curvature : float or (K,), in space (2,) or (2, K) [1/m], optional
+        Curvature without load, at K <= 64 places evenly spaced from start to end, between them a
+        cubic spline; counter-clockwise, in space about the material axes y and z. Straight by
+        default.
+    model, limits : mapping, optional
+        As in a configuration: {"n": 40, "effects": [...]}, each effect with all its values.
+
+    Raises
+    ------
+    ConfigError
+        If the arguments cannot be used; the message lists every problem with the argument's name.
+
+    Examples
+    --------
+    >>> rope = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+    >>> rope = dlo.known_cable(rope, gravity=(0, -9.81), boundary=("pinned", "pinned"))
+    >>> rope.solve(end=(0.5, 0.1)).points
+    """
+    given = _given(gravity=gravity, boundary=boundary, model=model, limits=limits)
+    given |= _given(rest_curvature=rest_curvature) | {"cable": cable} | unknown
+    names = tuple(signature(known_cable).parameters)[:-1]
+    config, coefficients = known_config(given, names)
+    return exact_cable(declared_model(config, exact=True), coefficients, config.limits)
 
 
 def predict(

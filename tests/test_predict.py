@@ -398,7 +398,7 @@ def test_the_command_takes_what_the_function_takes(loom, capsys):
             "start_heading: a finite number belongs here, found nan",
         ),
         ("overhang", {"end": (0.3, 0.0)}, "the end of 'overhang' is free: it cannot be held"),
-        ("overhang", {}, "differed from pose to pose: give start_heading [rad]"),
+        ("overhang", {}, "with no heading that all poses share: give start_heading [rad]"),
     ],
 )
 def test_ends_that_do_not_suit_the_cable(request, file, ends, message):

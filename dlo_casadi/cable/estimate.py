@@ -91,7 +91,8 @@ class Covariance:
                 "  Try: covariance[name, name] is the variance, `std` has its root."
             )
         if unknown := [name for name in pair if name not in self.names]:
-            raise DloError(f"{unknown[0]!r} was not fitted; fitted are {', '.join(self.names)}")
+            fitted = ", ".join(self.names) or "none"
+            raise DloError(f"{unknown[0]!r} was not fitted; fitted are {fitted}")
         i, j = map(self.names.index, pair)
         return float(self.values[i, j])
 

@@ -36,11 +36,12 @@ class EstimatedCable(CasadiCable):
 
     def __repr__(self) -> str:
         mesh = counted(self.model.n, f"{self.model.element} element")
+        fitted = bool(self.covariance.names)
         hidden = tuple(f"{effect.label}." for effect in self.model.effects if not effect.shown)
         rows = (
             f"  {name}: {x}"
             for name, x in self.params.items()
-            if not (x.fixed or name.startswith(hidden))
+            if not ((x.fixed and fitted) or name.startswith(hidden))
         )
         return "\n".join([f"<FittedCable {self.name!r}: {self.length:g} m, {mesh}>", *rows])
 

@@ -45,8 +45,8 @@ _POINTS = 101
 class FittedCable(EstimatedCable):
     """A fitted cable: its model with the fitted values, and what is known of their errors.
 
-    From `Result.cable`, or `dlo_casadi.load` of a folder of results. Its `function` and `equations`
-    are for CasADi problems of one's own.
+    From `Result.cable`, `dlo_casadi.load` of a folder of results, or without a fit from
+    `dlo_casadi.known_cable`. Its `function` and `equations` are for CasADi problems of one's own.
 
     Parameters
     ----------
@@ -186,7 +186,8 @@ class FittedCable(EstimatedCable):
         to, known, first = target_of(target), self.metadata, self.solve(**held).held
         fitted = (known.coefficients, known.covariance.names, known.covariance.values)
         others = samples_of(first, *fitted, samples, seed)
-        origin = f"fitted cable {known.model_hash[:16]} of {known.config}"
+        kind = "fitted" if known.covariance.names else "known"
+        origin = f"{kind} cable {known.model_hash[:16]} of {known.config}"
         return write_rods(to, Path(path), [first, *others], origin, segments, seed)
 
     def with_mesh(self, n: int | None = None, element: str | None = None) -> Self:

@@ -74,7 +74,8 @@ class LimitUse:
         return f"s = {self.at:.3f} m{self.holder and f', {self.holder}'}"
 
     def text(self, *values: float) -> str:
-        """A value of the quantity with its unit, and its standard deviation if it is given."""
+        """A value of the quantity with its unit, and its standard deviation if there is one."""
+        values = values if any(values[1:]) else values[:1]
         unit = UNITS[self.quantity]
         unit, size = ("mm", 1e3) if unit == "m" else (unit, 1.0)
         forms = zip(values, (".4g", ".2g"), strict=False)
@@ -111,7 +112,7 @@ class LimitCheck(LimitUse):
         Shapes that were solved to count the probability, 0 where first order suffices; and those of
         them where the cable snaps to another shape, which count as violations.
     shares : mapping of str to float
-        Parts of the variance by their causes, the largest first.
+        Parts of the variance by their causes, the largest first; empty where nothing is uncertain.
     decided_by : str
         The largest cause in words, with its size.
     """
@@ -134,16 +135,22 @@ class LimitCheck(LimitUse):
     @property
     def method(self) -> str:
         """How the probability was found."""
+        if not self.shares:
+            return "exact"
         return counted(self.draws, "draw") if self.draws else "first order"
 
     @property
     def chance(self) -> str:
         """The probability as text."""
+        if not self.shares:
+            return f"{100 * self.probability:.0f} %"
         if not SHOWN < self.probability < 1 - SHOWN:
             return "< 0.1 %" if self.probability < 0.5 else "> 99.9 %"
         return f"{100 * self.probability:.{1 if self.probability < 0.1 else 0}f} %"
 
     def __str__(self) -> str:
+        if not self.shares:
+            return f"{self.verdict}: {super().__str__()}; {self.decided_by}"
         return (
             f"{self.verdict}: {self.label} {self.text(self.value, self.std)} at {self.where} "
             f"({self.bound}), violated with {self.chance} ({self.method}); "
@@ -178,7 +185,7 @@ def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Li
     """
     asked = _given(Limits, limits, _TRY) or known.limits
     if not asked.given:
-        raise DloError(f"no limit is given, and the session declared none.\n  Try: {_TRY}")
+        raise DloError(f"no limit is given, and none was declared.\n  Try: {_TRY}")
     held = (model.start, model.end, *model.clips)
     avoided = any(not one.touch for one in model.obstacles)
     if wrong := [*asked.problems(held, model.node.twists, model.cable.length, avoided)]:
@@ -354,9 +361,9 @@ def limit_checks(
 
 def _said(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:
     """The largest cause of an uncertain value in words: "2 mm at the end (81 %)"."""
-    cause, share = next(iter(chance.shares.items()))
     if not chance.std > 0:
         return "nothing is uncertain"
+    cause, share = next(iter(chance.shares.items()))
     own = [name for name in model.deviations if cause_of(model, name) == cause]
     size = max((known.scatter.get(name, 0.0) for name in own), default=known.added.get(cause, 0.0))
     tolerance = next((x for x, y in tolerances_of(model).items() if {cause, *own} & {*y}), "")

@@ -5,6 +5,7 @@ reported at once, each with its line.
 """
 
 from dlo_casadi.config.document import dump_yaml, read_yaml
+from dlo_casadi.config.known import known_config
 from dlo_casadi.config.load import (
     any_photographs,
     checked_config,

@@ -12,7 +12,13 @@ from dlo_casadi.config.document import Document
 from dlo_casadi.config.options import DeclaredEffect, DeclaredTolerances
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
-from dlo_casadi.config.supports import clip_problems, clips_differ, obstacle_problems, too_short
+from dlo_casadi.config.supports import (
+    clip_problems,
+    clips_differ,
+    obstacle_problems,
+    too_short,
+    undetermined,
+)
 from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.effects.setup import height_of
@@ -149,13 +155,7 @@ def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
     if experiment.in_space and measurement.kind == "images" and measurement.board is None:
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
         yield ConfigProblem(("experiment", "measurement"), text)
-    if experiment.in_space and held.start == "pinned" and held.end == "free":
-        text = (
-            "on a ball joint and with a free end a cable in space may be turned about gravity, "
-            "which holds it in no shape of all these. Try: start: clamped, with start_orientation; "
-            "or two numbers of gravity, in the plane in which it hangs"
-        )
-        yield ConfigProblem(("experiment", "boundary"), text)
+    yield from undetermined(held.start, held.end, experiment.in_space)
     names = [pose.name for pose in poses]
     for i, pose in enumerate(poses):
         wrong = [*_file_problems(experiment, pose), *_end_problems(experiment, pose)]

@@ -138,7 +138,7 @@ class Source:
         return ConfigError(message)
 
     def inside(self, key: str, section: str) -> str:
-        """Say that a key stands in a section."""
+        """Say that a key stands in a section; empty where that cannot be given."""
         return section
 
     def label(self, place: Place) -> str:
@@ -169,9 +169,10 @@ class Arguments(Source):
         self.data, self.folder, self.names = data, Path(), names
 
     def inside(self, key: str, section: str) -> str:
-        """Say that a key stands in a mapping."""
+        """Say that a key stands in a mapping that is an argument."""
         own = re.sub(r"^experiment\.(measurement [^.]*\.)?", "", section)
-        return f'{own}={{"{key}": ...}}'
+        known = not self.names or own.partition(".")[0] in self.names
+        return f'{own}={{"{key}": ...}}' if known else ""
 
 
 def _help(section: type[BaseModel], key: object) -> str:
@@ -260,6 +261,7 @@ def explain(
                 for inner, name in sections.values()
                 if str(key) in inner.model_fields
             ]
+            homes = [home for home in homes if home]
             if homes and "did you mean" not in hint:
                 hint = f"; it belongs into {' or '.join(homes)}"
             text = f"unknown key {show(str(key))} in {source.label(place[:-1])}{hint}"

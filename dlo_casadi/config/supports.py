@@ -24,6 +24,17 @@ from dlo_casadi.rod.obstacles import Obstacle as Surface
 KINDS = ("pinned", "clamped", "eyelet")
 
 
+def undetermined(start: str, end: str, in_space: bool) -> Iterator[ConfigProblem]:
+    """Why ends that are held so leave a cable in more than one place."""
+    if in_space and start == "pinned" and end == "free":
+        text = (
+            "on a ball joint and with a free end a cable in space may be turned about gravity, "
+            "which holds it in no shape of all these. Try: start: clamped, with start_orientation; "
+            "or two numbers of gravity, in the plane in which it hangs"
+        )
+        yield ConfigProblem(("experiment", "boundary"), text)
+
+
 class Clip(ConfigSection):
     """A clip that holds the cable between its ends."""
 

@@ -145,6 +145,7 @@ class Exceedance:
         They count as exceeding.
     shares : mapping of str to float
         Parts of the variance by their causes, see `Uncertainty.causes_in`; the largest first.
+        Empty where nothing is uncertain.
     """
 
     std: float
@@ -196,6 +197,9 @@ class Varied:
         names = tuple(bounds)
         causes = self.uncertainty.causes_in(self.model)
         sizes, slopes = self.linear(names)
+        if not any(map(np.any, self._ways)):
+            sure = {x: float((sizes[x] > bounds[x]).any()) for x in names}
+            return {x: Exceedance(0.0, sure[x], 0.0, 0, 0, {}) for x in names}
         z = np.random.default_rng(0).standard_normal((LINEAR, len(causes)))
         solved, lost = self._solved(z[:PAIRED], names)
         likely = {x: _crossing(sizes[x], slopes[x], bounds[x], z) for x in names}

@@ -325,10 +325,13 @@ def samples_of(
     Raises
     ------
     DloError
-        If the fit leaves hardly anything within the bounds, or the rest shape changed from pose to
-        pose, which is not known together with the parameters.
+        If nothing is uncertain, the fit leaves hardly anything within the bounds, or the rest shape
+        changed from pose to pose, which is not known together with the parameters.
     """
     model = cable.model
+    if count and not names:
+        text = "is known exactly: all samples would be the same.\n  Try: samples=0"
+        raise DloError(f"{model.cable.name!r} {text}")
     if count and model.has_state:
         raise DloError(
             f"{model.cable.name!r} has a rest shape that changed from pose to pose: the covariance "

@@ -14,16 +14,20 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, length_of
-from dlo_casadi.cable.estimate import Estimate
+from dlo_casadi.cable.estimate import Covariance, Estimate
 from dlo_casadi.cable.file import SCHEMA, metadata_of, parameters_hash
 from dlo_casadi.cable.fitted_cable import FittedCable
-from dlo_casadi.config import Config, dump_yaml
+from dlo_casadi.config import Config, Limits, dump_yaml
 from dlo_casadi.config.values import AXES
 from dlo_casadi.effects import Effect, known_effect
+from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import DloError, well_formed
 from dlo_casadi.estimation.result import Fit, uncertainty_of
-from dlo_casadi.model.cable_model import STIFFNESSES
+from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.report.words import ALWAYS, all_warnings
+from dlo_casadi.runtime.executors import software
+from dlo_casadi.session.fitting import Declared
 from dlo_casadi.session.hypotheses import Suspicion
 from dlo_casadi.session.outcome import (
     Outcome,
@@ -235,6 +239,16 @@ def fitted_cable(outcome: Outcome) -> FittedCable:
     return FittedCable(replace(fit.model, clips=(), obstacles=()), fit.p, final_rest(fit), metadata)
 
 
+def exact_cable(known: Declared, coefficients: FloatArray, limits: Limits) -> FittedCable:
+    """A cable of which nothing is uncertain, of rest coefficients [1/m], as a fit would give it."""
+    model, p, rest = known.model, known.start, known.model.rest_basis @ coefficients
+    nothing = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter())
+    document = _cable_dict(model, p, coefficients, rest, nothing)
+    document |= {"limits": limits.given, "config": model.cable.name, "versions": software()}
+    document["model_hash"] = parameters_hash(document)
+    return FittedCable(model, p, rest, metadata_of(document, None))
+
+
 def parameters_dict(outcome: Outcome) -> dict[str, Any]:
     """Everything that parameters.yaml holds, as plain data."""
     config = outcome.config
@@ -269,9 +283,20 @@ def _scatter(fit: Fit) -> dict[str, Any] | None:
 
 def fit_dict(fit: Fit) -> dict[str, Any]:
     """What a fit alone tells: the model, its parameters, covariance and state."""
-    model = fit.model
-    names, covariance = fit.named_covariance
-    uncertainty = uncertainty_of(fit)
+    rest = final_rest(fit)
+    return _cable_dict(fit.model, fit.p, fit.coefficients, rest, uncertainty_of(fit))
+
+
+def _cable_dict(
+    model: CableModel,
+    p: FloatArray,
+    coefficients: FloatArray,
+    rest: FloatArray,
+    uncertainty: Uncertainty,
+) -> dict[str, Any]:
+    """The model of a cable, its values, and how uncertain they are."""
+    names, covariance = uncertainty.names, uncertainty.covariance
+    stds = Covariance(names, covariance).std
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "cable": {
@@ -288,21 +313,21 @@ def fit_dict(fit: Fit) -> dict[str, Any]:
         "parameters": {
             q.name: {
                 "value": float(value),
-                "std": fit.std(q.name),
+                "std": stds.get(q.name, 0.0),
                 **fields_of(q, "unit", "lower", "upper"),
                 "fitted": q.name in names,
                 # Standard deviation of the prior of what is known within a tolerance.
                 "tolerance": model.priors.get(q.name),
             }
-            for q, value in zip(model.parameters, fit.p, strict=True)
+            for q, value in zip(model.parameters, p, strict=True)
         },
         "rest_curvature": {
-            "coefficients": _by_name(fit.coefficients, model.node.curvatures),
+            "coefficients": _by_name(coefficients, model.node.curvatures),
             "unit": "1/m",
             "basis": "cubic B-splines on clamped uniform knots over [0, length]",
         },
         "state": {
-            "rest_curvature": _by_name(final_rest(fit), model.node.strains),
+            "rest_curvature": _by_name(rest, model.node.strains),
             "unit": "1/m",
             "of": "cells, last pose done",
         },

@@ -96,6 +96,8 @@ def declared_model(
     config: Config,
     center: tuple[float, float] | None = None,
     pixel: float | None = None,
+    *,
+    exact: bool = False,
 ) -> Declared:
     """Build the declared model.
 
@@ -105,6 +107,8 @@ def declared_model(
         Middle of the photographs in the board frame.
     pixel : float, optional [m]
         Size of a pixel on the board, for photographs.
+    exact : bool
+        Whether all is exactly as declared: without nuisances.
 
     Raises
     ------
@@ -127,14 +131,15 @@ def declared_model(
         clips=experiment.clips,
         obstacles=experiment.surfaces,
     )
-    if END_ROLL in model.names:
+    if END_ROLL in model.names and not exact:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
     for item in options.effects:
         model = model.with_effect(EFFECTS[item.name].made_for(setup))
     if config.cable.mass is None:
         model = model.with_effect(UNKNOWN_MASS())
     tolerances = Tolerances(**setup.tolerances)
-    model = nuisances(model, tolerances, pixel, setup.readings)
+    if not exact:
+        model = nuisances(model, tolerances, pixel, setup.readings)
     start, free = model.nominal.copy(), list(model.names)
     for item in options.effects:
         for name, parameter in item.parameters.items():

@@ -1,0 +1,212 @@
+"""A cable of which everything is known, beside closed forms; and it is what a fit returns."""
+
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import fresnel
+
+import dlo_casadi as dlo
+from dlo_casadi.config import dump_yaml
+
+ROPE = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, name="rope")
+WIRE = dlo.Cable(
+    length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, torsional_stiffness=0.008
+)
+PINNED = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
+FREE = {"gravity": (0, -9.81), "boundary": ("clamped", "free")}
+WEIGHTLESS = {"gravity": (0, 0), "boundary": ("clamped", "free")}
+IN_SPACE = {"gravity": (0, 0, -9.81), "boundary": ("clamped", "free")}
+FORWARD = {"start_orientation": (0, 0, 0, 1)}
+
+
+def effect(name, **parameters):
+    return {"effects": [{"name": name, "parameters": parameters}]}
+
+
+@pytest.fixture(scope="module")
+def rope():
+    return dlo.known_cable(ROPE, **PINNED, model={"n": 20})
+
+
+def test_a_limp_cable_hangs_in_a_catenary():
+    """L = 2a sinh(s/2a), sag = a (cosh(s/2a) - 1), H = w a  [Irvine, Cable Structures, 1981]."""
+    length, span, mass = 1.0, 0.6, 0.05
+    a = brentq(lambda a: 2 * a * np.sinh(span / (2 * a)) - length, 0.05, 10.0)
+    limp = dlo.Cable(length=length, mass=mass, diameter=0.004, bending_stiffness=1e-7)
+    shape = dlo.known_cable(limp, **PINNED).solve(end=(span, 0.0))
+    weight = mass * 9.81
+    rel = 1e-7 / (weight / length * a**3)  # the cable's own stiffness, 1e-4
+    assert -shape.points[50, 1] == pytest.approx(a * (np.cosh(span / (2 * a)) - 1), rel=rel)
+    assert shape.end_force == pytest.approx([-weight / length * a, -weight / 2], rel=rel)
+
+
+def test_a_stiff_cantilever_droops_by_its_weight_and_that_at_its_tip():
+    """Droop w L^4 / (8 EI) + m g L^3 / (3 EI); the next term is the square of the slope smaller."""
+    stiff = dlo.Cable(length=0.5, mass=0.02, diameter=0.004, bending_stiffness=2.0)
+    tip = effect("lumped_mass", mass=0.01, position=0.5)
+    bare, loaded = (dlo.known_cable(stiff, **FREE, model=model) for model in ({}, tip))
+    own, more = 0.02 * 9.81 * 0.5**3 / (8 * 2.0), 0.01 * 9.81 * 0.5**3 / (3 * 2.0)
+    droops = [-cable.solve(start_heading=0.0).points[-1, 1] for cable in (bare, loaded)]
+    assert droops == pytest.approx([own, own + more], rel=1e-4)  # slope: 0.007
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 9])
+def test_a_free_cable_has_its_rest_curvature(count):
+    """A circle; and of a curvature that grows with the arc length a clothoid."""
+    s = np.linspace(0.0, 0.8, count)
+    circle = dlo.known_cable(WIRE, **WEIGHTLESS, rest_curvature=np.full(count, 2.0))
+    shape = circle.solve(start_heading=0.0)
+    assert shape.points[-1] == pytest.approx([np.sin(1.6) / 2, (1 - np.cos(1.6)) / 2], abs=1e-6)
+    assert shape.energy == pytest.approx(0.0, abs=1e-12)
+    if count > 1:
+        clothoid = dlo.known_cable(WIRE, **WEIGHTLESS, rest_curvature=5.0 * s)
+        size = np.sqrt(np.pi / 5.0)
+        exact = size * np.array(fresnel(0.8 / size))[::-1]
+        assert clothoid.solve(start_heading=0.0).points[-1] == pytest.approx(exact, abs=1e-6)
+
+
+def test_in_space_a_rest_curvature_is_about_the_axes_y_and_z():
+    weightless = IN_SPACE | {"gravity": (0, 0, 0)}
+    arc = np.array([np.sin(1.6) / 2, (1 - np.cos(1.6)) / 2])
+    for axes, end in (((0, 2.0), (*arc, 0)), ((2.0, 0), (arc[0], 0, -arc[1]))):
+        cable = dlo.known_cable(WIRE, **weightless, rest_curvature=axes, model={"n": 20})
+        assert cable.solve(**FORWARD).points[-1] == pytest.approx(end, abs=1e-5)
+
+
+def test_it_is_what_a_fit_returns(rope, tmp_path):
+    """All that a fitted cable can, and the same when it is written and read."""
+    assert type(rope) is dlo.FittedCable
+    shape = rope.solve(end=(0.5, 0.1))
+    pose = [0, 0, 0.5, 0.1, 0, 0]
+    force = rope.function()(pose)[1].full().ravel()
+    assert force == pytest.approx(shape.end_force, abs=1e-9)
+    guess = rope.initial(pose)
+    assert np.abs(rope.equations()(guess.x, guess.multipliers, pose)[0].full()).max() < 1e-9
+    placed = rope.place(1, [{"end": (0.5, 0.1)}], ((0, -0.3), (0.5, 0.1)), {"bend_radius": 0.02})
+    assert len(placed.clips) == 1
+    rope.export("mujoco", tmp_path / "rope.xml", end=(0.5, 0.1))
+    assert "known cable" in (tmp_path / "rope.xml").read_text()
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(rope.metadata.document))
+    for same in (dlo.load(tmp_path), pickle.loads(pickle.dumps(rope))):
+        assert not same.metadata.edited
+        assert np.array_equal(same.solve(end=(0.5, 0.1)).points, shape.points)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_its_compiled_solver_finds_its_shape(rope):
+    found = rope.compile().solve(dlo.Pose((0, 0), (0.5, 0.1)))
+    assert found.end_force == pytest.approx(rope.solve(end=(0.5, 0.1)).end_force, rel=1e-6)
+
+
+def test_another_mesh_has_the_same_rest_curvature():
+    bent = dlo.known_cable(WIRE, **FREE, rest_curvature=[0.0, 1.0, 4.0, 2.0])
+    ends = [bent.with_mesh(n).solve(start_heading=0.0).points[-1] for n in (40, 80)]
+    assert ends[0] == pytest.approx(ends[1], abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("cable", "held", "pose"), [(ROPE, PINNED, {"end": (0.5, 0.1)}), (WIRE, IN_SPACE, FORWARD)]
+)
+def test_nothing_about_it_is_uncertain(cable, held, pose):
+    known = dlo.known_cable(cable, **held, rest_curvature=None, model={"n": 20})
+    shape = known.solve(**pose)
+    assert known.covariance.std == {}
+    assert {x.std for x in known.params.values()} == {0.0}
+    assert "  bending_stiffness: 0.01 N m^2, fixed" in repr(known)
+    assert np.all(shape.band == 0.0)
+    assert shape.other_side is None
+    limits = {"bend_radius": shape.min_bend_radius / 2, "force": 0.1}
+    kept, violated = shape.check(limits)
+    assert (kept.std, kept.probability, kept.chance, kept.verdict) == (0.0, 0.0, "0 %", "pass")
+    assert (violated.std, violated.probability, violated.verdict) == (0.0, 1.0, "fail")
+    assert (violated.method, violated.chance) == ("exact", "100 %")
+    assert str(kept).endswith("mm); nothing is uncertain")
+    assert "±" not in str(kept) + kept.text(kept.value, kept.std)
+    assert kept.as_dict()["shares"] == {}
+
+
+def test_only_the_fixtures_are_uncertain_where_they_are_told(rope):
+    shape = rope.solve(end=(0.5, 0.1))
+    (check,) = shape.check({"force": 0.3}, tolerances={"end": 2e-3})
+    moved = [rope.solve(end=(0.5 + dx, 0.1)).end_force for dx in (-1e-4, 1e-4)]
+    lifted = [rope.solve(end=(0.5, 0.1 + dy)).end_force for dy in (-1e-4, 1e-4)]
+    slopes = [np.diff(np.linalg.norm(two, axis=1))[0] / 2e-4 for two in (moved, lifted)]
+    assert check.std == pytest.approx(2e-3 * np.hypot(*slopes), rel=1e-3)
+    assert check.decided_by == "2 mm at the end (100 %)"
+
+
+UNWEIGHED = dlo.Cable(length=0.8, mass=None, diameter=0.005, bending_stiffness=0.01)
+STRAIGHT = dlo.Cable(
+    length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, rest_shape="straight"
+)
+
+
+@pytest.mark.parametrize(
+    ("cable", "wrong", "message"),
+    [
+        (ROPE, {"boundary": None}, "'boundary' is missing in the arguments: How the two ends"),
+        (ROPE, {"gravity": None}, "'gravity' is missing in the arguments"),
+        (ROPE, {"boundary": ("pinned", "hinged")}, "boundary: allowed are 'pinned', 'clamped' or"),
+        (ROPE, {"boundary": "pinned"}, "[start, end] belongs here, such as [pinned, clamped]"),
+        (ROPE, {"gravity": (0, 0, -9.81)}, "cable.torsional_stiffness is not given, and no fit"),
+        (
+            WIRE,
+            {"gravity": (0, 0, -9.81), "boundary": ("pinned", "free")},
+            "may be turned about gravity",
+        ),
+        (UNWEIGHED, {}, "cable.mass is not given, and no fit tells it. Try: the mass"),
+        (3, {}, "cable: a mapping of keys and values belongs here, found 3"),
+        (ROPE, {"model": {"effects": ["lumped_mas"]}}, "did you mean 'lumped_mass'?"),
+        (ROPE, {"model": effect("lumped_mass", mass=0.1)}, "lumped_mass needs position [m]: no"),
+        (ROPE, {"model": {"effects": ["plastic_set"]}}, "Try: rest_curvature as it is now"),
+        (
+            ROPE,
+            {"model": effect("lumped_mass", mass=0.1, position=3.0)},
+            "lumped_mass.position: 3 m: 0 to 0.8 m is possible",
+        ),
+        (ROPE, {"effects": []}, 'it belongs into model={"effects": ...}'),
+        (ROPE, {"gravty": 1}, "unknown key 'gravty' in the arguments; did you mean 'gravity'?"),
+        (ROPE, {"poses": []}, "unknown key 'poses' in the arguments; known here: boundary, cable"),
+        (ROPE, {"diagnosis": {}}, "unknown key 'diagnosis' in the arguments; known here: bound"),
+        (ROPE, {"limits": {"twist": 1.0}}, "does not twist. Try: leave it out"),
+        (ROPE, {"rest_curvature": "round"}, "one number or (K,) [1/m], K <= 64, belong here"),
+        (ROPE, {"rest_curvature": [[1.0, 2.0]]}, "rest_curvature: one number or (K,) [1/m], K <="),
+        (ROPE, {"rest_curvature": [1.0, np.nan]}, "belong here, found [1.0, nan]"),
+        (ROPE, {"rest_curvature": []}, "rest_curvature: one number or (K,) [1/m], K <= 64"),
+        (ROPE, {"rest_curvature": np.ones(65)}, "rest_curvature: one number or (K,) [1/m], K <="),
+        (ROPE, {"rest_curvature": 400.0}, "400 1/m bends it more sharply than it is thick"),
+        (STRAIGHT, {"rest_curvature": 1.0}, "rest_curvature: the cable is declared straight"),
+        (
+            WIRE,
+            {"gravity": (0, 0, -9.81), "rest_curvature": 1.0},
+            "rest_curvature: (2,) or (2, K) numbers [1/m]",
+        ),
+    ],
+)
+def test_what_cannot_be_says_what_to_try(cable, wrong, message):
+    with pytest.raises(dlo.ConfigError) as refused:
+        dlo.known_cable(cable, **PINNED | wrong)
+    assert message in str(refused.value)
+
+
+def test_all_that_is_missing_is_told_at_once():
+    with pytest.raises(dlo.ConfigError, match=r"^3 problems\n(.*\n)*.*rest_curvature: \(2,\)"):
+        dlo.known_cable(UNWEIGHED, **PINNED | {"gravity": (0, 0, -9.81)}, rest_curvature=1.0)
+
+
+def test_what_needs_a_fit_says_so(rope, tmp_path):
+    with pytest.raises(dlo.DloError, match="'rope' is known exactly: all samples would be the sam"):
+        rope.export("mujoco", tmp_path / "rope.xml", end=(0.5, 0.1), samples=2)
+    with pytest.raises(dlo.DloError, match="'bending_stiffness' was not fitted; fitted are none"):
+        _ = rope.covariance["bending_stiffness", "bending_stiffness"]
+    with pytest.raises(dlo.DloError, match="no limit is given, and none was declared"):
+        rope.solve(end=(0.5, 0.1)).check()
+
+
+def test_declared_limits_are_checked():
+    known = dlo.known_cable(ROPE, **PINNED, limits={"force": 0.3})
+    (check,) = known.solve(end=(0.5, 0.1)).check()
+    assert (check.quantity, check.limit, check.verdict) == ("force", 0.3, "pass")
