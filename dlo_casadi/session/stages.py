@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from dlo_casadi.estimation.prediction import (
 )
 from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.estimation.stiffness import StiffnessFit
+from dlo_casadi.estimation.variances import with_roughest_rest
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
 from dlo_casadi.model.clips import clip_rows
 from dlo_casadi.model.contact import surfaces_at
@@ -96,17 +98,35 @@ def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArra
 
 @dataclass(frozen=True)
 class _Model:
-    """A model with its parameters; of a fit also how well they are known, to say what to expect.
-
-    `nodes` are those of the fitted poses, `noise` [m] is that of a point beside other repeats.
-    """
+    """A model with its parameters; of a fit also how well they are known, to say what to expect."""
 
     model: CableModel
     p: FloatArray
     rest: FloatArray
-    uncertainty: Uncertainty | None = None
-    nodes: Mapping[str, FloatArray] | None = None
-    noise: float = 0.0
+    fit: Fit | None = None
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """What makes its predictions uncertain."""
+        return uncertainty_of(self.fit) if self.fit else None
+
+    @cached_property
+    def roughest(self) -> Uncertainty | None:
+        """The same with a rest curvature as rough as the data allow."""
+        return uncertainty_of(with_roughest_rest(self.fit)) if self.fit else None
+
+    @property
+    def nodes(self) -> dict[str, FloatArray]:
+        """Of the fitted poses, by name."""
+        if self.fit is None:
+            return {}
+        problem, x = self.fit.problem, self.fit.point.shapes.x
+        return {problem.measured[j].pose.name: x[j] for j in problem.used}
+
+    @property
+    def noise(self) -> float:
+        """Of a point [m] beside other repeats."""
+        return self.fit.noise.of_points.beside_repeats if self.fit else 0.0
 
     def stage(
         self,
@@ -188,7 +208,7 @@ class _Model:
         return replace(
             shape,
             either_side=self._either_side(item, known, other, self.uncertainty),
-            undecided=other is not None and self._undecided(item, known, other, self.uncertainty),
+            undecided=other is not None and self._undecided(item, known, other),
             spread=spread_across(curve, places, moved[: len(places)]).squeeze(),
             expected=expected,
             missed=missed,
@@ -225,21 +245,24 @@ class _Model:
         tipping = tipping_of(self.model, self.p, known.rest, item.pose, *pair, uncertainty)
         return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
 
-    def _undecided(
-        self, item: MeasuredPose, known: Prediction, other: MeasuredBranch, known_to: Uncertainty
-    ) -> bool:
+    def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
         """Whether the uncertain parameters leave open in which equilibrium a pose is."""
-        std = np.sqrt(np.maximum(np.diag(known_to.covariance), 1e-300))
-        by_p, by_rest = known_to.unknowns_in(self.model)
-        gap = EnergyGap.between(
-            self.model,
-            item.pose,
-            (other.prediction.equilibrium, known.equilibrium),
-            (self.p, known.rest),
-            (by_p * std, by_rest * std),
-            known_to.covariance / np.outer(std, std),
-        )
-        return gap.value < UNSEEN * gap.std
+
+        def left_open_by(uncertain: Uncertainty | None) -> bool:
+            assert uncertain is not None
+            std = np.sqrt(np.maximum(np.diag(uncertain.covariance), 1e-300))
+            by_p, by_rest = uncertain.unknowns_in(self.model)
+            gap = EnergyGap.between(
+                self.model,
+                item.pose,
+                (other.prediction.equilibrium, known.equilibrium),
+                (self.p, known.rest),
+                (by_p * std, by_rest * std),
+                uncertain.covariance / np.outer(std, std),
+            )
+            return gap.value < UNSEEN * gap.std
+
+        return left_open_by(self.uncertainty) or left_open_by(self.roughest)
 
 
 def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple[LimitCheck, ...]:
@@ -345,9 +368,7 @@ def fit_stage(
     reported : sequence of str
         Qualified names of the parameters that are effects, not nuisances.
     """
-    nodes = {fit.problem.measured[j].pose.name: fit.point.shapes.x[j] for j in fit.problem.used}
-    noise = fit.noise.of_points.beside_repeats
-    return _Model(fit.model, fit.p, fit.rest, uncertainty_of(fit), nodes, noise).stage(
+    return _Model(fit.model, fit.p, fit.rest, fit).stage(
         name,
         measured,
         fitted_parameters(fit, intervals, reported),
