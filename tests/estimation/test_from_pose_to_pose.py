@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+import hidden_sets
 from hidden_sets import simulated
 
 from dlo_casadi.effects import CableData
@@ -76,3 +77,17 @@ def test_turned_clamps_are_named_and_leave_the_stiffness_alone():
     assert own.std == pytest.approx(found.values["random.clamp_angle"], rel=0.5)
     interval = profile_interval(fit)
     assert interval.low < found.values["bending_stiffness"] < interval.high
+
+
+@pytest.mark.parametrize("source", ["rest_curvature", "end_offset"])
+def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_with(
+    monkeypatch, source
+):
+    points = []
+    for elements in (10, 40):
+        monkeypatch.setitem(hidden_sets.ELEMENTS, 2, elements)
+        session = simulated(generator_of(3301, 0), 2, 0, source).session
+        measured = measured_poses(session, read_inputs(session))
+        points.append(np.concatenate([item.points for item in measured]))
+    gap = np.linalg.norm(points[1] - points[0], axis=1)
+    assert np.sqrt((gap**2).mean()) < hidden_sets.FINE
