@@ -52,6 +52,10 @@ RANDOM_SIZES = {
     "length_error": lambda stiffness, length: 0.008 * length,
 }
 
+# Ends that show what differs from pose to pose in the plane. Between two clamps a smooth rest
+# curvature of that size moves a cable by 0.1 mm: its mean and slope do not bend a beam there.
+SHOWN_BY = {"rest_curvature": "pinned", "pin_moment": "pinned", "clamp_angle": "clamped"}
+
 
 def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Generator) -> Values:
     """Parameters of an effect, drawn; `typical` [1/m] is the cable's curvature."""
@@ -177,7 +181,8 @@ def _tried(
     if dimension == 3:
         cable = CableData(length, mass, 0.006, bending * off, torsional_stiffness=torsion * off)
     held = "clamped" if dimension == 3 or generator.random() < 0.5 else "pinned"
-    held = {"pin_moment": "pinned", "clamp_angle": "clamped"}.get(random, held)
+    if dimension == 2:
+        held = SHOWN_BY.get(random, held)
     chosen = [name for name in HIDDEN[dimension] if held == "clamped" or "clamp" not in name]
     hidden = tuple(str(x) for x in generator.choice(chosen, count, replace=False))
     gravity = (0.0, -9.81) if dimension == 2 else (0.0, 0.0, -9.81)

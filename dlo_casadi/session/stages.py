@@ -15,6 +15,7 @@ from dlo_casadi.equilibrium.sides import on_other_side
 from dlo_casadi.equilibrium.spread import (
     Uncertainty,
     displacements,
+    gap_std_of_repeats,
     sides_of,
     spread_across,
     tipping_of,
@@ -228,18 +229,20 @@ class _Model:
     def _undecided(
         self, item: MeasuredPose, known: Prediction, other: MeasuredBranch, known_to: Uncertainty
     ) -> bool:
-        """Whether the uncertain parameters leave open in which equilibrium a pose is."""
+        """Whether parameters, fixtures and scatter leave open in which equilibrium a pose is."""
         std = np.sqrt(np.maximum(np.diag(known_to.covariance), 1e-300))
         by_p, by_rest = known_to.unknowns_in(self.model)
+        pair = other.prediction.equilibrium, known.equilibrium
         gap = EnergyGap.between(
             self.model,
             item.pose,
-            (other.prediction.equilibrium, known.equilibrium),
+            pair,
             (self.p, known.rest),
             (by_p * std, by_rest * std),
             known_to.covariance / np.outer(std, std),
         )
-        return gap.value < UNSEEN * gap.std
+        own = gap_std_of_repeats(self.model, self.p, known.rest, item.pose, pair, known_to)
+        return bool(gap.value < UNSEEN * np.hypot(gap.std, own))
 
 
 def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple[LimitCheck, ...]:
