@@ -47,6 +47,7 @@ import dlo_casadi as dlo
 from dlo_casadi.config import declared_setup, load_config
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.effects import RANDOM
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import tipping
 from dlo_casadi.estimation.constrained import profile_intervals
@@ -149,6 +150,10 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
+    kind, dimension = RANDOM.get(args.random), 3 if args.space else 2
+    if kind is not None and dimension not in kind.dimensions:
+        where = "in space" if args.space else "in a plane"
+        parser.error(f"--random {args.random} is not of cables {where}")
     rows: dict[int, dict] = {}
     seconds = []
     with open_executor(args.jobs, args.scheduler) as executor:
@@ -244,8 +249,9 @@ def run_random(
     own = result.fit.problem.priors.pose_scatter
     if random:
         row["random"] = [one.source for one in (own, *own.rivals) if one.std]
-        row["std_over_true"] = own.std / found.values[f"random.{random}"]
         row["missed"] = [] if random in row["random"] else [random]
+        sizes = [one.std for one in (own, *own.rivals) if one.source == random]
+        row["std_over_true"] = float(sum(sizes) / found.values[f"random.{random}"])
     named = [{item.name, *item.indistinguishable_from} for item in result.effects]
     row["verdict"] = result.verdict
     row["named"] = [sorted(names) for names in named]

@@ -52,6 +52,10 @@ RANDOM_SIZES = {
     "length_error": lambda stiffness, length: 0.008 * length,
 }
 
+# Ends that show what differs from pose to pose in the plane. Between two clamps a smooth rest
+# curvature of that size moves a cable by 0.1 mm: its mean and slope do not bend a beam there.
+SHOWN_BY = {"rest_curvature": "pinned", "pin_moment": "pinned", "clamp_angle": "clamped"}
+
 
 def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Generator) -> Values:
     """Parameters of an effect, drawn; `typical` [1/m] is the cable's curvature."""
@@ -177,7 +181,8 @@ def _tried(
     if dimension == 3:
         cable = CableData(length, mass, 0.006, bending * off, torsional_stiffness=torsion * off)
     held = "clamped" if dimension == 3 or generator.random() < 0.5 else "pinned"
-    held = {"pin_moment": "pinned", "clamp_angle": "clamped"}.get(random, held)
+    if dimension == 2:
+        held = SHOWN_BY.get(random, held)
     chosen = [name for name in HIDDEN[dimension] if held == "clamped" or "clamp" not in name]
     hidden = tuple(str(x) for x in generator.choice(chosen, count, replace=False))
     gravity = (0.0, -9.81) if dimension == 2 else (0.0, 0.0, -9.81)
@@ -195,24 +200,15 @@ def _tried(
     ends = [_ends(generator, dimension, length, held, k) for k in range(POSES)]
     true = [_moved(generator, pose) for pose in ends]
     waves = generator.normal(0.0, 0.1, (len(model.node.curvatures), 3))
-    rest = _rest(waves, model)
+    scatter, draws = PoseScatter(), np.zeros((0, POSES))
     if random:
         size = RANDOM_SIZES[random](bending, length) * generator.uniform(0.5, 1.5)
         scatter = PoseScatter(size, source=random)
-        by_p, by_rest = scatter.ways(model)
-        draws = scatter.sizes(by_p.shape[1])[:, None] * generator.standard_normal(
-            (by_p.shape[1], POSES)
-        )
-        each = scatter.values(p, model)[:, None] + by_p @ draws, rest[:, None] + by_rest @ draws
-        larger = scatter.within(model)
-        shapes = [
-            predict_poses(larger, *(part[:, k] for part in each), [pose])[0]
-            for k, pose in enumerate(true)
-        ]
+        count = scatter.ways(model)[0].shape[1]
+        draws = scatter.sizes(count)[:, None] * generator.standard_normal((count, POSES))
         values[f"random.{random}"] = size
-    else:
-        model, shapes = _finely(model, p, waves, true)
-        rest = _rest(waves, model)
+    model, shapes = _finely(model, p, waves, true, scatter, draws)
+    rest = _rest(waves, model)
     if table and all(shapes):
         height = _table_under(generator, model, true, shapes)
         model = model.with_effect(ContactPlane())
@@ -257,13 +253,18 @@ def _finely(
     p: NDArray[np.floating],
     waves: NDArray[np.floating],
     poses: Sequence[HeldPose],
+    scatter: PoseScatter,
+    draws: NDArray[np.floating],
 ) -> tuple[CableModel, list[Prediction | None]]:
-    """The model on a mesh that is fine enough, and its shapes; without shapes if none is."""
-    shapes = predict_poses(model, p, _rest(waves, model), poses)
+    """The model on a mesh that is fine enough, and its shapes; without shapes if none is.
+
+    `draws` (q, poses): what each pose has of its own along the directions of `scatter`.
+    """
+    shapes = _shapes(model, p, waves, poses, scatter, draws)
     s = np.linspace(0.0, model.cable.length, 201)
     for _ in range(HALVED + 1):
         finer = model.with_mesh(2 * model.n)
-        others = predict_poses(finer, p, _rest(waves, finer), poses)
+        others = _shapes(finer, p, waves, poses, scatter, draws)
         if not (all(shapes) and all(others)):
             break
         pairs = zip(shapes, others, strict=True)
@@ -272,6 +273,26 @@ def _finely(
             return model, shapes
         model, shapes = finer, others
     return model, [None]
+
+
+def _shapes(
+    model: CableModel,
+    p: NDArray[np.floating],
+    waves: NDArray[np.floating],
+    poses: Sequence[HeldPose],
+    scatter: PoseScatter,
+    draws: NDArray[np.floating],
+) -> list[Prediction | None]:
+    """Shapes of the poses on a model's mesh, each with what it has of its own."""
+    rest = _rest(waves, model)
+    if not scatter.std:
+        return predict_poses(model, p, rest, poses)
+    own, (by_p, by_rest) = scatter.within(model), scatter.ways(model)
+    p = scatter.values(p, model)
+    return [
+        predict_poses(own, p + by_p @ draw, rest + by_rest @ draw, [pose])[0]
+        for draw, pose in zip(draws.T, poses, strict=True)
+    ]
 
 
 def _table_under(

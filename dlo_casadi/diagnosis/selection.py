@@ -16,7 +16,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of, settle
-from dlo_casadi.thresholds import EVIDENCE_APART, LEAST_NOISE_DEGREES, UNSEEN
+from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     without = descend(Fit(smaller, smaller.evaluate(open_.point)))
     gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
     dof = len(winner.candidate.frees)
-    return sidak(survival(gain, dof, max(LEAST_NOISE_DEGREES, noise.slow_dof)), tried)
+    return sidak(survival(gain, dof, noise_degrees(larger)), tried)
 
 
 def gains(item: Confirmed, base: Fit, validation: CrossValidation) -> tuple[float, float]:

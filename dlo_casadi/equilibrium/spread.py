@@ -229,19 +229,47 @@ def tipping_of(
     First order in all that makes a prediction uncertain: the derivative of an equilibrium's energy
     by any input is that of the Lagrangian at fixed nodes and multipliers.
     """
+    std = float(np.linalg.norm(_gap_slopes(model, p, rest, pose, (eq, other), uncertainty)))
+    return Tipping(tipping(model, eq, other), std / _lever(model, eq, other))
+
+
+def gap_std_of_repeats(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    pose: HeldPose,
+    pair: tuple[Equilibrium, Equilibrium],
+    uncertainty: Uncertainty,
+) -> float:
+    """Standard deviation [J] of the difference in energy of a pose's two equilibria.
+
+    From repeat to repeat, by its fixtures and what it has of its own, at known parameters.
+    """
+    slopes = _gap_slopes(model, p, rest, pose, pair, uncertainty)
+    return float(np.linalg.norm(slopes[len(uncertainty.names) :]))
+
+
+def _gap_slopes(
+    model: CableModel,
+    p: FloatArray,
+    rest: FloatArray,
+    pose: HeldPose,
+    pair: tuple[Equilibrium, Equilibrium],
+    uncertainty: Uncertainty,
+) -> FloatArray:
+    """Changes (q,) [J] of the difference in energy along `Uncertainty.ways_in`."""
     each, scatter = uncertainty.ways_in(model), uncertainty.pose_scatter
     p, larger = scatter.values(p, model), scatter.within(model)
     count = each[0].shape[1]
     p_steps, rest_steps, deviations = (_SHARE * np.hstack([by, -by]).T for by in each)
     given = Inputs.of(p + p_steps, rest + rest_steps, np.tile(pose.vector, (2 * count, 1)))
     slopes = []
-    for found in (eq, other):
+    for found in pair:
         x = np.broadcast_to(found.x, (2 * count, *found.x.shape))
         lam = np.broadcast_to(found.multipliers, (2 * count, len(found.multipliers)))
         value = assembly_of(larger).balance(Shapes(x, lam, deviations), given)[0]
         slopes.append((value[:count] - value[count:]) / (2 * _SHARE))
-    std = float(np.linalg.norm(slopes[1] - slopes[0]))
-    return Tipping(tipping(model, eq, other), std / _lever(model, eq, other))
+    return np.asarray(slopes[1] - slopes[0])
 
 
 def sides_of(model: CableModel, pose: HeldPose, *pair: Equilibrium) -> list[HeldPose]:

@@ -97,7 +97,8 @@ class PoseShape:
     measured_branch : BranchShape or None
         Where the pose was measured in another stable equilibrium than the predicted one.
     undecided : bool
-        Whether the uncertain parameters leave open that that one is the lowest.
+        Whether uncertain parameters, fixtures and the cable's scatter leave open that that one is
+        the lowest.
     measured_side : BranchShape or None
         Of a fit pose that is compared on the side where it was measured, not the lower one.
     either_side : EitherSide or None

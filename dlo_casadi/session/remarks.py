@@ -91,7 +91,8 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             if undecided := [name for name in names if stage.shapes[name].undecided]:
                 told = ", ".join(undecided)
                 lines[-1] += (
-                    f". The fit is too uncertain to tell which of the two is lower in {told}"
+                    ". Fit, fixtures and scatter from pose to pose leave open which of the two is "
+                    f"lower in {told}"
                 )
         lines += [
             f"stage {stage.name}: {', '.join(names)}: the cable of these fit poses hangs on "
@@ -167,7 +168,8 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
     hangs on the other side (see `EitherSide`), and one whose equilibrium has no name but the way
     that led there, tells of the model what it tells there; but where all poses were measured in
     another equilibrium, and a simpler model comes nearer, nothing is predicted. A pose does not
-    count whose lowest equilibrium the uncertain parameters leave open.
+    count whose lowest equilibrium is open, by the uncertain parameters, its fixtures or the
+    cable's scatter.
     """
     lines, stage = [], stages[-1]
     if fit.failed:

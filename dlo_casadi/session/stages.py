@@ -16,6 +16,7 @@ from dlo_casadi.equilibrium.sides import on_other_side
 from dlo_casadi.equilibrium.spread import (
     Uncertainty,
     displacements,
+    gap_std_of_repeats,
     sides_of,
     spread_across,
     tipping_of,
@@ -246,7 +247,8 @@ class _Model:
         return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
 
     def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
-        """Whether the uncertain parameters leave open in which equilibrium a pose is."""
+        """Whether parameters, fixtures and scatter leave open in which equilibrium a pose is."""
+        pair = other.prediction.equilibrium, known.equilibrium
 
         def left_open_by(uncertain: Uncertainty | None) -> bool:
             assert uncertain is not None
@@ -255,12 +257,13 @@ class _Model:
             gap = EnergyGap.between(
                 self.model,
                 item.pose,
-                (other.prediction.equilibrium, known.equilibrium),
+                pair,
                 (self.p, known.rest),
                 (by_p * std, by_rest * std),
                 uncertain.covariance / np.outer(std, std),
             )
-            return gap.value < UNSEEN * gap.std
+            own = gap_std_of_repeats(self.model, self.p, known.rest, item.pose, pair, uncertain)
+            return bool(gap.value < UNSEEN * np.hypot(gap.std, own))
 
         return left_open_by(self.uncertainty) or left_open_by(self.roughest)
 

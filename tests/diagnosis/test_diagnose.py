@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -144,6 +146,24 @@ def test_no_force_is_asked_for_where_shapes_lead_to_an_explanation(
     monkeypatch.setattr(module, "cross_validate", lambda _: lost)
     assert diagnose(fit).verdict == "effect_found"
     assert bool(asked) != from_shapes
+
+
+@pytest.mark.parametrize(("behind", "again"), [(-1.0, True), (0.8, True), (20.0, False)])
+def test_an_effect_found_in_a_misfit_has_to_hold_beside_the_scatter_from_pose_to_pose(
+    monkeypatch, behind, again
+):
+    """0.8 behind: an offset that was the mean of 12 random ones, of 8 mm each."""
+
+    def scattering(evidence, source="declared"):
+        priors = SimpleNamespace(pose_scatter=PoseScatter(0.008, source="end_offset"))
+        noise, problem = SimpleNamespace(source=source), SimpleNamespace(priors=priors)
+        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem)
+
+    near = scattering(3040.0 - behind)
+    monkeypatch.setattr(module, "at_random", lambda _: near)
+    search = Search(scattering(0.0, "misfit"), None, (), 0.005, 4, lambda *_: None, None)
+    found = SimpleNamespace(fit=scattering(3040.0), unexplained=False)
+    assert search.at_random(found) is (near if again else None)
 
 
 def test_the_score_predicts_the_gain_of_a_refit(session):

@@ -1,24 +1,27 @@
 """What differs at random from pose to pose is named, sized, and does not pull the stiffness."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+import hidden_sets
 from hidden_sets import simulated
 
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty, displacements
+from dlo_casadi.equilibrium.spread import Uncertainty, displacements, gap_std_of_repeats
 from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, sources_in
 from dlo_casadi.runtime.parallel import generator_of
 from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs
+from dlo_casadi.session.stages import fit_stage
 
 PLANE = CableData(0.6, 0.04, 0.005, 0.01)
 SPACE = CableData(0.6, 0.04, 0.005, 0.01, torsional_stiffness=0.008)
@@ -76,3 +79,64 @@ def test_turned_clamps_are_named_and_leave_the_stiffness_alone():
     assert own.std == pytest.approx(found.values["random.clamp_angle"], rel=0.5)
     interval = profile_interval(fit)
     assert interval.low < found.values["bending_stiffness"] < interval.high
+
+
+@pytest.mark.parametrize("source", ["rest_curvature", "end_offset"])
+def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_with(
+    monkeypatch, source
+):
+    points = []
+    for elements in (10, 40):
+        monkeypatch.setitem(hidden_sets.ELEMENTS, 2, elements)
+        session = simulated(generator_of(3301, 0), 2, 0, source).session
+        measured = measured_poses(session, read_inputs(session))
+        points.append(np.concatenate([item.points for item in measured]))
+    gap = np.linalg.norm(points[1] - points[0], axis=1)
+    assert np.sqrt((gap**2).mean()) < hidden_sets.FINE
+
+
+def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
+    """22 moments tell their variance as well as that: F of 18 degrees of freedom, no chi-square."""
+    found = simulated(generator_of(3301, 6), 2, 0, "pin_moment").session.fit()
+    assert found.fit.problem.priors.pose_scatter.source == "pin_moment"
+    assert not found.effects
+    assert found.verdict == "complete"
+
+
+def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():
+    session = simulated(generator_of(3301, 7), 2, 0, "rest_curvature").session
+    measured = measured_poses(session, read_inputs(session))
+    fit, _ = fit_declared(session, declared_model(session), measured)
+    shape = fit_stage("batch", fit, measured, {}, ()).shapes["pose_02"]
+    assert shape.rmse > 0.1
+    assert shape.measured_branch.rmse < 0.003
+    assert shape.undecided
+
+
+def test_gap_of_two_equilibria_moves_with_each_repeat_as_energies_solved_anew():
+    model, pose = MODELS["pins"]
+    rest = np.zeros(model.chain.n_rests)
+    pair = [
+        solve_equilibrium(model, model.nominal, rest, replace(pose, branch=branch))
+        for branch in ("cw", "ccw")
+    ]
+    for source in (REST_CURVATURE, "pin_moment"):
+        scatter = PoseScatter(1e-3, source=source)
+        larger, p = scatter.within(model), scatter.values(model.nominal, model)
+        by_p, by_rest = scatter.ways(model)
+        moved = []
+        for k, size in enumerate(scatter.sizes(by_p.shape[1])):
+            energies = [
+                [
+                    solve_equilibrium(
+                        larger, p + x * by_p[:, k], rest + x * by_rest[:, k], pose, x_init=eq.x
+                    ).energy
+                    for x in (1e-3, -1e-3)
+                ]
+                for eq in pair
+            ]
+            (a, b), (c, d) = energies
+            moved.append(size * (a - b - c + d) / 2e-3)
+        uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
+        found = gap_std_of_repeats(model, model.nominal, rest, pose, pair, uncertainty)
+        assert found == pytest.approx(np.linalg.norm(moved), rel=1e-4)
