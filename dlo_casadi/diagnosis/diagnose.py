@@ -348,10 +348,12 @@ class Search:
         if self.declared.noise.source != "misfit" or not (found.unexplained or scatter.std):
             return None
         near = at_random(self.declared)
+        if near is not None and self.finest:
+            # Evidence is compared on one mesh.
+            n = max(near.model.n, found.fit.model.n)
+            near = fine_enough(near, n, finest=self.finest)[0]
         least = found.fit.log_evidence - EVIDENCE_APART
-        if near is None or not (found.unexplained or near.log_evidence > least):
-            return None
-        return fine_enough(near, near.model.n, finest=self.finest)[0] if self.finest else near
+        return near if near and (found.unexplained or near.log_evidence > least) else None
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
         """Backward step: without the effects that others have made superfluous.

@@ -166,6 +166,24 @@ def test_an_effect_found_in_a_misfit_has_to_hold_beside_the_scatter_from_pose_to
     assert search.at_random(found) is (near if again else None)
 
 
+def test_evidence_of_scatter_and_of_effects_is_compared_on_one_mesh(monkeypatch):
+    """On 10 elements and on 15 it differed by 7."""
+
+    def scattering(evidence, n, source="declared"):
+        priors = SimpleNamespace(pose_scatter=PoseScatter(0.007, source="end_offset"))
+        noise, problem = SimpleNamespace(source=source), SimpleNamespace(priors=priors)
+        model = SimpleNamespace(n=n)
+        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, model=model)
+
+    coarse, fine = scattering(3065.6, 10), scattering(3072.0, 15)
+    monkeypatch.setattr(module, "at_random", lambda _: coarse)
+    refined = {10: coarse, 15: fine}
+    monkeypatch.setattr(module, "fine_enough", lambda _, n, finest: (refined[n], 0.0))
+    search = Search(scattering(0.0, 10, "misfit"), None, (), 0.005, 4, lambda *_: None, None, 80)
+    found = SimpleNamespace(fit=scattering(3072.3, 15), unexplained=False)
+    assert search.at_random(found) is fine
+
+
 def test_the_score_predicts_the_gain_of_a_refit(session):
     """For a small effect the score is the decrease of twice the objective, up to third order."""
     declared, measured = session
