@@ -239,8 +239,10 @@ def near_data(
     kept = nearest(near, softness, likely, *among, pairs=pairs, least=least)[:REFITTED]
     tried = list(map_in_order(executor, partial(confirm_from_data, base), kept))
     for k, start in () if explained else enumerate(kept):
-        if not explains(tried[k]):
-            tried[k] = confirm_rolled(base, start, tried[k])
+        item = tried[k]
+        # What a wrongly rolled end leaves may pass for a scatter from pose to pose.
+        if item is None or not explains(item) or item.fit.problem.priors.pose_scatter.std:
+            tried[k] = confirm_rolled(base, start, item)
         if explains(tried[k]):
             break
     fitted = {item.name: item.screened for item in touching}
