@@ -171,8 +171,8 @@ class Screen:
     def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
         """Normal equations at scans.
 
-        The first scan comes first. They are dealt out in as many parts as there are workers, for
-        what a part needs is made once.
+        If the first is among them it has to come first: later ones overwrite its derivatives. They
+        are dealt out in as many parts as there are workers, for what a part needs is made once.
         """
         workers = max(1, min(getattr(executor, "workers", 1), len(scans)))
         parts = [scans[i::workers] for i in range(workers)]

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple
 
@@ -398,7 +399,10 @@ def _off(stage: Stage) -> float:
 
 
 def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> Fit | None:
-    """What a straight cable of a stage's stiffness leads to if it is `better` or lower."""
+    """The fit that begins at a straight cable of a stage's stiffness; None if there is none.
+
+    Unless that cable is `better` it has to begin below the fit.
+    """
     problem, model = fit.problem, fit.model
     values = model.nominal.copy()
     values[model.stiffness_indices] *= simpler.parameters[BENDING_STIFFNESS].value / values[0]
@@ -409,4 +413,6 @@ def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> Fit | None:
         point = problem.balanced(replace(start, shapes=predicted_shapes(problem, start)))
     if point is None or (not better and point.objective >= fit.point.objective):
         return None
-    return descend(Fit(problem, point))
+    with suppress(EstimationError):  # at a fold of its equilibria
+        return descend(Fit(problem, point))
+    return None
