@@ -108,10 +108,12 @@ def by_own_starts(
     return energies
 
 
-def check_random(count: int, where: tuple[bool, ...], only: int | None, ipopt: bool) -> None:
+def check_random(
+    count: int, where: tuple[bool, ...], only: int | None, ipopt: bool, seed: int
+) -> None:
     """Count what is solved."""
     for spatial in where:
-        rng, found, began = np.random.default_rng(0), Counter(), time.process_time()
+        rng, found, began = np.random.default_rng(seed), Counter(), time.process_time()
         missed: dict[str, list[int]] = {}
         while found["cables"] < count:
             drawn = random_pose(rng, spatial)
@@ -216,6 +218,7 @@ def main() -> None:
     parser.add_argument(
         "--where", nargs="+", choices=("plane", "space"), default=["plane", "space"]
     )
+    parser.add_argument("--seed", type=int, default=0, help="of the random cables")
     parser.add_argument("--only", type=int, help="number of one random cable")
     parser.add_argument("--no-ipopt", action="store_true", help="count what is solved alone")
     parser.add_argument("--fixtures", type=Path, help="folder of sessions, its truth beside it")
@@ -223,7 +226,7 @@ def main() -> None:
     if chosen.only is None:
         check_bvp()
     where = tuple(name == "space" for name in chosen.where)
-    check_random(chosen.count, where, chosen.only, not chosen.no_ipopt)
+    check_random(chosen.count, where, chosen.only, not chosen.no_ipopt, chosen.seed)
     if chosen.fixtures is not None:
         check_fixtures(chosen.fixtures)
 

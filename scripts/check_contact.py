@@ -180,7 +180,7 @@ def same_on_finer(model: CableModel, pose: HeldPose, found: list[np.ndarray]) ->
     )
 
 
-def check_random(count: int, spatial: bool, only: int | None) -> None:
+def check_random(count: int, spatial: bool, only: int | None, seed: int) -> None:
     """Energies of random cables beside IPOPT's, see `Ipopt`.
 
     IPOPT starts from our shape, from that without obstacles, from the documented guesses and from
@@ -188,7 +188,7 @@ def check_random(count: int, spatial: bool, only: int | None) -> None:
     counts where Newton's method from there finds the same, stable, and apart where both shapes are
     one on a finer mesh.
     """
-    rng, found, began = np.random.default_rng(0), Counter(), time.process_time()
+    rng, found, began = np.random.default_rng(seed), Counter(), time.process_time()
     missed: dict[str, list[int]] = {}
     worst = ours = 0.0
     while found["cables"] < count:
@@ -262,6 +262,7 @@ if __name__ == "__main__":
     parser.add_argument(
         "--where", nargs="+", choices=("plane", "space"), default=["plane", "space"]
     )
+    parser.add_argument("--seed", type=int, default=0, help="of the random cables")
     parser.add_argument("--only", type=int, help="number of one random cable")
     parser.add_argument("--fixtures", type=Path)
     chosen = parser.parse_args()
@@ -270,6 +271,6 @@ if __name__ == "__main__":
         check_cylinder()
         check_rod()
     for where in chosen.where:
-        check_random(chosen.count, where == "space", chosen.only)
+        check_random(chosen.count, where == "space", chosen.only, chosen.seed)
     if chosen.fixtures:
         check_fixtures(chosen.fixtures)
