@@ -37,7 +37,7 @@ from dlo_casadi.config import (
 from dlo_casadi.config.problems import Arguments
 from dlo_casadi.config.values import plain
 from dlo_casadi.errors import DloError, library
-from dlo_casadi.report.documents import exact_cable, fitted_cable
+from dlo_casadi.report.documents import cable_of_known, fitted_cable
 from dlo_casadi.report.figures_poses import outcome_figure
 from dlo_casadi.report.tables import estimates_of, outcome_html, outcome_text, summary_text
 from dlo_casadi.report.writer import ResultsFolder
@@ -357,7 +357,7 @@ def known_cable(
     given |= _given(rest_curvature=rest_curvature) | {"cable": cable} | unknown
     names = tuple(signature(known_cable).parameters)[:-1]
     config, coefficients = known_config(given, names)
-    return exact_cable(declared_model(config, exact=True), coefficients, config.limits)
+    return cable_of_known(declared_model(config, known=True), coefficients, config.limits)
 
 
 def predict(

@@ -239,7 +239,7 @@ def fitted_cable(outcome: Outcome) -> FittedCable:
     return FittedCable(replace(fit.model, clips=(), obstacles=()), fit.p, final_rest(fit), metadata)
 
 
-def exact_cable(known: Declared, coefficients: FloatArray, limits: Limits) -> FittedCable:
+def cable_of_known(known: Declared, coefficients: FloatArray, limits: Limits) -> FittedCable:
     """A cable of which nothing is uncertain, of rest coefficients [1/m], as a fit would give it."""
     model, p, rest = known.model, known.start, known.model.rest_basis @ coefficients
     nothing = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter())

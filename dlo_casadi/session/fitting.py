@@ -98,7 +98,7 @@ def declared_model(
     center: tuple[float, float] | None = None,
     pixel: float | None = None,
     *,
-    exact: bool = False,
+    known: bool = False,
 ) -> Declared:
     """Build the declared model.
 
@@ -108,8 +108,8 @@ def declared_model(
         Middle of the photographs in the board frame.
     pixel : float, optional [m]
         Size of a pixel on the board, for photographs.
-    exact : bool
-        Whether all is exactly as declared: without nuisances.
+    known : bool
+        Whether all is known to be as declared: without nuisances.
 
     Raises
     ------
@@ -132,14 +132,14 @@ def declared_model(
         clips=experiment.clips,
         obstacles=experiment.surfaces,
     )
-    if END_ROLL in model.names and not exact:
+    if END_ROLL in model.names and not known:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
     for item in options.effects:
         model = model.with_effect(EFFECTS[item.name].made_for(setup))
     if config.cable.mass is None:
         model = model.with_effect(UNKNOWN_MASS())
     tolerances = Tolerances(**setup.tolerances)
-    if not exact:
+    if not known:
         model = nuisances(model, tolerances, pixel, setup.readings)
     start, free = model.nominal.copy(), list(model.names)
     for item in options.effects:
