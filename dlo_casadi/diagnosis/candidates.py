@@ -54,6 +54,13 @@ class Candidate:
             return replace(model, priors=kept)
         return model.with_effect(self.effect)
 
+    def remove_from(self, model: CableModel, before: CableModel) -> CableModel:
+        """Return the model without this effect, a nuisance held as in a model before."""
+        if self.nuisance:
+            held = {name: before.priors[name] for name in self.frees}
+            return replace(model, priors={**model.priors, **held})
+        return model.without_effect(self.effect.label)
+
     def add_linear_to(self, model: CableModel) -> CableModel:
         """Return the model with this effect in the parameters that it is screened in."""
         return self.add_to(model) if self.nuisance else model.with_effect(self.effect.linear())

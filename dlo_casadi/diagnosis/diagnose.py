@@ -362,7 +362,7 @@ class Search:
         one is significant, but may have led out of a local minimum in which there is no need of it.
         """
         for effect in added:
-            smaller = refits.refit_without(fit, effect.candidate)
+            smaller = refits.refit_without(fit, effect.candidate, self.declared.model)
             if smaller is None:
                 continue
             needless = smaller.log_evidence > fit.log_evidence

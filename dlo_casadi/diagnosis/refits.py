@@ -315,11 +315,9 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
     return best
 
 
-def refit_without(fit: Fit, candidate: Candidate) -> Fit | None:
-    """Fit without a candidate, from the fit with it; None for a nuisance, or if none is found."""
-    if candidate.nuisance:
-        return None
-    return _followed(fit, fit.model.without_effect(candidate.effect.label), {})
+def refit_without(fit: Fit, candidate: Candidate, before: CableModel) -> Fit | None:
+    """Fit without a candidate, a nuisance held as before; None if none is found."""
+    return _followed(fit, candidate.remove_from(fit.model, before), {})
 
 
 def start_from(force: UnknownForce, candidate: Candidate) -> dict[str, float]:

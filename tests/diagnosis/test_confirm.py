@@ -67,7 +67,7 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
     }
     slope, std = (f("stiffness_gradient.slope") for f in (larger.value, larger.std))
     assert abs(slope - 0.4) < 3 * std
-    smaller = refit_without(larger, taper)
+    smaller = refit_without(larger, taper, base.model)
     assert kept(smaller) == FIXED
     assert "lumped_mass.mass" not in smaller.problem.unknowns.names
 

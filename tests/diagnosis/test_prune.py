@@ -14,6 +14,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.session.fitting import nuisances
 
 NOISE, CENTER, SIGNIFICANCE = 3e-4, (0.25, 0.0), 0.01
 PLAIN = CableModel(CableData(0.5, 0.03, 0.006, 0.01, straight=True), 12)
@@ -55,3 +56,32 @@ def test_an_effect_stays_only_while_it_is_significant_among_all_candidates(coeff
     names = ["image_distortion"] * kept + ["stiffness_gradient"]
     assert [item.candidate.name for item in left] == names
     assert [effect.name for effect in smaller.model.effects] == names
+
+
+def test_a_nuisance_that_is_needless_is_held_within_its_tolerance_again():
+    held = nuisances(PLAIN, Tolerances())
+    listed = candidates(held, setup_of(held))
+    length, taper = (
+        next(c for c in listed if c.name == name) for name in ("length_error", "stiffness_gradient")
+    )
+    model = taper.add_to(length.add_to(held))
+    assert set(length.frees) == set(held.priors) - set(model.priors)
+    true = {"stiffness_gradient.slope": 0.4}
+    p = np.array([true.get(x, y) for x, y in zip(model.names, model.nominal, strict=True)])
+    poses, rng = [HeldPose((0.0, 0.0), end) for end in ENDS], np.random.default_rng(0)
+    s = np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
+    shapes = predict_poses(model, p, np.zeros(model.chain.n_cells), poses)
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2)))
+        for pose, shape in zip(poses, shapes, strict=True)
+    ]
+    fit = fit_model(model, measured, Tolerances(), NOISE)
+    told = cross_validate(fit)
+    added = [AddedEffect(c, 1e-3, told, told, ()) for c in (length, taper)]
+    declared = fit_model(held, measured, Tolerances(), NOISE)
+    search = Search(declared, CENTER, (), SIGNIFICANCE, 2, lambda *_: None, InProcess())
+
+    smaller, left = search._pruned(fit, added)
+
+    assert [item.candidate.name for item in left] == ["stiffness_gradient"]
+    assert smaller.model.priors == held.priors
