@@ -12,7 +12,7 @@ from dlo_casadi.config.sections import Config
 from dlo_casadi.config.supports import undetermined
 from dlo_casadi.config.values import REST_COEFFICIENTS, plain
 from dlo_casadi.effects import EFFECTS
-from dlo_casadi.model.rest_curvature import RestCurvature
+from dlo_casadi.rod.chain import RestCurvature
 
 
 def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config, FloatArray]:

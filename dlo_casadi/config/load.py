@@ -21,7 +21,7 @@ from dlo_casadi.config.supports import (
 )
 from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
-from dlo_casadi.effects.setup import height_of
+from dlo_casadi.effects.cable import height_of
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
 

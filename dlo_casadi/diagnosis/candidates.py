@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.effects import EFFECTS, Effect, Fitted, Load, Setup
-from dlo_casadi.effects.cable import CableData
-from dlo_casadi.effects.setup import height_of
-from dlo_casadi.estimation.resting import resting_height
+from dlo_casadi.effects.cable import CableData, height_of
+from dlo_casadi.estimation.fit import resting_height
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.thresholds import ALIKE

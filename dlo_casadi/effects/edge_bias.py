@@ -4,9 +4,8 @@ from typing import ClassVar
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Parameter
+from dlo_casadi.effects.cable import Parameter, Setup
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
-from dlo_casadi.effects.setup import Setup
 
 # Harmonics of the cable's direction: light from one side shifts all of its picture, which is the
 # first; the grid of pixels has the fourth. Of the three rendered sessions of photographs, without

@@ -6,9 +6,8 @@ from typing import Any, Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import MeasurementEffect, Params
-from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.ends import REACTIONS, clip_force
 
 _KINDS = {"N": "force", "N m": "moment"}

@@ -20,8 +20,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.clips import CLAMPS, ClipKind, clip_size
-from dlo_casadi.model.rest_curvature import RestCurvature
-from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
+from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain, RestCurvature
 from dlo_casadi.rod.ends import EndConditions, deviation_names
 from dlo_casadi.rod.node import NODES, Node
 from dlo_casadi.rod.obstacles import Capsule, Obstacle
