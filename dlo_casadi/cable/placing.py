@@ -270,20 +270,13 @@ class _Search:
             for one, row in zip(sizes, scales, strict=True)
             for scale, (name, bound) in zip(row, self.bounded.items(), strict=True)
         ]
-        forces = np.concatenate([one["force"] for one in sizes]) / self.weight
+        forces = np.concatenate([one["force"] for one in sizes]) / self.cable.model.force_scale
         none = forces[:0]
         return (
             (np.concatenate(shares), none)
             if self.aim == "margin"
             else (forces, np.concatenate([none, *shares]))
         )
-
-    @cached_property
-    def weight(self) -> float:
-        """A scale of forces [N]: the cable's weight, and what bends it."""
-        cable = self.cable.model.cable
-        weight = cable.mass * np.linalg.norm(self.cable.model.gravity)
-        return float(weight + cable.bending_stiffness / cable.length**2)
 
     def slopes(self, now: _Hung, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (R, size of z), (S, size of z) of `aims` and `others`."""

@@ -153,7 +153,6 @@ class _Search:
         """
         problem, model = self.base.problem, self.model
         scatter, cable = problem.priors.scatter.copy(), model.cable
-        weight = cable.mass * float(np.linalg.norm(model.gravity))
         bending = cable.bending_stiffness / cable.length**2
-        scatter[-model.node.dimension :] = FORCE_WEIGHTS * max(weight, bending)
+        scatter[-model.node.dimension :] = FORCE_WEIGHTS * max(model.weight, bending)
         return replace(problem, unknowns=unknowns, priors=replace(problem.priors, scatter=scatter))

@@ -47,15 +47,23 @@ def _held(
 
     Lengths are relative to the cable's; the chord of a free end and the frame of a pin are None.
     """
+    (start, end), clamps, length = true_ends(model, p, pose)
+    chord = None if model.end == "free" else (end - start) / length
+    return model.chain.places / model.chain.length, chord, clamps
+
+
+def true_ends(
+    model: CableModel, p: FloatArray, pose: HeldPose
+) -> tuple[tuple[FloatArray, FloatArray], Clamps, float]:
+    """Places [m] of the ends; frames of clamps, None of a pin or a tip; length [m]."""
     ends, length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
-    chord = None if model.end == "free" else (end - start) / float(length)
     clamps = (
         first if model.start == "clamped" else None,
         last if model.end == "clamped" else None,
     )
-    return model.chain.places / model.chain.length, chord, clamps
+    return (start, end), clamps, float(length)
 
 
 # ---- in a plane ----------------------------------------------------------------------------------

@@ -274,7 +274,7 @@ def allowed_mesh_error(fit: Fit) -> float:
     return max(MESH_SHARE * fit.compared_std, left * fit.residual_rms)
 
 
-# ---- a plane of unknown height on which cables rest: what their shapes have in common -------------
+# ---- a plane of unknown height on which cables rest: what their shapes share ---------------------
 
 
 def resting_height(problem: Problem) -> float | None:

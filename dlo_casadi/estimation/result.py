@@ -210,6 +210,13 @@ class Fit:
         return self.point.data / self.degrees_of_freedom
 
     @property
+    def rest_now(self) -> FloatArray:
+        """Rest curvature (n_rests,) [1/m] that the session's last pose leaves behind."""
+        if not self.model.has_state:
+            return self.rest
+        return self.problem.equilibria.rest_after_last(self.point.shapes, self.p, self.rest)
+
+    @property
     def chi2_of_points(self) -> float:
         """`chi2_per_dof` by the noise of the points where the fit weighs them by its misfit."""
         return self.chi2_per_dof * (self.noise.std / self.noise.of_points.std) ** 2

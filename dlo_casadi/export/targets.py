@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.errors import DloError, EquilibriumError, OutputError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
 from dlo_casadi.export.common import Relaxed
@@ -346,7 +346,7 @@ def samples_of(
     log = np.array([name in logarithms for name in fitted], dtype=bool)
     # The covariance of log(v) is that of v over v.
     scale = np.where(log, mean, 1.0)
-    root = _root(covariance[np.ix_(kept, kept)] / np.outer(scale, scale))
+    root = root_of(covariance[np.ix_(kept, kept)] / np.outer(scale, scale))
     generator, out = np.random.default_rng(seed), list[Held]()
     for _ in range(_DRAWS * count):
         if len(out) == count:
@@ -376,9 +376,3 @@ def _cable(cable: Held, values: Mapping[str, float], count: int) -> Held | None:
         return Held.solved(model, p, rest, cable.pose)
     except EquilibriumError:
         return None
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Matrix A with A A^T = the covariance, which rounding may have made indefinite."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -132,6 +132,16 @@ class CableModel:
         return NODES[len(self.gravity)]
 
     @property
+    def weight(self) -> float:
+        """Declared weight [N]."""
+        return self.cable.mass * float(np.linalg.norm(self.gravity))
+
+    @property
+    def force_scale(self) -> float:
+        """A scale of forces [N]: the cable's weight, and what bends it."""
+        return self.weight + self.cable.bending_stiffness / self.cable.length**2
+
+    @property
     def n_pose(self) -> int:
         """Size of `HeldPose.vector`."""
         return EndConditions.size(self.node) + VIEWPOINT_SIZE + self.clip_numbers

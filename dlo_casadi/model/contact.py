@@ -376,6 +376,4 @@ def _count(model: CableModel) -> int:
 
 def gap_per_force(model: CableModel, gap: float) -> float:
     """A gap in lengths for a force as large as the cable's weight and bending forces, [m/N]."""
-    cable = model.cable
-    weight = cable.mass * float(np.linalg.norm(model.gravity))
-    return gap * cable.length / (weight + cable.bending_stiffness / cable.length**2)
+    return gap * model.cable.length / model.force_scale
