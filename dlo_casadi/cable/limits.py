@@ -178,10 +178,7 @@ _TRY = "{'bend_radius': 0.05, 'force': 8.0}, of the commands --limits bend_radiu
 def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Limits:
     """Limits that a caller gives, or the session's.
 
-    Raises
-    ------
-    DloError
-        If there is none, or one has no meaning for this cable.
+    Raises DloError if there is none, or one has no meaning for this cable.
     """
     asked = _given(Limits, limits, _TRY) or known.limits
     if not asked.given:
@@ -323,14 +320,8 @@ def limit_checks(
     """Checks of one predicted shape, one for each limit, in their order.
 
     A bend is measured on a mesh that resolves it, see `resolved`. Draws are solved there, too: how
-    places compete for the sharpest bend depends on the mesh.
-
-    Parameters
-    ----------
-    coefficients : (n_coefficients,) [1/m]
-        Of the rest curvature.
-    limits : Limits
-        With a meaning for this cable, see `Limits.problems`.
+    places compete for the sharpest bend depends on the mesh. `coefficients` (n_coefficients,)
+    [1/m]: of the rest curvature. `limits`: with a meaning for this cable, see `Limits.problems`.
     """
     shape, bounds = _Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
     drawn, near = shape.meshes[-1]

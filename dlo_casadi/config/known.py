@@ -18,10 +18,8 @@ from dlo_casadi.rod.chain import RestCurvature
 def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config, FloatArray]:
     """A configuration without poses, and rest coefficients [1/m], of arguments of `known_cable`.
 
-    Raises
-    ------
-    ConfigError
-        If something is missing or cannot be; the message lists every problem with its argument.
+    Raises ConfigError if something is missing or cannot be; the message lists every problem with
+    its argument.
     """
     given = plain(given)
     rest = given.pop("rest_curvature", None)

@@ -112,10 +112,7 @@ def candidates_of(
 ) -> list[Candidate]:
     """List all effects that may be missing in a fitted model; see `candidates`.
 
-    Parameters
-    ----------
-    center : (float, float), optional [m]
-        Middle of the photographs in the board frame.
+    `center` [m]: middle of the photographs in the board frame.
     """
     problem, shapes = fit.problem, fit.point.shapes
     setup = setup_of(

@@ -248,11 +248,8 @@ class Search:
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
 
-        Parameters
-        ----------
-        force : UnknownForce, optional
-            Whose causes are tried in the first step; else all effects, followed from the
-            declared model.
+        `force`: whose causes are tried in the first step; else all effects, followed from the
+        declared model.
         """
         current, validation = self.declared, self.validation
         added: list[AddedEffect] = []

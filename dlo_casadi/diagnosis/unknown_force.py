@@ -63,16 +63,10 @@ class UnknownForce:
 def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> UnknownForce | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
-    The fit without it may have gone far off, so that it is no place to start from: on a
-    coarse mesh places along the cable are searched from the measured shapes, the best refitted
-    with the place along with everything else, and the best of those on the base's mesh.
-
-    Parameters
-    ----------
-    base : Fit
-        Without the load.
-    executor : Executor, optional
-        Where the places are tried, a second or two each; in this process by default.
+    The fit without it may have gone far off, so that it is no place to start from: on a coarse mesh
+    places along the cable are searched from the measured shapes, the best refitted with the place
+    along with everything else, and the best of those on the base's mesh. `base`: without the load.
+    `executor`: where the places are tried, a second or two each; in this process by default.
     """
     effect = UnknownPull()
     model = base.model.with_effect(effect)

@@ -95,12 +95,8 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) 
     4. the cable falling down the other way round: where the nearer one turns by more than 1.5 rad,
        or the rest shape by more than 1 rad.
 
-    In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings.
-
-    Parameters
-    ----------
-    p : (n_parameters,)
-    rest : (n_rests,) [1/m]
+    In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings. `p`
+    (n_parameters,). `rest` (n_rests,) [1/m].
     """
     u, chord, clamps = _held(model, p, pose)
     bent = resting_headings(model.chain, rest)
@@ -133,12 +129,8 @@ def resting_headings(chain: Chain, rest: FloatArray) -> FloatArray:
 def arc_half_angle(chord: float, length: float) -> float:
     """Half the turning of a circular arc: sin(a) / a = chord / length, a in [0, pi].
 
-    By a polynomial, to 2e-4 rad.
-
-    Parameters
-    ----------
-    chord, length : float [m]
-        0 <= chord; a chord longer than the arc gives 0.
+    By a polynomial, to 2e-4 rad. `chord`, `length` [m]: 0 <= chord; a chord longer than the arc
+    gives 0.
     """
     y = max(1.0 - chord / length, 0.0)
     total = 0.0

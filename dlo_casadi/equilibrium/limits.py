@@ -346,14 +346,9 @@ def resolved(
 ) -> list[tuple[CableModel, Equilibrium]]:
     """The same shape on finer meshes, the last of which resolves its sharpest bend.
 
-    Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`.
-    The radius of the segments, and also the curve's, are too large on a coarse mesh: beside a clamp
-    of a soft cable by tens of percent.
-
-    Parameters
-    ----------
-    coefficients : (n_coefficients,) [1/m]
-        Of the rest curvature.
+    Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`. The
+    radius of the segments, and also the curve's, are too large on a coarse mesh: beside a clamp of
+    a soft cable by tens of percent. `coefficients` (n_coefficients,) [1/m]: of the rest curvature.
     """
     meshes, settled = [(model, found)], False
     while not settled and 2 * model.n <= FINEST:

@@ -114,12 +114,7 @@ class Minima:
 def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
     """Minimise the energy of each of m shapes under its end conditions.
 
-    Parameters
-    ----------
-    shapes : Shapes
-        First guesses; deviations are kept.
-    given : Inputs
-        What each of them depends on.
+    `shapes`: first guesses; deviations are kept. `given`: what each of them depends on.
     """
     m = len(shapes.x)
     wanted = assembly.model.n_multipliers

@@ -99,12 +99,8 @@ def profile_intervals(fit: Fit) -> dict[str, Interval]:
 def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     """Profile-likelihood interval of a positive parameter, such as a stiffness [N m^2].
 
-    It is fixed, everything else refitted; its own prior does not count.
-
-    Parameters
-    ----------
-    name : str
-        The bending stiffness by default.
+    It is fixed, everything else refitted; its own prior does not count. `name`: the bending
+    stiffness by default.
     """
     limit = threshold(fit, name)
     std = fit.std(name) / fit.inflation / fit.value(name)

@@ -193,10 +193,7 @@ def fit_to_misfit(near: Fit) -> Fit:
 def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     """Fit the same model on another mesh, from a fit's minimum.
 
-    Parameters
-    ----------
-    modes : int
-        Slow displacements kept out of the noise estimate, if the noise is estimated.
+    `modes`: slow displacements kept out of the noise estimate, if the noise is estimated.
     """
     model, moved = fit.model.with_mesh(n), None
     with suppress(EstimationError):

@@ -340,10 +340,7 @@ class Relaxation:
     def solve(self, values: Values, fixed: BoolArray | None = None, steps: int = STEPS) -> Values:
         """Levenberg-Marquardt from any values.
 
-        Parameters
-        ----------
-        fixed : (size,) bool, optional
-            Entries of theta that stay where they are; none by default.
+        `fixed` (size,): entries of theta that stay where they are; none by default.
         """
         damping, least = FIRST_DAMPING, self.objective(values)
         for _ in range(steps):

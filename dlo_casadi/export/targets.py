@@ -160,10 +160,8 @@ REFUSED = {
 def target_of(name: str) -> Target:
     """The target of a name.
 
-    Raises
-    ------
-    DloError
-        If there is none, with the nearest name, or it cannot take a cable, with the reason.
+    Raises DloError if there is none, with the nearest name, or it cannot take a cable, with the
+    reason.
     """
     if name in REFUSED:
         raise DloError(REFUSED[name])
@@ -186,12 +184,7 @@ def require(target: Target) -> None:
 def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence[str]) -> list[str]:
     """Lines that a file begins with: which number went where, and what is lost.
 
-    Parameters
-    ----------
-    lost : dict
-        Feature that is not carried -> what that costs.
-    origin : sequence of str
-        What the cable is.
+    `lost`: feature that is not carried -> what that costs. `origin`: what the cable is.
     """
     bends, masses = rod.bending[:, [0, 1], [0, 1]], rod.masses.sum() + rod.lumps[:, 0].sum()
     known = [
@@ -241,15 +234,8 @@ def write_rods(
 ) -> list[Path]:
     """Write cables, the first to `path` and the others to <path>_001, ...; return the files.
 
-    Parameters
-    ----------
-    origin : str
-        Where the first comes from; the others are samples of it, drawn with the seed.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written, or is there and no export.
+    `origin`: where the first comes from; the others are samples of it, drawn with the seed. Raises
+    OutputError if a file cannot be written, or is there and no export.
     """
     count = len(cables) - 1
     names = [path, *(path.with_stem(f"{path.stem}_{k:03d}") for k in range(1, count + 1))]

@@ -276,10 +276,8 @@ class Job:
 def fit_one(job: Job) -> Row:
     """Fit a session, write its results and then its row; a failure is a row with a message.
 
-    Raises
-    ------
-    OutputError
-        If the results or the row cannot be written: that is no property of the session.
+    Raises OutputError if the results or the row cannot be written: that is no property of the
+    session.
     """
     begin, key = time.perf_counter(), job.session.key
     try:

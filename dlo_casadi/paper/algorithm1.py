@@ -293,10 +293,7 @@ def expected_angles(k_theta: float, theta_0: FloatArray, slopes: FloatArray) -> 
 
         theta_hat = theta_0 - (1 / k_theta) sum_i m_link g grad y_i(theta)
 
-    Parameters
-    ----------
-    slopes : (..., n - 1) [J/rad]
-        `gravity_slopes` at the interior joints.
+    `slopes` (..., n - 1) [J/rad]: `gravity_slopes` at the interior joints.
     """
     return theta_0 - slopes / k_theta
 

@@ -139,12 +139,8 @@ def most_likely(
     """Parameters (k,) of least deviance between bounds, logits or logarithms, and the deviance.
 
     By L-BFGS-B. Newton steps with the average information take more evaluations: far from the
-    optimum it is a tenth of the second derivative.
-
-    Raises
-    ------
-    EstimationError
-        If rounding leaves no covariance that can be factorised where the search ends.
+    optimum it is a tenth of the second derivative. Raises EstimationError if rounding leaves no
+    covariance that can be factorised where the search ends.
     """
 
     def sloped(q: FloatArray) -> tuple[float, FloatArray]:
@@ -260,10 +256,7 @@ def estimate_noise(
 def tell_of_noise(samples: list[NoiseSample], least: float = _LEAST_DEGREES) -> bool:
     """Whether enough degrees of freedom are left for `estimate_noise` after the projection.
 
-    Parameters
-    ----------
-    least : float
-        Fewest degrees of freedom.
+    `least`: fewest degrees of freedom.
     """
     kept = _telling(samples)
     return bool(kept) and _degrees(kept) >= least
