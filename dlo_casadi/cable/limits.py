@@ -98,31 +98,15 @@ class LimitUse:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LimitCheck(LimitUse):
+class LimitCheck(LimitUse, Exceedance):
     """One quantity of one pose beside its limit, and how likely a new repeat violates it.
 
     Parameters
     ----------
-    std : float
-        Standard deviation of the value to first order.
-    probability, error : float
-        That a new repeat of the pose violates the limit, by the parameters' covariance, the
-        fixtures and the cable's own scatter; and the standard error of a counted one.
-    draws, lost : int
-        Shapes that were solved to count the probability, 0 where first order suffices; and those of
-        them where the cable snaps to another shape, which count as violations.
-    shares : mapping of str to float
-        Parts of the variance by their causes, the largest first; empty where nothing is uncertain.
     decided_by : str
         The largest cause in words, with its size.
     """
 
-    std: float
-    probability: float
-    error: float
-    draws: int
-    lost: int
-    shares: Mapping[str, float]
     decided_by: str
 
     @property
@@ -239,7 +223,7 @@ def _size(quantity: str) -> str:
 
 
 @dataclass(frozen=True)
-class _Resolved:
+class Resolved:
     """A shape on meshes of which the last one resolves its sharpest bend.
 
     Where a state has changed the rest curvature, it is known on the fit's elements alone, and these
@@ -298,17 +282,6 @@ class _Resolved:
         return tuple(out)
 
 
-def limit_uses(
-    cable: CasadiCable,
-    coefficients: FloatArray,
-    pose: HeldPose,
-    found: Equilibrium,
-    limits: Limits,
-) -> tuple[LimitUse, ...]:
-    """How much of each limit a shape uses, as `limit_checks` without probabilities."""
-    return _Resolved.of(cable, coefficients, pose, found, limits).uses(limits)
-
-
 def limit_checks(
     cable: CasadiCable,
     coefficients: FloatArray,
@@ -323,7 +296,7 @@ def limit_checks(
     places compete for the sharpest bend depends on the mesh. `coefficients` (n_coefficients,)
     [1/m]: of the rest curvature. `limits`: with a meaning for this cable, see `Limits.problems`.
     """
-    shape, bounds = _Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
+    shape, bounds = Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
     drawn, near = shape.meshes[-1]
     # What a size is on the mesh of the draws, over what it is.
     ratio = {

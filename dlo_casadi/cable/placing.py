@@ -25,7 +25,7 @@ from scipy.optimize import linprog, minimize
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Metadata
 from dlo_casadi.cable.held import held_pose
-from dlo_casadi.cable.limits import Asked, LimitUse, asked_limits, bounds_of, limit_uses
+from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
 from dlo_casadi.equilibrium.curve import NodeCurve
@@ -367,7 +367,9 @@ class _Search:
         for _ in range(ROUNDS):
             now, before = self._descended(now, scales, STEPS), scales
             uses = [
-                limit_uses(self.slipping, self.coefficients, pose, eq, self.limits)
+                Resolved.of(self.slipping, self.coefficients, pose, eq, self.limits).uses(
+                    self.limits
+                )
                 for pose, eq in zip(self.held(now.z), now.shapes, strict=True)
             ]
             found.append(self._told(now, [use for row in uses for use in row]))

@@ -21,7 +21,6 @@ from dlo_casadi.diagnosis.selection import (
     Found,
     Ranked,
     added_by,
-    as_complete,
     choose,
     p_values_of,
     p_with_closed_noise,
@@ -263,7 +262,9 @@ class Search:
             closed, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen
-                closed = as_complete(winner.fit)
+                # With it the model may be complete now.
+                known = winner.fit.noise.source != "misfit"
+                closed = settle(winner.fit) if known else winner.fit
                 p_value = max(p_values[item.candidate.name] for item in winner.each)
                 scatters = current.problem.priors.pose_scatter.std > 0
                 misfit = self._astray(current)

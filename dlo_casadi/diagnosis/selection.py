@@ -15,7 +15,7 @@ from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_o
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.variances import errors_of, settle
+from dlo_casadi.estimation.variances import errors_of
 from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
 
 
@@ -125,11 +125,6 @@ class Found:
         """By the log evidence, all numbers of effects and all sets of as many equally likely."""
         sets = comb(candidates, min(len(self.added), candidates))
         return not self.unexplained, self.fit.log_evidence - log(sets)
-
-
-def as_complete(fit: Fit) -> Fit:
-    """A fit with an effect added, as that of a model that may be complete now."""
-    return fit if fit.noise.source == "misfit" else settle(fit)
 
 
 def sidak(p_value: float, tried: int) -> float:

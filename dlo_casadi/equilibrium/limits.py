@@ -128,7 +128,7 @@ def _along(model: CableModel, points: FloatArray, x: FloatArray) -> FloatArray:
     return np.concatenate([flat, points[..., -1:, :]], axis=-2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Exceedance:
     """How likely a quantity exceeds its bound.
 
@@ -137,7 +137,8 @@ class Exceedance:
     std : float
         Standard deviation of the greatest size, to first order.
     probability, error : float
-        That a size exceeds its bound, and the standard error of that; 0 to first order.
+        That a size exceeds its bound, by the parameters' covariance, the fixtures and the cable's
+        own scatter; and the standard error of that; 0 to first order.
     draws : int
         Shapes among which it was counted; 0 where it is of first order.
     lost : int
