@@ -22,7 +22,6 @@ class Candidate:
 
     Parameters
     ----------
-    effect : Effect
     frees : tuple of str
         Qualified parameters that are estimated without a prior once it is added.
     screened : tuple of str
@@ -84,7 +83,6 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
     model : CableModel
         With its nuisances; an effect that it has without a prior is no candidate any more, but a
         second lumped mass is.
-    setup : Setup
     exclude : sequence of str
         Effects that the user does not want to be tried.
     """
@@ -142,7 +140,6 @@ def equivalents(
     ----------
     fit : Fit
         With the effect.
-    added : Candidate
     tried : names
         What the data have decided on already.
     rivals : sequence of Candidate

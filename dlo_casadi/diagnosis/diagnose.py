@@ -66,7 +66,6 @@ class Diagnosis:
         The declared model, and the model with the effects that were added.
     validation_before, validation_after : CrossValidation
     structure_before, structure_after : Structure
-    added : tuple of AddedEffect
     ranked : tuple of Ranked
         All candidates of the first step: those refitted by `support`, then the others by score.
     unexplained : bool
@@ -122,7 +121,6 @@ def diagnose(
         Effects that are not tried.
     significance : float
         Probability of a false alarm in a complete model, over all candidates.
-    max_effects : int
     step : callable
         Told how far the search has come.
     executor : Executor, optional

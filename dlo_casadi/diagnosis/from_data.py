@@ -119,8 +119,6 @@ class RelaxedStart:
     ----------
     near : Fit
         Relaxed, without the candidate.
-    screened : Screened
-    problem : Problem
     begun, values : Values
         Before and after.
     left : float

@@ -48,7 +48,6 @@ class Screened:
 
     Parameters
     ----------
-    candidate : Candidate
     score : float
         T, the predicted decrease of twice the objective, at the best scan.
     p_value : float

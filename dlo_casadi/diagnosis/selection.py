@@ -25,7 +25,6 @@ class AddedEffect:
 
     Parameters
     ----------
-    candidate : Candidate
     p_value : float
         Score test, corrected for places and candidates. Where the noise is estimated, the larger
         of it and of the test under the noise that is left once the effect is in the model.
@@ -67,15 +66,6 @@ class Ranked:
 @dataclass(frozen=True)
 class Found:
     """Where a search has ended.
-
-    Parameters
-    ----------
-    fit : Fit
-    added : tuple of AddedEffect
-    ranked : tuple of Ranked
-    validation : CrossValidation
-    structure : Structure
-    unexplained : bool
     """
 
     fit: Fit

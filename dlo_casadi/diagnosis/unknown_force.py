@@ -42,7 +42,6 @@ class UnknownForce:
         95 %.
     gain : float
         Decrease of twice the objective against the fit without it.
-    fit : Fit
     poses : tuple of str
         Names of the fit poses.
     """

@@ -170,8 +170,6 @@ def equilibria_of(
 
     Parameters
     ----------
-    shapes : Shapes
-    given : Inputs
     stable : (m,) bool
     iterations : (m,) int
     bound_multipliers : (m, n_nodes - 1) [N m], optional

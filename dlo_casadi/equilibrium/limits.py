@@ -165,7 +165,6 @@ class Varied:
     ----------
     model, p, rest, pose, found
         As of `spread.displacements`.
-    uncertainty : Uncertainty
     """
 
     model: CableModel

@@ -83,7 +83,6 @@ class Minima:
 
     Parameters
     ----------
-    shapes : Shapes
     balanced : (m,) bool
         Whether the forces balance.
     converged : (m,) bool
@@ -349,7 +348,6 @@ def by_ipopt(
     ----------
     p, rest
         As in `solve.solve_equilibrium`.
-    pose : HeldPose
     phi : (n_nodes,) [rad]
     """
     count, touching = model.chain.n_nodes, model.n_contacts

@@ -39,7 +39,6 @@ class Uncertainty:
         Of these, in SI units.
     scatter : mapping of str to float
         Standard deviation of the fixtures from pose to pose, by the deviation's name.
-    pose_scatter : PoseScatter
     repeat_std : float [m]
         Standard deviation of a coordinate between repeats of one pose, root mean square along the
         cable; 0 where no pose was repeated.

@@ -97,7 +97,6 @@ class Curvature:
     Parameters
     ----------
     matrix : (size, size)
-    used : bool
 
     References
     ----------

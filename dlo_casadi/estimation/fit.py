@@ -63,10 +63,8 @@ def fit_model(
 
     Parameters
     ----------
-    model : CableModel
     measured : sequence of MeasuredPose
         All poses in the order in which they were taken.
-    tolerances : Tolerances
     std : float, optional [m]
         Declared noise of one coordinate; estimated, with its correlation, when absent.
     free : sequence of str, optional

@@ -25,7 +25,6 @@ class Prediction:
 
     Parameters
     ----------
-    equilibrium : Equilibrium
     seen : Observed
         As camera and sensors would see it.
     rest : (n_rests,) [1/m]

@@ -244,7 +244,6 @@ class RestLikelihood:
 
     Parameters
     ----------
-    samples : sequence of ScatterSample
     distances : (m, m) [m]
         Between the poses' shapes, root mean square.
     source : str
@@ -368,7 +367,6 @@ class ScatterEstimate:
 
     Parameters
     ----------
-    scatter : PoseScatter
     noise : float
         Factor on the standard deviation of the noise.
     p_systematic : float

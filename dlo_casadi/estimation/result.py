@@ -37,7 +37,6 @@ class Fit:
         With the noise and the roughness found.
     point : Point
         Unknowns, shapes and objective at the minimum, or on the way there.
-    converged : bool
     """
 
     problem: Problem

@@ -31,7 +31,6 @@ class Unknowns:
 
     Parameters
     ----------
-    model : CableModel
     free : (n_parameters,) bool
         Which parameters are estimated; the others stay at `fixed`.
     fixed : (n_parameters,)

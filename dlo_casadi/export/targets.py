@@ -28,12 +28,10 @@ class Target:
 
     Parameters
     ----------
-    title : str
     suffix : str
         End of the names of its files, where none is given.
     packages : tuple of str
         Modules that have to be installed to relax a cable in it, and the `extra` that has them.
-    carries : frozenset of Feature
     write : callable
         The text of a file: of a rod, and the lines of its head.
     settle : callable

@@ -195,11 +195,8 @@ def fit_fleet(
 
     Parameters
     ----------
-    sessions : sequence of SessionFile
     output : Path
         On a file system that all workers see.
-    executor : Executor
-    options : Options, optional
     retry_failed : bool
         Whether failed sessions are tried again. Lost ones always are: with a killed worker, or
         because their results could not be written.

@@ -41,10 +41,6 @@ def _repeated(rows: FloatArray, count: int) -> FloatArray:
 
 class Assembly:
     """A model evaluated over poses.
-
-    Parameters
-    ----------
-    model : CableModel
     """
 
     def __init__(self, model: CableModel) -> None:

@@ -54,7 +54,6 @@ class Contact:
 
     Parameters
     ----------
-    obstacle : str
     start, end : float [m]
         Arc lengths where it begins and ends; equal where the cable touches in a point. Between
         nodes they follow from the forces beside them: evenly spread in between, points at both.
@@ -80,7 +79,6 @@ class Touching:
 
     Parameters
     ----------
-    model : CableModel
     border : (m, k)
         All unknowns beside the nodes, the sizes of the forces [N] last.
     start : (m, d) [m]

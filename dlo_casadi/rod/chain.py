@@ -31,7 +31,6 @@ class Chain:
     element : str
         A name of ELEMENTS, or of ELEMENTS_IN_SPACE.
     start_clamped, end_clamped : bool
-    node : type[Node]
     """
 
     length: float

@@ -226,7 +226,6 @@ def estimate_noise(
 
     Parameters
     ----------
-    samples : list of NoiseSample
     cable_length : float [m]
     max_points : int
         Maximum number of points used per pose, evenly spaced; fewer where the noise is smooth.

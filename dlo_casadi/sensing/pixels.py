@@ -33,7 +33,6 @@ class ViewInput:
     ----------
     name : str
         File stem.
-    image : Path
     seen : ImageCurve
         The line found in it.
     places : (K, 3) [m]

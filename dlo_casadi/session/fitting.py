@@ -61,7 +61,6 @@ class Declared:
         Parameters at their declared values.
     free : list of str
         Parameters that do not keep them.
-    tolerances : Tolerances
     """
 
     model: CableModel

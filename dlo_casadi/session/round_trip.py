@@ -56,10 +56,8 @@ class Relaxation:
     measured_force : (d,) [N] or None
     points, predicted, measured : (K, d) [m]
         What is drawn.
-    links : int
     lost : tuple of str
         Features of the identified cable that the target cannot carry.
-    problem : str
     """
 
     pose: str
