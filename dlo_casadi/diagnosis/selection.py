@@ -65,8 +65,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Found:
-    """Where a search has ended.
-    """
+    """Where a search has ended."""
 
     fit: Fit
     added: tuple[AddedEffect, ...]
