@@ -151,20 +151,16 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     return sidak(survival(gain, dof, noise_degrees(larger)), tried)
 
 
-def gains(item: Confirmed, base: Fit, validation: CrossValidation) -> tuple[float, float]:
-    """How much likelier a refit makes the data than its base does, twice: logarithms.
+def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
+    """How much likelier a refit makes the data than its base does, twice: logarithms, their mean.
 
     By marginal likelihood, and by the predictive density of poses that are left out (of which the
     base's is in `validation`). Both agree where nothing else is missing. A wrong effect bends to
-    what is fitted, and predicts what is left out badly.
+    what is fitted, and predicts what is left out badly: the mean is harmonic, which the smaller
+    decides; that itself if it is negative.
     """
-    evidence = item.fit.log_evidence - base.log_evidence
-    return evidence, item.validation.log_density - validation.log_density
-
-
-def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
-    """Harmonic mean of both `gains`, which the smaller decides; that itself if it is negative."""
-    one, other = gains(item, base, validation)
+    one = item.fit.log_evidence - base.log_evidence
+    other = item.validation.log_density - validation.log_density
     smaller = min(one, other)
     return smaller if smaller <= 0 else 2 * one * other / (one + other)
 
