@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from scipy.special import ndtri
 
-from dlo_casadi.arrays import FloatArray, root_of
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
@@ -58,7 +58,8 @@ class Uncertainty:
     def root(self) -> FloatArray:
         """Matrix A (N, N) with A A^T = `covariance`, which may be singular."""
         std = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
-        return std[:, None] * root_of(self.covariance / np.outer(std, std))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(std, std))
+        return std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
     def unknowns_in(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
         """Derivatives of parameters (n_parameters, N) and rests (n_rests, N) by `names`."""
