@@ -9,11 +9,12 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.continuation import relaxed
 from dlo_casadi.estimation.descent import descend, refit
 from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, fit_from, relaxed
+from dlo_casadi.estimation.start import begin, fit_from
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
