@@ -28,3 +28,9 @@ def chord_lengths(points: FloatArray) -> NDArray[np.float64]:
 def length_of(points: FloatArray) -> float:
     """Length of a polyline through points (K, d)."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Square root F (n, n) with F F^T = covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -7,7 +7,7 @@ import pytest
 
 from dlo_casadi.cable import placing
 from dlo_casadi.cable.held import held_pose
-from dlo_casadi.cable.limits import limit_uses
+from dlo_casadi.cable.limits import Resolved
 from dlo_casadi.cable.placing import ROOM, placed
 from dlo_casadi.config import Limits
 from dlo_casadi.effects import CableData
@@ -41,7 +41,8 @@ def used(known: CasadiCable, clips: list[dict], limits: dict, poses=POSES):
     for pose in poses:
         own = held_pose(held.model, {}, asked | pose)
         eq = solve_equilibrium(held.model, held.p, held.rest, own)
-        yield from limit_uses(held, KNOWN.coefficients, own, eq, Limits(**limits))
+        bounds = Limits(**limits)
+        yield from Resolved.of(held, KNOWN.coefficients, own, eq, bounds).uses(bounds)
 
 
 def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():

@@ -4,8 +4,7 @@ import itertools
 
 import numpy as np
 
-from dlo_casadi.model.rest_curvature import RestCurvature
-from dlo_casadi.rod.chain import Chain
+from dlo_casadi.rod.chain import Chain, RestCurvature
 
 LENGTH = 0.8  # m
 

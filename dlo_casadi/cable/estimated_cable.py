@@ -156,15 +156,6 @@ class CableCurve(NodeCurve):
         return np.stack([tangents, y, np.cross(tangents, y)], axis=2)
 
 
-def curves_of(
-    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
-) -> tuple[CableCurve, CableCurve]:
-    """The cable itself in a pose, and as the session's camera measures it."""
-    models = (without_camera(model, p), (model, p))
-    true, seen = (CableCurve.at_rest(*one, rest, pose, eq) for one in models)
-    return true, seen
-
-
 def without_camera(model: CableModel, p: FloatArray) -> tuple[CableModel, FloatArray]:
     """The model without the effects of the camera, and its part of `p`."""
     return model.without_kind(MeasurementEffect, p)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable, curves_of, without_camera
+from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable, without_camera
 from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
@@ -212,7 +212,9 @@ class FittedCable(EstimatedCable):
 
     def shape_in(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
         """The shape in an equilibrium."""
-        return Shape(self, pose, eq, *curves_of(self.model, self.p, self.rest, pose, eq))
+        models = without_camera(self.model, self.p), (self.model, self.p)
+        true, seen = (CableCurve.at_rest(*one, self.rest, pose, eq) for one in models)
+        return Shape(self, pose, eq, true, seen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,12 +122,7 @@ def among(
     """Model and parameters `p` of a cable among obstacles, checked as those of a session.
 
     They are where they are declared: an `obstacle_offset` is of the session's own. `over` as of
-    `HeldPose`.
-
-    Raises
-    ------
-    DloError
-        If one cannot be so.
+    `HeldPose`. Raises DloError if one cannot be so.
     """
     given: dict[str, Any] = {"obstacles": obstacles}
     listed = _Obstacles(**given).obstacles
@@ -200,12 +195,8 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
 
     Columns are end_x_m, end_y_m and, where they differ from pose to pose, start_x_m, start_y_m,
     start_heading_rad, end_heading_rad; in space also end_z_m, start_z_m, start_qx to start_qw,
-    end_qx to end_qw and turns; and name, the line's number when absent.
-
-    Raises
-    ------
-    DloError
-        If there is no such file, or it has other columns or cells that are no numbers.
+    end_qx to end_qw and turns; and name, the line's number when absent. Raises DloError if there is
+    no such file, or it has other columns or cells that are no numbers.
     """
     node, sides = model.node, ("start", "end")
     keys = {side: [f"{side}_{axis}_m" for axis in node.axes] for side in sides}

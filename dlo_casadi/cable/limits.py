@@ -98,31 +98,15 @@ class LimitUse:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LimitCheck(LimitUse):
+class LimitCheck(LimitUse, Exceedance):
     """One quantity of one pose beside its limit, and how likely a new repeat violates it.
 
     Parameters
     ----------
-    std : float
-        Standard deviation of the value to first order.
-    probability, error : float
-        That a new repeat of the pose violates the limit, by the parameters' covariance, the
-        fixtures and the cable's own scatter; and the standard error of a counted one.
-    draws, lost : int
-        Shapes that were solved to count the probability, 0 where first order suffices; and those of
-        them where the cable snaps to another shape, which count as violations.
-    shares : mapping of str to float
-        Parts of the variance by their causes, the largest first; empty where nothing is uncertain.
     decided_by : str
         The largest cause in words, with its size.
     """
 
-    std: float
-    probability: float
-    error: float
-    draws: int
-    lost: int
-    shares: Mapping[str, float]
     decided_by: str
 
     @property
@@ -178,10 +162,7 @@ _TRY = "{'bend_radius': 0.05, 'force': 8.0}, of the commands --limits bend_radiu
 def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Limits:
     """Limits that a caller gives, or the session's.
 
-    Raises
-    ------
-    DloError
-        If there is none, or one has no meaning for this cable.
+    Raises DloError if there is none, or one has no meaning for this cable.
     """
     asked = _given(Limits, limits, _TRY) or known.limits
     if not asked.given:
@@ -242,7 +223,7 @@ def _size(quantity: str) -> str:
 
 
 @dataclass(frozen=True)
-class _Resolved:
+class Resolved:
     """A shape on meshes of which the last one resolves its sharpest bend.
 
     Where a state has changed the rest curvature, it is known on the fit's elements alone, and these
@@ -301,17 +282,6 @@ class _Resolved:
         return tuple(out)
 
 
-def limit_uses(
-    cable: CasadiCable,
-    coefficients: FloatArray,
-    pose: HeldPose,
-    found: Equilibrium,
-    limits: Limits,
-) -> tuple[LimitUse, ...]:
-    """How much of each limit a shape uses, as `limit_checks` without probabilities."""
-    return _Resolved.of(cable, coefficients, pose, found, limits).uses(limits)
-
-
 def limit_checks(
     cable: CasadiCable,
     coefficients: FloatArray,
@@ -323,16 +293,10 @@ def limit_checks(
     """Checks of one predicted shape, one for each limit, in their order.
 
     A bend is measured on a mesh that resolves it, see `resolved`. Draws are solved there, too: how
-    places compete for the sharpest bend depends on the mesh.
-
-    Parameters
-    ----------
-    coefficients : (n_coefficients,) [1/m]
-        Of the rest curvature.
-    limits : Limits
-        With a meaning for this cable, see `Limits.problems`.
+    places compete for the sharpest bend depends on the mesh. `coefficients` (n_coefficients,)
+    [1/m]: of the rest curvature. `limits`: with a meaning for this cable, see `Limits.problems`.
     """
-    shape, bounds = _Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
+    shape, bounds = Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
     drawn, near = shape.meshes[-1]
     # What a size is on the mesh of the draws, over what it is.
     ratio = {

@@ -25,7 +25,7 @@ from scipy.optimize import linprog, minimize
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Metadata
 from dlo_casadi.cable.held import held_pose
-from dlo_casadi.cable.limits import Asked, LimitUse, asked_limits, bounds_of, limit_uses
+from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
 from dlo_casadi.equilibrium.curve import NodeCurve
@@ -270,20 +270,13 @@ class _Search:
             for one, row in zip(sizes, scales, strict=True)
             for scale, (name, bound) in zip(row, self.bounded.items(), strict=True)
         ]
-        forces = np.concatenate([one["force"] for one in sizes]) / self.weight
+        forces = np.concatenate([one["force"] for one in sizes]) / self.cable.model.force_scale
         none = forces[:0]
         return (
             (np.concatenate(shares), none)
             if self.aim == "margin"
             else (forces, np.concatenate([none, *shares]))
         )
-
-    @cached_property
-    def weight(self) -> float:
-        """A scale of forces [N]: the cable's weight, and what bends it."""
-        cable = self.cable.model.cable
-        weight = cable.mass * np.linalg.norm(self.cable.model.gravity)
-        return float(weight + cable.bending_stiffness / cable.length**2)
 
     def slopes(self, now: _Hung, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (R, size of z), (S, size of z) of `aims` and `others`."""
@@ -374,7 +367,9 @@ class _Search:
         for _ in range(ROUNDS):
             now, before = self._descended(now, scales, STEPS), scales
             uses = [
-                limit_uses(self.slipping, self.coefficients, pose, eq, self.limits)
+                Resolved.of(self.slipping, self.coefficients, pose, eq, self.limits).uses(
+                    self.limits
+                )
                 for pose, eq in zip(self.held(now.z), now.shapes, strict=True)
             ]
             found.append(self._told(now, [use for row in uses for use in row]))

@@ -32,8 +32,8 @@ COMMANDS = {
     "export": ("export", "write a fitted cable for a simulator, such as MuJoCo"),
     "generate-solver": ("fitted", "write the C solver of a fitted cable for planners to embed"),
     "schema": ("new", "print the JSON schema of a configuration, for editors"),
-    "reproduce": ("checkout", "compare with the paper's results (needs a checkout)"),
-    "benchmark": ("checkout", "time the C solver beside other solvers (needs a checkout)"),
+    "reproduce": ("new", "compare with the paper's results (needs a checkout)"),
+    "benchmark": ("new", "time the C solver beside other solvers (needs a checkout)"),
 }
 
 EXAMPLES = """\

@@ -1,12 +1,15 @@
-"""`dlo new`, `dlo schema`: a configuration to start from, and what editors know of it."""
+"""Commands without a session: `dlo new`, `dlo schema`, `dlo reproduce`, `dlo benchmark`."""
 
 import argparse
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import dlo_casadi
 from dlo_casadi.cli.options import Page, command, one_of, option
 from dlo_casadi.config.supports import KINDS
 from dlo_casadi.config.template import schema_text, template
@@ -103,3 +106,43 @@ def schema(chosen: argparse.Namespace) -> None:
         gives completion, help and checks in editors with the YAML language server
     """
     print(schema_text(), end="")
+
+
+# ---- a checkout's scripts ------------------------------------------------------------------------
+
+
+_script = command(
+    option("option", nargs="*", help="passed on to the script"),
+    codes="others are the script's own",
+    json=None,
+)
+
+
+@_script
+def reproduce(chosen: argparse.Namespace) -> int:
+    """Compare with the paper of Quartaro et al.; runs scripts/reproduce_paper.py of a checkout.
+
+    dlo reproduce
+    dlo reproduce -- --help                         options of the script, which follow --
+    """
+    return _run("reproduce_paper.py", chosen)
+
+
+@_script
+def benchmark(chosen: argparse.Namespace) -> int:
+    """Time the C solver beside other solvers: runs scripts/benchmark.py of the checkout.
+
+    dlo benchmark
+    dlo benchmark -- --help                         options of the script, which follow --
+    """
+    return _run("benchmark.py", chosen)
+
+
+def _run(name: str, chosen: argparse.Namespace) -> int:
+    path = Path(dlo_casadi.__file__).parents[1] / "scripts" / name
+    if not path.is_file():
+        raise DloError(
+            f"{name} is not part of the installed package; it needs a checkout: clone the "
+            "repository, install it with `pip install -e .` and call dlo from there."
+        )
+    return subprocess.run([sys.executable, str(path), *chosen.option], check=False).returncode

@@ -26,11 +26,7 @@ def read_yaml(path: str | Path) -> Any:
     """Read a YAML file as plain dicts, lists, text and numbers.
 
     Numbers such as 1e-3 are numbers here, as in YAML 1.2; a key that occurs twice is an error.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is empty, or is not YAML.
+    Raises ConfigError if the file cannot be read, is empty, or is not YAML.
     """
     return Document.read(Path(path)).data
 

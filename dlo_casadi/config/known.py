@@ -12,16 +12,14 @@ from dlo_casadi.config.sections import Config
 from dlo_casadi.config.supports import undetermined
 from dlo_casadi.config.values import REST_COEFFICIENTS, plain
 from dlo_casadi.effects import EFFECTS
-from dlo_casadi.model.rest_curvature import RestCurvature
+from dlo_casadi.rod.chain import RestCurvature
 
 
 def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config, FloatArray]:
     """A configuration without poses, and rest coefficients [1/m], of arguments of `known_cable`.
 
-    Raises
-    ------
-    ConfigError
-        If something is missing or cannot be; the message lists every problem with its argument.
+    Raises ConfigError if something is missing or cannot be; the message lists every problem with
+    its argument.
     """
     given = plain(given)
     rest = given.pop("rest_curvature", None)
@@ -48,16 +46,15 @@ def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config,
         *config.limit_problems,
     ]
     values = np.zeros((1 + in_space, 0)) if rest is None else _curvatures(rest, 1 + in_space)
+    text = ""
     if values is None:
         form = "(2,) or (2, K) numbers" if in_space else "one number or (K,)"
         text = f"{form} [1/m], K <= {REST_COEFFICIENTS.most}, belong here, found {show(rest)}"
-        problems.append(ConfigProblem((), f"rest_curvature: {text}"))
     elif values.size and cable.rest_shape == "straight":
         text = "the cable is declared straight. Try: one of rest_curvature and rest_shape"
-        problems.append(ConfigProblem((), f"rest_curvature: {text}"))
     elif values.size and np.abs(values).max() * cable.diameter >= 2.0:
         text = f"{np.abs(values).max():g} 1/m bends it more sharply than it is thick: units are SI"
-        problems.append(ConfigProblem((), f"rest_curvature: {text}"))
+    problems += [ConfigProblem((), f"rest_curvature: {text}")] if text else []
     if problems or values is None:
         raise source.error(problems)
     count = values.shape[1]

@@ -21,7 +21,7 @@ from dlo_casadi.config.supports import (
 )
 from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
-from dlo_casadi.effects.setup import height_of
+from dlo_casadi.effects.cable import height_of
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS
 
@@ -92,7 +92,9 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
     poses = config.experiment.poses
     unreachable = _unreachable(poses, config.cable, config.experiment.tolerances)
     reachable = tuple(pose for pose in poses if pose.name not in unreachable)
-    reasons = unreachable | _missing(reachable)
+    absent = {pose.name: [_absent(path) for path in pose.paths] for pose in reachable if pose.paths}
+    missing = {name: "; ".join(told) for name, told in absent.items() if all(told)}
+    reasons = unreachable | missing
     n_fit = sum(pose.role == "fit" and pose.name not in reasons for pose in poses)
     if n_fit == 0:
         lost = [
@@ -275,12 +277,6 @@ def _unreachable(
         elif wrong := too_short(pose, cable.length, slack):
             reasons[pose.name] = wrong
     return reasons
-
-
-def _missing(poses: Iterable[Pose]) -> dict[str, str]:
-    """Find poses of which no file exists."""
-    found = {pose.name: [_absent(path) for path in pose.paths] for pose in poses if pose.paths}
-    return {name: "; ".join(reasons) for name, reasons in found.items() if all(reasons)}
 
 
 def _absent(file: Path) -> str:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.effects import EFFECTS, Effect, Fitted, Load, Setup
-from dlo_casadi.effects.cable import CableData
-from dlo_casadi.effects.setup import height_of
-from dlo_casadi.estimation.resting import resting_height
+from dlo_casadi.effects.cable import CableData, height_of
+from dlo_casadi.estimation.fit import resting_height
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.thresholds import ALIKE
@@ -23,7 +22,6 @@ class Candidate:
 
     Parameters
     ----------
-    effect : Effect
     frees : tuple of str
         Qualified parameters that are estimated without a prior once it is added.
     screened : tuple of str
@@ -92,7 +90,6 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
     model : CableModel
         With its nuisances; an effect that it has without a prior is no candidate any more, but a
         second lumped mass is.
-    setup : Setup
     exclude : sequence of str
         Effects that the user does not want to be tried.
     """
@@ -120,10 +117,7 @@ def candidates_of(
 ) -> list[Candidate]:
     """List all effects that may be missing in a fitted model; see `candidates`.
 
-    Parameters
-    ----------
-    center : (float, float), optional [m]
-        Middle of the photographs in the board frame.
+    `center` [m]: middle of the photographs in the board frame.
     """
     problem, shapes = fit.problem, fit.point.shapes
     setup = setup_of(
@@ -153,7 +147,6 @@ def equivalents(
     ----------
     fit : Fit
         With the effect.
-    added : Candidate
     tried : names
         What the data have decided on already.
     rivals : sequence of Candidate

@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 from scipy.special import stdtr
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.problem import NO_INFORMATION
 from dlo_casadi.estimation.result import Fit
@@ -150,14 +150,8 @@ def _density(
     else:
         item = problem.measured[problem.used[k]]
         off = white @ item.residual(seen, item.located(seen, fit.point.projections[k]))
-    ways = np.concatenate([a @ _root(covariance), own * problem.deviation_std], axis=1)
+    ways = np.concatenate([a @ root_of(covariance), own * problem.deviation_std], axis=1)
     return _log_density(off, ways) + float(np.linalg.slogdet(white)[1])
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Square root F with F F^T = covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _log_density(white: FloatArray, ways: FloatArray) -> float:
@@ -248,7 +242,7 @@ def _stretches(fit: Fit) -> CrossValidation:
         off: FloatArray = lin.raw[0] + lin.raw_directions[0] @ step
         if seen is not None:
             off = item.residual(seen, item.located(seen, fit.point.projections[0]))
-        rows, ways = noise[~kept], lin.raw_directions[0][~kept] @ _root(np.linalg.inv(hessian))
+        rows, ways = noise[~kept], lin.raw_directions[0][~kept] @ root_of(np.linalg.inv(hessian))
         white = np.linalg.inv(np.linalg.cholesky(rows @ rows.T))
         told = _log_density(white @ off[~kept], white @ ways)
         densities.append(told + float(np.linalg.slogdet(white)[1]))

@@ -21,7 +21,6 @@ from dlo_casadi.diagnosis.selection import (
     Found,
     Ranked,
     added_by,
-    as_complete,
     choose,
     p_values_of,
     p_with_closed_noise,
@@ -67,7 +66,6 @@ class Diagnosis:
         The declared model, and the model with the effects that were added.
     validation_before, validation_after : CrossValidation
     structure_before, structure_after : Structure
-    added : tuple of AddedEffect
     ranked : tuple of Ranked
         All candidates of the first step: those refitted by `support`, then the others by score.
     unexplained : bool
@@ -123,7 +121,6 @@ def diagnose(
         Effects that are not tried.
     significance : float
         Probability of a false alarm in a complete model, over all candidates.
-    max_effects : int
     step : callable
         Told how far the search has come.
     executor : Executor, optional
@@ -248,11 +245,8 @@ class Search:
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise, or nothing improves what is left out.
 
-        Parameters
-        ----------
-        force : UnknownForce, optional
-            Whose causes are tried in the first step; else all effects, followed from the
-            declared model.
+        `force`: whose causes are tried in the first step; else all effects, followed from the
+        declared model.
         """
         current, validation = self.declared, self.validation
         added: list[AddedEffect] = []
@@ -266,7 +260,9 @@ class Search:
             closed, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen
-                closed = as_complete(winner.fit)
+                # With it the model may be complete now.
+                known = winner.fit.noise.source != "misfit"
+                closed = settle(winner.fit) if known else winner.fit
                 p_value = max(p_values[item.candidate.name] for item in winner.each)
                 scatters = current.problem.priors.pose_scatter.std > 0
                 misfit = self._astray(current)

@@ -16,7 +16,6 @@ from functools import partial
 
 import numpy as np
 
-from dlo_casadi.arrays import BoolArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.continuation import loosely_relaxed, relaxed, with_springs_in_place
@@ -114,8 +113,6 @@ class RelaxedStart:
     ----------
     near : Fit
         Relaxed, without the candidate.
-    screened : Screened
-    problem : Problem
     begun, values : Values
         Before and after.
     left : float
@@ -165,7 +162,9 @@ class RelaxedStart:
         others = {name: near.value(name) for x in beside for name in x.candidate.frees}
         values = {**others, **scan, **known}
         linear, begun = _as_measured(near, candidate.add_linear_to(near.model), values)
-        fixed = _places(linear, candidate)
+        # Where and which way it acts stays where its score is largest until it acts: before, a step
+        # of these leads anywhere.
+        fixed = np.isin(linear.unknowns.names, list(candidate.scans[0]))
         if rolls:
             linear, begun = begin(linear, begun.theta, fixed)
         reached = loosely_relaxed(linear, begun, fixed)
@@ -280,14 +279,6 @@ def _stiffnesses(model: CableModel) -> list[dict[str, float]]:
         dict(zip(names, (size * typical / own[0] * own).tolist(), strict=True))
         for size in STIFFNESSES_OF_CONTACT
     ]
-
-
-def _places(problem: Problem, candidate: Candidate) -> BoolArray:
-    """Which unknowns say where or which way a candidate acts.
-
-    They stay where its score is largest until it acts: before, a step of theirs leads anywhere.
-    """
-    return np.isin(problem.unknowns.names, list(candidate.scans[0]))
 
 
 def _in_own_parameters(

@@ -229,7 +229,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
         reach = float(np.linalg.norm(end - np.array(nearest.start)))
         if 0.03 < reach / first.model.cable.length < 0.97:
             tried.append(replace(nearest, end=tuple(map(float, end)), name="next"))
-    rivals = [predict_each(fit.model, fit.p, _rest_now(fit), tried) for fit in (first, second)]
+    rivals = [predict_each(fit.model, fit.p, fit.rest_now, tried) for fit in (first, second)]
     best: tuple[float, HeldPose, Prediction, Prediction] | None = None
     for pose, one, other in zip(tried, *rivals, strict=True):
         if one is None or other is None:
@@ -274,10 +274,3 @@ def _separation(fit: Fit, end: FloatArray, curves: tuple[NodeCurve, NodeCurve]) 
     s, item = fit.point.projections[k], problem.measured[problem.used[k]]
     gap = item.components(curves[0], s, (curves[0].at(s) - curves[1].at(s))[..., None])
     return float(np.linalg.norm(item.whitening(fit.noise, s) @ gap))
-
-
-def _rest_now(fit: Fit) -> FloatArray:
-    """Rest curvature after the session's last pose."""
-    if not fit.model.has_state:
-        return fit.rest
-    return fit.problem.equilibria.rest_after_last(fit.point.shapes, fit.p, fit.rest)

@@ -67,9 +67,6 @@ class Confirmed:
 
     Parameters
     ----------
-    screened : Screened
-    fit : Fit
-    validation : CrossValidation
     gain : float
         Decrease of twice the objective.
     beside : tuple of Screened

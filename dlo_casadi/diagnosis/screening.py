@@ -48,7 +48,6 @@ class Screened:
 
     Parameters
     ----------
-    candidate : Candidate
     score : float
         T, the predicted decrease of twice the objective, at the best scan.
     p_value : float
@@ -206,12 +205,8 @@ class Screen:
     def run(self, noise_dof: float, executor: Executor | None = None) -> list[Screened]:
         """Score all candidates, best first.
 
-        Parameters
-        ----------
-        noise_dof : float
-            Degrees of freedom of the noise estimate; inf where it is declared.
-        executor : Executor, optional
-            Where scans are done; in this process by default.
+        `noise_dof`: degrees of freedom of the noise estimate; inf where it is declared. `executor`:
+        where scans are done; in this process by default.
         """
         best: dict[str, tuple[Screened, int]] = {}
 
@@ -330,12 +325,8 @@ def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, Float
 def survival(score: float, dof: int, noise_dof: float) -> float:
     """Probability of a larger score where nothing is missing: chi-square, or F.
 
-    Parameters
-    ----------
-    dof : int
-        Of the score, at least one.
-    noise_dof : float
-        With which the noise is known; inf where it is declared.
+    `dof`: of the score, at least one. `noise_dof`: with which the noise is known; inf where it is
+    declared.
     """
     if np.isinf(noise_dof):
         return float(chdtrc(dof, score))

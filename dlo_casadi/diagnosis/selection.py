@@ -15,7 +15,7 @@ from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_o
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.variances import errors_of, settle
+from dlo_casadi.estimation.variances import errors_of
 from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
 
 
@@ -25,7 +25,6 @@ class AddedEffect:
 
     Parameters
     ----------
-    candidate : Candidate
     p_value : float
         Score test, corrected for places and candidates. Where the noise is estimated, the larger
         of it and of the test under the noise that is left once the effect is in the model.
@@ -66,17 +65,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Found:
-    """Where a search has ended.
-
-    Parameters
-    ----------
-    fit : Fit
-    added : tuple of AddedEffect
-    ranked : tuple of Ranked
-    validation : CrossValidation
-    structure : Structure
-    unexplained : bool
-    """
+    """Where a search has ended."""
 
     fit: Fit
     added: tuple[AddedEffect, ...]
@@ -127,11 +116,6 @@ class Found:
         return not self.unexplained, self.fit.log_evidence - log(sets)
 
 
-def as_complete(fit: Fit) -> Fit:
-    """A fit with an effect added, as that of a model that may be complete now."""
-    return fit if fit.noise.source == "misfit" else settle(fit)
-
-
 def sidak(p_value: float, tried: int) -> float:
     """Probability that the best of so many independent tests is as good (Sidak)."""
     return float(-np.expm1(tried * np.log1p(-min(p_value, 1 - 1e-16))))
@@ -167,20 +151,16 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     return sidak(survival(gain, dof, noise_degrees(larger)), tried)
 
 
-def gains(item: Confirmed, base: Fit, validation: CrossValidation) -> tuple[float, float]:
-    """How much likelier a refit makes the data than its base does, twice: logarithms.
+def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
+    """How much likelier a refit makes the data than its base does, twice: logarithms, their mean.
 
     By marginal likelihood, and by the predictive density of poses that are left out (of which the
     base's is in `validation`). Both agree where nothing else is missing. A wrong effect bends to
-    what is fitted, and predicts what is left out badly.
+    what is fitted, and predicts what is left out badly: the mean is harmonic, which the smaller
+    decides; that itself if it is negative.
     """
-    evidence = item.fit.log_evidence - base.log_evidence
-    return evidence, item.validation.log_density - validation.log_density
-
-
-def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
-    """Harmonic mean of both `gains`, which the smaller decides; that itself if it is negative."""
-    one, other = gains(item, base, validation)
+    one = item.fit.log_evidence - base.log_evidence
+    other = item.validation.log_density - validation.log_density
     smaller = min(one, other)
     return smaller if smaller <= 0 else 2 * one * other / (one + other)
 

@@ -43,7 +43,6 @@ class UnknownForce:
         95 %.
     gain : float
         Decrease of twice the objective against the fit without it.
-    fit : Fit
     poses : tuple of str
         Names of the fit poses.
     """
@@ -64,16 +63,10 @@ class UnknownForce:
 def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> UnknownForce | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
-    The fit without it may have gone far off, so that it is no place to start from: on a
-    coarse mesh places along the cable are searched from the measured shapes, the best refitted
-    with the place along with everything else, and the best of those on the base's mesh.
-
-    Parameters
-    ----------
-    base : Fit
-        Without the load.
-    executor : Executor, optional
-        Where the places are tried, a second or two each; in this process by default.
+    The fit without it may have gone far off, so that it is no place to start from: on a coarse mesh
+    places along the cable are searched from the measured shapes, the best refitted with the place
+    along with everything else, and the best of those on the base's mesh. `base`: without the load.
+    `executor`: where the places are tried, a second or two each; in this process by default.
     """
     effect = UnknownPull()
     model = base.model.with_effect(effect)
@@ -154,7 +147,6 @@ class _Search:
         """
         problem, model = self.base.problem, self.model
         scatter, cable = problem.priors.scatter.copy(), model.cable
-        weight = cable.mass * float(np.linalg.norm(model.gravity))
         bending = cable.bending_stiffness / cable.length**2
-        scatter[-model.node.dimension :] = FORCE_WEIGHTS * max(weight, bending)
+        scatter[-model.node.dimension :] = FORCE_WEIGHTS * max(model.weight, bending)
         return replace(problem, unknowns=unknowns, priors=replace(problem.priors, scatter=scatter))

@@ -3,12 +3,11 @@
 from dlo_casadi.effects.across_gravity import GravityTilt, SideLoad
 from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening
-from dlo_casadi.effects.cable import CableData
+from dlo_casadi.effects.cable import CableData, Setup
 from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle, ClampCompliance, ClampRotation
 from dlo_casadi.effects.clips import ClipOffset, ClipSlip
 from dlo_casadi.effects.contact import ContactPlane, ObstacleOffset
-from dlo_casadi.effects.edge_bias import EdgeBias
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
     ContactEffect,
@@ -32,10 +31,9 @@ from dlo_casadi.effects.image_scale import ImageScale
 from dlo_casadi.effects.length import AxialStretch, LengthError
 from dlo_casadi.effects.lumped_mass import LumpedMass
 from dlo_casadi.effects.mass_error import MassError
+from dlo_casadi.effects.nuisances import EdgeBias, SensorBias
 from dlo_casadi.effects.point_force import PointForce, UnknownPull
 from dlo_casadi.effects.rest_shape import PlasticSet, RestCurvatureDrift
-from dlo_casadi.effects.sensor_bias import SensorBias
-from dlo_casadi.effects.setup import Setup
 from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiffness import StiffnessGradient, StiffSection
 from dlo_casadi.effects.tether import Tether

@@ -6,9 +6,8 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import Load, Params
-from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.node import rotated, rotation
 
 

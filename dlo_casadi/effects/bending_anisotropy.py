@@ -5,9 +5,8 @@ from math import atan2, copysign, hypot, pi
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import Effect, Params, SectionLaw
-from dlo_casadi.effects.setup import Setup
 
 # Largest ratio of the two stiffnesses: a ribbon of width w and thickness t has (w / t)^2.
 LARGEST = 100.0

@@ -39,13 +39,9 @@ class CameraFrame(MeasurementEffect):
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the rotation and the translation."""
-        bound, scale = 0.3 * cable.length, 0.002 * cable.length
         return (
-            *(Parameter(name, "rad", scale=0.01, lower=-0.5, upper=0.5) for name in _ROTATIONS),
-            *(
-                Parameter(name, "m", scale=scale, lower=-bound, upper=bound)
-                for name in _TRANSLATIONS
-            ),
+            *Parameter.symmetric(_ROTATIONS, "rad", 0.01, 0.5),
+            *Parameter.symmetric(_TRANSLATIONS, "m", 0.002 * cable.length, 0.3 * cable.length),
         )
 
     def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:

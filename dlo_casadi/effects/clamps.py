@@ -6,9 +6,8 @@ from typing import ClassVar, Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Fitted, Params
-from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.node import quaternion_product, rotation
 
 

@@ -3,9 +3,10 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-from dlo_casadi.effects.cable import CableData, Parameter
+import casadi as ca
+
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vector
-from dlo_casadi.effects.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,18 @@ class _OfOneClip(BoundaryEffect):
         """One for each clip that may have it."""
         return tuple(cls(clip=k) for k in cls.numbers(setup))
 
+    def moved(self, place: ca.SX, at: ca.SX, params: Params) -> tuple[ca.SX, ca.SX]:
+        """Place (dimension,) and arc length of its clip, from the declared ones."""
+        raise NotImplementedError
+
+    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
+        """Move its clip."""
+        clips = [
+            self.moved(*clip, params) if k == self.clip else clip
+            for k, clip in enumerate(ends.clips)
+        ]
+        return replace(ends, clips=tuple(clips))
+
 
 @dataclass(frozen=True)
 class ClipOffset(_OfOneClip):
@@ -60,13 +73,9 @@ class ClipOffset(_OfOneClip):
         names = (f"d{axis}" for axis in cable.axes)
         return Parameter.symmetric(names, "m", 0.002 * cable.length, 0.1 * cable.length)
 
-    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
-        """Move the clip."""
-        clips = [
-            (place + vector(params, "d"), at) if k == self.clip else (place, at)
-            for k, (place, at) in enumerate(ends.clips)
-        ]
-        return replace(ends, clips=tuple(clips))
+    def moved(self, place: ca.SX, at: ca.SX, params: Params) -> tuple[ca.SX, ca.SX]:
+        """Move its place."""
+        return place + vector(params, "d"), at
 
 
 @dataclass(frozen=True)
@@ -93,10 +102,6 @@ class ClipSlip(_OfOneClip):
         """Declare the slip."""
         return Parameter.symmetric(["ds"], "m", 0.005 * cable.length, 0.1 * cable.length)
 
-    def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
-        """Move the place on the cable."""
-        clips = [
-            (place, at + params["ds"]) if k == self.clip else (place, at)
-            for k, (place, at) in enumerate(ends.clips)
-        ]
-        return replace(ends, clips=tuple(clips))
+    def moved(self, place: ca.SX, at: ca.SX, params: Params) -> tuple[ca.SX, ca.SX]:
+        """Move it along the cable."""
+        return place, at + params["ds"]

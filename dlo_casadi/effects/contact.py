@@ -5,9 +5,8 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import ContactEffect, Scan
-from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.obstacles import Obstacle, Plane
 
 

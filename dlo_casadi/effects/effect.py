@@ -14,8 +14,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects.cable import CableData, Parameter
-from dlo_casadi.effects.setup import Setup
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.errors import counted
 from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.ends import EndConditions

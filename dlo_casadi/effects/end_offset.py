@@ -3,9 +3,8 @@
 from dataclasses import replace
 from typing import ClassVar
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vector
-from dlo_casadi.effects.setup import Setup
 
 
 class EndOffset(BoundaryEffect):

@@ -5,9 +5,8 @@ from typing import ClassVar, Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import BoundaryEffect, Fitted, Params, Scan
-from dlo_casadi.effects.setup import Setup
 
 # Trial headings of the relaxed spring, relative to the mean heading of the cable there [rad].
 HEADINGS = (-1.2, -0.6, 0.0, 0.6, 1.2)

@@ -5,9 +5,8 @@ from typing import Self
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
-from dlo_casadi.effects.setup import Setup
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,8 @@
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import Load, Params
-from dlo_casadi.effects.setup import Setup
 
 # Qualified name of its parameter.
 MASS_FACTOR = "mass_error.factor"

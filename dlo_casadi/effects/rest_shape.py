@@ -2,9 +2,8 @@
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import Params, Scan, StateEffect
-from dlo_casadi.effects.setup import Setup
 
 # A kink max(x, 0) is rounded to (x + sqrt(x^2 + d^2)) / 2 with d this share of one turn per length:
 # off by d / 2 at the kink, by d^2 / (4 |x|) away from it.

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import Parameter
+from dlo_casadi.effects.cable import Parameter, Setup
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
-from dlo_casadi.effects.setup import Setup
 
 
 class StandoffError(MeasurementEffect):

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 
 import casadi as ca
 
-from dlo_casadi.effects.cable import CableData, Parameter
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import PLACES, Params, Scan, SectionLaw
-from dlo_casadi.effects.setup import Setup
 from dlo_casadi.rod.element import Cell
 
 # Trial lengths of sections, as shares of the cable's length.

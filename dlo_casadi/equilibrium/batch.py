@@ -46,7 +46,6 @@ class BatchEquilibrium:
 
     Parameters
     ----------
-    model : CableModel
     poses : sequence of HeldPose
         In the order in which they were taken.
     """

@@ -134,14 +134,9 @@ def curvatures_along(
 ) -> FloatArray:
     """Sizes (..., K) [1/m] of curvatures (..., axes n_cells) that are means over cells.
 
-    They are continued linearly to both ends of each stretch, see `Equilibrium.min_bend_radius`;
-    the curvature jumps at clamped clips.
-
-    Parameters
-    ----------
-    cells : (..., n_cells, 2) [m]
-    clamped : sequence of int
-        Numbers of the cells that begin at clamped clips.
+    They are continued linearly to both ends of each stretch, see `Equilibrium.min_bend_radius`; the
+    curvature jumps at clamped clips. `cells` (..., n_cells, 2) [m]. `clamped`: numbers of the cells
+    that begin at clamped clips.
     """
     widths = np.diff(cells, axis=-1)[..., 0]
     inner = curvature.reshape((*curvature.shape[:-1], -1, widths.shape[-1]))
@@ -175,8 +170,6 @@ def equilibria_of(
 
     Parameters
     ----------
-    shapes : Shapes
-    given : Inputs
     stable : (m,) bool
     iterations : (m,) int
     bound_multipliers : (m, n_nodes - 1) [N m], optional

@@ -47,15 +47,23 @@ def _held(
 
     Lengths are relative to the cable's; the chord of a free end and the frame of a pin are None.
     """
+    (start, end), clamps, length = true_ends(model, p, pose)
+    chord = None if model.end == "free" else (end - start) / length
+    return model.chain.places / model.chain.length, chord, clamps
+
+
+def true_ends(
+    model: CableModel, p: FloatArray, pose: HeldPose
+) -> tuple[tuple[FloatArray, FloatArray], Clamps, float]:
+    """Places [m] of the ends; frames of clamps, None of a pin or a tip; length [m]."""
     ends, length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
-    chord = None if model.end == "free" else (end - start) / float(length)
     clamps = (
         first if model.start == "clamped" else None,
         last if model.end == "clamped" else None,
     )
-    return model.chain.places / model.chain.length, chord, clamps
+    return (start, end), clamps, float(length)
 
 
 # ---- in a plane ----------------------------------------------------------------------------------
@@ -87,12 +95,8 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) 
     4. the cable falling down the other way round: where the nearer one turns by more than 1.5 rad,
        or the rest shape by more than 1 rad.
 
-    In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings.
-
-    Parameters
-    ----------
-    p : (n_parameters,)
-    rest : (n_rests,) [1/m]
+    In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings. `p`
+    (n_parameters,). `rest` (n_rests,) [1/m].
     """
     u, chord, clamps = _held(model, p, pose)
     bent = resting_headings(model.chain, rest)
@@ -125,12 +129,8 @@ def resting_headings(chain: Chain, rest: FloatArray) -> FloatArray:
 def arc_half_angle(chord: float, length: float) -> float:
     """Half the turning of a circular arc: sin(a) / a = chord / length, a in [0, pi].
 
-    By a polynomial, to 2e-4 rad.
-
-    Parameters
-    ----------
-    chord, length : float [m]
-        0 <= chord; a chord longer than the arc gives 0.
+    By a polynomial, to 2e-4 rad. `chord`, `length` [m]: 0 <= chord; a chord longer than the arc
+    gives 0.
     """
     y = max(1.0 - chord / length, 0.0)
     total = 0.0

@@ -128,7 +128,7 @@ def _along(model: CableModel, points: FloatArray, x: FloatArray) -> FloatArray:
     return np.concatenate([flat, points[..., -1:, :]], axis=-2)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Exceedance:
     """How likely a quantity exceeds its bound.
 
@@ -137,7 +137,8 @@ class Exceedance:
     std : float
         Standard deviation of the greatest size, to first order.
     probability, error : float
-        That a size exceeds its bound, and the standard error of that; 0 to first order.
+        That a size exceeds its bound, by the parameters' covariance, the fixtures and the cable's
+        own scatter; and the standard error of that; 0 to first order.
     draws : int
         Shapes among which it was counted; 0 where it is of first order.
     lost : int
@@ -164,7 +165,6 @@ class Varied:
     ----------
     model, p, rest, pose, found
         As of `spread.displacements`.
-    uncertainty : Uncertainty
     """
 
     model: CableModel
@@ -346,14 +346,9 @@ def resolved(
 ) -> list[tuple[CableModel, Equilibrium]]:
     """The same shape on finer meshes, the last of which resolves its sharpest bend.
 
-    Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`.
-    The radius of the segments, and also the curve's, are too large on a coarse mesh: beside a clamp
-    of a soft cable by tens of percent.
-
-    Parameters
-    ----------
-    coefficients : (n_coefficients,) [1/m]
-        Of the rest curvature.
+    Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`. The
+    radius of the segments, and also the curve's, are too large on a coarse mesh: beside a clamp of
+    a soft cable by tens of percent. `coefficients` (n_coefficients,) [1/m]: of the rest curvature.
     """
     meshes, settled = [(model, found)], False
     while not settled and 2 * model.n <= FINEST:

@@ -83,7 +83,6 @@ class Minima:
 
     Parameters
     ----------
-    shapes : Shapes
     balanced : (m,) bool
         Whether the forces balance.
     converged : (m,) bool
@@ -114,12 +113,7 @@ class Minima:
 def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
     """Minimise the energy of each of m shapes under its end conditions.
 
-    Parameters
-    ----------
-    shapes : Shapes
-        First guesses; deviations are kept.
-    given : Inputs
-        What each of them depends on.
+    `shapes`: first guesses; deviations are kept. `given`: what each of them depends on.
     """
     m = len(shapes.x)
     wanted = assembly.model.n_multipliers
@@ -354,7 +348,6 @@ def by_ipopt(
     ----------
     p, rest
         As in `solve.solve_equilibrium`.
-    pose : HeldPose
     phi : (n_nodes,) [rad]
     """
     count, touching = model.chain.n_nodes, model.n_contacts

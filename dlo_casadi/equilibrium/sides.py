@@ -47,12 +47,8 @@ def beside_bars(model: CableModel, x: FloatArray, points: FloatArray) -> list[Fl
     """Nodes x (n_nodes, coordinates), and the same pushed to all combinations of sides of bars.
 
     Places beside a bar move across the cable by a Gaussian of the arc length as wide as the bar;
-    the nodes turn with the line through them.
-
-    Parameters
-    ----------
-    points : (n_nodes, dimension) [m]
-        Places of the nodes x.
+    the nodes turn with the line through them. `points` (n_nodes, dimension) [m]: places of the
+    nodes x.
     """
     s, ahead, found = model.chain.places, tangents(model.node, x), []
     for bar in model.surfaces:

@@ -108,7 +108,6 @@ def solve_equilibria(
     ----------
     p, rest
         As in `solve_equilibrium`.
-    poses : sequence of HeldPose
     starts : sequence of (n_nodes, coordinates) or None, optional
         `x_init` of each pose.
     """
@@ -406,8 +405,6 @@ def continued(
     ----------
     p, rest
         As in `solve_equilibrium`.
-    pose : HeldPose
-    before : HeldPose
     x : (n_nodes, coordinates)
         Nodes of the cable in the pose `before`.
 

@@ -23,6 +23,7 @@ from dlo_casadi.equilibrium.guesses import (
     guesses,
     sagging,
     smallest_turn,
+    true_ends,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import named_sides
@@ -31,7 +32,6 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes, tangents
 from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import Frame
 
 # Half angle [rad] of an arc below which its sides are not told apart.
@@ -83,16 +83,13 @@ class Span:
 
 def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
     """All that holds the cable, from start to end; arc lengths relative to the declared length."""
-    ends, _ = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
-    d, c = model.node.dimension, model.node.coordinates
-    start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
-    found = [_Holder(0.0, start, first if model.start == "clamped" else None)]
+    (start, end), clamps, _ = true_ends(model, p, pose)
+    found = [_Holder(0.0, start, clamps[0])]
     places, at = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
     for k, clip in enumerate(pose.clips):
         s = None if clip.kind == "eyelet" else float(at[k, 0])
         found.append(_Holder(s, places[:, k], clip.frame, clip.kind == "swivel"))
-    own = last if model.end == "clamped" else None
-    found.append(_Holder(model.cable.length, None if model.end == "free" else end, own))
+    found.append(_Holder(model.cable.length, None if model.end == "free" else end, clamps[1]))
     return found
 
 
@@ -377,9 +374,8 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         return no_equilibrium(pose, *wrong)
     if pose.end is None or model.extensible:
         return None
-    ends, true_length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
-    start, end = np.array(ends).ravel()[: 2 * model.node.dimension].reshape(2, -1)
-    distance, length = float(np.linalg.norm(end - start)), float(true_length)
+    (start, end), _, length = true_ends(model, p, pose)
+    distance = float(np.linalg.norm(end - start))
     if distance < length:
         return None
     where = ", ".join(f"{x:.4f}" for x in pose.end)
@@ -420,7 +416,7 @@ def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str,
     held = holders(model, p, pose) if pose.clips and not model.extensible else []
     names = ["the start", *(clip.name for clip in pose.clips), "the end"]
     apart = chords(held)
-    true_length = float(lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1])
+    *_, true_length = true_ends(model, p, pose)
     for low, high, declared in fixed_stretches(held):
         length = declared * true_length / model.cable.length
         if sum(apart[low:high]) >= length:

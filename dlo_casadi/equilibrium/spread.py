@@ -1,7 +1,7 @@
 """Uncertainty of a prediction: the spread of a new repeat of a pose, and its side."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import ways_of
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.thresholds import EITHER
@@ -39,7 +39,6 @@ class Uncertainty:
         Of these, in SI units.
     scatter : mapping of str to float
         Standard deviation of the fixtures from pose to pose, by the deviation's name.
-    pose_scatter : PoseScatter
     repeat_std : float [m]
         Standard deviation of a coordinate between repeats of one pose, root mean square along the
         cable; 0 where no pose was repeated.
@@ -258,18 +257,33 @@ def _gap_slopes(
     uncertainty: Uncertainty,
 ) -> FloatArray:
     """Changes (q,) [J] of the difference in energy along `Uncertainty.ways_in`."""
-    each, scatter = uncertainty.ways_in(model), uncertainty.pose_scatter
-    p, larger = scatter.values(p, model), scatter.within(model)
-    count = each[0].shape[1]
-    p_steps, rest_steps, deviations = (_SHARE * np.hstack([by, -by]).T for by in each)
-    given = Inputs.of(p + p_steps, rest + rest_steps, np.tile(pose.vector, (2 * count, 1)))
-    slopes = []
-    for found in pair:
-        x = np.broadcast_to(found.x, (2 * count, *found.x.shape))
-        lam = np.broadcast_to(found.multipliers, (2 * count, len(found.multipliers)))
-        value = assembly_of(larger).balance(Shapes(x, lam, deviations), given)[0]
-        slopes.append((value[:count] - value[count:]) / (2 * _SHARE))
-    return np.asarray(slopes[1] - slopes[0])
+    along, scatter = uncertainty.ways_in(model), uncertainty.pose_scatter
+    given, larger = (scatter.values(p, model), rest), scatter.within(model)
+    own, other = (energy_slope(larger, pose, eq, given, along, _SHARE) for eq in pair)
+    return np.asarray(other - own)
+
+
+def energy_slope(
+    model: CableModel,
+    pose: HeldPose,
+    eq: Equilibrium,
+    given: tuple[FloatArray, FloatArray],
+    along: Sequence[FloatArray],
+    step: float,
+) -> FloatArray:
+    """Derivative (q,) of an equilibrium's energy: that of the Lagrangian at a fixed shape.
+
+    By central differences of parameters and rest curvature, which are `given`, and of deviations,
+    if there are three directions `along` which they change.
+    """
+    by_p, by_rest, *by_deviation = (step * np.hstack([by, -by]).T for by in along)
+    m, q = len(by_p), len(by_p) // 2
+    shapes = eq.shapes.subset(np.zeros(m, dtype=np.intp))
+    for moved in by_deviation:
+        shapes = replace(shapes, deviation=moved)
+    inputs = Inputs.of(given[0] + by_p, given[1] + by_rest, np.tile(pose.vector, (m, 1)))
+    total = assembly_of(model).balance(shapes, inputs)[0]
+    return np.asarray((total[:q] - total[q:]) / (2 * step))
 
 
 def sides_of(model: CableModel, pose: HeldPose, *pair: Equilibrium) -> list[HeldPose]:

@@ -42,7 +42,6 @@ def solve_batch(problem: Problem, start: Point) -> tuple[Point, float]:
 
     Parameters
     ----------
-    problem : Problem
     start : Point
         For example of `fit_model`.
 

@@ -19,6 +19,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.spread import energy_slope
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
@@ -26,7 +27,6 @@ from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import settle
-from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES, CableModel
 from dlo_casadi.thresholds import EVIDENCE_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
 
@@ -99,12 +99,8 @@ def profile_intervals(fit: Fit) -> dict[str, Interval]:
 def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     """Profile-likelihood interval of a positive parameter, such as a stiffness [N m^2].
 
-    It is fixed, everything else refitted; its own prior does not count.
-
-    Parameters
-    ----------
-    name : str
-        The bending stiffness by default.
+    It is fixed, everything else refitted; its own prior does not count. `name`: the bending
+    stiffness by default.
     """
     limit = threshold(fit, name)
     std = fit.std(name) / fit.inflation / fit.value(name)
@@ -271,28 +267,11 @@ class EnergyGap:
             Along these.
         """
         value = pair[0].energy - pair[1].energy
-        first, second = (_slope(model, pose, eq, given, along) for eq in pair)
+        first, second = (energy_slope(model, pose, eq, given, along, _STEP) for eq in pair)
         whole = first - second
         slope = whole - value * along[0][0] / given[0][0]
         variances = [max(float(way @ covariance @ way), 0.0) for way in (whole, slope)]
         return cls(value, slope, float(np.sqrt(min(variances))))
-
-
-def _slope(
-    model: CableModel,
-    pose: HeldPose,
-    eq: Equilibrium,
-    given: tuple[FloatArray, FloatArray],
-    along: tuple[FloatArray, FloatArray],
-) -> FloatArray:
-    """Derivative (q,) of an equilibrium's energy: that of the Lagrangian at a fixed shape."""
-    steps = [np.concatenate([_STEP * ways.T, -_STEP * ways.T]) for ways in along]
-    p, rest = (base + step for base, step in zip(given, steps, strict=True))
-    m, q = len(p), len(p) // 2
-    shapes = eq.shapes.subset(np.zeros(m, dtype=np.intp))
-    inputs = Inputs(p, rest, np.repeat(pose.vector[None], m, 0))
-    total = assembly_of(model).balance(shapes, inputs)[0]
-    return np.asarray((total[:q] - total[q:]) / (2 * _STEP))
 
 
 def as_measured(fit: Fit) -> Fit:

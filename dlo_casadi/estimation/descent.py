@@ -97,7 +97,6 @@ class Curvature:
     Parameters
     ----------
     matrix : (size, size)
-    used : bool
 
     References
     ----------
@@ -251,12 +250,8 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
     """Shapes of a problem's poses from those of a fit, on the problem's mesh.
 
     Poses that the fit did not need, because it carried no state, are predicted; beside a relaxed
-    fit that predicts none they begin at a first guess.
-
-    Raises
-    ------
-    EstimationError
-        If such a pose has no equilibrium.
+    fit that predicts none they begin at a first guess. Raises EstimationError if such a pose has no
+    equilibrium.
     """
     known = {index: k for k, index in enumerate(fit.problem.indices)}
     own = fit.point.shapes

@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.effects import Setup
+from dlo_casadi.effects.cable import height_of
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
-from dlo_casadi.estimation.resting import on_planes
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, fit_from, weighed
+from dlo_casadi.estimation.start import begin, fit_from, measured_shapes, weighed
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.estimation.variances import (
     SCATTER_FLOOR,
@@ -29,7 +30,7 @@ from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
-from dlo_casadi.thresholds import DIFFERENT, LACKING_SHARE, MESH_SHARE
+from dlo_casadi.thresholds import DIFFERENT, LACKING_SHARE, MESH_SHARE, RESTING_APART, RESTING_NOISE
 
 # Standard deviation of points over length by which a fit weighs them that meets them no better.
 MISFIT_STD = 0.01
@@ -62,10 +63,8 @@ def fit_model(
 
     Parameters
     ----------
-    model : CableModel
     measured : sequence of MeasuredPose
         All poses in the order in which they were taken.
-    tolerances : Tolerances
     std : float, optional [m]
         Declared noise of one coordinate; estimated, with its correlation, when absent.
     free : sequence of str, optional
@@ -192,10 +191,7 @@ def fit_to_misfit(near: Fit) -> Fit:
 def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     """Fit the same model on another mesh, from a fit's minimum.
 
-    Parameters
-    ----------
-    modes : int
-        Slow displacements kept out of the noise estimate, if the noise is estimated.
+    `modes`: slow displacements kept out of the noise estimate, if the noise is estimated.
     """
     model, moved = fit.model.with_mesh(n), None
     with suppress(EstimationError):
@@ -271,3 +267,44 @@ def allowed_mesh_error(fit: Fit) -> float:
     """Error of the mesh [m] that is far below the noise, or below what else is left."""
     left = LACKING_SHARE if fit.beyond_noise else MESH_SHARE
     return max(MESH_SHARE * fit.compared_std, left * fit.residual_rms)
+
+
+# ---- a plane of unknown height on which cables rest: what their shapes share ---------------------
+
+
+def resting_height(problem: Problem) -> float | None:
+    """The lowest height [m] that measured shapes of several poses share, if there is one.
+
+    What lies on a table is at the same height in all poses, and nothing is below it. Fixtures are
+    where they are held.
+    """
+    model = problem.unknowns.model
+    if not (any(model.gravity) and model.chain.kind.smooth):
+        return None
+    length, rest = model.cable.length, np.zeros(model.chain.n_rests)
+    places, (shapes, _) = np.linspace(0.0, length, 201), measured_shapes(problem)
+    seen = problem.equilibria.seen(shapes, problem.unknowns.fixed, rest)
+    heights = height_of([seen[j].curve.at(places) for j in problem.used], model.gravity)
+    lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
+    hanging = lowest[(inside > 0) & (inside < len(places) - 1)]
+    least, most = (share * length for share in RESTING_APART)
+    apart = np.clip(RESTING_NOISE * problem.noise.of_points.std, least, most)
+    shared = hanging[hanging < lowest.min() + apart]
+    return float(shared.mean()) if len(shared) > 1 else None
+
+
+def on_planes(problem: Problem, theta: FloatArray) -> FloatArray:
+    """Theta (size,) whose effects without derivative where they vanish begin where shapes rest."""
+    unknowns = problem.unknowns
+    model, p = unknowns.model, unknowns.p(theta)
+    asked = [x for x in model.effects if not x.gradual]
+    found = resting_height(problem) if asked else None
+    if found is None:
+        return theta
+    for effect in asked:
+        (start,) = effect.scans(Setup(model.cable, gravity=model.gravity, resting=found))
+        for q in effect.parameters(model.cable):
+            k = model.names.index(f"{effect.label}.{q.name}")
+            if unknowns.fixed[k] == q.nominal:
+                p[k] = start[q.name]
+    return unknowns.pack(p, unknowns.coefficients(theta))

@@ -25,7 +25,6 @@ class Prediction:
 
     Parameters
     ----------
-    equilibrium : Equilibrium
     seen : Observed
         As camera and sensors would see it.
     rest : (n_rests,) [1/m]
@@ -207,13 +206,8 @@ def measured_elsewhere(
     """Stable equilibria in which poses were measured, where others are predicted; else None.
 
     Each pose is solved from its measured shape. It is another equilibrium where headings differ,
-    and the measured one where it is nearer to the points.
-
-    Parameters
-    ----------
-    fitted : mapping, optional
-        Nodes (n_nodes, coordinates) of the poses whose shapes a fit has found, by name; others
-        start from the chords of their points.
+    and the measured one where it is nearer to the points. `fitted`: nodes (n_nodes, coordinates) of
+    the poses whose shapes a fit has found, by name; others start from the chords of their points.
     """
     fits, lines = fitted or {}, [item.traced for item in measured]
     starts = [

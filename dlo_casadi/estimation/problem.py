@@ -49,7 +49,6 @@ class Values:
     Parameters
     ----------
     theta : (size,)
-    shapes : Shapes
     projections : list of (K_j,) [m]
         Arc lengths at which the fitted poses' points are compared.
     """
@@ -145,7 +144,6 @@ class Priors:
 
     Parameters
     ----------
-    tolerances : Tolerances
     scatter : (n_deviations,)
         Standard deviations of a pose's own deviations.
     roughness_std : float
@@ -175,13 +173,10 @@ class Problem:
 
     Parameters
     ----------
-    unknowns : Unknowns
     history : sequence of MeasuredPose
         All poses in order; those held out or unreadable are among the problem's own poses,
         `measured`, only if the model carries a state. The poses that are fitted are
         `history[k] for k in fitted`, the same as `measured[j] for j in used`.
-    noise : NoiseModel
-    priors : Priors
     weights : tuple of (R_j, R_j), optional
         Whitening matrices W_j of the fitted poses, see `weighed`. Objectives of problems compare
         only if they have the same ones.

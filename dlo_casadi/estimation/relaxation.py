@@ -122,14 +122,13 @@ class Relaxation:
     def _weights(self, theta: FloatArray) -> FloatArray:
         """Weights (n b + k,) of the rows of F at these unknowns."""
         model, p = self.problem.unknowns.model, self.problem.unknowns.p(theta)
-        cable = model.cable
-        force = cable.mass * float(np.linalg.norm(model.gravity)) + p[0] / cable.length**2
+        force = model.weight + p[0] / model.cable.length**2
         border = []
         for kind in model.border_kinds.values():
             if kind == "place":  # its row is the balance of forces there [N]
                 border.append(1 / force)
             else:  # a multiplier's is its condition
-                border.append(1 / END / (cable.length if kind == "distance" else 1.0))
+                border.append(1 / END / (model.cable.length if kind == "distance" else 1.0))
         moments = model.chain.h / np.exp(self._stiffness(theta)[0])
         return np.concatenate([moments, border]) / self.softness
 
@@ -341,10 +340,7 @@ class Relaxation:
     def solve(self, values: Values, fixed: BoolArray | None = None, steps: int = STEPS) -> Values:
         """Levenberg-Marquardt from any values.
 
-        Parameters
-        ----------
-        fixed : (size,) bool, optional
-            Entries of theta that stay where they are; none by default.
+        `fixed` (size,): entries of theta that stay where they are; none by default.
         """
         damping, least = FIRST_DAMPING, self.objective(values)
         for _ in range(steps):

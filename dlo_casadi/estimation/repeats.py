@@ -37,8 +37,13 @@ from dlo_casadi.model.pose_scatter import REST_CURVATURE, SMOOTHNESS, PoseScatte
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
-from dlo_casadi.sensing.restricted import Deviance, most_likely
+from dlo_casadi.sensing.noise_estimate import (
+    Deviance,
+    NoiseSample,
+    estimate_noise,
+    most_likely,
+    tell_of_noise,
+)
 from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE, SIGNIFICANCE
 
 # Share of the length beside each fixture that is left out: repeats agree where they are held.
@@ -239,7 +244,6 @@ class RestLikelihood:
 
     Parameters
     ----------
-    samples : sequence of ScatterSample
     distances : (m, m) [m]
         Between the poses' shapes, root mean square.
     source : str
@@ -363,7 +367,6 @@ class ScatterEstimate:
 
     Parameters
     ----------
-    scatter : PoseScatter
     noise : float
         Factor on the standard deviation of the noise.
     p_systematic : float

@@ -37,7 +37,6 @@ class Fit:
         With the noise and the roughness found.
     point : Point
         Unknowns, shapes and objective at the minimum, or on the way there.
-    converged : bool
     """
 
     problem: Problem
@@ -208,6 +207,13 @@ class Fit:
     def chi2_per_dof(self) -> float:
         """Sum of squares of the whitened residuals per degree of freedom."""
         return self.point.data / self.degrees_of_freedom
+
+    @property
+    def rest_now(self) -> FloatArray:
+        """Rest curvature (n_rests,) [1/m] that the session's last pose leaves behind."""
+        if not self.model.has_state:
+            return self.rest
+        return self.problem.equilibria.rest_after_last(self.point.shapes, self.p, self.rest)
 
     @property
     def chi2_of_points(self) -> float:

@@ -51,14 +51,9 @@ def begin(
     """Relaxed shapes, forces and unknowns along the measured lines, and the problem weighed there.
 
     In space no line shows how the cable is turned in its end clamp: rolls are tried in turn, then
-    poses twisted by more than a quarter of a turn the other way round.
-
-    Parameters
-    ----------
-    theta : (size,)
-        Where the unknowns start; any stiffness will do.
-    fixed : (size,) bool, optional
-        Entries of theta that stay where they are; none by default.
+    poses twisted by more than a quarter of a turn the other way round. `theta` (size,): where the
+    unknowns start; any stiffness will do. `fixed` (size,): entries of theta that stay where they
+    are; none by default.
     """
     problem = problem if problem.weights else weighed(problem, theta)
     if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:

@@ -31,7 +31,6 @@ class Unknowns:
 
     Parameters
     ----------
-    model : CableModel
     free : (n_parameters,) bool
         Which parameters are estimated; the others stay at `fixed`.
     fixed : (n_parameters,)
@@ -202,10 +201,7 @@ class Unknowns:
     def prior(self, roughness_std: float) -> tuple[FloatArray, FloatArray]:
         """Mean (size,) and precision matrix (size, size) of the Gaussian prior of theta.
 
-        Parameters
-        ----------
-        roughness_std : float
-            Standard deviation of second differences of the scaled rest coefficients.
+        `roughness_std`: standard deviation of second differences of the scaled rest coefficients.
         """
         mean, n = self._nominal.copy(), self.n_parameters
         std = np.array([q.prior_std for q in self._parameters]) / self.scales[:n]

@@ -152,12 +152,10 @@ def first_reading_noise(
 
     FIRST_FORCE of the forces by which such a cable hangs and bends, and at a tenth of its length.
     """
-    cable = model.cable
-    weight = cable.mass * float(np.linalg.norm(model.gravity))
-    guess = FIRST_FORCE * (weight + cable.bending_stiffness / cable.length**2)
+    guess = FIRST_FORCE * model.force_scale
     return ReadingNoise(
         guess if force is None else force,
-        guess * cable.length / 10 if moment is None else moment,
+        guess * model.cable.length / 10 if moment is None else moment,
         force is not None,
         moment is not None,
     )

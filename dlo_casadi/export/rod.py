@@ -68,7 +68,6 @@ class Held:
         Without the effects of the camera.
     p : (n_parameters,)
     rest : (n_rests,) [1/m]
-    pose : HeldPose
     curve : NodeCurve
         The true curve, by declared arc length.
     x : (n_nodes, coordinates)
@@ -116,7 +115,6 @@ class Rod:
 
     Parameters
     ----------
-    name : str
     node : type[Node]
         The kind of the model's nodes; of headings the cable stayed in the plane z = 0, and nothing
         is known of the rest.

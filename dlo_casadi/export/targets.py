@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.errors import DloError, EquilibriumError, OutputError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
 from dlo_casadi.export.common import Relaxed
@@ -28,12 +28,10 @@ class Target:
 
     Parameters
     ----------
-    title : str
     suffix : str
         End of the names of its files, where none is given.
     packages : tuple of str
         Modules that have to be installed to relax a cable in it, and the `extra` that has them.
-    carries : frozenset of Feature
     write : callable
         The text of a file: of a rod, and the lines of its head.
     settle : callable
@@ -160,10 +158,8 @@ REFUSED = {
 def target_of(name: str) -> Target:
     """The target of a name.
 
-    Raises
-    ------
-    DloError
-        If there is none, with the nearest name, or it cannot take a cable, with the reason.
+    Raises DloError if there is none, with the nearest name, or it cannot take a cable, with the
+    reason.
     """
     if name in REFUSED:
         raise DloError(REFUSED[name])
@@ -186,12 +182,7 @@ def require(target: Target) -> None:
 def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence[str]) -> list[str]:
     """Lines that a file begins with: which number went where, and what is lost.
 
-    Parameters
-    ----------
-    lost : dict
-        Feature that is not carried -> what that costs.
-    origin : sequence of str
-        What the cable is.
+    `lost`: feature that is not carried -> what that costs. `origin`: what the cable is.
     """
     bends, masses = rod.bending[:, [0, 1], [0, 1]], rod.masses.sum() + rod.lumps[:, 0].sum()
     known = [
@@ -241,15 +232,8 @@ def write_rods(
 ) -> list[Path]:
     """Write cables, the first to `path` and the others to <path>_001, ...; return the files.
 
-    Parameters
-    ----------
-    origin : str
-        Where the first comes from; the others are samples of it, drawn with the seed.
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written, or is there and no export.
+    `origin`: where the first comes from; the others are samples of it, drawn with the seed. Raises
+    OutputError if a file cannot be written, or is there and no export.
     """
     count = len(cables) - 1
     names = [path, *(path.with_stem(f"{path.stem}_{k:03d}") for k in range(1, count + 1))]
@@ -346,7 +330,7 @@ def samples_of(
     log = np.array([name in logarithms for name in fitted], dtype=bool)
     # The covariance of log(v) is that of v over v.
     scale = np.where(log, mean, 1.0)
-    root = _root(covariance[np.ix_(kept, kept)] / np.outer(scale, scale))
+    root = root_of(covariance[np.ix_(kept, kept)] / np.outer(scale, scale))
     generator, out = np.random.default_rng(seed), list[Held]()
     for _ in range(_DRAWS * count):
         if len(out) == count:
@@ -376,9 +360,3 @@ def _cable(cable: Held, values: Mapping[str, float], count: int) -> Held | None:
         return Held.solved(model, p, rest, cable.pose)
     except EquilibriumError:
         return None
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Matrix A with A A^T = the covariance, which rounding may have made indefinite."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -295,11 +295,7 @@ def robust_z(values: Sequence[float | None]) -> list[float | None]:
 def overview_html(rows: Sequence[Row], output: Path) -> str:
     """The page of a fleet as text: one row per session; self-contained, without a script.
 
-    Parameters
-    ----------
-    rows : sequence of dict
-    output : Path
-        Folder in which the page will lie; sessions with results in it are linked.
+    `output`: folder in which the page will lie; sessions with results in it are linked.
     """
     judged = judge(rows)
     verdicts = Counter(item.verdict for item in judged)

@@ -195,11 +195,8 @@ def fit_fleet(
 
     Parameters
     ----------
-    sessions : sequence of SessionFile
     output : Path
         On a file system that all workers see.
-    executor : Executor
-    options : Options, optional
     retry_failed : bool
         Whether failed sessions are tried again. Lost ones always are: with a killed worker, or
         because their results could not be written.
@@ -276,10 +273,8 @@ class Job:
 def fit_one(job: Job) -> Row:
     """Fit a session, write its results and then its row; a failure is a row with a message.
 
-    Raises
-    ------
-    OutputError
-        If the results or the row cannot be written: that is no property of the session.
+    Raises OutputError if the results or the row cannot be written: that is no property of the
+    session.
     """
     begin, key = time.perf_counter(), job.session.key
     try:

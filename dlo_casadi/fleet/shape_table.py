@@ -185,7 +185,6 @@ class Plan:
 
     Parameters
     ----------
-    model : CableModel
     p : (n_parameters,)
     rest : (n_rests,) [1/m]
     branch : "ccw", "cw" or None
@@ -243,11 +242,8 @@ def shape_table(
 
     Parameters
     ----------
-    plan : Plan
-    poses : Grid or PoseList
     output : Path
         The file.
-    executor : Executor
     metadata : dict, optional
         More to be written into the file, as plain data.
     restart : bool

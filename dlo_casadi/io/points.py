@@ -58,11 +58,8 @@ class MeasuredPoints:
     ) -> "MeasuredPoints":
         """The points from start to end, as `read_points` returns them.
 
-        Raises
-        ------
-        MeasurementError
-            If they are no measurement of a cable of that length; the message begins with the `name`
-            of a file and calls the arc lengths `place`.
+        Raises MeasurementError if they are no measurement of a cable of that length; the message
+        begins with the `name` of a file and calls the arc lengths `place`.
         """
         points, s = self.points, self.s
         if s is not None:

@@ -40,12 +40,7 @@ def _repeated(rows: FloatArray, count: int) -> FloatArray:
 
 
 class Assembly:
-    """A model evaluated over poses.
-
-    Parameters
-    ----------
-    model : CableModel
-    """
+    """A model evaluated over poses."""
 
     def __init__(self, model: CableModel) -> None:
         self.model = model

@@ -20,8 +20,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.clips import CLAMPS, ClipKind, clip_size
-from dlo_casadi.model.rest_curvature import RestCurvature
-from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain
+from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain, RestCurvature
 from dlo_casadi.rod.ends import EndConditions, deviation_names
 from dlo_casadi.rod.node import NODES, Node
 from dlo_casadi.rod.obstacles import Capsule, Obstacle
@@ -131,6 +130,16 @@ class CableModel:
     def node(self) -> type[Node]:
         """The kind of its nodes."""
         return NODES[len(self.gravity)]
+
+    @property
+    def weight(self) -> float:
+        """Declared weight [N]."""
+        return self.cable.mass * float(np.linalg.norm(self.gravity))
+
+    @property
+    def force_scale(self) -> float:
+        """A scale of forces [N]: the cable's weight, and what bends it."""
+        return self.weight + self.cable.bending_stiffness / self.cable.length**2
 
     @property
     def n_pose(self) -> int:

@@ -37,7 +37,6 @@ class HeldClip:
 
     Parameters
     ----------
-    kind : ClipKind
     place : (dimension,) [m]
     at : float [m] or None
         Arc length from the start at which it holds the cable; None of an eyelet.
@@ -45,7 +44,6 @@ class HeldClip:
         Direction of a clamped clip in a plane, continuous along the cable.
     orientation : (4,), optional
         Frame of a clamped clip in space: a unit quaternion (x, y, z, w), x forward.
-    name : str
     """
 
     kind: ClipKind
@@ -127,10 +125,8 @@ class Clipped:
 
     Parameters
     ----------
-    chain : Chain
     at : (m, k) [m]
         Arc lengths of the clips.
-    clamps : tuple of ClampNode
     places : (m, n + 1) [m]
         Arc lengths of the nodes, those of clamped clips moved to them.
     """

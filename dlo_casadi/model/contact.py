@@ -54,7 +54,6 @@ class Contact:
 
     Parameters
     ----------
-    obstacle : str
     start, end : float [m]
         Arc lengths where it begins and ends; equal where the cable touches in a point. Between
         nodes they follow from the forces beside them: evenly spread in between, points at both.
@@ -80,7 +79,6 @@ class Touching:
 
     Parameters
     ----------
-    model : CableModel
     border : (m, k)
         All unknowns beside the nodes, the sizes of the forces [N] last.
     start : (m, d) [m]
@@ -376,6 +374,4 @@ def _count(model: CableModel) -> int:
 
 def gap_per_force(model: CableModel, gap: float) -> float:
     """A gap in lengths for a force as large as the cable's weight and bending forces, [m/N]."""
-    cable = model.cable
-    weight = cable.mass * float(np.linalg.norm(model.gravity))
-    return gap * cable.length / (weight + cable.bending_stiffness / cable.length**2)
+    return gap * model.cable.length / model.force_scale

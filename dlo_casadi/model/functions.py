@@ -23,7 +23,6 @@ class Functions:
 
     Parameters
     ----------
-    model : CableModel
     unheld : bool
         See `Lagrangian`.
     """

@@ -63,7 +63,6 @@ class Lagrangian:
 
     Parameters
     ----------
-    model : CableModel
     unheld : bool
         Of a segment with no clip inside: its end is pulled by the first clip's force; `Unheld`.
 
@@ -356,7 +355,6 @@ class Lagrangian:
             Frames of both nodes.
         multipliers : (3, 1 + n_springs + n_clips) [N]
             Force on the end's holder, then on springs and clips.
-        numbers : SegmentNumbers
         """
         spread, dead = len(self.kind.rule[0]), len(self.dead_forces)
         weights = np.zeros((spread + dead + len(self.pulls), multipliers.shape[1]))

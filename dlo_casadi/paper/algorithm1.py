@@ -80,12 +80,10 @@ class Algorithm1Result:
         Rest angles of the interior joints.
     iterations : int
         Complete passes of the loop.
-    status : Algorithm1Status
     message : str
         One or more sentences with numbers.
     history : (iterations + 1,) [N m/rad]
         k_theta of the prior and after each iteration.
-    seconds : float
     """
 
     model: CableModel
@@ -153,7 +151,6 @@ class InnerProblem:
 
     Parameters
     ----------
-    cable : CableData
     gravity : (float, float) [m/s^2]
     n : int
         Number of links.
@@ -293,10 +290,7 @@ def expected_angles(k_theta: float, theta_0: FloatArray, slopes: FloatArray) -> 
 
         theta_hat = theta_0 - (1 / k_theta) sum_i m_link g grad y_i(theta)
 
-    Parameters
-    ----------
-    slopes : (..., n - 1) [J/rad]
-        `gravity_slopes` at the interior joints.
+    `slopes` (..., n - 1) [J/rad]: `gravity_slopes` at the interior joints.
     """
     return theta_0 - slopes / k_theta
 
@@ -354,7 +348,6 @@ def run_algorithm1(
         Number of links.
     inner : "ipopt" or "cobyla"
         Minimiser of Eq. 13; COBYLA takes about a second a pose and iteration at n = 10.
-    max_iterations : int
 
     Returns
     -------

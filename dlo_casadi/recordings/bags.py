@@ -28,12 +28,8 @@ def read_bag(path: Path) -> Recording:
 
     Times are those of the messages' headers. Markers and clouds share one clock, grippers and force
     sensors another. A body is called as its topic or, in TF, as its frame, and given in the root of
-    its tree; clouds are turned there, too, where TF tells where the camera stands.
-
-    Raises
-    ------
-    MeasurementError
-        If the bag is damaged, or holds none of these.
+    its tree; clouds are turned there, too, where TF tells where the camera stands. Raises
+    MeasurementError if the bag is damaged, or holds none of these.
     """
     anyreader = library("rosbags.highlevel", "recordings", "reading this file")
     typesys = library("rosbags.typesys", "recordings", "reading this file")

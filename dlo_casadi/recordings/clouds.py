@@ -34,10 +34,7 @@ class CloudView:
     def of(self, cloud: Cloud) -> Cloud:
         """The cloud without what is not the cable.
 
-        Raises
-        ------
-        MeasurementError
-            If no points are left, or they have no colour.
+        Raises MeasurementError if no points are left, or they have no colour.
         """
         points = cloud.points * METRES[self.units]
         kept = np.isfinite(points).all(axis=1)
@@ -63,10 +60,7 @@ class CloudView:
 def read_cloud(path: Path) -> Recording:
     """Read a cloud: PLY or PCD, text or binary, or an array (K, 3) or (K, 6) with colours as NPY.
 
-    Raises
-    ------
-    MeasurementError
-        If the file is damaged.
+    Raises MeasurementError if the file is damaged.
     """
     reader = {".ply": _ply, ".pcd": _pcd, ".npy": _npy}[path.suffix.lower()]
     try:

@@ -105,10 +105,8 @@ class Recording:
 def together(recordings: Sequence[Recording]) -> Recording:
     """Several files as one recording.
 
-    Raises
-    ------
-    MeasurementError
-        If they hold two streams of one name, or coordinates that are not in metres.
+    Raises MeasurementError if they hold two streams of one name, or coordinates that are not in
+    metres.
     """
     streams = [stream for item in recordings for stream in item.streams]
     names = [(stream.kind, stream.name) for stream in streams]

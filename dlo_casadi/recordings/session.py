@@ -102,15 +102,8 @@ class Imported:
 def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     """Make a session of a recording: align clocks, find poses, name markers, turn grippers.
 
-    Parameters
-    ----------
-    name : str
-        What to call the cable.
-
-    Raises
-    ------
-    MeasurementError
-        If the recording does not hold what a session takes; the message says what to try.
+    `name`: what to call the cable. Raises MeasurementError if the recording does not hold what a
+    session takes; the message says what to try.
     """
     recording, offsets = align_clocks(recording)
     stills = find_stills(recording, wishes.hold)

@@ -84,12 +84,8 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
 
     The offset of two clocks is the lag at which the mean speeds of their markers and bodies
     correlate best, to a fraction of a frame by a parabola through the maximum. A clock whose
-    streams do not move, as that of a force sensor, keeps its times.
-
-    Raises
-    ------
-    MeasurementError
-        If two recordings do not move alike.
+    streams do not move, as that of a force sensor, keeps its times. Raises MeasurementError if two
+    recordings do not move alike.
     """
     clocks = tuple(dict.fromkeys(s.clock for s in recording.streams if s.kind != "wrench"))
     if not clocks:
@@ -122,14 +118,10 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
 def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
     """Stretches of at least `hold` [s] in which no marker and no body moves.
 
-    The noise of each stream is its scatter in the quietest tenth of the time, in windows of
-    0.4 s; the recording is still where the root mean square over all streams of scatter over
-    noise is below 2. A steady drift of 6 noises a second is just seen.
-
-    Raises
-    ------
-    MeasurementError
-        If nothing was seen, or it never stands still.
+    The noise of each stream is its scatter in the quietest tenth of the time, in windows of 0.4 s;
+    the recording is still where the root mean square over all streams of scatter over noise is
+    below 2. A steady drift of 6 noises a second is just seen. Raises MeasurementError if nothing
+    was seen, or it never stands still.
     """
     shown = [stream for stream in recording.streams if stream.kind != "wrench"]
     tracks = [track for stream in shown for track in _tracks(stream)]

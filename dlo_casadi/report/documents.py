@@ -236,7 +236,7 @@ def fitted_cable(outcome: Outcome) -> FittedCable:
     """The fitted cable of a run, as `load` would read it from the run's file."""
     fit, metadata = outcome.fit, metadata_of(parameters_dict(outcome), outcome.config.path)
     # What held it in the session is no part of a cable.
-    return FittedCable(replace(fit.model, clips=(), obstacles=()), fit.p, final_rest(fit), metadata)
+    return FittedCable(replace(fit.model, clips=(), obstacles=()), fit.p, fit.rest_now, metadata)
 
 
 def cable_of_known(known: Declared, coefficients: FloatArray, limits: Limits) -> FittedCable:
@@ -283,8 +283,7 @@ def _scatter(fit: Fit) -> dict[str, Any] | None:
 
 def fit_dict(fit: Fit) -> dict[str, Any]:
     """What a fit alone tells: the model, its parameters, covariance and state."""
-    rest = final_rest(fit)
-    return _cable_dict(fit.model, fit.p, fit.coefficients, rest, uncertainty_of(fit))
+    return _cable_dict(fit.model, fit.p, fit.coefficients, fit.rest_now, uncertainty_of(fit))
 
 
 def _cable_dict(
@@ -341,13 +340,6 @@ def _cable_dict(
         },
     }
     return finite(document)
-
-
-def final_rest(fit: Fit) -> FloatArray:
-    """Rest curvature (n_rests,) [1/m] that the session's last pose leaves behind."""
-    if not fit.model.has_state:
-        return fit.rest
-    return fit.problem.equilibria.rest_after_last(fit.point.shapes, fit.p, fit.rest)
 
 
 def _by_name(values: FloatArray, names: Sequence[str]) -> Any:

@@ -49,12 +49,8 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
     """The text of report.html.
 
     All text of the session is escaped. The page's own policy forbids it to load anything, and to
-    run any script but those that are written into it, known by their hashes.
-
-    Parameters
-    ----------
-    drawn : mapping of str to Figure, optional
-        The `figures_of` the outcome, if they have been drawn already.
+    run any script but those that are written into it, known by their hashes. `drawn`: the
+    `figures_of` the outcome, if they have been drawn already.
     """
     shown = pictures(outcome)
     charts = figures_of(outcome) if drawn is None else drawn

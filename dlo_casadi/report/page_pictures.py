@@ -166,10 +166,7 @@ def pose_pictures(
 ) -> list[Picture]:
     """A picture of every pose; of a run that has failed with what was measured until then.
 
-    Parameters
-    ----------
-    stages : sequence of ComparedStage
-        Whose predictions are drawn.
+    `stages`: whose predictions are drawn.
     """
     scenes, marks = scenes_of(config, poses, [item.stage for item in stages])
     declared = {pose.name: pose for pose in config.experiment.poses}
@@ -219,10 +216,7 @@ def view_pictures(
 ) -> list[Picture]:
     """A picture of every usable photograph of poses in space, those of a pose side by side.
 
-    Parameters
-    ----------
-    stages : sequence of ComparedStage
-        Whose predictions are projected into it.
+    `stages`: whose predictions are projected into it.
     """
     shown = [(pose, view) for pose in poses for view in pose.views]
     return [_view_picture(pose, view, stages, PHOTOGRAPHS // len(shown)) for pose, view in shown]

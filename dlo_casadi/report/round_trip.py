@@ -1,6 +1,7 @@
 """How an exported cable came to rest in its simulator: table, data and picture."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -59,12 +60,8 @@ def round_trip_dict(rows: Sequence[Relaxation]) -> dict[str, Any]:
         *("pose", "case", "problem", "to_prediction", "to_measured"),
         *("force", "predicted_force", "measured_force"),
     )
-    listed = [{key: _plain(getattr(row, key)) for key in kept} for row in rows]
+    listed = [{key: asdict(row)[key] for key in kept} for row in rows]
     return finite({"summary": summary(rows), "poses": listed})
-
-
-def _plain(value: Any) -> Any:
-    return vars(value) if isinstance(value, Distance) else value
 
 
 def round_trip_table(target: Target, rows: Sequence[Relaxation]) -> Table:

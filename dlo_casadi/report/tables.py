@@ -170,12 +170,8 @@ def _after(unit: str) -> str:
 def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
     """Errors of the stages in words: fit, cross-validated, held out, chi-square.
 
-    A stage of which poses were measured in another equilibrium has a second row.
-
-    Parameters
-    ----------
-    nothing : str
-        What stands where there is no number.
+    A stage of which poses were measured in another equilibrium has a second row. `nothing`: what
+    stands where there is no number.
     """
 
     def row(label: str, note: str, fit: float | None, held_out: float | None) -> dict[str, str]:

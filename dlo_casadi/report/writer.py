@@ -85,12 +85,8 @@ class ResultsFolder(FolderDraft):
         """Write all results, then put them in place of the previous ones.
 
         A page or a figure that cannot be drawn does not lose the numbers: they are put in place
-        before the error goes on.
-
-        Parameters
-        ----------
-        executor : Executor, optional
-            Where a part is drawn at the same time; in this process by default.
+        before the error goes on. `executor`: where a part is drawn at the same time; in this
+        process by default.
         """
         write_numbers(self.folder, outcome)
         failed = None

@@ -308,13 +308,9 @@ class BandFactor:
     def solve(self, right: Vector) -> Vector:
         """Solution of each pose for columns (m, n, b, q), (m, k, q), refined to rounding.
 
-        Conditions that depend on each other share their multiplier, the least one. Right-hand
-        sides have no rows of internal unknowns.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If a matrix is not finite.
+        Conditions that depend on each other share their multiplier, the least one. Right-hand sides
+        have no rows of internal unknowns. Raises numpy.linalg.LinAlgError if a matrix is not
+        finite.
         """
         k = right.y.shape[1]
         rows = np.pad(right.y, [(0, 0), (0, self._internal), (0, 0)])

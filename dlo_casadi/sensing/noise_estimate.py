@@ -1,15 +1,18 @@
 """Size and correlation of the noise, estimated from residuals of all poses."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from scipy.linalg.lapack import dtrtri
+from scipy.optimize import Bounds, minimize
 from scipy.special import expit
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.errors import EstimationError
 from dlo_casadi.sensing.noise import SLOW_MODES, Count, Kernel, NoiseModel, smooth_modes
-from dlo_casadi.sensing.restricted import Deviance, most_likely
 
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
 # Singular value, relative to the largest, below which directions are dependent: the square root of
@@ -101,6 +104,71 @@ class NoiseSample:
         return np.asarray(by_point / self.weight[:, None, None])
 
 
+# Slope at which a search ends, by parameters in units of their standard errors.
+_FLAT = 0.01
+# D of sizes whose sums are lost in rounding.
+_LOST = 1e30
+
+
+@dataclass(frozen=True)
+class Deviance:
+    """D = -2 log restricted likelihood up to a constant, and its gradient (k,) by the parameters.
+
+        D = log |V| + log |X^T V^-1 X| + y^T P y,   P = V^-1 - V^-1 X (X^T V^-1 X)^-1 X^T V^-1
+        dD/dq_j = tr(P V_j) - y^T P V_j P y,   d2D/dq_j dq_k ~ y^T P V_j P V_k P y
+
+    of observations y with covariance V(q), V_j = dV/dq_j, what any effect of X may explain left
+    out. The average of the observed and the expected second derivative needs no trace.
+
+    References
+    ----------
+    Patterson and Thompson, Biometrika 58 (1971); Gilmour, Thompson and Cullis, Biometrics 51
+    (1995).
+    """
+
+    value: float
+    gradient: FloatArray
+
+
+Found = TypeVar("Found", bound=Deviance)
+
+
+def most_likely(
+    deviance: Callable[[FloatArray], Found], start: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[FloatArray, Found]:
+    """Parameters (k,) of least deviance between bounds, logits or logarithms, and the deviance.
+
+    By L-BFGS-B. Newton steps with the average information take more evaluations: far from the
+    optimum it is a tenth of the second derivative. Raises EstimationError if rounding leaves no
+    covariance that can be factorised where the search ends.
+    """
+
+    def sloped(q: FloatArray) -> tuple[float, FloatArray]:
+        try:
+            found = deviance(q)
+        except np.linalg.LinAlgError:
+            return _LOST, np.zeros(len(q))
+        return found.value, found.gradient
+
+    found = minimize(
+        sloped,
+        start.astype(float),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=Bounds(low.astype(float), high.astype(float)),
+        options={"gtol": _FLAT, "ftol": 1e-7},
+    )
+    q = np.clip(found.x, low, high)
+    try:
+        return q, deviance(q)
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(
+            "noise and scatter from pose to pose cannot be estimated: rounding leaves no "
+            "covariance that can be factorised, as of a fit that has run away.\n"
+            "  Try: the units of mass and length, the noise as measurement.std."
+        ) from error
+
+
 @dataclass(frozen=True)
 class Profile(Deviance):
     """By logit(share) and log(length), if correlated, with the scale `std` [m] profiled out."""
@@ -158,7 +226,6 @@ def estimate_noise(
 
     Parameters
     ----------
-    samples : list of NoiseSample
     cable_length : float [m]
     max_points : int
         Maximum number of points used per pose, evenly spaced; fewer where the noise is smooth.
@@ -188,10 +255,7 @@ def estimate_noise(
 def tell_of_noise(samples: list[NoiseSample], least: float = _LEAST_DEGREES) -> bool:
     """Whether enough degrees of freedom are left for `estimate_noise` after the projection.
 
-    Parameters
-    ----------
-    least : float
-        Fewest degrees of freedom.
+    `least`: fewest degrees of freedom.
     """
     kept = _telling(samples)
     return bool(kept) and _degrees(kept) >= least

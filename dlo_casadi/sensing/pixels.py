@@ -33,7 +33,6 @@ class ViewInput:
     ----------
     name : str
         File stem.
-    image : Path
     seen : ImageCurve
         The line found in it.
     places : (K, 3) [m]
@@ -171,14 +170,8 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     Errors of neighbouring pixels are correlated over the length of the average along the cable:
     pixels are taken at its integral's distance. None is taken where the average reaches beyond an
     end of the line, into the holder, where another part of the cable hides an edge, or where the
-    cable runs along the line of sight.
-
-    Parameters
-    ----------
-    view : ViewInput
-        With the line found in it.
-    std : scalar [m]
-        Standard deviation of a pixel of weight one.
+    cable runs along the line of sight. `view`: with the line found in it. `std` [m]: standard
+    deviation of a pixel of weight one.
     """
     curve = view.seen
     every = max(1, int(np.ceil(curve.correlation / curve.spacing)))

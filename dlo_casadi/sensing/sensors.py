@@ -260,7 +260,6 @@ class Wrench(_Known):
     measured : dict
         Forces (dimension,) [N] and moments (increment,) [N m] of the cable on its fixtures, in
         world axes, moments about the fixture; by names of `ends.reaction_rows`.
-    node : type of Node
     clips : int
         Number of clips of the pose.
     """

@@ -264,10 +264,8 @@ class ComparedReading:
 def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple[Suspicion, ...]:
     """What was read otherwise than the configuration says, the likeliest of each reading.
 
-    Parameters
-    ----------
-    sized : bool
-        Whether the shapes tell stiffness over weight: else only how forces and moments compare.
+    `sized`: whether the shapes tell stiffness over weight: else only how forces and moments
+    compare.
     """
     found, scales = [], {}
     for one in readings:

@@ -61,7 +61,6 @@ class Declared:
         Parameters at their declared values.
     free : list of str
         Parameters that do not keep them.
-    tolerances : Tolerances
     """
 
     model: CableModel
@@ -337,13 +336,8 @@ def _not_applicable(
 def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
     """A fit, or a better one that starts from a simpler one.
 
-    A simpler fit is a start where its objective is smaller, where it predicts the fit poses
-    better, or where the fit has not converged.
-
-    Parameters
-    ----------
-    stages : sequence of Stage
-        The simpler ones, and at last the fit's own.
+    A simpler fit is a start where its objective is smaller, where it predicts the fit poses better,
+    or where the fit has not converged. `stages`: the simpler ones, and at last the fit's own.
     """
     *others, own = stages
     best = fit
@@ -362,16 +356,10 @@ def nearest_to_poses(
 ) -> tuple[Fit, Stage]:
     """A fit and its stage; of one that lacks something the nearest to the fit poses, if need be.
 
-    A fit that trusts each point to its noise bends ends and rest shape to whatever the model
-    lacks, and may predict the poses worse than a straight cable. Then it is fitted to its misfit,
-    too, from itself and from each simpler fit: what predicts the poses best is taken.
-
-    Parameters
-    ----------
-    stages : sequence of Stage
-        As in `not_worse`.
-    staged : callable
-        Stage of a fit.
+    A fit that trusts each point to its noise bends ends and rest shape to whatever the model lacks,
+    and may predict the poses worse than a straight cable. Then it is fitted to its misfit, too,
+    from itself and from each simpler fit: what predicts the poses best is taken. `stages`: as in
+    `not_worse`. `staged`: stage of a fit.
     """
     *others, own = stages
     simpler = [stage for stage in others if stage.name in SIMPLER]

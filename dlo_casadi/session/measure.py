@@ -69,12 +69,8 @@ def _read(config: Config, pose: Pose) -> PoseInput:
 def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[MeasuredPose, ...]:
     """What was read, with its end conditions, for the fit.
 
-    A pose that cannot be read keeps its end conditions, for the history.
-
-    Raises
-    ------
-    MeasurementError
-        If no fit pose could be read; its text lists the reasons.
+    A pose that cannot be read keeps its end conditions, for the history. Raises MeasurementError if
+    no fit pose could be read; its text lists the reasons.
     """
     if not any(item.readable and item.role == "fit" for item in inputs):
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
@@ -214,12 +210,8 @@ def _held(config: Config, pose: Pose) -> vision.KnownCable:
 def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
     """Pictures (h, w, 3) of each step of the camera, as far as it comes.
 
-    By the photograph's name and that of the step.
-
-    Raises
-    ------
-    VisionError
-        If none of its photographs can be read.
+    By the photograph's name and that of the step. Raises VisionError if none of its photographs can
+    be read.
     """
     reader = _reader(config, pose)
     if reader in (_read_csv, _read_points):
@@ -330,10 +322,7 @@ def needs_camera(config: Config) -> str:
 def calibrated(config: Config, step: Step = nobody) -> Config:
     """Return the configuration with the camera that its photographs show, where it needs one.
 
-    Raises
-    ------
-    MeasurementError
-        If they do not show it.
+    Raises MeasurementError if they do not show it.
     """
     why = needs_camera(config)
     if not why:
@@ -355,11 +344,8 @@ def calibrated(config: Config, step: Step = nobody) -> Config:
 def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration:
     """Calibrate the camera from all photographs of a session, see `vision.calibrate_camera`.
 
-    Raises
-    ------
-    MeasurementError
-        If the session has no photographs of a board, too few that show it, or if they leave the
-        focal length unknown.
+    Raises MeasurementError if the session has no photographs of a board, too few that show it, or
+    if they leave the focal length unknown.
     """
     measurement = config.experiment.measurement
     if measurement.kind != "images" or measurement.board is None:

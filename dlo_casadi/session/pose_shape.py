@@ -81,7 +81,6 @@ class PoseShape:
         along two normals, which at the start are the axes y and z of the cable's frame there and
         are carried along without twist.
     energy : float [J]
-    stable : bool
     forces : (2, d) [N]
         Of the cable on what holds its start and its end.
     readings : mapping

@@ -22,10 +22,7 @@ from dlo_casadi.thresholds import FIXTURES, UNSEEN
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
     """What the camera step noticed, pose by pose, and which poses were not read at all.
 
-    Parameters
-    ----------
-    skipped : sequence of SkippedPose
-        What the configuration leaves out; poses that are among the inputs say so themselves.
+    `skipped`: what the configuration leaves out; poses that are among the inputs say so themselves.
     """
     shown = {item.name for item in inputs}
     lines = [
@@ -118,10 +115,7 @@ def _cure(chosen_by: str | None) -> str:
 def weight_warning(weight: HiddenWeight, expected: float) -> str:
     """What an undeclared weight would do, and which measurement would reveal it.
 
-    Parameters
-    ----------
-    expected : float [m]
-        Distance of a pose from its prediction if nothing is missing.
+    `expected` [m]: distance of a pose from its prediction if nothing is missing.
     """
     low, high = weight.stiffness_95
     text = (
@@ -245,12 +239,7 @@ def _errors(shape: PoseShape) -> FloatArray:
 def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[str]:
     """What a fit cannot promise.
 
-    Parameters
-    ----------
-    error : float [m]
-        Of its mesh.
-    declared : float, optional [m]
-        Noise of the points.
+    `error` [m]: of its mesh. `declared` [m]: noise of the points.
     """
     lines = []
     points, floor = fit.noise.of_points, noise_distance(fit.problem.history, fit.noise.std)

@@ -56,10 +56,8 @@ class Relaxation:
     measured_force : (d,) [N] or None
     points, predicted, measured : (K, d) [m]
         What is drawn.
-    links : int
     lost : tuple of str
         Features of the identified cable that the target cannot carry.
-    problem : str
     """
 
     pose: str
@@ -80,10 +78,7 @@ class Relaxation:
 def session_of(cable: FittedCable, given: Path | None) -> Config:
     """The session that a cable was fitted to: as given, or by its name near its results and here.
 
-    Raises
-    ------
-    ConfigError
-        If it cannot be found, or is another one.
+    Raises ConfigError if it cannot be found, or is another one.
     """
     name, source = f"{cable.metadata.config}.yaml", cable.metadata.path
     places = [Path(), Path("configs"), *([] if source is None else source.resolve().parents[1:4])]
@@ -109,11 +104,7 @@ def round_trip(
     """Relax a cable in every held-out pose; in every pose if none was held out.
 
     With a number of `poses`, in so many of them, and of the fitted ones if those are too few.
-
-    Raises
-    ------
-    DloError
-        If the target is not installed.
+    Raises DloError if the target is not installed.
     """
     require(target)
     config, inputs = read_session(config)

@@ -364,12 +364,8 @@ def fit_stage(
 ) -> Stage:
     """A fit of the batch problem.
 
-    Parameters
-    ----------
-    intervals : mapping
-        Of the stiffnesses and of the mass's factor, by name; None where none is to be told.
-    reported : sequence of str
-        Qualified names of the parameters that are effects, not nuisances.
+    `intervals`: of the stiffnesses and of the mass's factor, by name; None where none is to be
+    told. `reported`: qualified names of the parameters that are effects, not nuisances.
     """
     return _Model(fit.model, fit.p, fit.rest, fit).stage(
         name,

@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.repeats import RestLikelihood, ScatterSample, estimate_pose_scatter
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, modes_of
-from dlo_casadi.sensing.restricted import Deviance
+from dlo_casadi.sensing.noise_estimate import Deviance
 
 M, ROWS = 9, 6
 

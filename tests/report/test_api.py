@@ -22,7 +22,7 @@ import dlo_casadi as dlo
 from dlo_casadi import api
 from dlo_casadi.cli import main
 from dlo_casadi.diagnosis.selection import Ranked
-from dlo_casadi.effects.edge_bias import EdgeBias
+from dlo_casadi.effects.nuisances import EdgeBias
 from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
 from dlo_casadi.session import Outcome

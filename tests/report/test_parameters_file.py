@@ -18,7 +18,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Inputs, assembly_of
-from dlo_casadi.report.documents import final_rest, fit_dict, parameters_text
+from dlo_casadi.report.documents import fit_dict, parameters_text
 from dlo_casadi.session.fitting import declared_model, minimum_by_ipopt
 from dlo_casadi.session.measure import measured_poses, read_inputs
 
@@ -171,7 +171,7 @@ def test_the_next_pose_finds_the_cable_as_the_last_one_left_it(outcome, tmp_path
     assert rate > 0.005
     assert np.abs(expected - fit.rest).max() > 0.01
     assert rest == pytest.approx(expected, abs=1e-9)
-    assert np.array_equal(rest, final_rest(fit))
+    assert np.array_equal(rest, fit.rest_now)
 
 
 def test_the_hash_depends_on_the_model_alone(outcome):
