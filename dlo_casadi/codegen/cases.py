@@ -273,19 +273,18 @@ class _SpaceCase(Case):
     # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
     # guesses on the fine mesh.
     least_coarse, coarsening = 6, 2.0
-    # Arcs of a span between clips there, and of one more with each eyelet.
+    # Arcs of a span between clips there, of eyelets where they lie evenly.
     coarse_span = 3
 
     @property
     def coarse_elements(self) -> int:
         """Number of arcs of the mesh for first guesses; 0 if there is none."""
-        model, eyelets = self.model, len(self.model.sliding)
-        spans = len(model.clips) - eyelets + 1
+        model, spans = self.model, len(self.model.clips) + 1
         if model.end == "free" and not model.clips:
             return 0
         least = max(self.least_coarse, round(model.n / self.coarsening))
         if model.clips:
-            each = max(self.coarse_span * (1 + eyelets), self.least_coarse // spans)
+            each = max(self.coarse_span, self.least_coarse // spans)
             least = spans * min(each, model.n // spans)
         count = min(model.n, least)
         return 0 if count == model.n and model.element == "arc" else count
