@@ -145,14 +145,15 @@ def run_space() -> dict[str, Any]:
         "largest_over_smallest": times.max() / times.min(),
         "farthest_from_the_line": np.abs(times / line - 1).max(),
     }
-    out["clips"] = {
-        f"{' '.join(kinds)}, {where.__name__}": space_speed.clipped(kinds, where(kinds))
-        for kinds in (
-            *(("pinned",), ("eyelet",)),
-            *(("pinned", "pinned"), ("clamped", "pinned"), ("pinned", "eyelet")),
-        )
-        for where in (space_speed.near, space_speed.slack)
-    }
+    out["clips"] = {}
+    for kinds in (
+        *(("pinned",), ("eyelet",), ("pinned", "pinned")),
+        *(("clamped", "pinned"), ("pinned", "eyelet"), ("clamped", "eyelet")),
+    ):
+        for where in (space_speed.near, space_speed.slack):
+            row = space_speed.clipped(kinds, where(kinds))
+            out["clips"][f"{' '.join(kinds)}, {where.__name__}"] = row
+            print(kinds, where.__name__, row, flush=True)
     return out
 
 
