@@ -130,13 +130,15 @@ def main() -> int:
         truth = yaml.safe_load((truths / name / "truth.yaml").read_text(encoding="utf-8"))
         named, right = effects(outcome, truth)
         bending, known = stiffness_cell(outcome, "bending_stiffness", truth["bending_stiffness"])
-        torsion, too = stiffness_cell(outcome, "torsional_stiffness", truth["torsional_stiffness"])
+        torsion, torsion_right = stiffness_cell(
+            outcome, "torsional_stiffness", truth["torsional_stiffness"]
+        )
         verdict = "effect_found" if truth["effects"] else "complete"
-        passed = outcome.verdict == verdict and right and known and too
+        passed = outcome.verdict == verdict and right and known and torsion_right
         good, stage = good and passed, outcome.stages[-1]
         branch = stage.rmse_fit_measured_branch, stage.rmse_held_out_measured_branch
-        told = zip(branch, (stage.rmse_fit, stage.rmse_held_out), strict=True)
-        errors = [1e3 * (x or y or np.nan) for x, y in told]
+        errors_by_role = zip(branch, (stage.rmse_fit, stage.rmse_held_out), strict=True)
+        errors = [1e3 * (x or y or np.nan) for x, y in errors_by_role]
         cells = [str(outcome.verdict), named, bending, torsion, "{:.2f}, {:.2f}".format(*errors)]
         cells.append(off_truth(outcome, truth, truths / name))
         noise = f"{1e3 * outcome.measurement.std:.2f}"

@@ -103,6 +103,14 @@ class LimitCheck(LimitUse, Exceedance):
 
     Parameters
     ----------
+    std : float
+        Standard deviation of `value`, in its unit, to first order.
+    probability, error : float
+        That a new repeat of the pose violates the limit; and the standard error of a counted one.
+    draws, lost : int
+        As of `Exceedance`.
+    shares : mapping of str to float
+        Parts of the variance by their causes, the largest first; empty where nothing is uncertain.
     decided_by : str
         The largest cause in words, with its size.
     """

@@ -273,9 +273,9 @@ class _SpaceCase(Case):
     # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
     # guesses on the fine mesh.
     least_coarse, coarsening = 6, 2.0
-    # Arcs of a span between clips there. Where clamps tell the twist a span ends at no eyelet, and
-    # all have as many more with each: with these alone, of 2,400 random cables in a saddle and an
-    # eyelet 80 lead to a higher and 9 to a lower equilibrium.
+    # Arcs of a span between clips there. Beside a clamp an eyelet ends no span; each adds as many
+    # arcs to all of them: without these, of 2,400 random cables in a saddle and an eyelet 80 lead
+    # to a higher and 9 to a lower equilibrium.
     coarse_span = 3
 
     @property

@@ -53,7 +53,7 @@ class Candidate:
         return model.with_effect(self.effect)
 
     def remove_from(self, model: CableModel, before: CableModel) -> CableModel:
-        """Return the model without this effect, a nuisance held as in a model before."""
+        """Return the model without this effect; a nuisance gets the priors of `before` back."""
         if self.nuisance:
             held = {name: before.priors[name] for name in self.frees}
             return replace(model, priors={**model.priors, **held})

@@ -354,6 +354,8 @@ class Search:
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
         """Backward step: without the effects that others have made superfluous.
 
+        A nuisance is held within its declared tolerance again.
+
         An effect has to be worth its parameters, and as significant as when it was added. The last
         one is significant, but may have led out of a local minimum in which there is no need of it.
         """

@@ -23,7 +23,7 @@ from dlo_casadi.estimation.fit import FIRST_STD
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, few_anew, fit_from, measured_shapes
+from dlo_casadi.estimation.start import begin, fit_from, measured_shapes, retry_outlying_poses
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
@@ -171,7 +171,7 @@ class RelaxedStart:
         reached = relaxed(linear, reached, COMPARED[1:-1])
         problem, reached = _in_own_parameters(near, candidate, linear, reached)
         reached = relaxed(problem, reached, COMPARED[-1:])
-        reached = few_anew(problem, begun, reached, COMPARED[-1])
+        reached = retry_outlying_poses(problem, begun, reached, COMPARED[-1])
         left = Relaxation(problem, COMPARED[-1]).objective(reached)
         return cls(near, screened, problem, begun, reached, left, beside)
 

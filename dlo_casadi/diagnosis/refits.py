@@ -313,7 +313,7 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
 
 
 def refit_without(fit: Fit, candidate: Candidate, before: CableModel) -> Fit | None:
-    """Fit without a candidate, a nuisance held as before; None if none is found."""
+    """Fit without a candidate, a nuisance held as in the declared model `before`; None if none."""
     return _followed(fit, candidate.remove_from(fit.model, before), {})
 
 

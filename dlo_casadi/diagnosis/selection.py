@@ -152,12 +152,12 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
 
 
 def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
-    """How much likelier a refit makes the data than its base does, twice: logarithms, their mean.
+    """How much likelier a refit makes the data than its base does: a mean of two logarithms.
 
-    By marginal likelihood, and by the predictive density of poses that are left out (of which the
-    base's is in `validation`). Both agree where nothing else is missing. A wrong effect bends to
-    what is fitted, and predicts what is left out badly: the mean is harmonic, which the smaller
-    decides; that itself if it is negative.
+    Of the marginal likelihood, and of the predictive density of poses that are left out (that of
+    the base is in `validation`). Both agree where nothing else is missing. A wrong effect bends to
+    what is fitted, and predicts what is left out badly: the mean is harmonic, so that the smaller
+    decides; that one alone if it is not positive.
     """
     one = item.fit.log_evidence - base.log_evidence
     other = item.validation.log_density - validation.log_density

@@ -271,10 +271,18 @@ def energy_slope(
     along: Sequence[FloatArray],
     step: float,
 ) -> FloatArray:
-    """Derivative (q,) of an equilibrium's energy: that of the Lagrangian at a fixed shape.
+    """Derivative (q,) [J] of an equilibrium's energy along q directions.
 
-    By central differences of parameters and rest curvature, which are `given`, and of deviations,
-    if there are three directions `along` which they change.
+    That of the Lagrangian at a fixed shape, by central differences.
+
+    Parameters
+    ----------
+    given : ((n_parameters,), (n_rests,))
+        Parameters and rest strains.
+    along : sequence of (n_parameters, q), (n_rests, q) and, optionally, (n_deviations, q)
+        Directions of these, and of the pose's deviations.
+    step : float
+        Share of a direction that is taken to both sides.
     """
     by_p, by_rest, *by_deviation = (step * np.hstack([by, -by]).T for by in along)
     m, q = len(by_p), len(by_p) // 2

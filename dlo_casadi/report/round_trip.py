@@ -60,7 +60,7 @@ def round_trip_dict(rows: Sequence[Relaxation]) -> dict[str, Any]:
         *("pose", "case", "problem", "to_prediction", "to_measured"),
         *("force", "predicted_force", "measured_force"),
     )
-    listed = [{key: asdict(row)[key] for key in kept} for row in rows]
+    listed = [{key: found[key] for key in kept} for found in map(asdict, rows)]
     return finite({"summary": summary(rows), "poses": listed})
 
 

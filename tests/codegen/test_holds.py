@@ -45,6 +45,7 @@ POSE = HeldPose(
 SADDLE = HeldClip("clamped", CLIPS[0].place, 0.36, orientation=turned(0.3, 0.2, 0.1))
 SWIVEL = replace(SADDLE, kind="swivel")
 EYELET = HeldClip("eyelet", CLIPS[1].place)
+NEARBY = HeldClip("eyelet", (0.33, 0.12, 0.01))  # in the same element of a coarse mesh as CLIPS[0]
 # In a plane.
 FLAT = CableData(1.0, 0.2, 0.01, bending_stiffness=0.02)
 FLAT_CLIPS = (HeldClip("pinned", (0.3, 0.1), 0.36), HeldClip("pinned", (0.55, 0.1), 0.68))
@@ -137,6 +138,9 @@ def test_a_cable_in_a_plane_that_stretches():
         ((SADDLE, CLIPS[1]), {"start": "pinned"}),
         ((SWIVEL,), {"end": "free"}),
         ((CLIPS[0], EYELET), {"end": "pinned"}),
+        ((SADDLE, EYELET), {}),
+        ((CLIPS[0], NEARBY), {}),
+        ((HeldClip("eyelet", CLIPS[0].place), NEARBY), {}),
     ],
 )
 def test_saddles_and_eyelets_in_space(clips, held):

@@ -58,7 +58,8 @@ def test_an_effect_stays_only_while_it_is_significant_among_all_candidates(coeff
     assert [effect.name for effect in smaller.model.effects] == names
 
 
-def test_a_nuisance_that_is_needless_is_held_within_its_tolerance_again():
+@pytest.mark.parametrize(("longer", "kept"), [(0.0, False), (0.02, True)])
+def test_a_nuisance_is_held_within_its_tolerance_again_where_it_is_needless(longer, kept):
     held = nuisances(PLAIN, Tolerances())
     listed = candidates(held, setup_of(held))
     length, taper = (
@@ -66,7 +67,7 @@ def test_a_nuisance_that_is_needless_is_held_within_its_tolerance_again():
     )
     model = taper.add_to(length.add_to(held))
     assert set(length.frees) == set(held.priors) - set(model.priors)
-    true = {"stiffness_gradient.slope": 0.4}
+    true = {"stiffness_gradient.slope": 0.4, "length_error.length_difference": longer}
     p = np.array([true.get(x, y) for x, y in zip(model.names, model.nominal, strict=True)])
     poses, rng = [HeldPose((0.0, 0.0), end) for end in ENDS], np.random.default_rng(0)
     s = np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
@@ -83,5 +84,6 @@ def test_a_nuisance_that_is_needless_is_held_within_its_tolerance_again():
 
     smaller, left = search._pruned(fit, added)
 
-    assert [item.candidate.name for item in left] == ["stiffness_gradient"]
-    assert smaller.model.priors == held.priors
+    names = ["length_error"] * kept + ["stiffness_gradient"]
+    assert [item.candidate.name for item in left] == names
+    assert (smaller.model.priors == held.priors) is not kept
