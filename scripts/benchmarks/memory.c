@@ -10,10 +10,15 @@
 
 #define COUNT 16
 #define MOST_THREADS 8
+#if DLO_OBSTACLES
+#define AMONG obstacles, 2,
+#else
+#define AMONG
+#endif
 
 typedef struct {
     long problems;
-    long counts[DLO_TURNS_SHED + 1];
+    long counts[DLO_NO_ROOM + 1];
     double sum; /* of what was found */
 } job_t;
 
@@ -89,7 +94,7 @@ static void *work_off(void *what)
         size_t jump, i;
         for (i = 0; i < COUNT; ++i)
             draw_pose(poses + i, &state);
-        dlo_batch(poses, COUNT, branch, shapes, statuses, work, DLO_WORKSPACE_SIZE);
+        dlo_batch(poses, COUNT, AMONG branch, shapes, statuses, work, DLO_WORKSPACE_SIZE);
         for (i = 0; i < COUNT; ++i) {
             dlo_gap gap;
             dlo_usage usages[DLO_QUANTITIES];
@@ -97,17 +102,17 @@ static void *work_off(void *what)
             dlo_shape near;
             ++job->counts[statuses[i]];
             job->sum += shapes[i].energy;
-            dlo_sensitivity(poses + i, shapes + i, slope, work, DLO_WORKSPACE_SIZE);
+            dlo_sensitivity(poses + i, AMONG shapes + i, slope, work, DLO_WORKSPACE_SIZE);
             dlo_clearance(shapes + i, obstacles, 2, slope, &gap);
             dlo_limits(shapes + i, limits, obstacles, 2, slope, usages, &tightest);
             job->sum += gap.gradient[0] + usages[tightest].gradient[0];
             poses[i].end[0] += 1e-3;
-            dlo_step(poses + i, shapes + i, 4, &near, work, DLO_WORKSPACE_SIZE);
-            dlo_solve(poses + i, other, shapes + i, shapes + i, work, DLO_WORKSPACE_SIZE);
+            dlo_step(poses + i, AMONG shapes + i, 4, &near, work, DLO_WORKSPACE_SIZE);
+            dlo_solve(poses + i, AMONG other, shapes + i, shapes + i, work, DLO_WORKSPACE_SIZE);
             job->sum += near.energy + shapes[i].energy;
         }
-        dlo_path(poses, 4, branch, 0, shapes, statuses, &jump, work, DLO_WORKSPACE_SIZE);
-        dlo_solve(poses, other, 0, shapes, work, DLO_WORKSPACE_SIZE - 1);
+        dlo_path(poses, 4, AMONG branch, 0, shapes, statuses, &jump, work, DLO_WORKSPACE_SIZE);
+        dlo_solve(poses, AMONG other, 0, shapes, work, DLO_WORKSPACE_SIZE - 1);
     }
     free(slope);
     free(shapes);

@@ -381,14 +381,17 @@ def test_clips_in_a_plane_that_cannot_be(clips, status):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("case", ["tether", "in space", "in a plane"])
+@pytest.mark.parametrize("case", ["tether", "in space", "in a plane", "among obstacles"])
 def test_sanitizers_are_silent(tmp_path, case):
     model, values = loom(1, (Tether(),), n=6), TETHER
-    if case != "tether":
+    if case == "among obstacles":
+        model, values = loom(0, n=6), {}
+    elif case != "tether":
         clips = (FLAT_EYELET, replace(FLAT_SADDLE, at=0.6))
         model = flat(*clips)[0] if case == "in a plane" else loom(("swivel", "eyelet"), n=6)
         values = {}
-    generate(model, *numbers(model, values)).write(tmp_path)
+    obstacles = 2 if case == "among obstacles" else 0
+    generate(model, *numbers(model, values), obstacles=obstacles).write(tmp_path)
     shutil.copy(memory.HERE / "memory.c", tmp_path)
     flags = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     assert memory.build_and_run(tmp_path, flags, [], 5, threads=2).startswith("silent")
