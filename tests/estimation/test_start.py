@@ -107,3 +107,9 @@ def test_where_most_poses_lie_off_none_is_tried_from_other_shapes(flat):
     problem, begun, _ = flat
     values = replace(begun, shapes=replace(begun.shapes, lam=begun.shapes.lam + 1.0))
     assert retry_outlying_poses(problem, begun, values, SOFTNESS[-1]) is values
+
+
+def test_where_no_pose_can_be_evaluated_none_is_tried_from_other_shapes(flat):
+    problem, begun, _ = flat
+    values = replace(begun, shapes=replace(begun.shapes, lam=np.nan * begun.shapes.lam))
+    assert retry_outlying_poses(problem, begun, values, SOFTNESS[-1]) is values
