@@ -289,6 +289,19 @@ def test_a_pose_names_the_side_of_a_bar(bar, ends):
     assert lowest == pytest.approx(energies[False], abs=1e-12)
 
 
+@pytest.mark.parametrize("height", [-0.05, -0.1])
+def test_a_cable_pressed_on_a_table_has_the_energy_of_hard_contacts(height):
+    """Forces of fifty weights: IPOPT with inequalities on the same energy."""
+    cable = CableData(1.0, 0.1 / 9.81, 2 * RADIUS, 0.1)
+    table = Plane((0.0, height - RADIUS), (0.0, 1.0), "table")
+    pose = HeldPose((0.0, 0.0), (0.85, 0.0), start_heading=-1.0, end_heading=1.0)
+    model, found = solved(cable, pose, table, n=24, start="clamped", end="clamped")
+    assert len(found.contacts) == 2
+    rest = np.zeros(model.chain.n_rests)
+    (one,) = Ipopt(model).solve(model.nominal, rest, pose, [found.x])
+    assert one.energy == pytest.approx(found.energy, abs=1e-10)
+
+
 def test_a_free_end_hangs_over_a_bar():
     """Frictionless: from the clamp over the bar, all beyond hangs down on its other side."""
     bar = Capsule((0.3, 0.0), (0.3, 0.0), 0.03, "bar")

@@ -36,7 +36,7 @@ from dlo_casadi.diagnosis.structure import (
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
 from dlo_casadi.effects import PointLoad, StateEffect
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import at_random, fine_enough
+from dlo_casadi.estimation.fit import FINEST_MESH, at_random, fine_enough
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
@@ -227,7 +227,10 @@ class Search:
         )
 
     def _searched(self) -> Found:
-        """From the measured shapes first where the fit leaves far more than noise, else last."""
+        """From the measured shapes first where the fit leaves far more than noise, else last.
+
+        Last, too, if a scatter from pose to pose is left: it explains anything.
+        """
         # From such a fit a first effect bends to what two explain, and others to what it leaves.
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
@@ -236,7 +239,8 @@ class Search:
             return first
         found = self.run()
         found = found.or_better(self.of_simpler_effects(found))
-        if found.unexplained and may_be_far:
+        scatters = found.fit.problem.priors.pose_scatter.std > 0
+        if may_be_far and (found.unexplained or scatters):
             return found.or_better(first or of_shapes.run())
         # Where left-out poses are not even reached refits may have begun too far from the effect.
         lost = may_be_far and not self.validation.complete
@@ -357,14 +361,17 @@ class Search:
         A nuisance is held within its declared tolerance again.
 
         An effect has to be worth its parameters, and as significant as when it was added. The last
-        one is significant, but may have led out of a local minimum in which there is no need of it.
+        one is significant, but may have led out of a local minimum in which there is no need of it,
+        or stand for what the mesh lacked: 80 elements on a table were 0.6 mm off.
         """
+        before, fit = fit, self._fine(fit, FINEST_MESH) if added else fit
+        significant = added[-1:] if fit is before else []
         for effect in added:
             smaller = refits.refit_without(fit, effect.candidate, self.declared.model)
             if smaller is None:
                 continue
             needless = smaller.log_evidence > fit.log_evidence
-            if not needless and effect is not added[-1]:
+            if not needless and effect not in significant:
                 gain = 2 * (smaller.point.objective - fit.point.objective)
                 single = survival(gain, len(effect.candidate.frees), noise_degrees(fit))
                 tried = len(candidates_of(smaller, self.center, self.exclude))
@@ -419,19 +426,13 @@ class Search:
         """What has been found, and whether it explains the data."""
         if not added and not fit.noise.known:
             fit = settle(fit)
-        found = self._judged(fit, added, ranked)
-        # What effects leave may be the mesh's, which was fine enough for what they explain.
-        if found.unexplained and added:
-            finer = self._fine(fit)
-            found = found if finer is fit else self._judged(finer, added, ranked)
-        return found
-
-    def _fine(self, fit: Fit) -> Fit:
-        """A fit with effects on a mesh that is fine enough, where the mesh may be refined."""
-        return fine_enough(fit, fit.model.n, SETTLED_MODES, self.finest)[0] if self.finest else fit
-
-    def _judged(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         return Found.of(fit, added, ranked, len(self.declared.problem.used), self.significance)
+
+    def _fine(self, fit: Fit, finest: int | None = None) -> Fit:
+        """A fit with effects on a mesh that is fine enough, where the mesh may be refined."""
+        if self.finest is None:
+            return fit
+        return fine_enough(fit, fit.model.n, SETTLED_MODES, finest or self.finest)[0]
 
     def without_wrong_causes(self, found: Found) -> Found:
         """Withdraw effects that do not explain nearly all of what the declared model lacks.

@@ -178,6 +178,8 @@ def equilibria_of(
     assembly, chain, node = assembly_of(model), model.chain, model.node
     total, force, _ = assembly.balance(shapes, given)
     energies = total - assembly.work(shapes, force)
+    if touching := assembly.touching(shapes, given):
+        energies += touching.given_way
     residuals = np.abs(force.y[..., 0]).max(axis=1, initial=0.0)
     strains = assembly.strain(shapes, given)
     on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(node)

@@ -275,8 +275,9 @@ def allowed_mesh_error(fit: Fit) -> float:
 def resting_height(problem: Problem) -> float | None:
     """The lowest height [m] that measured shapes of several poses share, if there is one.
 
-    What lies on a table is at the same height in all poses, and nothing is below it. Fixtures are
-    where they are held.
+    What lies on a table is at the same height in all poses, and nothing is below it. The lowest
+    place of a cable is not above its lowest point, and a smooth curve may pass below it. Fixtures
+    are where they are held.
     """
     model = problem.unknowns.model
     if not (any(model.gravity) and model.chain.kind.smooth):
@@ -286,11 +287,14 @@ def resting_height(problem: Problem) -> float | None:
     seen = problem.equilibria.seen(shapes, problem.unknowns.fixed, rest)
     heights = height_of([seen[j].curve.at(places) for j in problem.used], model.gravity)
     lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
-    hanging = lowest[(inside > 0) & (inside < len(places) - 1)]
+    lines = [problem.measured[j].traced for j in problem.used]
+    points = [height_of(item.points, model.gravity).min(initial=np.inf) for item in lines]
+    highest = np.maximum(lowest, np.where(np.isfinite(points), points, lowest))
     least, most = (share * length for share in RESTING_APART)
     apart = np.clip(RESTING_NOISE * problem.noise.of_points.std, least, most)
-    shared = hanging[hanging < lowest.min() + apart]
-    return float(shared.mean()) if len(shared) > 1 else None
+    shared = (inside > 0) & (inside < len(places) - 1) & (lowest < highest.min() + apart)
+    height = np.clip(highest.min(), lowest, highest)[shared]
+    return float(height.mean()) if len(height) > 1 else None
 
 
 def on_planes(problem: Problem, theta: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import refit
-from dlo_casadi.estimation.fit import fit_model, mesh_error, misfits
+from dlo_casadi.estimation.fit import fit_model, mesh_error, misfits, resting_height
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.runtime.executors import InProcess
@@ -165,3 +165,19 @@ def test_a_pose_at_a_fold_ends_a_fit_with_an_error_that_says_so(on_a_table):
     beyond = [np.full_like(b, 1e27) for b in lin.by_deviation]
     with pytest.raises(EstimationError, match="fold"):
         on_a_table.problem.normal_equations(on_a_table.point, replace(lin, by_deviation=beyond))
+
+
+@pytest.mark.parametrize("count", [6, 8, 10])
+def test_a_limp_cable_rests_where_its_lowest_markers_are(count):
+    """A smooth curve through few markers passes below a table: 20 mm with six of them."""
+    true = CableData(0.8, 0.15, 0.006, bending_stiffness=0.002)
+    s = np.linspace(0.02, 0.78, count)
+    model = CableModel(true, 80, n_rest=0, effects=(ContactPlane(),))
+    p, rest = model.nominal.copy(), np.zeros(model.chain.n_rests)
+    p[model.names.index("contact_plane.height")] = -0.2
+    poses = [HeldPose((0.0, 0.0), end) for end in ((0.2, 0.0), (0.4, 0.12), (0.6, 0.1))]
+    points = [shape.curve.at(s) for shape in predict_poses(model, p, rest, poses)]
+    each = zip(poses, points, strict=True)
+    measured = [MeasuredPose.of_points(pose, some, s=s) for pose, some in each]
+    fit = fit_model(CableModel(true, 20, n_rest=0), measured, Tolerances(), 3e-4)
+    assert resting_height(fit.problem) == pytest.approx(-0.2 + 0.003, abs=1e-4)
