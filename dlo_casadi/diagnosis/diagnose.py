@@ -22,6 +22,7 @@ from dlo_casadi.diagnosis.selection import (
     Ranked,
     added_by,
     choose,
+    likelier_by,
     p_values_of,
     p_with_closed_noise,
     ranking,
@@ -127,8 +128,8 @@ def diagnose(
         Where candidates are screened and refitted and places of an unknown load tried, half a
         second to some seconds each; in this process by default.
     finest : int, optional
-        Elements up to which the mesh may be refined where what effects leave is not noise; by
-        default it stays.
+        Elements up to which the mesh may be refined during the search; found effects are tested on
+        up to FINEST_MESH. By default it stays.
     """
     run_in = executor or InProcess()
     return Search(fit, center, exclude, significance, max_effects, step, run_in, finest).closed()
@@ -241,9 +242,9 @@ class Search:
         found = found.or_better(self.of_simpler_effects(found))
         scatters = found.fit.problem.priors.pose_scatter.std > 0
         if may_be_far and (found.unexplained or scatters):
-            return found.or_better(first or of_shapes.run())
+            found = found.or_better(first or of_shapes.run())
         # Where left-out poses are not even reached refits may have begun too far from the effect.
-        lost = may_be_far and not self.validation.complete
+        lost = may_be_far and not found.unexplained and not self.validation.complete
         return self._or_causes(found)[0] if lost else found
 
     def run(self, force: UnknownForce | None = None) -> Found:
@@ -348,12 +349,13 @@ class Search:
         if self.declared.noise.source != "misfit" or not (found.unexplained or scatter.std):
             return None
         near = at_random(self.declared)
-        if near is not None and self.finest:
-            # Evidence is compared on one mesh.
-            n = max(near.model.n, found.fit.model.n)
+        if near is None:
+            return None
+        if self.finest:
+            n = max(near.model.n, min(found.fit.model.n, self.finest))
             near = fine_enough(near, n, finest=self.finest)[0]
-        least = found.fit.log_evidence - EVIDENCE_APART
-        return near if near and (found.unexplained or near.log_evidence > least) else None
+        likelier = found.unexplained or likelier_by(found.fit, near) > -EVIDENCE_APART
+        return near if likelier else None
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
         """Backward step: without the effects that others have made superfluous.
@@ -362,10 +364,11 @@ class Search:
 
         An effect has to be worth its parameters, and as significant as when it was added. The last
         one is significant, but may have led out of a local minimum in which there is no need of it,
-        or stand for what the mesh lacked: 80 elements on a table were 0.6 mm off.
+        or stand for what the mesh lacked: 80 elements on a table were 0.6 mm off. One found from
+        the shapes may stand for a scatter.
         """
         before, fit = fit, self._fine(fit, FINEST_MESH) if added else fit
-        significant = added[-1:] if fit is before else []
+        significant = added[-1:] if fit is before and not self.from_shapes else []
         for effect in added:
             smaller = refits.refit_without(fit, effect.candidate, self.declared.model)
             if smaller is None:

@@ -1,6 +1,7 @@
 """Which of the refitted candidates is added: evidence, cross-validation, significance."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import comb, log
 from typing import Self
@@ -14,6 +15,7 @@ from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of
 from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
@@ -98,7 +100,12 @@ class Found:
         if other is None:
             return self
         candidates = max(len(self.ranked), len(other.ranked))
-        if other._order(candidates) <= self._order(candidates):
+        if self.unexplained == other.unexplained:
+            likelier = likelier_by(self.fit, other.fit) - other._sets(candidates)
+            better = likelier + self._sets(candidates) > 0
+        else:
+            better = self.unexplained
+        if not better:
             return self
         names = " and ".join(item.candidate.name for item in other.added) or "no effect"
         known = {item.name for item in other.ranked}
@@ -110,10 +117,22 @@ class Found:
         )
         return replace(other, ranked=(*other.ranked, *rest))
 
-    def _order(self, candidates: int) -> tuple[bool, float]:
-        """By the log evidence, all numbers of effects and all sets of as many equally likely."""
-        sets = comb(candidates, min(len(self.added), candidates))
-        return not self.unexplained, self.fit.log_evidence - log(sets)
+    def _sets(self, candidates: int) -> float:
+        """Logarithm of the number of sets of as many effects, all of which are equally likely."""
+        return log(comb(candidates, min(len(self.added), candidates)))
+
+
+def likelier_by(fit: Fit, other: Fit) -> float:
+    """How much larger the log evidence of another fit is, on the finer one of both meshes."""
+    n = max(fit.model.n, other.model.n)
+    return _on_mesh(other, n).log_evidence - _on_mesh(fit, n).log_evidence
+
+
+def _on_mesh(fit: Fit, n: int) -> Fit:
+    """The fit on n elements; as it is where that has no equilibria near the measured shapes."""
+    with suppress(EstimationError):
+        return refine_mesh(fit, n) if n > fit.model.n and fit.noise.source != "misfit" else fit
+    return fit
 
 
 def sidak(p_value: float, tried: int) -> float:

@@ -276,8 +276,7 @@ def resting_height(problem: Problem) -> float | None:
     """The lowest height [m] that measured shapes of several poses share, if there is one.
 
     What lies on a table is at the same height in all poses, and nothing is below it. The lowest
-    place of a cable is not above its lowest point, and a smooth curve may pass below it. Fixtures
-    are where they are held.
+    place of a cable is not above its points and ends, and a smooth curve may pass below it.
     """
     model = problem.unknowns.model
     if not (any(model.gravity) and model.chain.kind.smooth):
@@ -287,13 +286,15 @@ def resting_height(problem: Problem) -> float | None:
     seen = problem.equilibria.seen(shapes, problem.unknowns.fixed, rest)
     heights = height_of([seen[j].curve.at(places) for j in problem.used], model.gravity)
     lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
-    lines = [problem.measured[j].traced for j in problem.used]
-    points = [height_of(item.points, model.gravity).min(initial=np.inf) for item in lines]
-    highest = np.maximum(lowest, np.where(np.isfinite(points), points, lowest))
+    ends = heights[:, :1] if model.end == "free" else heights[:, [0, -1]]
+    highest = ends.min(axis=1)
+    for k, item in enumerate(problem.measured[j] for j in problem.used):
+        known = height_of(item.traced.points, model.gravity) if item.has_line else heights[k]
+        highest[k] = max(lowest[k], known.min(initial=highest[k]))
     least, most = (share * length for share in RESTING_APART)
     apart = np.clip(RESTING_NOISE * problem.noise.of_points.std, least, most)
     shared = (inside > 0) & (inside < len(places) - 1) & (lowest < highest.min() + apart)
-    height = np.clip(highest.min(), lowest, highest)[shared]
+    height = np.maximum(lowest, highest.min())[shared]
     return float(height.mean()) if len(height) > 1 else None
 
 

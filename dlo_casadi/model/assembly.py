@@ -238,7 +238,10 @@ class Assembly:
         return BandMatrix(diagonal, upper, columns.x, columns.y)
 
     def energy(self, shapes: Shapes, given: Inputs) -> FloatArray:
-        """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers."""
+        """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers.
+
+        Contacts store some of it, see `Touching.given_way`.
+        """
         total, gradient, _ = self.balance(shapes, given)
         return total - self.work(shapes, gradient)
 

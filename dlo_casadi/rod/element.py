@@ -288,5 +288,5 @@ class Element(ABC):
     def expanded(
         self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> ca.SX:
-        """Energy to be minimised over the internal unknowns, with the minimum of `condensed`."""
+        """Energy to be minimised over the internal unknowns; its minimum is that of `condensed`."""
         return energy

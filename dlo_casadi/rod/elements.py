@@ -169,7 +169,7 @@ class Quadratic(Arc):
 
 
 def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Relative stiffness of a bubble and its derivative: 1 + x, but above 1/4 for any x < -1/2.
+    """Relative stiffness of a bubble and its derivative: 1 + x to x = -1/2, above 1/4 for any x.
 
     x is positive under tension. Without the lower bound elements of a limp cable buckle one by one
     on the way to an equilibrium. Twice differentiable. Equilibria that obstacles press reach

@@ -157,7 +157,8 @@ def test_an_effect_found_in_a_misfit_has_to_hold_beside_the_scatter_from_pose_to
     def scattering(evidence, source="declared"):
         priors = SimpleNamespace(pose_scatter=PoseScatter(0.008, source="end_offset"))
         noise, problem = SimpleNamespace(source=source), SimpleNamespace(priors=priors)
-        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem)
+        model = SimpleNamespace(n=10)
+        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, model=model)
 
     near = scattering(3040.0 - behind)
     monkeypatch.setattr(module, "at_random", lambda _: near)
@@ -242,3 +243,21 @@ def test_ipopt_and_gauss_newton_reach_the_same_minimum(session):
     assert solution.objective == pytest.approx(fit.point.objective, rel=1e-6)
     scaled = np.sqrt(np.diag(fit.covariance))
     assert np.abs(solution.theta - fit.point.theta).max() < 0.05 * scaled.max()
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.3])
+def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, monkeypatch, scatter):
+    ended = Found.of(found.after, found.added, found.ranked, 12, 0.005)
+    priors = replace(fit.problem.priors, pose_scatter=PoseScatter(scatter))
+    own = replace(ended.fit, problem=replace(ended.fit.problem, priors=priors))
+    searched = []
+
+    def run(search):
+        searched.append(search.from_shapes)
+        return ended if search.from_shapes else replace(ended, fit=own)
+
+    monkeypatch.setattr(module, "REACHED", np.inf)
+    monkeypatch.setattr(Search, "run", run)
+    monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
+    assert diagnose(fit).verdict == "effect_found"
+    assert searched == ([False, True] if scatter else [False])
