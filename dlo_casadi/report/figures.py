@@ -197,16 +197,19 @@ def residuals_figure(outcome: Outcome) -> Figure:
         for axes, (kind, label, stage, way, direction) in zip(grid, panels, strict=True):
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
             axes.axhline(0, color=style.GREY, lw=0.8)
+            fitted = []
             for k, pose in enumerate(outcome.poses):
                 shape = stage.shapes.get(pose.name)
                 if shape is None:
                     continue
                 held_out = pose.role == "held_out"
+                residual = np.atleast_2d(shape.residual.T)[way] / noise
+                fitted += [] if held_out else [residual]
                 every = slice(None, None, -(-len(shape.s) // _POINTS) or 1)
                 error = "" if shape.rmse is None else f", RMS distance {millimetres(shape.rmse)}"
                 axes.plot(
                     shape.s[every],
-                    np.atleast_2d(shape.residual.T)[way, every] / noise,
+                    residual[every],
                     color=style.HELD_OUT if held_out else style.BLUE,
                     ls="--" if held_out else "-",
                     lw=1.1,
@@ -215,8 +218,9 @@ def residuals_figure(outcome: Outcome) -> Figure:
                     gid=f"residual-{kind}-{k}{direction and f'-{direction}'}",
                     label=_name(pose) + error,
                 )
-            chi2 = stage.chi2_per_dof
-            quality = "" if chi2 is None else f", χ²\u00a0per\u00a0dof\u00a0{chi2:.3g}"
+            # Not the stage's chi-square, which goes by its own noise.
+            size = float(np.sqrt(np.mean(np.concatenate(fitted) ** 2))) if fitted else np.nan
+            quality = f", RMS\u00a0{size:.2g}" if np.isfinite(size) else ""
             title = f"{kind}: {label}{direction and f', along {direction}'}"
             axes.set_title(textwrap.fill(title + quality, 52), loc="left")
             axes.set_ylabel("residual [noise std]")
