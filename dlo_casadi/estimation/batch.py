@@ -7,14 +7,14 @@
     s.t.  grad_(phi, lam) Lagrangian(phi_j, lam_j; theta) = 0           (balance and end conditions)
           rest_(j+1) = rest_after(x_j, rest_j)                         (only with a state)
 
-What is measured enters through R_j, the triangular factor of the whitened residuals' Jacobian by
-the numbers z of the curve and of readings (of lines: whitening x normals x Hermite
-interpolation): |R_j z - b_j|^2 equals the sum of squares up to a constant. Projections and normals
-are brought up to date between solves, until they stand still; at a projection the normal distance
-is stationary in s, so that the fixed point is that of the consistent problem.
+The measurements enter through R_j, the triangular factor of the whitened residuals' Jacobian by z,
+the numbers of the curve and of the wrench measurements (for lines: whitening x normals x Hermite
+interpolation). |R_j z - b_j|^2 equals the sum of squares up to a constant. Projections and normals
+are updated between solves until they no longer change. The normal distance is stationary in s at a
+projection, so the fixed point solves the consistent problem.
 
-It has the same minimum as `descent.descend`, by another route: nothing is eliminated, and the
-Hessian is exact.
+This NLP has the same minimum as `descent.descend`, but it eliminates nothing and its Hessian is
+exact.
 """
 
 from typing import Any
@@ -43,7 +43,7 @@ def solve_batch(problem: Problem, start: Point) -> tuple[Point, float]:
     Parameters
     ----------
     start : Point
-        For example of `fit_model`.
+        For example the result of `fit_model`.
 
     Returns
     -------
@@ -101,7 +101,7 @@ def _compressed(problem: Problem, point: Point) -> list[tuple[FloatArray, FloatA
 
 
 def _n_rows(problem: Problem) -> int:
-    """Rows of a pose's compressed residuals: no more than what they depend on, or residuals."""
+    """Number of rows of a pose's compressed residuals: the smaller of n_z and n_residuals."""
     most = max(problem.measured[j].n_residuals for j in problem.used)
     return min(most, problem.observed_size)
 
@@ -110,8 +110,8 @@ class _BatchNlp:
     """The NLP's expressions, built once; the residuals' factors are its parameters.
 
     First and second derivatives of one pose are generated once and mapped over the poses; the
-    NLP's own are put together from these blocks. That is what its structure costs, while
-    differentiating the assembled NLP would cost as many sweeps as a pose has unknowns.
+    NLP's derivatives are assembled from these blocks. Differentiating the assembled NLP instead
+    would cost as many sweeps as a pose has unknowns.
     """
 
     def __init__(self, problem: Problem, p: FloatArray) -> None:
@@ -214,7 +214,7 @@ class _BatchNlp:
         of_balance = ca.reshape(lam_g[: n_balance * m], n_balance, m)
         of_after = ca.MX.zeros(self.n_rest, m)
         if model.has_state:
-            # Row block j + 1 of the carried constraints holds minus what pose j leaves behind.
+            # Row block j + 1 of the carried constraints subtracts what pose j leaves behind.
             later = ca.reshape(lam_g[n_balance * m :], self.n_rest, m)[:, 1:]
             of_after = ca.horzcat(-later, ca.MX.zeros(self.n_rest, 1))
         bends = self.bend.map(m)(
@@ -234,7 +234,7 @@ class _BatchNlp:
             {"x": x, "p": p, "f": objective, "g": g},
             {
                 "print_time": False,
-                # Multipliers of p are not wanted; the gradient for them takes minutes to build.
+                # Multipliers of p are not needed; building the gradient for them takes minutes.
                 "no_nlp_grad": True,
                 "calc_lam_p": False,
                 "grad_f": ca.Function("grad_f", [x, p], [objective, ca.vertcat(by_theta, *by_own)]),
@@ -247,7 +247,7 @@ class _BatchNlp:
                 "ipopt.mu_init": 1e-6,
                 "ipopt.bound_push": 1e-9,
                 "ipopt.bound_frac": 1e-9,
-                # IPOPT widens bounds by 1e-8; what it returns must lie within them.
+                # IPOPT widens bounds by 1e-8; its result must lie within the original ones.
                 "ipopt.honor_original_bounds": "yes",
                 "ipopt.nlp_scaling_method": "none",
             },
@@ -263,7 +263,7 @@ class _BatchNlp:
     def _carry(
         self, theta: ca.MX, own: ca.MX, after: ca.MX, slopes: ca.MX, width: int
     ) -> tuple[ca.MX, ca.MX]:
-        """What each pose finds minus what the one before left behind, and its Jacobian."""
+        """Rest curvature that each pose finds minus that left by the pose before; its Jacobian."""
         m, unknowns = len(self.poses), self.problem.unknowns
         scale = unknowns.model.cable.curvature_scale
         first = ca.DM(unknowns.rest_slopes) / scale

@@ -1,10 +1,10 @@
 """Fits under one more condition: a parameter fixed, or the measured equilibria the lowest.
 
-The profile likelihood of a parameter refits everything else where it is fixed. And without a branch
-that it names a pose is in the stable equilibrium of lowest energy; so a model says that predicts
-it. The shapes alone may leave open which one that is: a stiff cable in a single pose fits as well
-with a rest curvature that would bring it to the other side. That a pose was measured in an
-equilibrium is one more measurement of the parameters then.
+The profile likelihood of a parameter fixes that parameter and refits all others. A pose that names
+no branch is predicted in its stable equilibrium of lowest energy. The shapes alone may not tell
+which equilibrium that is: for a stiff cable in a single pose, a rest curvature that predicts the
+other side fits as well. The observation that the cable was in a certain equilibrium is then one
+more measurement of the parameters.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from dlo_casadi.thresholds import EVIDENCE_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
 
 # Probability below the upper end of a 95 % interval.
 BELOW_HIGH_END = 0.975
-# Search for the interval's ends within this factor of the estimate, threefold at most at a time.
+# Largest search range for the interval's ends: this log ratio to the estimate, at most ln 3 a step.
 LARGEST_LOG_STEP = float(np.log(1e4))
 FARTHEST_AIM, MOST_REFITS = 3.0, 12
 # Relative change of a crossing below which the search ends: the remaining error is of second order.
 SAME_CROSSING = 0.03
-# How far a measured equilibrium is to lie below the predicted one, in standard deviations of their
-# gap, and how closely that is met. Of nine simulated sessions of one pose eight predicted another
-# equilibrium than was measured: all eight came there in one round; chi-square rose by 2.5 at most.
+# Target gap of the measured equilibrium below the predicted one, and the tolerance on that target,
+# in standard deviations of the gap. Evidence: 8 of 9 simulated one-pose sessions predicted another
+# equilibrium than the measured one; one round corrected all 8; chi-square rose by 2.5 at most.
 BELOW, KEPT = 0.2, 0.03
 ROUNDS = 4
-# Steps of numerical derivatives of the energy, in units of the directions: it is a polynomial of
-# second degree in stiffnesses and rest curvatures, so that central differences are exact.
+# Step of numerical derivatives of the energy, in units of the directions. The energy is quadratic
+# in stiffnesses and rest curvatures, so central differences are exact.
 _STEP = 1e-4
 
 
@@ -63,16 +63,16 @@ class Interval:
 
 
 def student_95(fit: Fit, name: str) -> float:
-    """Standard deviations of a parameter to either end of its 95 % interval."""
+    """Half width of a parameter's 95 % interval in standard deviations (Student's t)."""
     return float(stdtrit(fit.variance_degrees(name), BELOW_HIGH_END))
 
 
 def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
     """Rise of twice the objective at the ends of a parameter's interval.
 
-    (t + b)^2 times the excess of the residual over the noise, with Student's t of 95 % for what the
-    sizes of noise and scatter are estimated from, 1.96 where they are declared; b, for a declared
-    noise, is the length in its weights of a systematic error of SYSTEMATIC_SHARE in all points.
+    (t + b)^2 times the excess of the residual over the noise. t is Student's t of 95 % where the
+    sizes of noise and scatter are estimated, and 1.96 where they are declared. b is used for a
+    declared noise: the whitened norm of a systematic error of SYSTEMATIC_SHARE in all points.
     """
     square = 0.0
     for j, white in zip(fit.problem.used, fit.problem.whitening, strict=True):
@@ -87,20 +87,20 @@ def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
 
 
 def profiled(fit: Fit) -> list[str]:
-    """The stiffnesses and the mass's factor, as far as they are estimated."""
+    """Names of the stiffnesses and the mass factor, if they are estimated."""
     return [name for name in (*STIFFNESSES, MASS_FACTOR) if name in fit.problem.unknowns.names]
 
 
 def profile_intervals(fit: Fit) -> dict[str, Interval]:
-    """Intervals of what is `profiled`."""
+    """Profile-likelihood interval of each parameter in `profiled`."""
     return {name: profile_interval(fit, name) for name in profiled(fit)}
 
 
 def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     """Profile-likelihood interval of a positive parameter, such as a stiffness [N m^2].
 
-    It is fixed, everything else refitted; its own prior does not count. `name`: the bending
-    stiffness by default.
+    The parameter is fixed and everything else is refitted; its own prior does not count. The
+    default `name` is the bending stiffness.
     """
     limit = threshold(fit, name)
     std = fit.std(name) / fit.inflation / fit.value(name)
@@ -111,10 +111,10 @@ def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
 
 
 def _crossing(profile: _Profile, limit: float, first: float) -> float | None:
-    """Place where a profile crosses its limit; None where it does not within LARGEST_LOG_STEP.
+    """Position at which a profile crosses its limit; None if not within LARGEST_LOG_STEP.
 
-    A profile is close to a parabola: the square root of its rise is all but linear, and the
-    secant of that root is followed until the place moves by less than SAME_CROSSING of itself.
+    A profile is close to a parabola, so the square root of its rise is nearly linear. The secant
+    method on that root stops when the relative change of the position is below SAME_CROSSING.
     """
     root, aim, near = np.sqrt(limit), first, profile.lowest
     low: tuple[float, float] = (0.0, 0.0)
@@ -161,7 +161,7 @@ def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
     rises = np.full(len(wanted), np.nan)
     order = np.argsort(wanted)
     profile = _Profile(fit, BENDING_STIFFNESS)
-    # Outwards from the estimate, each refit from its neighbour's.
+    # Outwards from the estimate: each refit starts from its neighbour.
     for side in (order[wanted[order] >= 0], order[wanted[order] < 0][::-1]):
         near = profile.lowest
         for k in side:
@@ -173,7 +173,7 @@ def stiffness_profile(fit: Fit, stiffness: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Refit:
-    """Everything else refitted where a parameter is fixed: at the log of its ratio to the fit's."""
+    """Refit with one parameter fixed; `place` is the log of its ratio to the fitted value."""
 
     place: float
     point: Point
@@ -205,7 +205,7 @@ class _Profile:
         return Unknowns(model, others, p)
 
     def refitted(self, place: float, near: _Refit) -> _Refit | None:
-        """Hold the parameter at a place, from a neighbour; None without equilibria there."""
+        """Refit with the parameter fixed, from a neighbour; None without equilibria there."""
         fit, k = self.fit, self._k
         base = 2 * fit.point.objective - fit.problem.unknowns.own_prior(fit.point.theta, k)
         problem = replace(fit.problem, unknowns=self._fixed_at(place))
@@ -217,7 +217,7 @@ class _Profile:
         return None
 
     def _along(self, place: float, near: _Refit) -> FloatArray:
-        """Where the other unknowns go with the parameter, to first order about the fit."""
+        """Values of the other unknowns as the parameter moves, to first order about the fit."""
         fit, k = self.fit, self._k
         whole = fit.problem.unknowns
         p = np.stack([self._fixed_at(at).fixed for at in (near.place, place)])
@@ -235,10 +235,10 @@ class EnergyGap:
     ----------
     value : float [J]
     slope : (q,) [J]
-        Along q directions of the parameters, less what grows with the bending stiffness: of a
-        stiffness that is hardly known it says nothing about the sign.
+        Along q directions of the parameters, without the part that grows with the bending
+        stiffness: a poorly known stiffness does not determine the sign of the gap.
     std : float [J]
-        Standard deviation of the value, the smaller one of with and without that part.
+        Standard deviation of the value: the smaller of those with and without that part.
     """
 
     value: float
@@ -255,7 +255,7 @@ class EnergyGap:
         along: tuple[FloatArray, FloatArray],
         covariance: FloatArray,
     ) -> EnergyGap:
-        """Gap of the first of two equilibria above the second.
+        """Energy of the first of two equilibria minus that of the second.
 
         Parameters
         ----------
@@ -264,7 +264,7 @@ class EnergyGap:
         along : (n_parameters, q), (n_rests, q)
             Directions of both.
         covariance : (q, q)
-            Along these.
+            Covariance along these directions.
         """
         value = pair[0].energy - pair[1].energy
         first, second = (energy_slope(model, pose, eq, given, along, _STEP) for eq in pair)
@@ -275,11 +275,11 @@ class EnergyGap:
 
 
 def as_measured(fit: Fit) -> Fit:
-    """A fit, or one that predicts its poses in the equilibria in which they were measured.
+    """Refit so that every measured equilibrium is the predicted one; unchanged if all already are.
 
-    The unknowns are fitted once more as far as needed for these to be the lowest ones; their
-    covariance stays that of the shapes. Where the evidence is very strong against it, the fit stays
-    as it is: something is missing.
+    The unknowns are refitted only as far as this requires; their covariance stays that of the
+    shapes. If the evidence against the refit is very strong, the fit is returned unchanged: the
+    model then lacks something.
     """
     found = fit
     for _ in range(ROUNDS):
@@ -297,7 +297,7 @@ def as_measured(fit: Fit) -> Fit:
 
 
 def _gaps(fit: Fit) -> list[EnergyGap]:
-    """By the unknowns: energy of each fitted pose as measured above another one, predicted."""
+    """Energy of each fitted pose as measured, minus that of its prediction, along the unknowns."""
     problem, model, unknowns = fit.problem, fit.model, fit.problem.unknowns
     poses = [item.pose for item in problem.history]
     predictions = predict_poses(model, fit.p, fit.rest, poses)
@@ -317,7 +317,7 @@ def _gaps(fit: Fit) -> list[EnergyGap]:
 
 
 def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:
-    """The fit with all gaps below zero as further measurements, to first order."""
+    """Refit with further measurements that all gaps are below zero, to first order."""
     problem, told = fit.problem, []
     for gap in gaps:
         row = gap.slope / (KEPT * gap.std)

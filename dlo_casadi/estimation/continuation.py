@@ -1,4 +1,4 @@
-"""The minimum of a relaxed problem followed as its balance of forces becomes strict."""
+"""Follow the minimum of a relaxed problem while its balance of forces becomes strict."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -13,9 +13,9 @@ from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.model.functions import functions_of
 
-# Standard deviation of points, over the length, from which the strict ones are approached. Of a
-# strong softening hidden in poses of 12 markers of 0.3 mm the strict search left 4464 or 6497, from
-# two starts; through 1e-3 or 3e-3 it leaves 529 from both, in a third of the time.
+# Std of points, over the length, of the first minimum; the true std follows. Evidence: a strong
+# softening hidden in poses of 12 markers of 0.3 mm. Directly, the strict search left 4464 or 6497
+# from two starts; by way of 1e-3 or 3e-3 it leaves 529 from both, in a third of the time.
 LOOSE = 3e-3
 
 
@@ -25,33 +25,33 @@ def relaxed(
     softness: Sequence[float] = SOFTNESS,
     fixed: BoolArray | None = None,
 ) -> Values:
-    """Follow the minimum of a relaxed problem from some values through falling softness."""
+    """Follow the minimum of a relaxed problem from some values as the softness falls."""
     for soft in softness:
         values = Relaxation(problem, soft).solve(with_unseen_predicted(problem, values), fixed)
     return values
 
 
 def loosened(problem: Problem, values: Values) -> Problem:
-    """The problem, its points taken for less sure than they are.
+    """The problem with a larger standard deviation of its points.
 
-    Between points known to a fraction of a millimetre every turn of a node that matters bends the
-    others off them by more: steps were refused, and the descent ended where it began.
+    If points are known to a fraction of a millimetre, any useful rotation of a node moves the
+    other nodes off their points by more: steps were refused, and the descent did not move.
     """
     noise = problem.noise.doubted(LOOSE * problem.unknowns.model.cable.length)
     return replace(problem, noise=noise, weights=None).weighed(values)
 
 
 def loosely_relaxed(problem: Problem, values: Values, fixed: BoolArray | None = None) -> Values:
-    """The first minimum of a relaxed problem, approached by that of the loosened one."""
+    """First minimum of a relaxed problem, starting from that of the loosened problem."""
     values = relaxed(loosened(problem, values), values, SOFTNESS[:1], fixed)
     return relaxed(problem, values, SOFTNESS[:1], fixed)
 
 
 def with_unseen_predicted(problem: Problem, values: Values) -> Values:
-    """Values whose poses that no measurement holds are where the model predicts them.
+    """Values in which every pose without measurements is at its predicted equilibrium.
 
-    They count where a state is carried through them. First guesses are made without forces: the
-    relaxed balance may keep such a pose in an equilibrium that the fitted model is never in.
+    Such poses matter where a state is carried through them. Their first guesses ignore forces, so
+    the relaxed balance may keep them in an equilibrium that the fitted model never takes.
     """
     model, shapes = problem.unknowns.model, values.shapes
     if not model.has_state:
@@ -68,7 +68,7 @@ def with_unseen_predicted(problem: Problem, values: Values) -> Values:
 
 
 def with_springs_in_place(problem: Problem, values: Values) -> Values:
-    """Values whose springs, which need not pull yet, are where they hang on the cable."""
+    """Values with every spring's place set to its point on the cable, even at zero force."""
     model = problem.unknowns.model
     if not model.n_springs:
         return values

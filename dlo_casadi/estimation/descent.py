@@ -28,32 +28,32 @@ from dlo_casadi.model.contact import forces_on_other_mesh
 
 # Longest step of a node along its derivative [rad]; beyond it the linearisation is poor.
 LONGEST_MOVE = 1.5
-# A step that lowers the objective by less has converged: one standard deviation of one parameter is
-# a decrease of 1/2.
+# Decrease of the objective below which a step counts as converged. For scale: one standard
+# deviation of one parameter is a decrease of 1/2.
 CONVERGED = 1e-4
-# Number of steps after which a descent has stalled if they gain less than one converged step may.
+# A descent has stalled if this many steps together gain less than one converged step may.
 STALLED = 4
 # Uphill steps allowed before backtracking; largest rise of the objective allowed.
 WATCHED, WORSE = 2, 3.0
 
 
 def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
-    """Levenberg-Marquardt from a problem's point, which is an equilibrium.
+    """Levenberg-Marquardt from a problem's point, which has to be an equilibrium.
 
     Parameters
     ----------
     fit : Fit
-        The problem, with its weights, and where to begin.
+        The problem, with its weights, and the starting point.
     steps : int
-        Iterations at most.
+        Maximum number of iterations.
     tolerance : float
         Decrease of the objective at which the fit has converged, see CONVERGED.
 
     Returns
     -------
     Fit
-        The minimum and whether it converged: a descent that has stalled, or has run out of
-        iterations, has not.
+        The minimum, and whether it converged. A descent that stalls or runs out of iterations
+        has not converged.
     """
     problem, point = fit.problem, fit.point
     damping, gains = 0.0, [np.inf] * STALLED
@@ -89,10 +89,10 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
 
 @dataclass(frozen=True)
 class Curvature:
-    """What Gauss-Newton leaves out of the Hessian of theta: residuals times their curvature.
+    """Part of theta's Hessian that Gauss-Newton neglects: residuals times their curvature.
 
-    Where a model lacks something, residuals are large, and Gauss-Newton steps go to and fro. A
-    secant update from gradients learns that part; it is used while it foretells gains better.
+    If a model lacks something, residuals are large and Gauss-Newton steps oscillate. A secant
+    update from gradients estimates this part; it is used while it predicts gains better.
 
     Parameters
     ----------
@@ -108,11 +108,11 @@ class Curvature:
 
     @classmethod
     def none(cls, size: int) -> Self:
-        """Of Gauss-Newton."""
+        """No correction: plain Gauss-Newton."""
         return cls(np.zeros((size, size)))
 
     def added(self, normal: Normal) -> Normal:
-        """Normal equations with it, if it is used and they stay convex."""
+        """Normal equations plus this part, if it is used and they stay convex."""
         if not self.used:
             return normal
         hessian = normal.hessian + self.matrix
@@ -121,7 +121,7 @@ class Curvature:
         return replace(normal, hessian=hessian) if convex else normal
 
     def after(self, step: FloatArray, before: Normal, ahead: Normal, gain: float) -> Self:
-        """Updated by a step of theta that gained so much of the objective."""
+        """Update after a step of theta that lowered the objective by `gain`."""
         change = ahead.gradient - before.gradient
         if step @ change <= 0:
             return self
@@ -138,9 +138,9 @@ class Curvature:
 
 
 def least_decrease(problem: Problem, point: Point, tolerance: float = CONVERGED) -> float:
-    """Decrease of the objective about a point that is worth a step.
+    """Decrease of the objective at a point below which a further step is not worthwhile.
 
-    Where the residual exceeds the noise, so does a standard deviation's decrease.
+    It grows with the residual's excess over the noise, as does one standard deviation's decrease.
     """
     return tolerance * max(1.0, point.data / max(problem.n_residuals, 1))
 
@@ -154,10 +154,10 @@ def _ahead(
     limit: float,
     more: int,
 ) -> Point | None:
-    """A point below a limit, in one step or with some more beyond one above it; else None.
+    """A point below a limit, by one step or by further steps from one above it; else None.
 
-    The valley of stiffness against rest curvature, whose product is what shapes know, is
-    curved: a full step along it leads up its side, the next one back to its bottom.
+    Shapes determine mainly the product of stiffness and rest curvature, so the objective has a
+    curved valley: a full step along it leads up its side, and the next one back to its bottom.
 
     References
     ----------
@@ -176,10 +176,10 @@ def _ahead(
 def _stepped(
     problem: Problem, point: Point, lin: Linearization, normal: Normal, damping: float
 ) -> Point | None:
-    """The point after a damped step within reach; None if some pose loses its equilibrium."""
+    """Point after a damped step within reach; None if some pose loses its equilibrium."""
     lower, upper = problem.unknowns.reach(point.theta)
     scale = np.maximum(np.diag(normal.hessian), 1e-12)
-    # A direction without any information (the place of a mass of zero) must not move.
+    # A direction without information (e.g. the place of a mass of zero) must not move.
     matrix = normal.hessian + damping * np.diag(scale) + NO_INFORMATION * np.eye(len(scale))
     step = -np.linalg.solve(matrix, normal.gradient)
     new = point.theta + step
@@ -197,7 +197,7 @@ def _bounded_step(
     matrix: FloatArray, gradient: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> FloatArray:
     """Minimise the quadratic model within bounds."""
-    # The matrix, a Schur complement, is positive but for rounding.
+    # The matrix, a Schur complement, is positive except for rounding.
     values, vectors = np.linalg.eigh(matrix)
     root = np.sqrt(np.maximum(values, NO_INFORMATION))
     factor, target = root[:, None] * vectors.T, -(vectors.T @ gradient) / root
@@ -217,17 +217,17 @@ def refit(
     values: Mapping[str, float] = MappingProxyType({}),
     steps: int = 40,
 ) -> Fit:
-    """Fit a similar model, or the same on another mesh, from a fit's minimum and with its weights.
+    """Fit a similar model, or another mesh, starting from a fit's minimum with its weights.
 
     Parameters
     ----------
     free : sequence of str, optional
         Names of the parameters to estimate; by default all but those that the fit keeps fixed.
     values : mapping, optional
-        Where parameters that the fit does not have start, and where those stay that are not
-        estimated, by name; by default as the fit has them, or nominal.
+        Start values by name of parameters that the fit does not have, and fixed values of those
+        that are not estimated; by default those of the fit, or nominal ones.
     steps : int
-        Iterations at most.
+        Maximum number of iterations.
 
     Raises
     ------
@@ -250,8 +250,8 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
     """Shapes of a problem's poses from those of a fit, on the problem's mesh.
 
     Poses that the fit did not need, because it carried no state, are predicted; beside a relaxed
-    fit that predicts none they begin at a first guess. Raises EstimationError if such a pose has no
-    equilibrium.
+    fit, which cannot predict, they start at a first guess. Raises EstimationError if such a pose
+    has no equilibrium.
     """
     known = {index: k for k, index in enumerate(fit.problem.indices)}
     own = fit.point.shapes
@@ -288,7 +288,7 @@ def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shape
 
 
 def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
-    """Multipliers in another model's order; what it has beside them begins at zero."""
+    """Multipliers in another model's order; those that only that model has start at zero."""
     if model.border_names == other.border_names:
         return shapes
     lam = np.zeros((len(shapes.lam), other.n_border))

@@ -32,20 +32,21 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 from dlo_casadi.thresholds import DIFFERENT, LACKING_SHARE, MESH_SHARE, RESTING_APART, RESTING_NOISE
 
-# Standard deviation of points over length by which a fit weighs them that meets them no better.
+# Std of points over length used as weight in a fit whose model cannot meet them any better.
 MISFIT_STD = 0.01
-# A first guess of an undeclared noise, only until it has been estimated.
+# First guess of an undeclared noise, used only until the noise has been estimated.
 FIRST_STD = 3e-4
-# Factor on the objective, from a mesh to the next finer one, at which a fit is stuck: of two poses
-# in space 20 elements left 280 and 40 left 6327, while two meshes of a fit differ by a few percent.
+# Growth of the objective from a mesh to the next finer one above which a fit counts as stuck: two
+# poses in space left 280 with 20 elements and 6327 with 40; usually meshes differ by a few percent.
 STUCK = 2.0
-# Turns per length, several times what heavy cables were measured to have, 0.1 to 0.3 1/m.
+# First std of each repeat's own rest curvature, in turns per length: several times that measured on
+# heavy cables, 0.1 to 0.3 1/m.
 FIRST_REST_TURNS = 0.05
 # Largest chi-square per degree of freedom at which a scatter from pose to pose explains a misfit:
-# turns of 0.06 rad, taken to first order, left 1.25.
+# clamp turns of 0.06 rad, treated to first order, left 1.25.
 EXPLAINED = 1.5
 FINEST_MESH = 160
-# Largest number of elements in the search for missing effects, which takes a hundred refits.
+# Maximum number of elements in the search for missing effects, which takes a hundred refits.
 SEARCH_MESH = 80
 
 
@@ -66,11 +67,11 @@ def fit_model(
     measured : sequence of MeasuredPose
         All poses in the order in which they were taken.
     std : float, optional [m]
-        Declared noise of one coordinate; estimated, with its correlation, when absent.
+        Declared noise of one coordinate; by default it is estimated, with its correlation.
     free : sequence of str, optional
         Names of the parameters to estimate; all by default.
     values : (n_parameters,), optional
-        Where the parameters start, or stay if they are not estimated; nominal by default.
+        Start values of the parameters, kept for those not estimated; nominal by default.
     readings : ReadingNoise, optional
         Noise of forces and moments on the fixtures; estimated by default.
 
@@ -95,7 +96,7 @@ def fit_model(
     noise = replace(noise, readings=readings or first_reading_noise(model))
     priors = Priors.of(tolerances, model)
     if count == 1:
-        # A single pose has no deviations of its own: its errors are those of the session.
+        # A single pose has no deviations of its own: its errors are the same as the session's.
         priors = replace(priors, scatter=SCATTER_FLOOR * priors.scatter)
     problem = Problem(unknowns, tuple(measured), noise, priors)
     theta = unknowns.pack(first, np.zeros(model.n_coefficients))
@@ -103,21 +104,21 @@ def fit_model(
     different = different_poses(measured, model.cable.length)
     doubtful = fit.residual_rms > SearchSettings.of(model).other_minima * model.cable.length
     if different >= DIFFERENT and fit.beyond_noise and doubtful:
-        # A fit that trusts each line to its noise bends rest shape and stiffness to whatever is
-        # left: search once more as if every repeat had a rest curvature of its own.
+        # A fit that trusts each line to its noise distorts rest shape and stiffness to fit whatever
+        # is left: search again with a rest curvature of its own for each repeat.
         scatter = PoseScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
         noise = fit.noise if std is not None and fit.noise.source == "estimated" else noise
         loose = replace(problem, noise=noise, priors=replace(priors, pose_scatter=scatter))
         near = fit_from(*begin(loose, theta))
         with suppress(EstimationError):
-            # What a point leaves must differ from repeat to repeat, and not as their shapes do.
+            # The rest of a point must vary between repeats, not systematically with their shapes.
             if near and errors_of(near, estimated=not near.noise.known, repeats=False)[1].std > 0:
                 return max(fit, refine(near, first=True), key=lambda found: found.log_evidence)
     return fit
 
 
 def at_random(fit: Fit) -> Fit | None:
-    """A fit that misfits, with what differs from pose to pose if that explains it; else None."""
+    """Refit of a misfit with a random effect from pose to pose, if that explains it; else None."""
     different = different_poses(fit.problem.history, fit.model.cable.length)
     if fit.noise.source != "misfit" or different < DIFFERENT:
         return None
@@ -133,10 +134,10 @@ def at_random(fit: Fit) -> Fit | None:
 
 
 def _searched(problem: Problem, theta: FloatArray) -> Fit:
-    """The minimum near the measured shapes, noise and scatters estimated.
+    """Minimum near the measured shapes, with noise and scatters estimated.
 
-    In space the search takes the points for less sure than they are: where an effect is missing,
-    shapes that are kept to a fraction of a millimetre allow no way to the minimum.
+    In space the search uses a larger standard deviation of the points: if an effect is missing,
+    shapes held to a fraction of a millimetre leave no path to the minimum.
     """
     cable, search = problem.unknowns.model.cable, SearchSettings.of(problem.unknowns.model)
     own = problem.unknowns.without_prior
@@ -151,7 +152,7 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
         fits.append(fit_from(*begin(loose, first)))
     best = min((fit for fit in fits if fit), key=lambda fit: fit.point.objective, default=None)
     if best is None:
-        # A model that lacks something is led to any stiffness: begin along equilibria of its own.
+        # If an effect is missing, any stiffness may result: start along the model's own equilibria.
         held = np.ones(len(theta), dtype=bool)
         best = fit_from(*begin(loose, problem.unknowns.off_bounds(theta), held), fixed=held)
     if best is None:
@@ -167,20 +168,20 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
 
 
 def misfits(fit: Fit) -> bool:
-    """Whether a fit leaves so much that its model lacks something."""
+    """Whether the residuals are so large that the model must lack something."""
     return fit.residual_rms > SearchSettings.of(fit.model).misfit * fit.model.cable.length
 
 
 def fit_to_misfit(near: Fit) -> Fit:
-    """Fit a model that lacks something, its points taken for no surer than it can meet them.
+    """Fit a model that lacks something, its points weighed by how well it can meet them.
 
-    Where an effect is missing, a fit to a fraction of a millimetre bends all that it may bend and
-    ends in folds of single poses.
+    If an effect is missing, a fit to a fraction of a millimetre distorts every free unknown and
+    ends where single poses lose their equilibrium (folds).
     """
     doubted = near.noise.doubted(MISFIT_STD * near.model.cable.length)
     noise = replace(doubted, source="misfit", before=near.noise)
     priors = Priors.of(near.problem.priors.tolerances, near.model)
-    # Ends that give way in single poses would take up what is missing, and predict worse.
+    # Ends that may deviate in each pose would absorb what is missing, and predict worse.
     priors = replace(priors, scatter=SCATTER_FLOOR * priors.scatter)
     return descend(near.reweighed(noise, priors))
 
@@ -191,14 +192,14 @@ def fit_to_misfit(near: Fit) -> Fit:
 def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
     """Fit the same model on another mesh, from a fit's minimum.
 
-    `modes`: slow displacements kept out of the noise estimate, if the noise is estimated.
+    `modes`: number of slow displacements kept out of the noise estimate, if noise is estimated.
     """
     model, moved = fit.model.with_mesh(n), None
     with suppress(EstimationError):
         moved = refit(fit, model)
     if moved is None or moved.point.objective > STUCK * fit.point.objective:
-        # The coarse mesh was too far off, or a pose loses its stability on the way to this one, so
-        # that no step leads on: start again from the measured shapes.
+        # The coarse mesh was too far off, or a pose loses its stability on the way to this mesh and
+        # no step succeeds: start again from the measured shapes.
         problem, known = fit.problem, fit.noise.before or fit.noise
         return fit_model(
             model,
@@ -215,7 +216,7 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
 def mesh_error(fit: Fit) -> float:
     """Largest RMS distance [m] between a pose on this mesh and on an infinitely fine one.
 
-    The difference to the mesh of half the element size, times 4/3: the error falls at least with
+    4/3 times the difference to a mesh of half the element size, as the error falls at least with
     the square of the element size (Richardson). Infinite if the fitted parameters have no
     equilibria nearby on the finer mesh.
     """
@@ -240,7 +241,7 @@ def fine_enough(
 ) -> tuple[Fit, float]:
     """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
 
-    Where an effect is missing, the mesh need not be much finer than what is missing.
+    If an effect is missing, the mesh error need only be small against the misfit.
     """
     while True:
         if fit.noise.source == "misfit":
@@ -249,22 +250,21 @@ def fine_enough(
             try:
                 fit = refine_mesh(fit, n, modes)
             except EstimationError:
-                # Its parameters have no equilibria near the measured shapes on a finer mesh.
+                # The parameters have no equilibria near the measured shapes on a finer mesh.
                 return fit, mesh_error(fit)
         error = mesh_error(fit)
         largest = finest if np.isfinite(error) else SEARCH_MESH
         allowed = allowed_mesh_error(fit)
         if error <= allowed or n >= largest:
             return fit, error
-        # Even; carefully: as if half of what lies above the second order were lost on a coarse
-        # mesh.
+        # Even; cautious: as if a coarse mesh lost half of the order above the second.
         order = 1 + ELEMENTS[fit.model.element].order / 2
         finer = n * np.clip((error / allowed) ** (1 / order), 1.2, 2.0)
         n = min(2 * int(np.ceil(finer / 2)), largest)
 
 
 def allowed_mesh_error(fit: Fit) -> float:
-    """Error of the mesh [m] that is far below the noise, or below what else is left."""
+    """Mesh error [m] that is far below the noise, or far below the remaining misfit."""
     left = LACKING_SHARE if fit.beyond_noise else MESH_SHARE
     return max(MESH_SHARE * fit.compared_std, left * fit.residual_rms)
 
@@ -273,10 +273,10 @@ def allowed_mesh_error(fit: Fit) -> float:
 
 
 def resting_height(problem: Problem) -> float | None:
-    """The lowest height [m] that measured shapes of several poses share, if there is one.
+    """Lowest height [m] that the measured shapes of several poses share, if there is one.
 
-    What lies on a table is at the same height in all poses, and nothing is below it. The lowest
-    place of a cable is not above its points and ends, and a smooth curve may pass below it.
+    Cables that lie on a table have the same lowest height in all poses. A cable's lowest place is
+    no higher than its lowest point or end; the smooth curve through them may pass below these.
     """
     model = problem.unknowns.model
     if not (any(model.gravity) and model.chain.kind.smooth):
@@ -299,7 +299,7 @@ def resting_height(problem: Problem) -> float | None:
 
 
 def on_planes(problem: Problem, theta: FloatArray) -> FloatArray:
-    """Theta (size,) whose effects without derivative where they vanish begin where shapes rest."""
+    """Theta (size,) in which effects without derivative at zero start where the shapes rest."""
     unknowns = problem.unknowns
     model, p = unknowns.model, unknowns.p(theta)
     asked = [x for x in model.effects if not x.gradual]

@@ -26,9 +26,9 @@ class Prediction:
     Parameters
     ----------
     seen : Observed
-        As camera and sensors would see it.
+        Predicted measurements of the camera and the sensors.
     rest : (n_rests,) [1/m]
-        Rest curvature that the pose finds.
+        Rest curvature before the pose.
     """
 
     equilibrium: Equilibrium
@@ -43,19 +43,19 @@ class Prediction:
 
 @dataclass(frozen=True)
 class MeasuredBranch:
-    """The equilibrium in which a pose was measured, where another one is predicted.
+    """The equilibrium in which a pose was measured, where a different one is predicted.
 
     Parameters
     ----------
     prediction : Prediction
-        Solved from the measured shape: no prediction any more, but what one would be if it knew
-        the branch.
+        Solved from the measured shape: not a prediction, but what the prediction would be if
+        the branch were known.
     branch : "ccw", "cw", "previous" or None
-        What the pose has to name for this equilibrium to be predicted; None if no name does.
+        Branch that the pose must name so that this equilibrium is predicted; None if none does.
     turns : 0.5, -0.5 or None
-        The same of a cable in space that is twisted the other way round, see `HeldPose`.
+        The same for a cable in space that is twisted the other way round, see `HeldPose`.
     other_side : bool
-        Whether it is a side of the cable, see `CableModel.tipped_by`, and the pose tells none.
+        Whether it is the other side, see `CableModel.tipped_by`, and the pose names no side.
     """
 
     prediction: Prediction
@@ -71,7 +71,7 @@ def predict_each(
     poses: Sequence[HeldPose],
     starts: Sequence[FloatArray | None] | None = None,
 ) -> list[Prediction | None]:
-    """Predict poses each of which is the first one; see `predict_poses`."""
+    """Predict poses, each as if it were the first one; see `predict_poses`."""
     solved = solve_equilibria(model, p, rest, poses, starts)
     kept = [j for j, eq in enumerate(solved) if isinstance(eq, Equilibrium)]
     found = [eq for eq in solved if isinstance(eq, Equilibrium)]
@@ -88,8 +88,8 @@ def predict_poses(
 ) -> list[Prediction | None]:
     """Predict poses in the order in which they are taken; None where there is no equilibrium.
 
-    Of several equilibria the stable one of lowest energy, unless the pose names a branch, or
-    continues the last one before it that has an equilibrium.
+    Of several equilibria the stable one of lowest energy is chosen, unless the pose names a branch
+    or continues the last pose before it that has an equilibrium.
 
     Parameters
     ----------
@@ -156,10 +156,10 @@ def stacked(equilibria: Sequence[Equilibrium]) -> Shapes:
 
 
 def predicted_shapes(problem: Problem, values: Values) -> Shapes:
-    """Shapes of a problem's poses as a user is told them, who knows their ends alone.
+    """Shapes of a problem's poses as predicted from their ends alone.
 
-    Where there is no prediction, or one on the other side (see `CableModel.tipped_by`), they are
-    those of `values`. A prediction takes 3 ms in the plane.
+    Where there is no prediction, or one on the other side (see `CableModel.tipped_by`), the shape
+    of `values` is kept. A prediction takes 3 ms in the plane.
     """
     shapes, p, rest = problem.state(values)
     model, history = problem.unknowns.model, [item.pose for item in problem.history]
@@ -183,14 +183,14 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
 
 
 def _tells_no_side(model: CableModel, pose: HeldPose) -> bool:
-    """Whether a cable has two sides, see `CableModel.tipped_by`, and the pose names neither."""
+    """Whether a cable has two sides, see `CableModel.tipped_by`, and the pose names none."""
     return model.tipped_by is not None and not pose.branch and not pose.turns
 
 
 def predict_other_side(
     model: CableModel, p: FloatArray, pose: HeldPose, known: Prediction
 ) -> Prediction | None:
-    """What a prediction would be on the other side, see `Equilibrium`; None where there is none."""
+    """Prediction on the other side, see `Equilibrium`; None where there is none."""
     other = known.equilibrium.other_side
     return None if other is None else _seen(model, p, known.rest, [pose], [other])[0]
 
@@ -205,9 +205,9 @@ def measured_elsewhere(
 ) -> list[Prediction | None]:
     """Stable equilibria in which poses were measured, where others are predicted; else None.
 
-    Each pose is solved from its measured shape. It is another equilibrium where headings differ,
-    and the measured one where it is nearer to the points. `fitted`: nodes (n_nodes, coordinates) of
-    the poses whose shapes a fit has found, by name; others start from the chords of their points.
+    Each pose is solved from its measured shape. The result counts if its headings differ from the
+    prediction and it is nearer to the points. `fitted`: nodes (n_nodes, coordinates) of fitted
+    poses, by name; the other poses start from the chords of their points.
     """
     fits, lines = fitted or {}, [item.traced for item in measured]
     starts = [
@@ -231,7 +231,7 @@ def measured_elsewhere(
 
 
 def _along_line(model: CableModel, p: FloatArray, line: MeasuredPose) -> list[FloatArray | None]:
-    """Nodes along a measured line; between two clamps in space twisted either way round."""
+    """Nodes along a measured line; in space between two clamps, one for each way of twist."""
     if not line.readable:
         return [None]
     pose = line.pose
@@ -251,7 +251,7 @@ def measured_branches(
     predictions: Sequence[Prediction | None],
     fitted: Mapping[str, FloatArray] | None = None,
 ) -> list[MeasuredBranch | None]:
-    """What `measured_elsewhere` finds, with the branch that a pose has to name for it."""
+    """`measured_elsewhere`, with the branch that a pose has to name for that equilibrium."""
     others = measured_elsewhere(model, p, rest, measured, predictions, fitted)
     told = _told(model, p, [item.pose for item in measured], others)
     out: list[MeasuredBranch | None] = []
@@ -279,7 +279,7 @@ def _square(prediction: Prediction, item: MeasuredPose) -> float:
 def _told(
     model: CableModel, p: FloatArray, poses: Sequence[HeldPose], others: Sequence[Prediction | None]
 ) -> list[HeldPose | None]:
-    """Poses that tell the branch or the turns for which others are predicted, where one does."""
+    """Poses with the branch or turns for which the other equilibrium is predicted, if any."""
     ways = [
         [] if found is None or pose.turns else ways_of(model, pose)
         for pose, found in zip(poses, others, strict=True)
@@ -305,7 +305,7 @@ def _continues(
     found: Prediction,
     last: tuple[HeldPose, FloatArray] | None,
 ) -> bool:
-    """Whether an equilibrium is that to which the pose before it, as measured, leads."""
+    """Whether continuing the pose before, as measured, leads to this equilibrium."""
     if last is not None:
         with suppress(EquilibriumError):
             eq = continued(model, p, found.rest, pose, *last)
@@ -316,8 +316,8 @@ def _continues(
 def noise_distance(measured: Sequence[MeasuredPose], std: float) -> float:
     """RMS distance [m] of all measured points from the true curve, by noise of one coordinate.
 
-    Of white points sqrt(d - 1) `std` [m] for a line, which is compared across, and sqrt(d) `std`
-    for markers.
+    For white noise sqrt(d - 1) `std` [m] for a line, which is compared across its tangent, and
+    sqrt(d) `std` for markers.
     """
     found = [item.noise_distances for item in measured if item.readable]
     return std * float(np.sqrt((np.concatenate(found) ** 2).mean()))

@@ -5,11 +5,11 @@
         + 1/2 (theta - mean)^T P (theta - mean)
     subject to every pose being an equilibrium
 
-with the residuals e_j of the pose's sensors, of a line N_j (x_j - r_j(s_j)). The projections s_j of
-its points move with the curve; there the normal distance does not change to first order with s, so
-that the Jacobian at fixed projections is the exact one. A Schur complement eliminates the
-deviations of a pose. A problem never changes: its weights W_j are taken at some values once
-(`Problem.weighed`), or handed over from another problem of the same poses with `replace`.
+with the residuals e_j of the pose's sensors; for a line N_j (x_j - r_j(s_j)). The projections s_j
+of its points move with the curve, but the normal distance is stationary in s there, so the Jacobian
+at fixed projections is exact. A Schur complement eliminates a pose's deviations. A problem never
+changes: its weights W_j are computed once at some values (`Problem.weighed`), or taken over from
+another problem of the same poses with `replace`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ NO_SCATTER = PoseScatter()
 
 @dataclass(frozen=True)
 class Values:
-    """Unknowns and shapes, in equilibrium or not.
+    """Unknowns and shapes, whether in equilibrium or not.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Values:
 
 @dataclass(frozen=True)
 class Point(Values):
-    """Everything at one value of the unknowns.
+    """Unknowns and shapes with the objective and the residuals there.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Point(Values):
     data : float
         Sum of squares of the whitened residuals alone.
     residuals : list of (R_j,)
-        These, whitened, of the fitted poses.
+        Whitened residuals of the fitted poses.
     """
 
     objective: float
@@ -88,13 +88,13 @@ class Linearization:
     by_theta : list of (R_j, size)
         Derivative of the residuals.
     by_deviation : list of (R_j, n_deviations)
-        By the pose's own deviations.
+        Derivative by the pose's own deviations.
     by_all : list of (R_j, fitted poses x n_deviations)
-        By those of all fitted poses, where poses leave a state behind; else empty.
+        Derivative by the deviations of all fitted poses, if poses carry a state; else empty.
     raw : list of (R_j,)
         Residuals, not whitened.
     raw_directions : list of (R_j, size + n_deviations)
-        Their derivatives, not whitened.
+        Derivatives of the raw residuals.
     shapes : Tangents
         Derivatives of the equilibria, see `BatchEquilibrium.directions`.
     """
@@ -112,8 +112,8 @@ class Linearization:
 class Normal:
     """Normal equations with the deviations eliminated: hessian @ step = -gradient.
 
-    `inner`: of each fitted pose the block of its own deviations, their derivative by theta and
-    their gradient; of no size where a model has no deviations.
+    `inner`: for each fitted pose the block of its own deviations, its coupling to theta, and its
+    gradient; of size zero if the model has no deviations.
     """
 
     hessian: FloatArray
@@ -121,7 +121,7 @@ class Normal:
     inner: list[tuple[FloatArray, FloatArray, FloatArray]]
 
     def own_covariances(self, covariance: FloatArray) -> list[FloatArray]:
-        """Covariance of each fitted pose's own deviations, by that of theta (size, size)."""
+        """Covariance of each fitted pose's own deviations, given that of theta (size, size)."""
         out: list[FloatArray] = []
         for block, cross, _ in self.inner:
             inverse = np.linalg.inv(block)
@@ -131,7 +131,7 @@ class Normal:
 
     @property
     def promised(self) -> float:
-        """Decrease of the objective that an undamped step promises, with the deviations' own."""
+        """Decrease of the objective predicted for an undamped step, deviations included."""
         matrix = self.hessian + NO_INFORMATION * np.eye(len(self.hessian))
         shared = self.gradient @ np.linalg.solve(matrix, self.gradient)
         own = (slope @ np.linalg.solve(block, slope) for block, _, slope in self.inner)
@@ -140,7 +140,7 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """What is known beside the measurements, and how far poses differ from one another.
+    """What is known besides the measurements, and how much poses differ from one another.
 
     Parameters
     ----------
@@ -149,10 +149,10 @@ class Priors:
     roughness_std : float
         Prior of the rest curvature, see `Unknowns.prior`.
     pose_scatter : PoseScatter
-        Rest curvature of each repeat's own. None by default: cables come back to the same shape,
-        unless the data tell otherwise.
+        Rest curvature of each repeat's own. By default none: the cable returns to the same shape
+        unless the data show otherwise.
     told : tuple of (row (size,), value)
-        What else is known of theta: row @ theta is `value`, with a standard deviation of one.
+        Other knowledge of theta: row @ theta is `value`, with a standard deviation of one.
     """
 
     tolerances: Tolerances
@@ -163,7 +163,7 @@ class Priors:
 
     @classmethod
     def of(cls, tolerances: Tolerances, model: CableModel) -> Priors:
-        """Priors of a model's poses that differ as much as the tolerances allow."""
+        """Priors for a model's poses, which differ as much as the tolerances allow."""
         return cls(tolerances, tolerances.deviation(model))
 
 
@@ -174,12 +174,12 @@ class Problem:
     Parameters
     ----------
     history : sequence of MeasuredPose
-        All poses in order; those held out or unreadable are among the problem's own poses,
-        `measured`, only if the model carries a state. The poses that are fitted are
+        All poses in order. Those held out or unreadable are among the problem's own poses,
+        `measured`, only if the model carries a state. The fitted poses are
         `history[k] for k in fitted`, the same as `measured[j] for j in used`.
     weights : tuple of (R_j, R_j), optional
-        Whitening matrices W_j of the fitted poses, see `weighed`. Objectives of problems compare
-        only if they have the same ones.
+        Whitening matrices W_j of the fitted poses, see `weighed`. Objectives of two problems can
+        be compared only if both have the same weights.
     """
 
     unknowns: Unknowns
@@ -190,21 +190,21 @@ class Problem:
 
     @cached_property
     def fitted(self) -> list[int]:
-        """Places in the history of the poses that are fitted."""
+        """Indices of the fitted poses in the history."""
         return [k for k, x in enumerate(self.history) if x.readable and not x.held_out]
 
     @property
     def indices(self) -> list[int]:
-        """Places in the history of the problem's own poses.
+        """Indices of the problem's own poses in the history.
 
-        Those that are not fitted matter only where they leave something behind in the cable.
+        Poses that are not fitted are included only if they change the state of the cable.
         """
         coupled = self.unknowns.model.has_state
         return list(range(len(self.history))) if coupled else self.fitted
 
     @cached_property
     def used(self) -> list[int]:
-        """Places among the problem's own poses of those that are fitted."""
+        """Indices of the fitted poses among the problem's own poses."""
         coupled = self.unknowns.model.has_state
         return self.fitted if coupled else list(range(len(self.fitted)))
 
@@ -220,7 +220,7 @@ class Problem:
 
     @cached_property
     def _prior(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and precision of the prior of theta, further measurements of it included."""
+        """Mean and precision of the prior of theta, including what else is known (`told`)."""
         mean, precision = self.unknowns.prior(self.priors.roughness_std)
         told = self.priors.told
         if told:
@@ -249,13 +249,13 @@ class Problem:
     def n_residuals(self) -> int:
         """Number of residuals of the fitted poses.
 
-        In the plane one of a point, two of a marker; one of each component of a reading.
+        In the plane one per point and two per marker; one per component of a wrench measurement.
         """
         return sum(self.measured[j].n_residuals for j in self.used)
 
     @property
     def observed_size(self) -> int:
-        """Numbers that residuals depend on: those of a measured curve, and of readings."""
+        """Number of quantities the residuals depend on: the measured curve's and the wrenches'."""
         model = self.unknowns.model
         curve = (model.chain.n + 1) * int(functions_of(model).station.size1_out(0))
         return curve + int(functions_of(model).readings.size1_out(0))
@@ -264,15 +264,15 @@ class Problem:
 
     @property
     def whitening(self) -> tuple[FloatArray, ...]:
-        """The weights, which have to be known."""
+        """The weights; an error if they have not been computed."""
         assert self.weights is not None, "Problem.weighed has not been called"
         return self.weights
 
     def weighed(self, values: Values) -> Problem:
-        """Return the problem with the weights of the residuals at these values.
+        """Return the problem with the weights of the residuals computed at these values.
 
-        The covariance of pose j is that of its noise plus E_j E_j^T, where E_j is what a standard
-        deviation of each mode of its own rest curvature does to the residuals.
+        The covariance of pose j is that of its noise plus E_j E_j^T. Column k of E_j is the change
+        of the residuals by one standard deviation of mode k of the pose's own rest curvature.
         """
         weights = [
             self.measured[j].whitening(self.noise, s)
@@ -287,7 +287,7 @@ class Problem:
         return replace(self, weights=tuple(weights))
 
     def moved_by(self, values: Values, scatter: PoseScatter) -> list[FloatArray]:
-        """Change (R_j, q) of the fitted residuals by a unit of what each pose has of its own."""
+        """Change (R_j, q) of the fitted residuals by a unit of each random quantity of a pose."""
         shapes, p, rest = self.state(values)
         model = self.unknowns.model
         larger = BatchEquilibrium(scatter.within(model), self.equilibria.poses)
@@ -298,7 +298,7 @@ class Problem:
         return [self.measured[j].linearized(seen[j][0], s, seen[j][1])[1] for j, s in places]
 
     def own_errors(self, values: Values) -> list[FloatArray]:
-        """The same by one standard deviation of each; (R_j, 0) where the cable repeats."""
+        """`moved_by` for one standard deviation of each; (R_j, 0) if the cable repeats."""
         scatter = self.priors.pose_scatter
         if scatter.std == 0:
             return [np.zeros((self.measured[j].n_residuals, 0)) for j in self.used]
@@ -317,7 +317,7 @@ class Problem:
     def located(self, values: Values, seen: list[Observed]) -> list[FloatArray]:
         """Arc lengths (K_j,) [m] at which the fitted poses' points are compared, near those given.
 
-        `seen` are all poses.
+        `seen` holds the measurements predicted for all poses.
         """
         places = zip(self.used, values.projections, strict=True)
         return [self.measured[j].located(seen[j], guess) for j, guess in places]
@@ -341,7 +341,7 @@ class Problem:
         return Point(values.theta, values.shapes, moved, objective, data, residuals)
 
     def objective(self, values: Values, residuals: list[FloatArray]) -> tuple[float, float]:
-        """Half the sum of squares, priors included, and that of the whitened residuals alone."""
+        """Half the sum of squares, priors included; whole one of the whitened residuals alone."""
         data = float(sum(white @ white for white in residuals))
         gap = values.theta - self.mean
         used = values.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
@@ -349,7 +349,7 @@ class Problem:
         return (data + prior) / 2, data
 
     def balanced(self, values: Values, **options: Any) -> Point | None:
-        """The objective at equilibria of all poses near some values; None if a pose has none there.
+        """Objective at equilibria of all poses near some values; None if a pose has none there.
 
         `options`: of `BatchEquilibrium.solve_or_descend`.
         """
@@ -405,7 +405,7 @@ class Problem:
         return Normal(hessian, gradient, inner)
 
     def step_equations(self, point: Values, lin: Linearization) -> Normal:
-        """Those of a descent: where poses leave a state behind, a deviation moves all later ones.
+        """Normal equations of a descent: with a state, a deviation also moves all later poses.
 
         `inner` has one block, of all fitted poses' deviations.
         """
@@ -421,7 +421,7 @@ class Problem:
         return Normal(hessian, gradient, [(block, cross, slope)])
 
     def moved(self, along: Tangents, normal: Normal, step: FloatArray) -> tuple[Vector, FloatArray]:
-        """How shapes, one column, and deviations (m, n_deviations) move with a step of theta."""
+        """Change of shapes (one column) and deviations (m, n_deviations) by a step of theta."""
         own = np.zeros((self.equilibria.m, len(self.equilibria.used_deviations)))
         found = [-np.linalg.solve(b, cross @ step + slope) for b, cross, slope in normal.inner]
         own[self.used] = np.reshape(found, (len(self.used), -1))
@@ -435,7 +435,7 @@ class Problem:
 
 
 def _solved(block: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of normal equations; an `EstimationError` at a fold, where shapes have no slope."""
+    """Solution of normal equations; `EstimationError` at a fold, where it is not finite."""
     try:
         return np.asarray(np.linalg.solve(block, right))
     except np.linalg.LinAlgError as error:

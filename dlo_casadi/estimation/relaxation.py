@@ -1,17 +1,17 @@
-"""Shapes, forces and parameters at once, the balance of forces a penalty.
+"""Fit of shapes, forces and parameters at once, with the balance of forces as a penalty.
 
     min over theta and of every pose its nodes, multipliers and deviations
         1/2 sum_j |W_j e_j|^2 + 1/2 sum_j |deviation_j / std|^2
         + 1/2 (theta - mean)^T P (theta - mean) + 1/2 sum_j |S F_j|^2 / softness^2
 
-F_j is the gradient of the Lagrangian of pose j, S its scale: h / EI for the bending moment that is
-left over at a node, h / GJ for a twisting one, so that S F is the angle [rad] by which the node
-would turn. The measured shapes fix the nodes, in which the balance is linear in forces, loads and
-1 / EI: no equilibrium has to be known, nor a stiffness. Steps are taken in these, the compliances
-and forces and loads per stiffness: those in log EI and newtons are refused nearly everywhere where
-a stiffness is 50 times off. The softness then falls to nothing. Where
-the model lacks something it may be fixed at a size at which the shapes are still those measured:
-what is left over of the balance there is what the model lacks.
+F_j is the gradient of the Lagrangian of pose j. S scales it to the angle [rad] by which a node
+would turn: h / EI for an unbalanced bending moment at a node, h / GJ for a twisting moment. The
+measured shapes fix the nodes, and then the balance is linear in forces, loads and 1 / EI: neither
+an equilibrium nor a stiffness has to be known. Steps are taken in compliances and in forces and
+loads per stiffness; steps in log EI and newtons are nearly always refused if a stiffness is 50
+times off. The softness is then reduced to nearly zero. If the model lacks something, the softness
+can be kept at a value at which the shapes are still those measured: the remaining imbalance is
+then what the model lacks.
 
 References
 ----------
@@ -37,32 +37,32 @@ from dlo_casadi.rod.band import Vector
 # between 12 markers of 0.3 mm on 1 m; the last leaves equilibria to Newton's method.
 SOFTNESS = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 # Error of an end condition that weighs as much as a unit of the balance, in lengths or [rad]. With
-# 1e-5 instead, whatever the softness, steps were refused because the conditions are curved.
+# 1e-5 at every softness, steps were refused because the conditions are curved.
 END = 1 / 30
-# Gap [lengths] that counts as much as a force of the weight in whether a node touches: with 0.01 or
-# 0.03 three fits of cables on planes reach the noise, with 0.3 one does not. Rounding of the corner
-# between both [lengths].
+# Gap [lengths] that counts as much as a force of the cable's weight in deciding whether a node
+# touches. Evidence: with 0.01 or 0.03 three fits of cables on planes reach the noise, with 0.3 one
+# does not. Rounding of the corner between gap and force [lengths].
 AT_A_DISTANCE, SHARP = 0.03, 1e-9
 # Longest step of a node [rad]; largest change of the logarithm of a stiffness in one step.
 LONGEST, LARGEST = 0.7, 1.0
-# First and smallest damping of the nodes [1/rad]; share of it for the unknowns of the fit.
+# First and smallest damping of the nodes [1/rad]; damping of the fit's unknowns as a share of it.
 FIRST_DAMPING, LEAST_DAMPING, OF_UNKNOWNS = 1.0, 0.1, 0.01
-# Maximum number of trials of a step, each with ten times the damping of the one before.
+# Maximum number of trials of a step; each has ten times the damping of the one before.
 REFUSED = 6
-# Maximum number of iterations at each softness; relative decrease below which they end.
+# Maximum number of iterations at each softness; they end below this relative decrease.
 STEPS, CONVERGED = 20, 5e-3
 
 
 @dataclass(frozen=True)
 class _Linearized:
-    """Rows of a Gauss-Newton step: by a pose's own unknowns, its state, theta, last their target.
+    """Rows of a Gauss-Newton step: derivatives by a pose's unknowns, its state, theta; then target.
 
     Parameters
     ----------
     poses : list of (n_j, own + r + size + 1)
-        Of each pose; the balance of forces first, its rows in the order of the unknowns.
+        One array per pose; the balance of forces comes first, in the order of the unknowns.
     states : list of (r, own + r + size + 1)
-        Change of each pose's state by the unknowns of the pose before; r is 0 without a state.
+        Derivatives of each pose's state by the unknowns of the pose before; r = 0 without a state.
     prior : (size, size + 1)
     """
 
@@ -73,9 +73,9 @@ class _Linearized:
 
 @dataclass(frozen=True)
 class _Reduced:
-    """Triangles of a Gauss-Newton step: of each pose's own unknowns, and what is left for theta.
+    """Triangular factors of a Gauss-Newton step: each pose's own unknowns, and the rest for theta.
 
-    With the states by what is free, their target left out.
+    It also holds the states' derivatives by the free unknowns, without their target.
     """
 
     own: list[FloatArray]
@@ -85,9 +85,9 @@ class _Reduced:
 
 @dataclass(frozen=True)
 class Relaxation:
-    """A batch problem whose balance of forces is a penalty of a softness [rad].
+    """A batch problem in which the balance of forces is a penalty with a softness [rad].
 
-    The problem has its weights. A state, the rest strains, is carried from pose to pose.
+    The problem has to be weighed. Poses may carry a state, the rest strains, to the next pose.
     """
 
     problem: Problem
@@ -97,7 +97,7 @@ class Relaxation:
 
     @cached_property
     def _counts(self) -> tuple[int, int, int, int, int]:
-        """Numbers of a pose's increments, these and multipliers, and deviations, and state, all."""
+        """Number of a pose's increments; plus multipliers; plus deviations; plus state; and all."""
         equilibria = self.problem.equilibria
         a, model = equilibria.assembly, self.problem.unknowns.model
         nodes = a.n * a.b
@@ -106,10 +106,10 @@ class Relaxation:
         return nodes, nodes + a.k, own, known, known + self.problem.unknowns.size
 
     def _stiffness(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Logarithms of the stiffnesses that scale the nodes' rows (n b,), and these by p.
+        """Log stiffnesses (n b,) that scale the nodes' rows, and their derivatives by p.
 
-        Torsional, or bending as it is at one turn per length: where the section softens its
-        stiffness at rest may be anything.
+        The torsional stiffness, or the bending stiffness at one turn per length: if the section
+        softens, its stiffness at rest may have any value.
         """
         model, p = self.problem.unknowns.model, self.problem.unknowns.p(theta)
         log, by_p = self._bent(theta)
@@ -136,7 +136,7 @@ class Relaxation:
 
     @cached_property
     def _assembly(self) -> Assembly:
-        """In which forces of obstacles are felt wherever they are."""
+        """Assembly in which forces of obstacles act whatever the gaps."""
         return self.problem.equilibria.assembly.felt_everywhere()
 
     @cached_property
@@ -148,12 +148,12 @@ class Relaxation:
     def _complementarity(
         self, left: FloatArray, shapes: Shapes
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What gaps g >= 0 and forces f >= 0 leave of f g = 0: (m, K) [m].
+        """Residual of f g = 0 for gaps g >= 0 and forces f >= 0: (m, K) [m].
 
             sqrt(g^2 + (c f)^2) - g - c f
 
-        It has a slope where neither holds, so that a force may grow at a distance. Its derivatives
-        along -g and f follow. `left`: the rows of all conditions, those of contacts -g.
+        Its slope is not zero where neither is zero, so a force may grow at a distance. Its
+        derivatives along -g and f follow. `left`: rows of all conditions; those of contacts are -g.
 
         References
         ----------
@@ -168,7 +168,7 @@ class Relaxation:
     # ---- evaluation --------------------------------------------------------------------------
 
     def objectives(self, values: Values) -> tuple[FloatArray, float]:
-        """Twice the objective: what each pose (m,) has in it, and the prior."""
+        """Twice the objective: the share of each pose (m,), and that of the prior."""
         problem = self.problem
         shapes = values.shapes
         given = problem.equilibria.given(*problem.state(values))
@@ -190,12 +190,12 @@ class Relaxation:
         return total if np.isfinite(total) else np.inf
 
     def normal(self, values: Values) -> Normal:
-        """Gauss-Newton normal equations of theta, all of the poses' own unknowns eliminated."""
+        """Gauss-Newton normal equations of theta, with the poses' own unknowns eliminated."""
         rows = self._reduced(self._linearized(values), 0.0).shared
         return Normal(rows[:, :-1].T @ rows[:, :-1], -rows[:, :-1].T @ rows[:, -1], [])
 
     def _along(self, values: Values, given: Inputs) -> Tangents:
-        """Every unknown of a pose on its own, then its state, then theta."""
+        """Directions: each own unknown of a pose, then of its state, then of theta."""
         problem = self.problem
         unknowns, equilibria, model = problem.unknowns, problem.equilibria, problem.unknowns.model
         a, m = equilibria.assembly, equilibria.m
@@ -217,21 +217,21 @@ class Relaxation:
         return Tangents(x, lam, p, rest, deviation)
 
     def _forces(self, values: Values) -> FloatArray:
-        """Multipliers (m, k), which grow with the stiffness; zero in the columns of places."""
+        """Multipliers (m, k), which scale with the stiffness; zero in the columns of places."""
         return values.shapes.lam * self.problem.unknowns.model.are_multipliers
 
     @cached_property
     def _are_forces(self) -> BoolArray:
-        """Which deviations (used,) are forces on the cable, and grow likewise."""
+        """Whether each deviation (used,) is a force on the cable, which scales with stiffness."""
         model, used = self.problem.unknowns.model, self.problem.equilibria.used_deviations
         names = {name for effect in model.effects for name in effect.per_pose(model.cable)}
         return np.array([model.deviation_names[k] in names for k in used], dtype=bool)
 
     def _growth(self, values: Values) -> FloatArray:
-        """Change (q,) of the logarithm of the bending stiffness along a pose's unknowns and theta.
+        """Change (q,) of log bending stiffness along a pose's unknowns and theta.
 
-        All forces grow with it, so that the balance of what is measured stays as it is. It is the
-        stiffness of a bent section: where that softens, EI may grow and its moments stay.
+        All forces scale with this stiffness, so the balance at the measured shapes does not change.
+        It is taken of the bent section: if that softens, EI may grow while its moments stay.
         """
         unknowns = self.problem.unknowns
         slope = self._bent(values.theta)[1] @ unknowns.slopes(values.theta)
@@ -244,7 +244,7 @@ class Relaxation:
         return float(log), np.array(by_p).ravel()
 
     def _states(self, values: Values, given: Inputs, along: Tangents) -> list[FloatArray]:
-        """Change of each pose's state along the unknowns of the pose before, see `_Linearized`."""
+        """Change of each pose's state by the unknowns of the pose before, see `_Linearized`."""
         problem = self.problem
         own, known, q = self._counts[2:]
         states = np.zeros((problem.equilibria.m, known - own, q + 1))
@@ -256,7 +256,7 @@ class Relaxation:
         return list(states)
 
     def _linearized(self, values: Values) -> _Linearized:
-        """Derivatives and residuals of all that the objective holds."""
+        """Derivatives and residuals of all terms of the objective."""
         problem = self.problem
         equilibria = problem.equilibria
         nodes, _, _, known, _ = self._counts
@@ -295,9 +295,9 @@ class Relaxation:
         damping: float,
         fixed: BoolArray | None = None,
     ) -> _Reduced:
-        """Orthogonal elimination of the poses' own unknowns, and of their states: the last first.
+        """Orthogonal elimination of each pose's own unknowns and state, from the last pose on.
 
-        What a pose leaves tells of its state, which is what the pose before has left behind.
+        The rest of a pose's rows depends on its state, hence on the unknowns of the pose before.
         """
         nodes, border, own, known, q = self._counts
         free = np.ones(q - known, dtype=bool) if fixed is None else ~fixed
@@ -305,7 +305,7 @@ class Relaxation:
         model = self.problem.unknowns.model
         damped = np.eye(border, q + 1) * max(damping, NO_INFORMATION)
         damped[nodes:] *= NO_INFORMATION
-        # A force of contact as its gap, in lengths: where neither holds nothing else bounds a step.
+        # Damp a contact force as its gap, in lengths: nothing else bounds it if neither is zero.
         of_contact = damping * gap_per_force(model, AT_A_DISTANCE) / model.cable.length
         damped[self._contacts, self._contacts] += of_contact * np.eye(border - nodes - model.n_lam)
         triangles: list[FloatArray] = []
@@ -340,7 +340,7 @@ class Relaxation:
     def solve(self, values: Values, fixed: BoolArray | None = None, steps: int = STEPS) -> Values:
         """Levenberg-Marquardt from any values.
 
-        `fixed` (size,): entries of theta that stay where they are; none by default.
+        `fixed` (size,): entries of theta that do not change; none by default.
         """
         damping, least = FIRST_DAMPING, self.objective(values)
         for _ in range(steps):
@@ -364,7 +364,7 @@ class Relaxation:
         return values
 
     def _scaled(self, linearized: _Linearized, values: Values) -> _Linearized:
-        """Rows of a step in which loads grow with the bending stiffness, as all forces do."""
+        """Rows in scaled steps: loads grow with the bending stiffness, as all forces do."""
         unknowns = self.problem.unknowns
         if not unknowns.are_loads.any():
             return linearized
@@ -391,7 +391,7 @@ class Relaxation:
         nodes, border, own, known, _ = self._counts
         free = np.ones(unknowns.size, dtype=bool) if fixed is None else ~fixed
         lower, upper = (end - values.theta for end in unknowns.reach(values.theta, LARGEST))
-        # Steps of a stiffness are those of its compliance, in which the balance is linear.
+        # Step a stiffness by its compliance, in which the balance is linear.
         stiff = np.isin(unknowns.names, STIFFNESSES)
         lower[stiff], upper[stiff] = (-np.expm1(-end[stiff]) for end in (lower, upper))
         step = np.zeros(unknowns.size)
@@ -425,7 +425,7 @@ class Relaxation:
 
 
 def _bounded(rows: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Least squares of stacked rows, their target last, within bounds."""
+    """Least squares within bounds, of stacked rows whose last column is the target."""
     step = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-12)[0]
     if np.all(step >= lower) and np.all(step <= upper):
         return np.asarray(step)

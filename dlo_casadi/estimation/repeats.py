@@ -1,18 +1,18 @@
 """Poses taken more than once, and cables that do not come back to the same shape.
 
-What differs between repeats of a pose no model can explain: it is pure error. Where many poses
-differ, every repeat has something of its own instead. Most often a rest curvature,
+Differences between repeats of a pose are pure error: no model can explain them. If there are many
+different poses, each repeat has a random quantity of its own. Most often it is a rest curvature,
 
     kappa_j(s) = kappa_0(s) + std sum_k sqrt(v_k) c_jk f_k(s),    c_jk ~ N(0, 1)
     f_0 = 1, f_k = sqrt(2) cos(k pi s / L),    v_k ~ exp(-(k pi l / L)^2 / 2),    sum_k v_k = 1
 
-which friction between strands and set leave; or moments of pins, turns of clamps, places of the
-end, lengths: the likeliest. To first order it moves the residuals of pose j by std E_j c_j, so that
-their covariance is that of the noise plus std^2 E_j E_j^T.
+left by friction between strands and by set. It may also be moments of pins, turns of clamps, places
+of the end, or lengths: the likeliest is chosen. To first order it changes the residuals of pose j
+by std E_j c_j, so their covariance is that of the noise plus std^2 E_j E_j^T.
 
-A model that lacks something leaves residuals, too, but alike in poses that are alike. So a second
-part, correlated over the poses' shapes, takes what is systematic while the size of the random one
-is estimated:
+A model that lacks something leaves residuals, too, but they are alike in poses that are alike. A
+second part, correlated over the poses' shapes, therefore absorbs what is systematic while the size
+of the random part is estimated:
 
     cov(c_j, c_k) = std^2 delta_jk + systematic^2 exp(-d_jk^2 / (2 range^2))
 
@@ -48,37 +48,37 @@ from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE, SIGNIFICANCE
 
 # Share of the length beside each fixture that is left out: repeats agree where they are held.
 _BESIDE_FIXTURES = 0.02
-# Largest difference of ends [lengths] and clamps [rad] of two poses that are held in the same way:
-# the shape of any cable then moves by about this share of its length at most.
+# Largest difference of ends [lengths] and clamps [rad] between poses that count as held alike: the
+# shape of any cable then changes by at most about this share of its length.
 NEARLY = 1e-3
-# Of the mean of repeats, a polyline.
+# Number of nodes of the mean of repeats, a polyline.
 _NODES = 201
-# Ranges of what is systematic that are tried, shares of the RMS distance of the poses' shapes.
+# Trial ranges of the systematic part, as shares of the RMS distance between the poses' shapes.
 RANGES = (0.25, 1.0)
-# Decrease of -2 log likelihood from which a size is not taken as zero: at that bound 5 % exceed it
-# by chance. At 0.5 % the scatter of 3 of 17 simulated cables that do not repeat was taken as none,
-# for decreases of 3.5 to 5.9; the stiffness of one of them was two standard deviations off.
+# Decrease of -2 log likelihood above which a size counts as nonzero: chance exceeds it in 5 % of
+# cases. Evidence: at 0.5 %, 3 of 17 simulated cables that do not repeat were judged to repeat
+# (decreases 3.5 to 5.9), and the stiffness of one of them was two standard deviations off.
 TELLING = float(chdtri(1, 0.1))
 # Maximum number of poses used, evenly spaced.
 MOST_POSES = 40
-# Smallest and largest size in units of the first guess that are looked at.
+# Smallest and largest size searched, in units of the first guess.
 _LOWEST, _HIGHEST = np.log(1e-4), np.log(1e2)
 
 
 def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | None:
     """RMS distance [m] of a fit pose from the mean of the others held in the same way.
 
-    The floor of any prediction of the next one; None where no pose was taken twice.
+    No prediction of the next pose can be better; None if no pose was repeated.
     """
     squares = [(gaps**2).sum(axis=2).mean(axis=1) for gaps, _ in _gaps(measured, length)]
     return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
 
 
 def repeat_std(measured: Sequence[MeasuredPose], length: float, noise: float) -> float:
-    """RMS of a coordinate [m] across the cable of what repeats of one pose differ by.
+    """RMS difference [m] between repeats of one pose, per coordinate across the cable.
 
-    From the mean of the others, as `repeatability`, less the noise of points [m] in both; 0 where
-    no pose was taken twice.
+    Measured from the mean of the others, as in `repeatability`, less the noise of points [m] in
+    both; 0 if no pose was repeated.
     """
     squares = []
     for gaps, tangents in _gaps(measured, length):
@@ -91,29 +91,29 @@ def repeat_std(measured: Sequence[MeasuredPose], length: float, noise: float) ->
 def _gaps(
     measured: Sequence[MeasuredPose], length: float
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Of each repeated pose: gaps (m, K, d) from the mean of the others, its tangents (K, d)."""
+    """For each repeated pose: gaps (m, K, d) from the mean of the others, its tangents (K, d)."""
     grid = np.linspace(_BESIDE_FIXTURES, 1 - _BESIDE_FIXTURES, 97) * length
     for group in _groups(measured, length):
         curves = np.array([_line(item, grid, length) for item in group])
         mean = curves.mean(axis=0)
-        # From the mean of the others it is m / (m - 1) times as far as from the mean of all.
+        # The gap from the mean of the others is m / (m - 1) times that from the mean of all.
         gaps = (curves - mean) * len(group) / (len(group) - 1)
-        # Beyond the points of a line its end stands still.
+        # Beyond its last point, a line is constant.
         yield gaps, unit(np.gradient(mean, axis=0))
 
 
 def different_poses(measured: Sequence[MeasuredPose], length: float) -> int:
-    """Number of fit poses that are held differently, wherever they stand."""
+    """Number of fit poses that are held in different ways, wherever they stand."""
     return len(_held_alike(measured, length))
 
 
 def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: float) -> NoiseModel:
-    """Noise of one line, or of repeats of a pose or two where they differ by more than twice that.
+    """Noise of one line; with a pose or two, that of repeats if these differ by more than twice it.
 
-    Pure error: the distances of repeats from their mean, sqrt(m / (m - 1)) larger for
-    its loss of one degree of freedom in m, with their correlation along the cable. A fit that
-    trusts each line to the noise of its points bends the rest shape to whatever is left, and may
-    end in one whose lowest equilibrium is far from all that was measured.
+    Pure error: the distances of repeats from their mean, with their correlation along the cable,
+    times sqrt(m / (m - 1)) because the mean of m takes one degree of freedom. A fit that
+    trusts each line to the noise of its points distorts the rest shape to fit the rest; its lowest
+    equilibrium may then be far from every measurement.
 
     References
     ----------
@@ -147,7 +147,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     found = estimate_noise(samples, length)
     if found.std <= REPEATS_ARE_NOISE * noise.std:
         return noise
-    # Of m distances from their mean m - 1 are free.
+    # Of m distances from their mean, m - 1 are independent.
     free = 1 - len(groups) / sum(map(len, groups))
     return replace(found, source="repeats", slow_dof=free * found.slow_dof)
 
@@ -159,7 +159,7 @@ def _groups(measured: Sequence[MeasuredPose], length: float) -> list[list[Measur
 
 
 def _held_alike(measured: Sequence[MeasuredPose], length: float) -> list[list[MeasuredPose]]:
-    """Fit poses in groups, each of those that are held as its first one."""
+    """Fit poses in groups, each of poses that are held like its first one."""
     groups: list[list[MeasuredPose]] = []
     for item in measured:
         if item.readable and not item.held_out:
@@ -173,7 +173,7 @@ def _held_alike(measured: Sequence[MeasuredPose], length: float) -> list[list[Me
 
 
 def _alike(pose: HeldPose, other: HeldPose, length: float) -> bool:
-    """Whether two poses hold a cable in the same way, up to where they stand."""
+    """Whether two poses hold a cable in the same way, wherever they stand."""
     chords = [np.subtract(one.end or one.start, one.start) / length for one in (pose, other)]
     node = Heading if len(pose.start) == 2 else Frame
     turned = np.abs(node.difference(np.stack(pose.frames), np.stack(other.frames))).max()
@@ -189,17 +189,17 @@ def _line(item: MeasuredPose, s: FloatArray, length: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class ScatterSample:
-    """What one pose tells: residuals e, and what moves them, all whitened by the noise.
+    """Data of one pose: residuals e, and the effects that change them, all whitened by the noise.
 
     Parameters
     ----------
     e : (R,)
     random : (R, q)
-        By a unit of what differs from pose to pose, see `PoseScatter.ways`.
+        Change by a unit of what differs from pose to pose, see `PoseScatter.ways`.
     own : (R, a)
-        By what else is the pose's own, one standard deviation each.
+        Change by one standard deviation of each other quantity of this pose alone.
     shared : (R, b)
-        By the unknowns of all poses, in any units.
+        Change by the unknowns that all poses share, in any units.
     """
 
     e: FloatArray
@@ -210,19 +210,19 @@ class ScatterSample:
 
 @dataclass(frozen=True)
 class Variances:
-    """Most likely sizes.
+    """Most likely sizes of noise, random part and systematic part.
 
     Parameters
     ----------
     noise : float
-        Factor on the standard deviation of the noise: where that is known, for what points are
-        off beyond it, which is no rest curvature either.
+        Factor on the standard deviation of the noise. If the noise is known, it stands for errors
+        of points beyond it, which are not a rest curvature either.
     std, systematic : float [1/m]
     deviance : float
         -2 log restricted likelihood, up to a constant.
     degrees : float
-        Degrees of freedom with which the variance std^2 is known: for k of them the curvature of
-        -2 log likelihood by log(std) is 4 k.
+        Degrees of freedom with which the variance std^2 is known: k degrees give -2 log
+        likelihood the curvature 4 k by log(std).
     """
 
     noise: float
@@ -234,7 +234,7 @@ class Variances:
 
 @dataclass(frozen=True)
 class InformedDeviance(Deviance):
-    """With the average information (k, k)."""
+    """Deviance with the average information (k, k)."""
 
     information: FloatArray
 
@@ -273,7 +273,7 @@ class RestLikelihood:
         self.cross = np.array([z.T @ x for z, x in zip(random, fixed, strict=True)])
         self.distances = distances
         square = (distances**2).sum() / max(self.m * (self.m - 1), 1)
-        # Poses taken again and again are alike at any range.
+        # If all poses are repeats of one, they are alike at any range.
         self.apart = max(float(np.sqrt(square)), 1e-9)
 
     def deviance(
@@ -281,8 +281,8 @@ class RestLikelihood:
     ) -> InformedDeviance:
         """Restricted deviance by the logarithms of the three sizes, see `sensing.restricted`.
 
-        By Woodbury's identity in the random parts, V = noise^2 1 + Z B Z^T, pose by pose or, if
-        poses are correlated, with those of all poses in one block.
+        By Woodbury's identity for the random parts, V = noise^2 1 + Z B Z^T: pose by pose, or in
+        one block of all poses if these are correlated.
         """
         m, q, r = self.m, self.random.shape[1], self.modes
         sizes = PoseScatter(1.0, smoothness, source=self.source).sizes(r) ** 2
@@ -318,7 +318,7 @@ class RestLikelihood:
         squares = np.einsum("jmq,mq->j", moved, pull)
         seen = np.einsum("mpq,jmq->jp", hidden, moved)
         bend = np.einsum("jmq,mqk,imk->ji", moved, inside, moved, optimize=True) - seen @ seen.T
-        # P V P = P separates the part of the noise from that of all random parts.
+        # P V P = P separates the noise's part from that of all random parts.
         by_noise = 2 * (self.free - traces[0] - quadratic + squares[0])
         information = bend.copy()
         information[0] = information[:, 0] = 2 * (squares - bend[0])
@@ -334,16 +334,16 @@ class RestLikelihood:
         guess: float = 0.1,
         weight: float = 0.0,
     ) -> Variances:
-        """Most likely sizes for a smoothness, and a range of what is systematic, or none.
+        """Most likely sizes for a smoothness and a range of the systematic part, or without one.
 
         Parameters
         ----------
         std : bool
-            Whether there may be a random part at all.
+            Whether a random part is allowed.
         guess : float [1/m]
-            Where to start.
+            Start value.
         weight : float
-            Of a prior std^weight of the random part, which keeps it from zero.
+            Exponent of a prior std^weight of the random part, which keeps it from zero.
         """
         sought = np.array([True, std, range_ is not None])
         start = np.log([1.0, guess if std else guess * np.exp(_LOWEST), guess])
@@ -363,14 +363,14 @@ class RestLikelihood:
 
 @dataclass(frozen=True)
 class ScatterEstimate:
-    """What a session shows of a cable that does not repeat.
+    """Evidence in a session that a cable does not repeat.
 
     Parameters
     ----------
     noise : float
         Factor on the standard deviation of the noise.
     p_systematic : float
-        Probability of as much that is alike in poses that are alike, if all is random.
+        Probability that alike poses share that much if all of it is random.
     deviance : float
         -2 log restricted likelihood, up to a constant.
     """
@@ -382,14 +382,14 @@ class ScatterEstimate:
 
 
 def estimate_pose_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -> ScatterEstimate:
-    """Sizes of maximal restricted likelihood: only what differs between poses alike is random.
+    """Sizes of maximal restricted likelihood; what alike poses share does not count as random.
 
     Parameters
     ----------
     sparse : bool
-        Whether a pose has no more points than a rest curvature has modes: they hardly tell noise
-        from scatter. The likeliest scatter is none by chance then, and intervals are too narrow: a
-        prior proportional to the scatter keeps it from there, by about a standard error.
+        Whether a pose has no more points than a rest curvature has modes, which hardly separates
+        noise from scatter. The likeliest scatter may then be zero by chance, with too narrow
+        intervals: a prior proportional to the scatter keeps it off zero by about one std error.
 
     References
     ----------
@@ -404,9 +404,9 @@ def estimate_pose_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -
     both = {r: likelihood.best(smoothness, r, guess=guess, weight=weight) for r in ranges}
     joint = min(both, key=lambda r: both[r].deviance, default=None)
     gain = 0.0 if joint is None else max(chosen.deviance - both[joint].deviance, 0.0)
-    # The best of the ranges; at a bound of zero half of chi-square's probability.
+    # Best of all ranges; a size bounded by zero takes half of chi-square's probability.
     p_systematic = float(min(1.0, 0.5 * len(RANGES) * chdtrc(1, gain)))
-    # What the verdict would not call systematic is random: see `Structure.p_noise`.
+    # What the verdict would not call systematic counts as random: see `Structure.p_noise`.
     if joint is not None and p_systematic < SIGNIFICANCE / 2:
         chosen, range_ = both[joint], joint
     without = likelihood.best(smoothness, range_, std=False, guess=guess)

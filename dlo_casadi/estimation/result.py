@@ -34,9 +34,9 @@ class Fit:
     Parameters
     ----------
     problem : Problem
-        With the noise and the roughness found.
+        The problem with the estimated noise and roughness.
     point : Point
-        Unknowns, shapes and objective at the minimum, or on the way there.
+        Unknowns, shapes and objective at the minimum, or at an intermediate point.
     """
 
     problem: Problem
@@ -44,11 +44,11 @@ class Fit:
     converged: bool = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without what is cached: another process computes it again, with the same rounding."""
+        """State without cached values: another process recomputes them, with the same rounding."""
         return {"problem": self.problem, "point": self.point, "converged": self.converged}
 
     def reweighed(self, noise: NoiseModel | None = None, priors: Priors | None = None) -> Fit:
-        """The same point under another noise or other priors, with the weights there."""
+        """The same point with another noise or other priors, and with weights computed there."""
         noise, priors = noise or self.noise, priors or self.problem.priors
         problem = replace(self.problem, noise=noise, priors=priors).weighed(self.point)
         return Fit(problem, problem.evaluate(self.point))
@@ -60,7 +60,7 @@ class Fit:
 
     @property
     def mass(self) -> float:
-        """Mass of the cable [kg]: as declared, or as found."""
+        """Mass of the cable [kg], declared or estimated."""
         known = self.model.cable.mass
         return known * self.value(MASS_FACTOR) if MASS_FACTOR in self.model.names else known
 
@@ -71,13 +71,13 @@ class Fit:
 
     @property
     def beyond_noise(self) -> bool:
-        """Whether more is left than noise: chi-square by two standard deviations, or a scatter."""
+        """Whether more than noise is left: chi-square two std too high, or a scatter of poses."""
         excess = 2 * np.sqrt(2 / self.degrees_of_freedom)
         return self.problem.priors.pose_scatter.std > 0 or self.chi2_per_dof > 1 + excess
 
     @property
     def errors_known(self) -> bool:
-        """Whether nothing of what the residuals are compared with was estimated from them."""
+        """Whether no noise or scatter was estimated from the residuals themselves."""
         return self.noise.known and self.problem.priors.pose_scatter.std == 0
 
     @property
@@ -107,19 +107,19 @@ class Fit:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance (size, size) of theta: inverse of the reduced Hessian and of `_by_bounds`.
+        """Covariance (size, size) of theta: inverse of the reduced Hessian plus `_by_bounds`.
 
-        The place of a mass of zero is as uncertain as its bounds leave it.
+        The uncertainty of the place of a mass of zero is that of its bounds.
         """
         return self._inverse(self._by_bounds)
 
     @cached_property
     def inflated_covariance(self) -> FloatArray:
-        """`covariance` with the residual's excess over the noise, which bounds do not have."""
+        """`covariance` times the residual's excess over the noise, which bounds do not have."""
         return self.inflation**2 * self._inverse(self.inflation**2 * self._by_bounds)
 
     def _inverse(self, more: FloatArray) -> FloatArray:
-        """Inverse of the reduced Hessian and some more precision on its diagonal."""
+        """Inverse of the reduced Hessian with more precision on its diagonal."""
         total = self.normal.hessian + more
         size = np.sqrt(np.maximum(np.diag(total), np.diag(more)))
         values, vectors = np.linalg.eigh(total / np.outer(size, size))
@@ -128,11 +128,11 @@ class Fit:
 
     @property
     def _by_bounds(self) -> FloatArray:
-        """Precision (size, size) of theta by its bounds alone."""
+        """Precision (size, size) of theta that its bounds alone give."""
         return np.diag(1 / self.problem.unknowns.widest**2)
 
     def is_determined(self, name: str) -> bool | None:
-        """Whether residuals and priors tell more of a parameter than its bounds; None if fixed."""
+        """Whether residuals and priors narrow a parameter beyond its bounds; None if fixed."""
         unknowns = self.problem.unknowns
         if name not in unknowns.names:
             return None
@@ -141,7 +141,7 @@ class Fit:
 
     @cached_property
     def determined_unknowns(self) -> float:
-        """Effective number of unknowns that the residuals determine, priors being what they are."""
+        """Effective number of unknowns that the residuals determine, given the priors."""
         problem = self.problem
         known = problem.precision + self._by_bounds
         effective = problem.unknowns.size - float(np.trace(self.covariance @ known))
@@ -151,7 +151,7 @@ class Fit:
 
     @cached_property
     def leverages(self) -> list[FloatArray]:
-        """What of each fitted residual (R_j,) the unknowns take up: 0 to 1."""
+        """Share, 0 to 1, of each fitted residual (R_j,) that the unknowns absorb."""
         out = []
         rows = zip(self._taken, self.linearization.by_deviation, self.normal.inner, strict=True)
         for taken, b, (block, _, _) in rows:
@@ -168,7 +168,7 @@ class Fit:
 
     @property
     def _taken(self) -> list[FloatArray]:
-        """Whitened residuals (R_j, size) by theta, each pose's own deviations following."""
+        """Derivatives (R_j, size) of whitened residuals by theta, with own deviations refitted."""
         lin = self.linearization
         rows = zip(lin.by_theta, lin.by_deviation, self.normal.inner, strict=True)
         return [a - b @ np.linalg.solve(block, cross) for a, b, (block, cross, _) in rows]
@@ -178,9 +178,9 @@ class Fit:
 
             1 / degrees = sum_c (v_c / v)^2 / degrees_c
 
-        of the parts v_c that the noise and the rest curvature of each repeat's own have in it,
-        degrees_c those of their sizes; at least LEAST_NOISE_DEGREES, inf where both are declared.
-        The fixtures' scatter counts as known.
+        The parts v_c of the variance v come from the noise and from each repeat's own rest
+        curvature; degrees_c are those of their sizes. At least LEAST_NOISE_DEGREES; inf if both are
+        declared. The fixtures' scatter counts as known.
 
         References
         ----------
@@ -217,7 +217,7 @@ class Fit:
 
     @property
     def chi2_of_points(self) -> float:
-        """`chi2_per_dof` by the noise of the points where the fit weighs them by its misfit."""
+        """`chi2_per_dof` with the noise of the points, even if the fit weighs by its misfit."""
         return self.chi2_per_dof * (self.noise.std / self.noise.of_points.std) ** 2
 
     @cached_property
@@ -227,29 +227,29 @@ class Fit:
         return float(np.sqrt((np.concatenate(rows) ** 2).mean()))
 
     def _rms_of_points(self, squares: Sequence[FloatArray]) -> float:
-        """Root mean square [m] over the points, by the squares (R_j,) of each pose's residuals."""
+        """Root mean square [m] over the points, given each pose's squared residuals (R_j,)."""
         rows = [square[on] for square, on in zip(squares, self._on_points, strict=True)]
         return float(np.sqrt(np.concatenate(rows).sum() / self._n_points))
 
     @property
     def compared_std(self) -> float:
-        """Standard deviation [m] of what the fit compares: of points, or of means of several."""
+        """Standard deviation [m] of the compared data: of points, or of means of several points."""
         noise, items = self.noise, [self.problem.measured[j] for j in self.problem.used]
         white = float(np.median(np.concatenate([item.relative_white for item in items])))
         return noise.std * float(np.sqrt((1 - noise.share) * white**2 + noise.share))
 
     @cached_property
     def fixture_error(self) -> float:
-        """RMS displacement of points [m] by what ends differ from where they are declared.
+        """RMS displacement of points [m] caused by deviations of the ends from declared values.
 
-        The scatter of the poses' ends and headings, carried to the curve by the equilibrium. The
-        fit estimates each pose's own; of a pose that is only predicted nobody knows them.
+        It is the scatter of ends and headings, propagated to the curve through the equilibrium. The
+        fit estimates the deviations of each fitted pose; those of a predicted pose are unknown.
         """
         return self._rms_of_points(self._by_fixtures)
 
     @property
     def _by_fixtures(self) -> list[FloatArray]:
-        """Variance (R_j,) of each residual by what a pose's ends differ from declared ones."""
+        """Variance (R_j,) of each residual caused by the deviations of a pose's ends."""
         size, std = self.problem.unknowns.size, self.problem.deviation_std
         return [
             ((directions[:, size:] * std) ** 2).sum(axis=1)
@@ -258,12 +258,12 @@ class Fit:
 
     @cached_property
     def repeat_error(self) -> float:
-        """RMS displacement of points [m] by the rest curvature of each repeat's own."""
+        """RMS displacement of points [m] caused by each repeat's own rest curvature."""
         return self._rms_of_points(self._by_rest)
 
     @property
     def _by_rest(self) -> list[FloatArray]:
-        """Variance (R_j,) of each residual by the rest curvature of each repeat's own."""
+        """Variance (R_j,) of each residual caused by each repeat's own rest curvature."""
         return [(way**2).sum(axis=1) for way in self._own_errors]
 
     @cached_property
@@ -276,10 +276,10 @@ class Fit:
 
     @property
     def failed(self) -> bool:
-        """Whether it stopped so far from a minimum that its numbers may be off.
+        """Whether the fit stopped so far from a minimum that its numbers may be wrong.
 
-        A Gauss-Newton step within the bounds would still lower the objective by more than one
-        standard deviation of one parameter does: 1/2, where the residual is noise.
+        That is so if a Gauss-Newton step within the bounds would still lower the objective by more
+        than one standard deviation of one parameter does: 1/2, if the residual is noise.
         """
         if self.converged:
             return False
@@ -296,20 +296,20 @@ class Fit:
 
     @cached_property
     def expected_error(self) -> float:
-        """RMS error [m] of a pose that is only predicted, if nothing is missing.
+        """RMS error [m] expected of a predicted pose if the model lacks nothing.
 
-        Of distances of points, and of readings as `NoiseModel.units` count them. Noise, scatter of
-        the fixtures, uncertain parameters, and how the cable repeats.
+        It covers distances of points and wrench measurements, converted by `NoiseModel.units`.
+        Causes: noise, scatter of the fixtures, uncertain parameters, and how the cable repeats.
         """
         return self.expected_with([self.covariance] * len(self.problem.used))
 
     def expected_with(self, covariances: Sequence[FloatArray]) -> float:
-        """RMS error [m] as `expected_error`, the unknowns known as well as is told of each pose.
+        """`expected_error`, but with a given covariance of the unknowns for each fitted pose.
 
         Parameters
         ----------
         covariances : sequence of (size, size)
-            Of the unknowns, of each fitted pose.
+            Covariance of the unknowns for each fitted pose.
         """
         problem, size = self.problem, self.problem.unknowns.size
         square, count = problem.n_residuals * self.noise.std**2, self._n_points
@@ -354,12 +354,12 @@ class Fit:
     def values_in(
         self, model: CableModel, given: Mapping[str, float] = MappingProxyType({})
     ) -> FloatArray:
-        """Parameter vector of a similar model: as given, this fit's, nominal where it has none."""
+        """Parameter vector of a similar model: values given, else this fit's, else nominal."""
         known = {**dict(zip(self.model.names, self.p, strict=True)), **given}
         return np.array([known.get(q.name, q.nominal) for q in model.parameters])
 
     def free_in(self, model: CableModel) -> BoolArray:
-        """Which parameters of a similar model are estimated: all but those kept fixed here."""
+        """Whether each parameter of a similar model is estimated: all except those fixed here."""
         free = dict(zip(self.model.names, self.problem.unknowns.free, strict=True))
         return np.array([free.get(name, True) for name in model.names], dtype=bool)
 
@@ -374,7 +374,7 @@ class Fit:
 
         -objective + 1/2 log|P+| - 1/2 log|H| - 1/2 sum log|block| + sum log|W|
 
-        with the whitenings W. A direction that is known worse than its scale counts as known so.
+        with the whitening matrices W. A direction known worse than its scale counts as known to it.
         """
         problem = self.problem
         eigen = np.linalg.eigvalsh(problem.precision)
@@ -390,10 +390,10 @@ class Fit:
 
 
 def uncertainty_of(fit: Fit) -> Uncertainty:
-    """What makes predictions from a fit uncertain.
+    """Causes of uncertainty in predictions from a fit.
 
-    How far repeats of a pose differ beyond the noise of their points holds fixtures that hold them
-    differently, too. Where many poses differ, the rest curvature of each repeat's own tells it.
+    The difference between repeats beyond the noise of their points includes that of the fixtures.
+    If there are many different poses, each repeat's own rest curvature accounts for it instead.
     """
     names, covariance = fit.named_covariance
     used = [fit.model.deviation_names[k] for k in fit.problem.equilibria.used_deviations]

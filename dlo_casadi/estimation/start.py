@@ -1,9 +1,9 @@
-"""Where every fit starts: from the measured shapes, by a relaxed balance of forces.
+"""The start of every fit: from the measured shapes, with a relaxed balance of forces.
 
-The order: nodes along the measured lines; forces and unknowns beside them, the balance a soft
-penalty (`relaxation`); the penalty harder and harder; equilibria of all poses; the descent along
-them. What no line shows is tried both ways at the soft penalty: how the cable is rolled in its end
-clamp, and which way round a pose is twisted.
+The order: nodes along the measured lines; then forces and unknowns, with the balance as a soft
+penalty (`relaxation`); a harder and harder penalty; equilibria of all poses; the descent along
+them. At the soft penalty, alternatives are tried for what no line shows: the roll of the cable in
+its end clamp, and which way round a pose is twisted.
 """
 
 from collections.abc import Sequence
@@ -26,22 +26,22 @@ from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
-# Rolls of the end [rad] that are tried first. Rolls 1.2 rad away from a trial were found.
+# First trial rolls of the end [rad]. Rolls 1.2 rad away from a trial were still found.
 ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
 # Iterations for each of these rolls; number of rolls that are continued.
 FIRST_STEPS, FOLLOWED = 5, 2
-# Iterations of shapes and forces alone before that, of cables in saddles and eyelets: lines do not
-# tell how the cable bends there, and a stiffness that is free runs away on the way.
+# Iterations of shapes and forces alone before those, for cables in saddles and eyelets: lines do
+# not show how the cable bends there, and a free stiffness diverges on the way.
 STEPS_AT_CLIPS = 15
-# Twist [rad] from which the other way round is tried: rolls are tried about one radian apart, and
-# the rest shape of a cable may be twisted by as much as a quarter of a turn.
+# Twist [rad] above which the other way round is tried: rolls are tried about one radian apart, and
+# the rest shape of a cable may be twisted by up to a quarter of a turn.
 EITHER_WAY = np.pi / 2
 # Softness [rad] at which forces hardly move the measured shapes.
 SHAPES_ALONE = 0.1
-# Maximum number of poses that are searched for the unknowns, evenly spaced.
+# Maximum number of poses used in the search for the unknowns, evenly spaced.
 POSES_OF_A_SEARCH = 40
-# Sum of squares per residual from which a pose is tried from its measured shape again: it may have
-# turned into another equilibrium on the way.
+# Sum of squares per residual above which a pose is tried again from its measured shape: it may
+# have moved to another equilibrium on the way.
 APART = 2.0
 
 
@@ -50,10 +50,10 @@ def begin(
 ) -> tuple[Problem, Values]:
     """Relaxed shapes, forces and unknowns along the measured lines, and the problem weighed there.
 
-    In space no line shows how the cable is turned in its end clamp: rolls are tried in turn, then
-    poses twisted by more than a quarter of a turn the other way round. `theta` (size,): where the
-    unknowns start; any stiffness will do. `fixed` (size,): entries of theta that stay where they
-    are; none by default.
+    In space no line shows the roll of the cable in its end clamp: several rolls are tried, then
+    for poses twisted by more than a quarter of a turn the other way round. `theta` (size,): start
+    of the unknowns; any stiffness will do. `fixed` (size,): entries of theta that do not change;
+    none by default.
     """
     problem = problem if problem.weights else weighed(problem, theta)
     if len(problem.used) > POSES_OF_A_SEARCH and not problem.unknowns.model.has_state:
@@ -69,7 +69,7 @@ def begin(
 def _along_lines(
     problem: Problem, theta: FloatArray, fixed: BoolArray | None, rolls: Sequence[float]
 ) -> tuple[Problem, Values]:
-    """As `begin`, from rolls beside that of theta."""
+    """As `begin`, with trial rolls added to that of theta."""
     names, unknowns = problem.unknowns.names, problem.unknowns
     own = names.index(END_ROLL) if END_ROLL in names else None
     loose = loosened(problem, Values(theta, *measured_shapes(problem)))
@@ -97,7 +97,7 @@ def _roll(problem: Problem, theta: FloatArray) -> float:
 
 
 def weighed(problem: Problem, theta: FloatArray) -> Problem:
-    """The problem weighed; noise that is not declared at least as large as what shapes leave."""
+    """Compute weights; noise that is not declared is at least what the measured shapes leave."""
     values = with_springs_in_place(problem, Values(theta, *measured_shapes(problem)))
     problem = problem.weighed(values)
     if problem.noise.known:
@@ -109,7 +109,7 @@ def weighed(problem: Problem, theta: FloatArray) -> Problem:
 
 
 def _first_solved(relaxation: Relaxation, values: Values, fixed: BoolArray | None = None) -> Values:
-    """Values after the first iterations from measured shapes."""
+    """Values after the first iterations, which start at measured shapes."""
     if set(relaxation.problem.unknowns.model.clips) - {"pinned"}:
         every = np.ones(len(values.theta), dtype=bool)
         values = relaxation.solve(values, every, STEPS_AT_CLIPS)
@@ -117,10 +117,10 @@ def _first_solved(relaxation: Relaxation, values: Values, fixed: BoolArray | Non
 
 
 def _either_way(problem: Problem, values: Values) -> Values:
-    """Values whose poses are twisted the other way round where that leaves less of the balance.
+    """Values with poses twisted the other way round where that leaves a smaller objective.
 
-    Where the end clamp is rolled by nearly half a turn and the pose does not tell its turns, the
-    twist nearest to none may be either way round within what is known of the roll.
+    If the end clamp is rolled by nearly half a turn and the pose names no turns, the smallest
+    twist may be in either direction, given the uncertainty of the roll.
     """
     if not problem.unknowns.model.node.twists:
         return values
@@ -139,7 +139,7 @@ def _either_way(problem: Problem, values: Values) -> Values:
 def _lower_of_each(
     relaxation: Relaxation, values: Values, other: Values, among: BoolArray
 ) -> Values:
-    """Values with those poses `among` (m,) of others, at the same theta, that have less left."""
+    """Values with those poses `among` (m,) of `other`, at the same theta, that fit better."""
     problem = relaxation.problem
     each = (relaxation.objectives(one)[0] for one in (values, other))
     lefts = [np.where(np.isnan(left), np.inf, left) for left in each]
@@ -165,7 +165,7 @@ def fit_from(
     fixed: BoolArray | None = None,
     followed: Values | None = None,
 ) -> Fit | None:
-    """The minimum that relaxed values lead to; None if some pose has no equilibrium there.
+    """Minimum reached from relaxed values; None if some pose has no equilibrium there.
 
     Parameters
     ----------
@@ -174,11 +174,11 @@ def fit_from(
     begun : Values
         Near the measured shapes.
     softness : sequence of float [rad]
-        Through which the balance becomes strict.
+        Sequence of softness values through which the balance becomes strict.
     fixed : (size,) bool, optional
-        Entries of theta that stay where they are until the shapes are equilibria.
+        Entries of theta that do not change until the shapes are equilibria.
     followed : Values, optional
-        Where those begun have led through a larger softness; by default they are followed from.
+        Result of relaxing `begun` at a larger softness; by default it is computed.
     """
     values = relaxed(problem, begun if followed is None else followed, softness, fixed)
     values = retry_outlying_poses(problem, begun, values, SOFTNESS[-1], fixed)
@@ -193,14 +193,14 @@ def retry_outlying_poses(
     softness: float,
     fixed: BoolArray | None = None,
 ) -> Values:
-    """Relaxed values whose outlying poses are tried from other shapes.
+    """Relaxed values with other shapes tried for outlying poses.
 
-    Poses that leave far more than most do; these may have been drawn off the noise by them. Theta
-    is that of the other poses alone. Each outlying pose is followed again from its first
-    shape, and solved from its ends, and from its line where that leads to another equilibrium; the
-    shape that leaves least is kept. The relaxed balance may hold a cable at a roll about its line
-    that no stable equilibrium has: of 12 flat cables in 6 poses 9 had such a pose even at their
-    true parameters. From parameters far off, 3 fits did not come to the noise; with this all do.
+    Outlying poses leave far more than most do, and may have pulled the others off their points:
+    theta is refitted to the other poses alone. Each outlying pose is then followed again from its
+    first shape, solved from its ends, and solved from its line if that gives another equilibrium;
+    the shape that leaves least is kept. The relaxed balance may hold a cable at a roll about its
+    line that no stable equilibrium has: 9 of 12 flat cables in 6 poses had such a pose even at
+    their true parameters. From distant parameters 3 fits missed the noise; with this all reach it.
     """
     relaxation = Relaxation(problem, softness)
     left = _left(relaxation, values)
@@ -215,7 +215,7 @@ def retry_outlying_poses(
 
 
 def _retried_from_first_shapes(problem: Problem, begun: Values, values: Values) -> Values:
-    """Values with poses that are far off followed again from their first shapes, theta fixed."""
+    """Values with outlying poses followed again from their first shapes, at the same theta."""
     relaxation = Relaxation(problem, SOFTNESS[-1])
     apart = ~(_left(relaxation, values) <= APART)
     if not apart.any():
@@ -225,7 +225,7 @@ def _retried_from_first_shapes(problem: Problem, begun: Values, values: Values) 
 
 
 def _left(relaxation: Relaxation, values: Values) -> FloatArray:
-    """What each pose (m,) leaves, per residual; poses without residuals leave nothing."""
+    """Objective per residual of each pose (m,); zero for poses without residuals."""
     problem, left = relaxation.problem, np.zeros(relaxation.problem.equilibria.m)
     each = relaxation.objectives(values)[0]
     for j in problem.used:
@@ -234,7 +234,7 @@ def _left(relaxation: Relaxation, values: Values) -> FloatArray:
 
 
 def _followed(relaxation: Relaxation, begun: Values, theta: FloatArray) -> Values:
-    """Values at theta followed from their first shapes."""
+    """Values at a fixed theta, followed from the first shapes."""
     softness = [soft for soft in SOFTNESS if soft >= relaxation.softness]
     held = np.ones(len(theta), dtype=bool)
     return relaxed(relaxation.problem, replace(begun, theta=theta), softness, held)
@@ -243,13 +243,13 @@ def _followed(relaxation: Relaxation, begun: Values, theta: FloatArray) -> Value
 def _led_by(
     relaxation: Relaxation, values: Values, kept: BoolArray, fixed: BoolArray | None
 ) -> Values:
-    """Values at the theta to which the poses `kept` (m,) lead alone, with their shapes there."""
+    """Values at the theta that fits the poses `kept` (m,) alone, with their shapes there."""
     problem, places, shapes = relaxation.problem, [*values.projections], values.shapes
     chosen = np.flatnonzero(kept)
     history = tuple(problem.measured[j] for j in chosen)
     few = replace(problem, history=history, weights=tuple(problem.whitening[j] for j in chosen))
     own = Shapes(shapes.x[chosen], shapes.lam[chosen], shapes.deviation[chosen])
-    # The others have drawn them far away: they go back to where the balance is soft.
+    # The other poses have pulled these far away: restart them at a soft balance.
     softness = [soft for soft in SOFTNESS[1:] if soft >= relaxation.softness]
     led = relaxed(few, Values(values.theta, own, [places[j] for j in chosen]), softness, fixed)
     x, lam, deviation = shapes.x.copy(), shapes.lam.copy(), shapes.deviation.copy()
@@ -260,7 +260,7 @@ def _led_by(
 
 
 def _from_ends_and_lines(problem: Problem, values: Values, among: BoolArray) -> list[Values]:
-    """Values with those poses `among` (m,) where their ends, and where their lines, lead to."""
+    """Values with the poses `among` (m,) solved from their ends, and from their lines."""
     shapes, p, rest = problem.state(values)
     model, chosen = problem.unknowns.model, np.flatnonzero(among)
     measured = [problem.measured[j] for j in chosen]
@@ -281,26 +281,26 @@ def _from_ends_and_lines(problem: Problem, values: Values, among: BoolArray) -> 
 # ---- along the measured lines --------------------------------------------------------------------
 
 _KINEMATIC_STEPS = 8
-# Eight poses with one photograph each, from two starts: what was left of 8 of the 16 fell by more
-# than a tenth between 8 and 12 steps, of 3 between 12 and 20.
+# Evidence: eight poses with one photograph each, from two starts. Between 8 and 12 steps the
+# residual of 8 of the 16 fell by more than a tenth; between 12 and 20 steps that of 3.
 _STEPS_WITHOUT_DEPTH = 20
 
 
 def measured_shapes(
     problem: Problem, roll: float = 0.0, turns: FloatArray | None = None
 ) -> tuple[Shapes, list[FloatArray]]:
-    """Shapes of all poses: along the measured line where there is one, guessed elsewhere.
+    """Shapes of all poses: along the measured line if there is one, else a first guess.
 
-    Gauss-Newton on the kinematics alone, all poses in step: distances of the points, with a
-    small penalty on the second differences of the headings where no point holds them.
+    Gauss-Newton on the kinematics alone, all poses at once: distances of the points, with a small
+    penalty on the second differences of the headings where no point determines them.
 
     Parameters
     ----------
     roll : float [rad]
-        Of the cable in its end clamp, in space: it decides which of the twists that reach the
-        clamp is the one nearest to none.
+        Roll of the cable in its end clamp, in space: it selects the smallest twist that reaches
+        the clamp.
     turns : (m,), optional
-        Turns of twist, see `HeldPose`, to which each is the nearest; by default as the poses tell.
+        Turns of twist to which each pose is nearest, see `HeldPose`; by default as poses name them.
 
     Returns
     -------
@@ -309,7 +309,7 @@ def measured_shapes(
     """
     model, used = problem.unknowns.model, problem.used
     chain = model.chain
-    # Without forces an element does not know its inner unknowns.
+    # Without forces the internal unknowns of an element are undetermined.
     equilibria = problem.equilibria
     if chain.kind.n_inner:
         equilibria = BatchEquilibrium(
@@ -328,7 +328,7 @@ def measured_shapes(
     shapes, projections, cost = _kinematics(problem, equilibria, along, roll)
     alone = [k for k, j in enumerate(used) if not problem.measured[j].has_line]
     if alone:
-        # One photograph shows a bend towards it and one away from it alike.
+        # One photograph cannot distinguish a bend towards the camera from one away from it.
         others, places, costs = _kinematics(problem, equilibria, predicted, roll)
         for k in alone:
             if costs[k] < cost[k]:
@@ -339,7 +339,7 @@ def measured_shapes(
 def _kinematics(
     problem: Problem, equilibria: BatchEquilibrium, x: FloatArray, roll: float
 ) -> tuple[Shapes, list[FloatArray], list[float]]:
-    """Shapes from nodes x on, arc lengths of the points, and what is left of each (used,) [m^2]."""
+    """Shapes from nodes x on, arc lengths of points, and residual of each (used,) [m^2]."""
     model, used = problem.unknowns.model, problem.used
     lines = [item.traced if item.has_line else item for item in (problem.measured[j] for j in used)]
     shapes = problem.equilibria.start_shapes(x)
@@ -366,7 +366,7 @@ def _kinematics(
 
 
 def _each_node(equilibria: BatchEquilibrium) -> Tangents:
-    """Every node moved on its own."""
+    """Directions: each increment of each node."""
     a, m = equilibria.assembly, equilibria.m
     q = a.n * a.b
     x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
@@ -389,7 +389,7 @@ def _kinematic_step(
     n, b, d = len(x), node.increment, node.dimension
     curve, slopes = now.curve, change.curve
     bends = node.difference(x[:-1], x[1:])
-    # 3 mm of noise a point against bends that change by 0.3 turns per length from cell to cell.
+    # Weight of 3 mm noise per point against bends that vary by 0.3 turns per length between cells.
     weight = 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
     rough = weight * np.kron(np.diff(np.eye(n), n=2, axis=0), np.eye(b))
     if item.has_line:

@@ -21,8 +21,8 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 # Steps per decade of the first search.
 _PER_DECADE = 3
 LEAST_POINTS = 10
-# Degree and largest number of parts of the measured curve: its curvature is a cubic spline of eight
-# coefficients, of fewer where there are fewer than two points for each coefficient of the curve.
+# Degree and maximum number of parts of the measured curve. Its curvature is a cubic spline of eight
+# coefficients; of fewer if the curve has fewer than two points per coefficient.
 DEGREE, MOST_PARTS = 5, 5
 # Points of the integrals, and places of the result.
 FINE = 1000
@@ -41,8 +41,8 @@ class StiffnessFit:
 def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> StiffnessFit:
     """Least squares of the distances of all fit points over EI, the cable straight at rest.
 
-    The equilibria are followed from the prior stiffness along the decades, each on the branch that
-    prediction would choose there, or on that on which the pose was measured.
+    The equilibria are followed from the prior stiffness along the decades, each on the branch of
+    the prediction there, or on that on which the pose was measured.
     """
     used = [item for item in measured if item.readable and not item.held_out]
     equilibria = BatchEquilibrium(model, [item.pose for item in used])
@@ -52,13 +52,13 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     stiff, search = model.stiffness_indices, SearchSettings.of(model)
 
     def at(log_ei: float) -> FloatArray:
-        # Torsion follows bending.
+        # Torsional stiffness is changed by the same factor as bending stiffness.
         p = model.nominal.copy()
         p[stiff] *= np.exp(log_ei) / p[0]
         return p
 
     def follow(shapes: Shapes, from_log_ei: float, log_ei: float) -> tuple[Shapes, float]:
-        # Where bending dominates the weight, the shape stays and the forces grow with EI.
+        # If bending dominates the weight, the shape stays the same and the forces grow with EI.
         grown = replace(shapes, lam=shapes.lam * np.exp(log_ei - from_log_ei))
         start = min(
             shapes,
@@ -93,11 +93,11 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     best = min(grid, key=lambda q: grid[q][1])
     if not np.isfinite(grid[best][1]):
         return StiffnessFit(float(np.exp(best)), float("inf"), float("inf"))
-    # On the way there some may have lost the branch on which they were measured.
+    # Some poses may have left their measured branch on the way.
     near = _cold(model, at(best), rest, used) or grid[best][0]
 
     def cost(log_ei: float) -> float:
-        # Where a pose is lost: worse than any neighbour, but a number that a parabola fits.
+        # If a pose is lost, return a finite value worse than any neighbour, so a parabola fits.
         return min(follow(near, best, log_ei)[1], 10 * grid[best][1])
 
     found = minimize_scalar(
@@ -114,7 +114,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
 def _cold(
     model: CableModel, p: FloatArray, rest: FloatArray, used: Sequence[MeasuredPose]
 ) -> Shapes | None:
-    """Stable equilibria as predicted or measured, or None if one is missing."""
+    """Stable equilibria as measured or else predicted; None if one is missing."""
     predictions = predict_poses(model, p, rest, [item.pose for item in used])
     others = measured_elsewhere(model, p, rest, used, predictions)
     found = [other or known for known, other in zip(predictions, others, strict=True)]
@@ -143,10 +143,10 @@ def measured_moment_curve(
         kappa(s) = |dt/ds|,   n = (dt/ds) / kappa,   a(s) = int_s^L (r(q) - r(s)) dq
         M(s) = (a . t) (f . n) - (a . n) (f . t),   f = w g / |g|
 
-    M is the moment of what hangs beyond s, in the plane of the tangent t and the normal n in which
-    the cable bends there: positive where the weight bends the cable the way it is bent. The curve
-    r is a quintic spline between the first point and the last, fitted to the points by least
-    squares; what lies beyond the last point is taken as straight.
+    M is the moment of the part beyond s, in the plane of the tangent t and the normal n in which
+    the cable bends there. It is positive where the weight increases the bend. The curve r is a
+    quintic spline from the first point to the last, fitted by least squares; the part beyond the
+    last point is taken as straight.
 
     Parameters
     ----------
@@ -155,10 +155,10 @@ def measured_moment_curve(
     length : float [m]
     weight : float [N/m]
     gravity : (d,) [m/s^2]
-        Its direction counts.
+        Only its direction is used.
     s : (K,) [m], optional
-        Arc lengths of the points where they are known; by default chords between all of them, the
-        whole cable together.
+        Arc lengths of the points, if known; by default from the chords, which are scaled to add up
+        to the whole cable.
 
     Raises
     ------
@@ -199,8 +199,8 @@ def measured_moment_curve(
 
 
 def law_of(model: CableModel, p: FloatArray, bend: FloatArray) -> FloatArray:
-    """Moments (K,) [N m] that a model's section answers to bends (K,) [1/m] with.
+    """Moments (K,) [N m] of a model's section at bends (K,) [1/m].
 
-    Laws that depend on the place count with the middle of the cable.
+    Laws that vary along the cable are evaluated at its middle.
     """
     return np.array([float(functions_of(model).section_moment(value, p)) for value in bend])

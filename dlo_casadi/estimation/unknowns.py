@@ -1,4 +1,4 @@
-"""Unknowns of a fit with their Gaussian prior, and how they are searched for."""
+"""Unknowns of a fit with their Gaussian prior, and the settings of the search for them."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from dlo_casadi.effects import Load
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.model.cable_model import STIFFNESS_RATIO_STD, STIFFNESSES, CableModel
 
-# Units of the sizes of loads; others are places and directions.
+# Units of parameters that are the size of a load; others are places and directions.
 LOAD_UNITS = ("N", "N/m", "kg")
 
-# A weak prior of the rest curvature: a turn per length, one standard deviation.
+# Weak prior std of the rest curvature: one turn per length.
 REST_TURNS_STD = 1.0
 # Bounds of the scaled rest coefficients, turns per length.
 LARGEST_REST = 20.0
-# Largest change of a logarithm in one step: a factor of 20. Where shapes hardly tell a stiffness, a
-# step led to its bounds, where equilibria are lost to rounding: 40 small steps instead of 7.
+# Largest change of a logarithm in one step: a factor of 20. Without it, where shapes hardly
+# determine a stiffness, a step led to bounds at which rounding loses equilibria: 40 steps, not 7.
 FARTHEST = 3.0
 
 
@@ -56,14 +56,14 @@ class Unknowns:
         return len(self._used)
 
     def off_bounds(self, theta: FloatArray) -> FloatArray:
-        """Theta whose parameters that vanish at a bound are one typical change away from it."""
+        """Theta with each parameter that vanishes at a bound moved one typical change off it."""
         vanish = [q.lower == q.nominal and not q.log for q in self._parameters]
         own = np.array(vanish + [False] * self.n_rest, dtype=bool)
         return np.where(own & (theta <= self.bounds[0]), theta + 1, theta)
 
     @property
     def without_prior(self) -> BoolArray:
-        """Entries (size,) of theta that no prior holds: parameters of declared effects."""
+        """Entries (size,) of theta without a prior: parameters of declared effects."""
         known = [np.isfinite(q.prior_std) or q.name in STIFFNESSES for q in self._parameters]
         return ~np.array(known + [True] * self.n_rest, dtype=bool)
 
@@ -90,7 +90,7 @@ class Unknowns:
 
     @cached_property
     def are_loads(self) -> BoolArray:
-        """Which entries (size,) of theta are the size of a load."""
+        """Whether each entry (size,) of theta is the size of a load."""
         loads = [effect for effect in self.model.effects if isinstance(effect, Load)]
         names = {
             f"{effect.label}.{q.name}"
@@ -165,7 +165,7 @@ class Unknowns:
 
     @cached_property
     def widest(self) -> FloatArray:
-        """Standard deviations of theta of which nothing is known but its bounds: even between them.
+        """Standard deviations of theta if only its bounds are known: a uniform distribution.
 
         Those of rest coefficients, which have a prior, are infinite.
         """
@@ -190,7 +190,7 @@ class Unknowns:
         return found[0], found[1]
 
     def own_prior(self, theta: FloatArray, k: int) -> float:
-        """What the prior of entry k itself adds to twice the objective."""
+        """Contribution of the prior of entry k alone to twice the objective."""
         gap = theta - self._nominal
         bending, torsion = self._stiffnesses
         if k == torsion:
@@ -226,25 +226,25 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How the unknowns are searched for, in the plane or in space.
+    """Settings of the search for the unknowns, in the plane or in space.
 
     Parameters
     ----------
     mesh : int
-        Elements of a search; in space an element takes 17 times the operations.
+        Number of elements; in space an element takes 17 times the operations.
     std : float
-        Standard deviation of points in a search, over the length; 0 leaves it as it is.
+        Standard deviation of points over the length; 0 leaves it unchanged.
     misfit : float
-        RMS distance over length that a search leaves, from which on the model lacks something.
+        RMS distance over length above which the model lacks something.
     other_minima : float
-        RMS distance over length from which a search may have found another minimum,
+        RMS distance over length above which the search may have found another minimum,
         because every repeat has a rest curvature of its own.
     decades : int
-        To both sides of the prior, of a search for the stiffness alone.
+        Range to both sides of the prior in the search for the stiffness alone.
     predicts : bool
-        Whether poses that are lost on the way are predicted anew, from their ends.
+        Whether poses lost on the way are predicted again, from their ends.
     converged_first : bool
-        Whether noise is first estimated of minima alone that have converged.
+        Whether noise is first estimated only at minima that have converged.
     """
 
     mesh: int
@@ -257,20 +257,20 @@ class SearchSettings:
 
     @classmethod
     def of(cls, model: CableModel) -> SearchSettings:
-        """How it is done for a model; beside obstacles a prediction takes seconds a pose."""
+        """Settings for a model; with obstacles a prediction takes seconds per pose."""
         found = IN_SPACE if model.in_space else IN_PLANE
         return replace(found, decades=1, predicts=False) if model.surfaces else found
 
 
-# misfit: of 37 hidden sets searches left 0.012 (a taper) and 0.06 (softening and a weight) in two;
-# there scores lead nowhere, and an estimated noise may swallow the effect. Real wires and bench
+# misfit: of 37 hidden sets two searches left 0.012 (a taper) and 0.06 (softening and a weight);
+# scores are useless there, and an estimated noise may absorb the effect. Real wires and bench
 # sessions left less than 0.0052.
-# other_minima: of 26 sessions in the plane 16 left less; no second search led elsewhere there.
+# other_minima: 16 of 26 sessions in the plane left less; a second search changed none of these.
 IN_PLANE = SearchSettings(20, 0.0, 0.01, 0.001, 3, predicts=True, converged_first=False)
-# std: of three sessions in which an effect is missing, one (space_flat) found its minimum at the
-# noise, too; at 3 mm two did, and one with a drift in neither. A judgement.
-# misfit: in four sessions in which an effect is missing the searches left 0.0025 to 0.0083, in
-# three with nothing or little missing 0.0008 to 0.0013. Either stiffness of such a fit may be far
-# off (a taper's torsion 0.0005 of 0.005 N m^2): what is missing is looked for from the measured
+# std, a judgement: of three sessions in which an effect is missing, one (space_flat) also found its
+# minimum with the noise itself; at 3 mm two did, and one with a drift at neither.
+# misfit: searches left 0.0025 to 0.0083 in four sessions in which an effect is missing, 0.0008 to
+# 0.0013 in three with little or nothing missing. Either stiffness of such a fit may be far off (a
+# taper's torsion 0.0005 of 0.005 N m^2): the missing effect is searched from the measured shapes.
 # shapes.
 IN_SPACE = SearchSettings(10, 0.004, 0.002, np.inf, 1, predicts=False, converged_first=True)

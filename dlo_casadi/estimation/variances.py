@@ -25,24 +25,24 @@ from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, smooth_modes
 from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.thresholds import DIFFERENT, SCATTER_APART, SCATTERED, SCATTERED_DEGREES
 
-# Slow displacements per pose that are kept out of the noise estimate: many while an effect may
-# be missing, few once the model is taken as complete, because noise is slow, too.
+# Number of slow displacements per pose kept out of the noise estimate: many while an effect may be
+# missing, few once the model is taken as complete, because noise is also slow.
 SMOOTH_MODES = 5
 SETTLED_MODES = 2
-# A first guess of the noise of readings, over the forces in the cable.
+# First guess of the noise of wrench measurements, relative to the forces in the cable.
 FIRST_FORCE = 0.01
-# Degrees of freedom from which the size of the noise can be estimated.
+# Minimum number of degrees of freedom to estimate the size of the noise.
 LEAST_SPARE = 3.0
 ROUGHNESS_FLOOR = 1e-3
-# Log evidence that a roughness may be behind the likeliest: half of what chi-square of one number
-# exceeds in a twentieth of all cases.
+# Largest loss of log evidence accepted for a rougher rest curvature than the likeliest: half the
+# 95 % point of chi-square with one degree of freedom.
 ALLOWED = 1.92
 # Smallest scatter of the poses' ends, as a share of the tolerance.
 SCATTER_FLOOR = 0.05
 
 
 def settle(fit: Fit) -> Fit:
-    """Estimate noise, roughness and scatter anew for a model that is taken as complete."""
+    """Estimate noise, roughness and scatter again for a model that is taken as complete."""
     return refine(fit, rounds=2, modes=SETTLED_MODES)
 
 
@@ -55,10 +55,10 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
     Parameters
     ----------
     modes : int
-        Slow displacements kept out of the noise estimate, if the noise is estimated.
+        Number of slow displacements kept out of the noise estimate, if noise is estimated.
     first : bool
-        Whether it is not known yet if the cable comes back to the same shape, and if the points
-        scatter as their noise is declared: it is estimated where they scatter more.
+        Whether two questions are still open: does the cable return to the same shape, and do the
+        points scatter as their declared noise says? If they scatter more, noise is estimated.
 
     References
     ----------
@@ -89,16 +89,16 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
         if moved < 0.1 and changed < 0.02 and same:
             break
         if rough and not fit.converged:
-            # What is missing is no noise: to estimate that once more leads farther off.
+            # What is missing is not noise: estimating the noise once more leads farther off.
             break
     return fit
 
 
 def contradicted(fit: Fit) -> bool:
-    """Whether the points scatter more than their declared noise lets expect.
+    """Whether the points scatter more than their declared noise.
 
-    By the white part of what is left beside all that the shapes may do: what a model lacks is
-    smooth along the cable.
+    Only the white part of the residuals counts, beside all that the shapes may do: the error of
+    an incomplete model is smooth along the cable.
     """
     samples = _noise_samples(fit, SMOOTH_MODES)
     if not tell_of_noise(samples, SCATTERED_DEGREES):
@@ -110,24 +110,24 @@ def contradicted(fit: Fit) -> bool:
 def errors_of(
     fit: Fit, modes: int = SMOOTH_MODES, *, estimated: bool, repeats: bool
 ) -> tuple[NoiseModel, PoseScatter]:
-    """Noise of the points and rest curvature of each repeat's own, from the residuals.
+    """Noise of the points and each repeat's own rest curvature, from the residuals.
 
-    The noise is estimated with all that the shape may do projected out. Lines of few points
-    leave nothing over then: fewer slow displacements are projected out of them, and at last the
-    noise is white, its size estimated together with that of the rest curvatures.
+    The noise is estimated with all changes of shape projected out. If lines have too few points
+    for that, fewer slow displacements are projected out; in the last resort the noise is white,
+    and its size is estimated together with that of the rest curvatures.
 
     Parameters
     ----------
     estimated : bool
-        Whether the noise is; else it is taken as it is.
+        Whether the noise is estimated; otherwise it is taken as it is.
     repeats : bool
-        Whether the cable does. It is a property of the specimen: a scatter that is not there in the
-        declared model, but once an effect has been added, is what that effect does not explain.
+        Whether the cable repeats. This is a property of the specimen: a scatter that appears only
+        after an effect was added to the declared model is an error of that effect.
 
     Raises
     ------
     EstimationError
-        If the points are hardly more than the unknowns that they determine.
+        If there are hardly more points than unknowns that they determine.
     """
     noise, together, length = fit.noise, False, fit.model.cable.length
     if estimated:
@@ -148,9 +148,9 @@ def errors_of(
 def first_reading_noise(
     model: CableModel, force: float | None = None, moment: float | None = None
 ) -> ReadingNoise:
-    """Noise of forces [N] and moments [N m] as declared; of others a first guess.
+    """Noise of forces [N] and moments [N m]: as declared, else a first guess.
 
-    FIRST_FORCE of the forces by which such a cable hangs and bends, and at a tenth of its length.
+    FIRST_FORCE times the forces of such a cable as it hangs and bends; lever arm: length / 10.
     """
     guess = FIRST_FORCE * model.force_scale
     return ReadingNoise(
@@ -189,7 +189,7 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
 
 
 def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
-    """What each repeat has of its own, the likeliest; see `estimate_pose_scatter`."""
+    """Likeliest random quantity of each repeat and its size; see `estimate_pose_scatter`."""
     if different_poses(fit.problem.history, fit.model.cable.length) < DIFFERENT:
         return ScatterEstimate(PoseScatter(), 1.0, 1.0, 0.0)
     found = _scatter_of_source(fit, noise, PoseScatter())
@@ -206,13 +206,13 @@ def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
 
 
 def _beyond_tolerances(fit: Fit) -> bool:
-    """Whether the poses' ends differ from declared ones by more than their scatter, clearly."""
+    """Whether the poses' ends deviate from declared values significantly beyond their scatter."""
     own = fit.own_deviations / fit.problem.deviation_std
     return bool((own**2).sum() > own.size + 2 * np.sqrt(2 * own.size))
 
 
 def _scatter_of_source(fit: Fit, noise: NoiseModel, scatter: PoseScatter) -> ScatterEstimate:
-    """The size of one thing that each repeat has of its own."""
+    """Estimate the size of one random quantity of each repeat."""
     problem, point, lin = fit.problem, fit.point, fit.linearization
     size, std = problem.unknowns.size, problem.deviation_std
     moved = problem.moved_by(point, scatter)
@@ -222,7 +222,7 @@ def _scatter_of_source(fit: Fit, noise: NoiseModel, scatter: PoseScatter) -> Sca
         white = problem.measured[problem.used[k]].whitening(noise, point.projections[k])
         by = white @ lin.raw_directions[k]
         own = by[:, size:] * std
-        # The poses' deviations are random, too: the residual is that without them.
+        # The poses' deviations are random, too: take the residual without them.
         deviation = point.shapes.deviation[problem.used[k], problem.equilibria.used_deviations]
         e = white @ lin.raw[k] - own @ (deviation / std)
         samples.append(ScatterSample(e, white @ moved[k], own, by[:, :size]))
@@ -237,7 +237,7 @@ def _scatter_of_source(fit: Fit, noise: NoiseModel, scatter: PoseScatter) -> Sca
 
 
 def _white_noise(fit: Fit) -> NoiseModel:
-    """White noise of the size of the residuals over their degrees of freedom."""
+    """White noise: size of the residuals over their degrees of freedom."""
     problem = fit.problem
     items = [problem.measured[j] for j in problem.used]
     on_points = np.concatenate([item.on_points for item in items])
@@ -259,7 +259,7 @@ def _white_noise(fit: Fit) -> NoiseModel:
 
 
 def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
-    """Residuals of each pose beside the directions that its curve may take."""
+    """Residuals of each pose, with the directions in which its curve may change."""
     problem, point, lin, model = fit.problem, fit.point, fit.linearization, fit.model
     length = model.cable.length
     size = problem.unknowns.size
@@ -283,7 +283,7 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
         shared = directions[:, :size] / np.maximum(scale, 1e-300)
         bases.append(basis)
         left_over.append(shared - basis @ (basis.T @ shared))
-    # A direction that the poses' own ones hold already costs no further degree of freedom.
+    # A direction already among the poses' own ones takes no further degree of freedom.
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
     blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in raws])[:-1])
     rows = zip(problem.used, raws, point.projections, bases, blocks, strict=True)
@@ -311,10 +311,10 @@ def roughness_of(fit: Fit) -> float:
 def with_roughest_rest(fit: Fit) -> Fit:
     """A fit whose rest curvature is as rough as the data allow.
 
-    Where shapes hardly tell the rest curvature a small roughness is the likeliest, and bands are
-    narrow. Of a simulated cable between pins it was 0.008: the rest curvature in the middle was
-    0.6 +- 0.4 1/m, in truth -1.3. With 0.03 the log evidence is 1.5 less, and the band +- 1.3 1/m.
-    Where a rougher fit comes to a fold of its equilibria the last one before is taken.
+    Where shapes hardly determine the rest curvature, a small roughness is the likeliest and bands
+    are too narrow. For a simulated cable between pins it was 0.008: the rest curvature in the
+    middle was 0.6 +- 0.4 1/m, in truth -1.3. At 0.03 the log evidence is 1.5 less, and the band
+    +- 1.3 1/m. If a rougher fit reaches a fold of its equilibria, the last one before is used.
     """
     found, least = fit, fit.log_evidence - ALLOWED
     while fit.problem.unknowns.n_rest and found.problem.priors.roughness_std < FIRST_ROUGHNESS:
@@ -336,10 +336,10 @@ def scatter_of(fit: Fit) -> FloatArray:
 
         std^2 = (sum of squares + u tolerance^2) / (determined + u),   u = 1 - determined / all
 
-    of the components that the poses have and those of them that they determine: the tolerance
-    counts as one more as far as they do not. The likeliest scatter alone is too small there, and so
-    were intervals: of ten random cables in space five lay more than two standard deviations off,
-    one 4.6; with the tolerance none of these and nine more, at most 1.85.
+    over the components of the poses, of which `determined` are known from the data. The tolerance
+    acts as one more component to the extent that they are not. The likeliest scatter alone was too
+    small, and so were intervals: of ten random cables in space five lay more than two std off, one
+    4.6; with the tolerance none of these and nine more does, at most 1.85.
     """
     problem, normal = fit.problem, fit.normal
     columns = problem.equilibria.used_deviations
@@ -352,8 +352,8 @@ def scatter_of(fit: Fit) -> FloatArray:
     scatter = problem.priors.scatter.copy()
     node = problem.unknowns.model.node
     limits = problem.priors.tolerances.deviation(problem.unknowns.model)
-    # The coordinates of an end share one scatter, and so do the turns of both clamps, and those of
-    # all clips.
+    # The coordinates of an end share one scatter, the turns of both clamps another, and all clips
+    # a third.
     d, b = node.dimension, node.increment
     for group in (range(d), range(d, d + 2 * b), range(2 * (d + b), len(scatter))):
         members = [k for k, column in enumerate(columns) if column in group]
