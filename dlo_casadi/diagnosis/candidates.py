@@ -23,15 +23,15 @@ class Candidate:
     Parameters
     ----------
     frees : tuple of str
-        Qualified parameters that are estimated without a prior once it is added.
+        Qualified parameters that are estimated without a prior once the effect is added.
     screened : tuple of str
-        Qualified parameters of `effect.linear()` whose derivatives where the effect vanishes are
-        the candidate's signature.
+        Qualified parameters of `effect.linear()`; their derivatives, taken where the effect
+        vanishes, are the candidate's signature.
     scans : tuple of dict
-        Values of the parameters by which the effect enters nonlinearly (a place, a direction),
-        at each of which it is screened.
+        Trial values of the parameters in which the effect is nonlinear (a place, a direction); it
+        is screened at each of them.
     nuisance : bool
-        True if the model has it already, held within its tolerance by a prior.
+        True if the model already has the effect, held within its tolerance by a prior.
     """
 
     effect: Effect
@@ -60,11 +60,11 @@ class Candidate:
         return model.without_effect(self.effect.label)
 
     def add_linear_to(self, model: CableModel) -> CableModel:
-        """Return the model with this effect in the parameters that it is screened in."""
+        """Return the model with this effect, in the parameters used for screening."""
         return self.add_to(model) if self.nuisance else model.with_effect(self.effect.linear())
 
     def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
-        """Qualified parameters, within their bounds, from those that it is screened in."""
+        """Qualified parameters, within their bounds, from those used for screening."""
         prefix = f"{self.effect.label}."
         own = self.effect.of_linear(
             cable, {name.removeprefix(prefix): value for name, value in values.items()}
@@ -76,22 +76,22 @@ class Candidate:
 
 
 def setup_of(model: CableModel, **seen: Any) -> Setup:
-    """How a model's cable is held, with what else is known of its measurement."""
+    """Setup of a model's cable, with other knowledge about its measurement."""
     curved = model.n_coefficients > 0
     seen |= {"clips": model.clips, "obstacles": len(model.obstacles)}
     return Setup(model.cable, model.start, model.end, model.gravity, curved, **seen)
 
 
 def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> list[Candidate]:
-    """List all effects that may be missing in a model.
+    """List all effects that may be missing from a model.
 
     Parameters
     ----------
     model : CableModel
-        With its nuisances; an effect that it has without a prior is no candidate any more, but a
+        Includes its nuisances. An effect that it has without a prior is no candidate any more; a
         second lumped mass is.
     exclude : sequence of str
-        Effects that the user does not want to be tried.
+        Effects that the user excludes.
     """
     found = []
     kinds = [x for x in EFFECTS.values() if x.name not in exclude and x.applies(setup)]
@@ -115,7 +115,7 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
 def candidates_of(
     fit: Fit, center: tuple[float, float] | None, exclude: Sequence[str]
 ) -> list[Candidate]:
-    """List all effects that may be missing in a fitted model; see `candidates`.
+    """List all effects that may be missing from a fitted model; see `candidates`.
 
     `center` [m]: middle of the photographs in the board frame.
     """
@@ -137,20 +137,20 @@ def candidates_of(
 def equivalents(
     fit: Fit, added: Candidate, tried: Collection[str], rivals: Sequence[Candidate] = ()
 ) -> tuple[str, ...]:
-    """Names of what an added effect may stand for.
+    """Names of other effects that may be the true cause of an added effect.
 
-    Effects that act as it does, but for those on which the data have decided. On a cable with a
-    free tip, which nothing lifts, a weight beside any load; and the stiffness, where the fit
-    cannot tell the load from it.
+    These are effects that act alike, except those on which the data have decided. For a load on a
+    cable with a free tip, which nothing lifts, a weight is always one of them; so is the stiffness
+    if the fit cannot distinguish the load from it.
 
     Parameters
     ----------
     fit : Fit
-        With the effect.
+        The fit with the effect.
     tried : names
-        What the data have decided on already.
+        Effects on which the data have already decided.
     rivals : sequence of Candidate
-        What they do not tell from it.
+        Candidates that the data cannot distinguish from it.
     """
     effect, cable, setup = added.effect, fit.model.cable, setup_of(fit.model)
     own = {q.name: f"{effect.label}.{q.name}" for q in effect.parameters(cable)}
@@ -174,7 +174,7 @@ def equivalents(
 
 
 def _like_stiffness(fit: Fit, parameters: Sequence[str]) -> bool:
-    """Whether these parameters, if they were known, would tell most of what EI is not known by."""
+    """Whether most of the uncertainty of EI would vanish if these parameters were known."""
     names, covariance = fit.problem.unknowns.names, fit.covariance
     if BENDING_STIFFNESS not in names:
         return False

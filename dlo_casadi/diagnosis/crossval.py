@@ -4,8 +4,8 @@ Leaving pose j out of the normal equations gives the unknowns without it in one 
 
     theta_(-j) = theta - (H - H_j)^-1 (g - g_j)
 
-(exact for a linear model), at which pose j is predicted from its declared end conditions. Where
-there is one pose only, stretches of its arc take the place of poses.
+(exact for a linear model). Pose j is then predicted from its declared end conditions. If there is
+one pose only, stretches of its arc take the place of poses.
 
 References
 ----------
@@ -31,30 +31,30 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 
-# Stretches into which the arc of a single pose is cut.
+# Number of stretches into which the arc of a single pose is cut.
 STRETCHES = 5
 
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """Errors of predictions of what was left out.
+    """Prediction errors of left-out data.
 
     Parameters
     ----------
     squares : (folds,) [m^2]
-        Sum of squared errors of each fold: distances of its points, and readings as
-        `NoiseModel.units` count them; infinite where it could not be predicted.
+        Sum of squared errors of each fold: distances of its points, and wrench measurements
+        converted by `NoiseModel.units`; infinite if it could not be predicted.
     counts : (folds,)
-        Number of points and components of readings of each fold.
+        Number of points and of wrench components of each fold.
     complete : bool
-        Whether each fold could be predicted.
+        Whether every fold could be predicted.
     of_points : float [m]
-        Root mean square distance over all points; that of everything where it is not given.
+        Root mean square distance over all points; if not given, that of everything.
     expected : float [m]
-        Error of everything that noise, fixtures, the cable's scatter and what the other folds know
-        of the parameters let expect, to first order; of a single pose's stretches it is not told.
+        Expected error of everything, to first order: from noise, fixtures, the cable's scatter and
+        the parameters' uncertainty given the other folds. Not given for stretches of a single pose.
     densities : (folds,)
-        Log density of each fold under the covariance, to first order, that this error comes from.
+        Log density of each fold under the covariance from which `expected` comes, to first order.
     """
 
     squares: FloatArray
@@ -73,9 +73,9 @@ class CrossValidation:
 
     @property
     def error_of_most(self) -> float:
-        """`error` of the folds that could be predicted [m]; infinite where most could not.
+        """`error` of the folds that could be predicted [m]; infinite if most could not.
 
-        A pose at the edge of its stability has no equilibrium beside it, whatever the model.
+        A pose at the edge of stability has no equilibrium nearby, whatever the model.
         """
         known = np.isfinite(self.squares)
         if 2 * known.sum() <= len(known):
@@ -89,17 +89,17 @@ class CrossValidation:
 
     @property
     def log_density(self) -> float:
-        """Log predictive density of everything that was left out."""
+        """Log predictive density of all left-out data."""
         return float(self.densities.sum())
 
     def loses_more_than(self, other: CrossValidation) -> bool:
-        """Whether a fold is not predicted that the other predicts."""
+        """Whether some fold is not predicted that the other validation predicts."""
         return bool((np.isinf(self.squares) & np.isfinite(other.squares)).any())
 
     def chance_of_gain(self, other: CrossValidation) -> float:
-        """Probability of a gain as large as that of the other, if it predicts no better.
+        """Probability of a gain as large as the other's if the other predicts no better.
 
-        One-sided paired t test over the folds; 1 where there is but one.
+        One-sided paired t test over the folds; 1 if there is only one fold.
         """
         gap = other.densities - self.densities
         if len(gap) < 2:
@@ -111,8 +111,8 @@ class CrossValidation:
 def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
-    All folds are solved together, some 6 ms each. Only where a state is carried is each a
-    task of its own; it runs in this process unless an executor is given.
+    All folds are solved together, in some 6 ms each. If a state is carried, each fold is a task of
+    its own instead, in this process unless an executor is given.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
@@ -142,7 +142,7 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
 def _density(
     fit: Fit, k: int, seen: Observed | None, theta: FloatArray, covariance: FloatArray
 ) -> float:
-    """Log density of the k-th fitted pose where it is predicted, or to first order if it is not."""
+    """Log density of the k-th fitted pose as predicted; to first order if it is not predicted."""
     problem, lin, white = fit.problem, fit.linearization, fit.problem.whitening[k]
     a, own = lin.by_theta[k], lin.by_deviation[k]
     if seen is None:
@@ -162,7 +162,7 @@ def _log_density(white: FloatArray, ways: FloatArray) -> float:
 
 
 def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> CrossValidation:
-    """From errors [m] of points and of readings of each fold; None where it was not predicted."""
+    """Validation from each fold's errors [m] of points and wrenches; None if not predicted."""
     known = [fold for fold in errors if fold is not None]
     complete = len(known) == len(errors)
     both = [np.zeros(1) if fold is None else np.concatenate(fold) for fold in errors]
@@ -174,17 +174,17 @@ def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> Cross
 
 
 def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unknowns after one step with a part of the data left out, and their covariance."""
+    """Unknowns after one step without part of the data, and their covariance."""
     unknowns = fit.problem.unknowns
     lower, upper = unknowns.bounds
-    # A direction without any information (the place of a mass of zero) is known by its bounds.
+    # A direction without information (e.g. the place of a mass of zero) has its bounds as prior.
     ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian)) + np.diag(1 / unknowns.widest**2)
     covariance = np.linalg.inv(hessian + ridge)
     return np.clip(fit.point.theta - covariance @ gradient, lower, upper), covariance
 
 
 def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[Observed | None]:
-    """What each fitted pose looks like at its own unknowns, from declared end conditions."""
+    """Predicted measurements of each fitted pose at its own unknowns, from declared ends."""
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
     if fit.model.has_state:
         folds = map_in_order(executor, partial(_predict_all, fit), thetas)
@@ -199,7 +199,7 @@ def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[O
 
 
 def _predict_all(fit: Fit, theta: FloatArray) -> list[Observed | None]:
-    """All poses in order at one value of the unknowns, a state carried along."""
+    """Predicted measurements of all poses in order at one theta, with the state carried along."""
     equilibria, unknowns = fit.problem.equilibria, fit.problem.unknowns
     p, rest = unknowns.p(theta), unknowns.rest(theta)
     solved, converged = equilibria.solve(_declared(fit), p, rest)
@@ -207,7 +207,7 @@ def _predict_all(fit: Fit, theta: FloatArray) -> list[Observed | None]:
 
 
 def _declared(fit: Fit) -> Shapes:
-    """The fitted shapes held as declared, from which to solve."""
+    """The fitted shapes with their ends as declared, used as start of a solve."""
     shapes = fit.point.shapes
     return replace(shapes, deviation=np.zeros_like(shapes.deviation))
 

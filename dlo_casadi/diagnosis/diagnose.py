@@ -1,4 +1,4 @@
-"""From a residual to the effects that are missing: screen, confirm, add, until it is noise."""
+"""Search for the effects missing from a fit: screen, confirm, add, until the residual is noise."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ NOT_NEAR = "does not come near the measured shapes"
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the residual of a fit has led to.
+    """Result of a search for missing effects.
 
     Parameters
     ----------
@@ -68,13 +68,13 @@ class Diagnosis:
     validation_before, validation_after : CrossValidation
     structure_before, structure_after : Structure
     ranked : tuple of Ranked
-        All candidates of the first step: those refitted by `support`, then the others by score.
+        All candidates of the first step: the refitted ones by `support`, then the others by score.
     unexplained : bool
-        Whether structure is left, or most poses that were left out are not predicted.
+        Whether structure is left, or most left-out poses are not predicted.
     pull : UnknownForce or None
-        Where that is so: the load that assumes no cause; None where none fits.
+        If unexplained: the load that assumes no cause; None if no load fits.
     weight : HiddenWeight or None
-        That the fit would not notice.
+        Hidden weight that the fit would not notice.
     """
 
     before: Fit
@@ -110,26 +110,26 @@ def diagnose(
 ) -> Diagnosis:
     """Search for effects that a fitted model lacks.
 
-    Held-out poses are not looked at.
+    Held-out poses are not used.
 
     Parameters
     ----------
     fit : Fit
-        Of the declared model.
+        Fit of the declared model.
     center : (float, float), optional [m]
         Middle of the photographs in the board frame.
     exclude : sequence of str
         Effects that are not tried.
     significance : float
-        Probability of a false alarm in a complete model, over all candidates.
+        Probability, over all candidates, of a false alarm in a complete model.
     step : callable
-        Told how far the search has come.
+        Called with the progress of the search.
     executor : Executor, optional
-        Where candidates are screened and refitted and places of an unknown load tried, half a
-        second to some seconds each; in this process by default.
+        Runs the screening and refits of candidates and the trial places of an unknown load, which
+        take half a second to some seconds each; in this process by default.
     finest : int, optional
-        Elements up to which the mesh may be refined during the search; found effects are tested on
-        up to FINEST_MESH. By default it stays.
+        Maximum number of elements to which the search may refine the mesh; by default none. Found
+        effects are tested on up to FINEST_MESH elements.
     """
     run_in = executor or InProcess()
     return Search(fit, center, exclude, significance, max_effects, step, run_in, finest).closed()
@@ -154,12 +154,12 @@ class Search:
 
     @cached_property
     def validation(self) -> CrossValidation:
-        """Of the declared model."""
+        """Cross-validation of the declared model."""
         return cross_validate(self.declared)
 
     @property
     def error(self) -> float:
-        """Cross-validated error of the declared model [m], 0 where it tells nothing."""
+        """Cross-validated error of the declared model [m]; 0 if the validation is incomplete."""
         return self.validation.error if self.validation.complete else 0.0
 
     @property
@@ -169,7 +169,7 @@ class Search:
 
     @property
     def doubt(self) -> float | None:
-        """What a gain is compared with where a pose or two were taken again and again."""
+        """Probability that a gain must beat if only a pose or two were measured repeatedly."""
         problem = self.declared.problem
         count = different_poses(problem.history, problem.unknowns.model.cable.length)
         return self.significance if count < min(DIFFERENT, len(problem.used)) else None
@@ -183,7 +183,7 @@ class Search:
 
     @cached_property
     def refitted(self) -> dict[str, Confirmed | None]:
-        """Refits of the declared model with a candidate, as far as they were needed, by names."""
+        """Refits of the declared model with a candidate, by name, made only as needed."""
         return self.wider.refitted if self.wider is not None else {}
 
     def _screened(self, current: Fit) -> list[Screened]:
@@ -192,12 +192,12 @@ class Search:
         degrees = screening_degrees(current)
         with suppress(EstimationError):
             return refits.scored(current, listed, degrees, self.executor)
-        # A pose that is held out has no equilibrium: what poses leave behind cannot be told.
+        # A held-out pose has no equilibrium, so what poses leave behind cannot be determined.
         listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
         return refits.scored(current, listed, degrees, self.executor)
 
     def closed(self) -> Diagnosis:
-        """What the search finds, without effects that explain too little."""
+        """Result of the search, without effects that explain too little."""
         fit, found, force = self.declared, self._searched(), None
         near = self.at_random(found)
         if near is not None:
@@ -228,11 +228,11 @@ class Search:
         )
 
     def _searched(self) -> Found:
-        """From the measured shapes first where the fit leaves far more than noise, else last.
+        """Search from the measured shapes: first if the fit leaves far more than noise, else last.
 
-        Last, too, if a scatter from pose to pose is left: it explains anything.
+        Also last if a scatter from pose to pose is left, because a scatter explains anything.
         """
-        # From such a fit a first effect bends to what two explain, and others to what it leaves.
+        # In such a fit a first effect absorbs what two explain; others then fit what it leaves.
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
         first = of_shapes.run() if may_be_far and self.declared.chi2_per_dof > REACHED else None
@@ -243,14 +243,14 @@ class Search:
         scatters = found.fit.problem.priors.pose_scatter.std > 0
         if may_be_far and (found.unexplained or scatters):
             found = found.or_better(first or of_shapes.run())
-        # Where left-out poses are not even reached refits may have begun too far from the effect.
+        # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.validation.complete
         return self._or_causes(found)[0] if lost else found
 
     def run(self, force: UnknownForce | None = None) -> Found:
-        """Add effects until the residual is noise, or nothing improves what is left out.
+        """Add effects until the residual is noise or left-out data are predicted no better.
 
-        `force`: whose causes are tried in the first step; else all effects, followed from the
+        `force`: its causes are tried in the first step; without it all effects, starting from the
         declared model.
         """
         current, validation = self.declared, self.validation
@@ -265,7 +265,7 @@ class Search:
             closed, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen
-                # With it the model may be complete now.
+                # With this effect the model may now be complete.
                 known = winner.fit.noise.source != "misfit"
                 closed = settle(winner.fit) if known else winner.fit
                 p_value = max(p_values[item.candidate.name] for item in winner.each)
@@ -273,7 +273,7 @@ class Search:
                 misfit = self._astray(current)
                 if (scatters or not closed.errors_known) and not misfit:
                     again = p_with_closed_noise(current, closed, winner, len(screened))
-                    # A scatter from pose to pose may be nothing but the effect.
+                    # A scatter from pose to pose may be due to the effect alone.
                     p_value = again if scatters else max(p_value, again)
                 if p_value > self.significance:
                     names = [item.candidate.name for item in chosen]
@@ -284,7 +284,7 @@ class Search:
             if p_value > self.significance:
                 break
             if self._astray(current) and force is None:
-                # The mesh of a misfit is coarse, and its error would look like the next effect.
+                # The mesh of a misfit is coarse; its error would look like the next effect.
                 closed = self._fine(closed)
             current, before = closed, validation
             validation = cross_validate(current)
@@ -295,7 +295,7 @@ class Search:
     def _refitted(
         self, current: Fit, force: UnknownForce | None, added: int
     ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
-        """Candidates screened, their p-values, refits of the likely ones, and who stays far off."""
+        """Screened candidates, p-values, refits of the likely ones, and names of those far off."""
         far: list[str] = []
         if self._astray(current) and force is None:
             return self._from_data(current, added)
@@ -312,14 +312,14 @@ class Search:
         return screened, p_values, tried, far
 
     def _astray(self, current: Fit) -> bool:
-        """Whether candidates are tried at the measured shapes, not where a fit has gone."""
+        """Whether candidates start at the measured shapes because the fit is too far from them."""
         first = self.from_shapes and current is self.declared
         return first or current.noise.source == "misfit"
 
     def of_simpler_effects(self, found: Found) -> Found | None:
-        """Search among effects of fewer parameters each, if the larger of two may be one of them.
+        """Search among effects with fewer parameters, if one of these may be the larger of two.
 
-        An effect of many parameters may stand for two of one each.
+        An effect of many parameters may stand for two effects of one parameter each.
         """
         if not found.added or self.declared.noise.source == "misfit":
             return None
@@ -333,17 +333,17 @@ class Search:
         return replace(self, exclude=[*self.exclude, *others], wider=self).run()
 
     def _or_causes(self, found: Found) -> tuple[Found, UnknownForce | None]:
-        """What has been found, or causes of an unknown force if these are better; and the force."""
+        """The found effects, or causes of an unknown force if these are better; and the force."""
         start = self.declared if found.added else found.fit
         force = estimate_unknown_force(start, self.executor)
         causes = self.run(force) if force is not None and self.several else None
         return found.or_better(causes), force
 
     def at_random(self, found: Found) -> Fit | None:
-        """The declared model with random effects, if it misfits and they explain it as well.
+        """The declared model with random effects, if it misfits and they explain it equally well.
 
-        Effects found in a misfit were never tested beside the scatter that they leave: of a scatter
-        of 8 mm the mean over 12 poses passed for an offset. From there on they are.
+        Effects found in a misfit were never tested against the scatter that they leave: the mean
+        over 12 poses of a scatter of 8 mm was taken for an offset. From this fit on they are.
         """
         scatter = found.fit.problem.priors.pose_scatter
         if self.declared.noise.source != "misfit" or not (found.unexplained or scatter.std):
@@ -358,14 +358,14 @@ class Search:
         return near if likelier else None
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
-        """Backward step: without the effects that others have made superfluous.
+        """Backward step: remove effects that later ones have made superfluous.
 
-        A nuisance is held within its declared tolerance again.
+        A removed nuisance is held within its declared tolerance again.
 
         An effect has to be worth its parameters, and as significant as when it was added. The last
-        one is significant, but may have led out of a local minimum in which there is no need of it,
-        or stand for what the mesh lacked: 80 elements on a table were 0.6 mm off. One found from
-        the shapes may stand for a scatter.
+        one is significant, but it may have led out of a local minimum and no longer be needed, or
+        stand for an error of the mesh: 80 elements on a table were 0.6 mm off. An effect found from
+        the measured shapes may stand for a scatter.
         """
         before, fit = fit, self._fine(fit, FINEST_MESH) if added else fit
         significant = added[-1:] if fit is before and not self.from_shapes else []
@@ -388,7 +388,7 @@ class Search:
         self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
     ) -> list[Confirmed | None]:
         """Refits of the significant candidates with the highest scores."""
-        # A scatter from pose to pose may hold the effect: the refit is tested with what is left.
+        # A scatter from pose to pose may hide the effect: test the refit with what is left.
         any_ = current.problem.priors.pose_scatter.std > 0
         significant = [
             x for x in screened if any_ or p_values[x.candidate.name] < self.significance
@@ -404,7 +404,7 @@ class Search:
     def _from_data(
         self, current: Fit, added: int
     ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
-        """As `_refitted`, from the measured shapes."""
+        """As `_refitted`, but starting at the measured shapes."""
         pairs = added + 2 <= self.max_effects
         found = refits.near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
         p_values = p_values_of(found.screened)
@@ -415,9 +415,9 @@ class Search:
         return found.screened, p_values, found.tried, found.far
 
     def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
-        """Refits of all loads at one place, whatever their scores, that explain the forces.
+        """Refits of all loads at one place that explain the forces, whatever their scores.
 
-        A force in each pose would be likelier if the law were wrong.
+        A load with the wrong law is less likely than a force in each pose, and is left out.
         """
         loads = [item for item in screened if isinstance(item.candidate.effect, PointLoad)]
         refit = partial(refits.confirm_cause, self.declared, force)
@@ -426,13 +426,13 @@ class Search:
         return [item for item in tried if item is not None and item.fit.log_evidence >= least]
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
-        """What has been found, and whether it explains the data."""
+        """The effects found, and whether they explain the data."""
         if not added and not fit.noise.known:
             fit = settle(fit)
         return Found.of(fit, added, ranked, len(self.declared.problem.used), self.significance)
 
     def _fine(self, fit: Fit, finest: int | None = None) -> Fit:
-        """A fit with effects on a mesh that is fine enough, where the mesh may be refined."""
+        """A fit with effects on a sufficiently fine mesh, if the mesh may be refined."""
         if self.finest is None:
             return fit
         return fine_enough(fit, fit.model.n, SETTLED_MODES, finest or self.finest)[0]
@@ -440,10 +440,10 @@ class Search:
     def without_wrong_causes(self, found: Found) -> Found:
         """Withdraw effects that do not explain nearly all of what the declared model lacks.
 
-        Something is missing still, and a wrong effect may stand for a part of it. Effects stay
-        if the mean square error of what is left out, beyond noise and fixtures, falls to less
-        than LEFT of what it was: then what is missing beside them is small against what they
-        explain.
+        If something is still missing, a wrong effect may stand for part of it. Effects are kept
+        only if the mean square error of left-out data, beyond noise and fixtures, falls below LEFT
+        times its value without them: what is missing beside them is then small compared with what
+        they explain.
         """
         floor = found.fit.expected_error**2
         after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))

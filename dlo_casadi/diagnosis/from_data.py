@@ -1,10 +1,10 @@
-"""Candidates tried at the measured shapes, where the declared model's equilibria lead astray.
+"""Candidates tried at the measured shapes, for when the declared model's equilibria mislead.
 
-The fit begins with the balance of forces relaxed, which needs no equilibrium, see
-`estimation.relaxation`. The imbalance tells which effect is missing: with each likely candidate the
-fit begins at the measured shapes again, until the balance is nearly strict, and what is left then
-tells how near the candidate comes. Where none comes near alone, each is tried beside a second one,
-screened anew beside the first.
+The fit starts with a relaxed balance of forces, which needs no equilibrium, see
+`estimation.relaxation`. The imbalance shows which effect is missing. With each likely candidate the
+fit starts again at the measured shapes and continues until the balance is nearly strict; what is
+left then measures how well the candidate fits. If no candidate fits well alone, each of them is
+tried with a second one, screened again in its presence.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import NEAR_LEADER, REFITTED
 
-# Softness [rad] at which candidates may be scored; largest sum of squares per residual at which the
+# Softness [rad] at which candidates may be scored; largest sum of squares per residual at which
 # relaxed shapes still count as the measured ones.
 SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
-# Softness [rad] through which candidates are relaxed before they are compared, and what one may
-# leave there of the objective, relative to the one that leaves least. In two sessions in space the
-# hidden effect left 3105 and 8250, its only rival 8051, and all others 27800 and more. If the least
-# is noise, differences are those of log likelihoods, twice: a tenth of hundreds is beyond doubt.
+# Softness [rad] through which candidates are relaxed before they are compared; largest objective of
+# a candidate relative to the least one. In two sessions in space the hidden effect left 3105 and
+# 8250, its only rival 8051, and all others 27800 and more. If the least is noise, differences are
+# twice those of log likelihoods: a tenth of hundreds is beyond doubt.
 COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
-# Largest sum of squares per residual at which a start counts as having reached the noise; of a
+# Largest sum of squares per residual at which a start counts as having reached the noise; for a
 # strict balance, relative to that of shapes that need not balance.
 REACHED = 1.5
-# Candidates beside each of which a second one is tried, and number of second ones: of a drift and a
-# force hidden together the drift left second least, and the force scored highest beside it.
+# Number of candidates to which a second one is added, and number of second ones. In a session with
+# a drift and a force, the drift left second least, and the force scored highest beside it.
 FIRST, SECOND = 3, 3
-# Bending stiffnesses from which a contact is tried, in weights times the length squared: from where
-# a weight bends cables much on, down to chains.
+# Trial bending stiffnesses for a contact, in weights times length squared: from cables that their
+# weight hardly bends down to chains.
 STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
 
 
 def from_data(base: Fit) -> tuple[Fit, float]:
-    """A base that lacks something, relaxed at the measured shapes; no equilibrium.
+    """Relax an incomplete base at the measured shapes; the result is no equilibrium.
 
-    At its known noise, or that of the shapes alone, on the mesh of a search, or a finer one where
-    points are better known than that can follow, and from nominal parameters: those of the base
-    fit what it lacks. Its softness [rad] is the least of SCORED at which the shapes are still those
-    measured.
+    The noise is the base's if known, else it follows from the shapes. The mesh is that of a search,
+    or finer if it cannot follow very accurate points. Parameters start at nominal values, since
+    those of the base are distorted by what it lacks. The softness [rad] is the least of SCORED at
+    which the shapes are still the measured ones.
     """
     model = base.model
     mesh = max(SearchSettings.of(model).mesh, model.coarse.n)
@@ -67,7 +67,7 @@ def from_data(base: Fit) -> tuple[Fit, float]:
 
 
 def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
-    """As `from_data`, on a mesh."""
+    """As `from_data`, on a given mesh."""
     alone = replace(NoiseModel(FIRST_STD), readings=base.noise.readings)
     model = base.model.with_mesh(mesh)
     known: NoiseModel = base.noise.before or (base.noise if base.noise.known else alone)
@@ -87,7 +87,7 @@ def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
 
 
 def _beside(base: Fit, model: CableModel) -> Problem:
-    """The problem of a model beside a base, at its noise and with priors that know no scatter."""
+    """The problem of another model, with a base's noise and with priors without any scatter."""
     unknowns = Unknowns(model, base.free_in(model), base.values_in(model))
     priors = Priors.of(base.problem.priors.tolerances, model)
     return replace(base.problem, unknowns=unknowns, priors=priors)
@@ -96,8 +96,8 @@ def _beside(base: Fit, model: CableModel) -> Problem:
 def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) -> list[Screened]:
     """Score tests in a relaxed model, best first.
 
-    Of those without derivative where they vanish a soft balance tells less than a fit does: last,
-    without a score.
+    For effects without derivative where they vanish, a soft balance is less informative than a
+    fit: they come last, without a score.
     """
     gradual = [x for x in listed if x.effect.gradual]
     found = RelaxedScreen(near, gradual, softness).run(np.inf) if gradual else []
@@ -107,18 +107,18 @@ def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) 
 
 @dataclass(frozen=True)
 class RelaxedStart:
-    """A candidate beside a relaxed fit, its balance nearly strict: no equilibrium yet.
+    """A candidate added to a relaxed fit, with a nearly strict balance: no equilibrium yet.
 
     Parameters
     ----------
     near : Fit
-        Relaxed, without the candidate.
+        The relaxed fit without the candidate.
     begun, values : Values
-        Before and after.
+        Values before and after the relaxation.
     left : float
         Twice the objective.
     beside : tuple of Screened
-        Candidates that `near` has, too.
+        Candidates that `near` already has.
     """
 
     near: Fit
@@ -131,10 +131,10 @@ class RelaxedStart:
 
     @classmethod
     def of(cls, near: Fit, screened: Screened, beside: tuple[Screened, ...] = ()) -> RelaxedStart:
-        """From the measured shapes; of a contact also from some stiffnesses, what leaves least.
+        """Best start from the measured shapes; for a contact also from several stiffnesses.
 
-        The stiffer a cable the less a soft balance tells of what pushes it up: with a contact
-        there is no way back from a stiffness that has run up a hundredfold.
+        The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
+        stiffness that has grown a hundredfold never returns.
         """
         known: list[dict[str, float]] = [{}]
         if not screened.candidate.effect.gradual:
@@ -152,18 +152,18 @@ class RelaxedStart:
         *,
         rolls: bool = False,
     ) -> RelaxedStart:
-        """From the measured shapes and what is known, the candidate not there yet.
+        """Relax from the measured shapes and known values, with the candidate initially absent.
 
-        In parameters in which it is linear: an anchor is nowhere while its tether does not pull.
-        Relaxed shapes and their parameters stand for what the model without it lacks.
+        Uses the parameters in which the candidate is linear: a tether without force has no anchor.
+        The relaxed shapes and parameters of `near` are distorted by what that model lacks.
         """
         candidate = screened.candidate
         scan = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
         others = {name: near.value(name) for x in beside for name in x.candidate.frees}
         values = {**others, **scan, **known}
         linear, begun = _as_measured(near, candidate.add_linear_to(near.model), values)
-        # Where and which way it acts stays where its score is largest until it acts: before, a step
-        # of these leads anywhere.
+        # Keep place and direction of the effect where its score is largest until it acts: before, a
+        # step in them leads anywhere.
         fixed = np.isin(linear.unknowns.names, list(candidate.scans[0]))
         if rolls:
             linear, begun = begin(linear, begun.theta, fixed)
@@ -183,7 +183,7 @@ class RelaxedStart:
     def and_second(
         self, softness: float, center: tuple[float, float] | None, exclude: Sequence[str]
     ) -> list[RelaxedStart]:
-        """Starts of the likely candidates beside this one, screened at a softness."""
+        """Starts with a likely second candidate added to this one, screened at a softness."""
         values = relaxed(self.problem, self.values, (softness,))
         near = Fit(self.problem, self.problem.evaluate(values))
         listed = candidates_of(near, center, exclude)
@@ -191,14 +191,14 @@ class RelaxedStart:
         return [RelaxedStart.of(near, x, (*self.beside, self.screened)) for x in likely]
 
     def fit(self) -> Fit | None:
-        """The fit that it leads to; None if some pose has no equilibrium there."""
+        """Fit reached from this start; None if some pose has no equilibrium there."""
         left = SOFTNESS[len(COMPARED) :]
         return fit_from(self.problem, self.begun, left, followed=self.values)
 
     def rolled(self) -> RelaxedStart | None:
-        """The same with the end rolled anew; None where lines tell how it is turned.
+        """The same start with the end roll searched again; None if the lines determine it.
 
-        The relaxed shapes without the candidate may be turned otherwise.
+        The roll of the relaxed shapes without the candidate may be wrong.
         """
         if END_ROLL not in self.problem.unknowns.names:
             return None
@@ -206,7 +206,7 @@ class RelaxedStart:
 
 
 def likeliest(screened: Sequence[Screened]) -> list[Screened]:
-    """Candidates whose score at the measured shapes comes near the leading one."""
+    """Candidates whose score at the measured shapes is close to the highest."""
     scored = [x for x in screened if x.candidate.effect.gradual]
     return [x for x in scored if x.score >= NEAR_LEADER * scored[0].score][:REFITTED]
 
@@ -222,11 +222,11 @@ def nearest(
     pairs: bool = True,
     least: float = np.inf,
 ) -> list[RelaxedStart]:
-    """Starts that leave little more than the one that leaves least, nearest first.
+    """Starts whose objective is close to the least one, best first.
 
-    Of the candidates, beside another start that leaves `least`; where none of these comes to the
-    noise that the relaxed shapes have, of two together if `pairs` may be added and REACHED times
-    what they leave is less.
+    The least one is that of the candidates, or `least` of another start. If none of them reaches
+    the noise of the relaxed shapes, pairs are tried, provided `pairs` may be added; pairs are
+    returned if REACHED times their objective is less.
     """
     noise = REACHED * near.point.data
     alone = map_in_order(executor, partial(RelaxedStart.of, near), likely)
@@ -243,7 +243,7 @@ def nearest(
 def _near_least(
     begun: Iterable[RelaxedStart], noise: float, least: float = np.inf
 ) -> list[RelaxedStart]:
-    """Those that leave little more than the one that leaves least, nearest first."""
+    """Starts whose objective is close to the least one, best first."""
     ordered = sorted(begun, key=lambda x: x.left)
     least = min([least, *(x.left for x in ordered[:1])])
     most = least * (NEAR_NOISE if least < noise else NEAR_LEAST)
@@ -253,9 +253,9 @@ def _near_least(
 def _as_measured(
     near: Fit, model: CableModel, known: Mapping[str, float]
 ) -> tuple[Problem, Values]:
-    """A model at the measured shapes, with parameters that are known, others nominal.
+    """A model at the measured shapes, with known parameters where given and others nominal.
 
-    The shapes are rolled in their end clamps as the relaxed ones.
+    The shapes have the end roll of the relaxed ones.
     """
     problem = _beside(near, model)
     names, free = model.names, problem.unknowns.free
@@ -271,7 +271,7 @@ def _as_measured(
 
 
 def _stiffnesses(model: CableModel) -> list[dict[str, float]]:
-    """Parameters by name for each of STIFFNESSES_OF_CONTACT, in their declared ratio."""
+    """Stiffnesses by name for each of STIFFNESSES_OF_CONTACT, in their declared ratio."""
     typical = model.cable.mass * float(np.linalg.norm(model.gravity)) * model.cable.length**2
     own = model.nominal[model.stiffness_indices]
     names = [model.names[k] for k in model.stiffness_indices]
@@ -284,7 +284,7 @@ def _stiffnesses(model: CableModel) -> list[dict[str, float]]:
 def _in_own_parameters(
     near: Fit, candidate: Candidate, linear: Problem, values: Values
 ) -> tuple[Problem, Values]:
-    """Relaxed values of parameters in which a candidate is linear, in its own parameters."""
+    """Convert relaxed values from a candidate's linear parameters to its own ones."""
     before, model = linear.unknowns.model, candidate.add_to(near.model)
     if before == model:
         return linear, values

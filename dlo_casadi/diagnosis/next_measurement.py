@@ -1,4 +1,4 @@
-"""What the poses do not tell, and the measurement that would: a hidden weight, the next pose."""
+"""What the poses do not determine, and the measurement that would: hidden weight, next pose."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,35 +23,35 @@ from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.thresholds import APART
 
-# Weights that are tried in turn, over the cable's own: until one does not fit.
+# Trial weights over the cable's own, in this order, until one does not fit.
 WEIGHTS = 0.05 * 1.6 ** np.arange(9)
-# Directions of the clamp that are tried for a pose that would tell.
+# Number of trial directions of the clamp for a pose that would reveal the weight.
 HEADINGS = 12
-# Decrease of twice the objective that 95 % of true values are within.
+# Decrease of twice the objective within which 95 % of true values lie.
 PROFILE_95 = float(chdtri(1, 0.05))
-# End poses that are tried, drawn within the reach that the session has explored.
+# Number of trial end poses, drawn within the region that the session has explored.
 TRIED = 30
 SEED = 0
 
 
 @dataclass(frozen=True)
 class HiddenWeight:
-    """A weight that is not told from stiffness.
+    """A weight that the data cannot distinguish from stiffness.
 
     Parameters
     ----------
     mass : float [kg]
-        The largest of those tried that fits as well as none.
+        Largest trial weight that fits as well as none.
     position : float [m]
-        Where on the cable it would make the stiffness most uncertain.
+        Arc length at which it would make the stiffness most uncertain.
     stiffness_95 : (float, float) [N m^2]
-        Interval of EI with no more than that weight, or none.
+        Interval of EI if there is no weight, or any up to that one.
     force : float [N]
-        That weight: a reading on the start fixture differs by it.
+        Force of that weight: it changes the force measured on the start fixture by this amount.
     heading : float or None [rad]
-        Direction of the start clamp in a plane in which shapes with and without it differ most.
+        Direction of the start clamp in a plane at which shapes with and without it differ most.
     difference : float or None [m]
-        By how much there, RMS along the cable.
+        That difference, RMS along the cable.
     """
 
     mass: float
@@ -63,9 +63,9 @@ class HiddenWeight:
 
 
 def hidden_weight(fit: Fit, exclude: Sequence[str] = ()) -> HiddenWeight | None:
-    """The weight that a fit would not notice; None if it notices a twentieth of the cable's.
+    """Largest weight that a fit would not notice; None if it notices 1/20 of the cable's own.
 
-    Only of a free tip: with both ends held the pull between them tells the stiffness.
+    Only for a free tip: with both ends held the force between them determines the stiffness.
     """
     model = fit.model
     free = model.end == "free" and BENDING_STIFFNESS in fit.problem.unknowns.names
@@ -101,7 +101,7 @@ def _place(fit: Fit, weight: Candidate) -> float:
 
 
 def _with_weights(fit: Fit, weight: Candidate, place: float) -> Iterator[Fit]:
-    """Fits with heavier and heavier weights at a place, as long as they fit as well as none."""
+    """Fits with increasing weights at a place, as long as they fit as well as without."""
     model, unknowns = weight.add_to(fit.model), fit.problem.unknowns
     free = unknowns.names[: unknowns.n_parameters]
     start, best = fit, fit.point.objective
@@ -124,7 +124,7 @@ def _interval(fit: Fit) -> tuple[float, float]:
 
 
 def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
-    """Direction [rad] of the clamp in which two fits differ most, and by how much [m], RMS."""
+    """Direction [rad] of the clamp at which two fits differ most, and that difference [m], RMS."""
     if fit.model.in_space or fit.model.start != "clamped":
         return None, None
     base = fit.problem.measured[fit.problem.used[0]].pose
@@ -136,7 +136,7 @@ def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
         curves = [
             item.curve.at(places)
             for item in pair
-            # Near a clamp that points up the cable may fall to either side: no clean test.
+            # Near a clamp that points up the cable may fall to either side: not a clear test.
             if item is not None and item.equilibrium.other_side is None
         ]
         gap = curves[0] - curves[1] if len(curves) == 2 else np.zeros((1, 2))
@@ -153,12 +153,12 @@ class NextReading:
     ----------
     name : str
         Of `ends.REACTIONS`.
-    difference : float [N] or [N m]
+    One of `ends.REACTIONS`.
         Size of the difference of the two predictions.
     separation : float
-        The same in standard deviations of one reading, that of a bias of the sensor included.
+        The same in standard deviations of one measurement, including the bias of the sensor.
     times : int or None
-        How often it has to be read to tell them apart; None if the bias hides the difference.
+        Number of measurements that separate the rivals; None if the bias hides the difference.
     """
 
     name: str
@@ -177,12 +177,12 @@ class NextPose:
     difference : float [m]
         RMS difference of the two predictions.
     separation : float
-        The same in standard deviations of one measurement, its noise and the correlation along
-        the cable included: sqrt(d^T C^-1 d) with the differences d between the predictions, as
-        the sensors see them, at the places of the points that the nearest pose has. What a new
-        fit of either rival could adapt to is not taken off.
+        The same in standard deviations of one measurement, with its noise and correlation along
+        the cable: sqrt(d^T C^-1 d) for the differences d of the predicted measurements at the
+        points of the nearest pose. It is not reduced by what a new fit of either rival could
+        absorb.
     reading : NextReading
-        What a sensor at a fixture would tell there.
+        Measurement of a sensor at a fixture that separates them best there.
     separates : tuple of str
         Names of the rivals.
     """
@@ -197,7 +197,7 @@ class NextPose:
 def separating_pose(fit: Fit, added: Sequence[AddedEffect]) -> NextPose | None:
     """Pose that separates one of a fit's added effects from its closest rival.
 
-    Both as fits on the mesh of the search.
+    Both rivals are fits on the mesh of the search.
     """
     for item in added:
         if item.rivals:
@@ -211,8 +211,8 @@ def separating_pose(fit: Fit, added: Sequence[AddedEffect]) -> NextPose | None:
 def next_pose(first: Fit, second: Fit) -> NextPose | None:
     """Reachable end pose at which two fits predict the most different shapes.
 
-    The candidates are spread over the box of the ends that were used, a tenth wider, within
-    97 % of the cable's length from the start; None for a free end.
+    The candidates are spread over the box of the ends used so far, a tenth wider, within 97 % of
+    the cable's length from the start. None for a free end.
     """
     poses = [item.pose for item in first.problem.history]
     if first.model.end == "free":
@@ -236,7 +236,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
             continue
         gap = one.curve.at(places) - other.curve.at(places)
         difference = float(np.sqrt((gap**2).sum(axis=1).mean()))
-        # Beyond a tenth of the length the rivals sit on different branches: no clean test.
+        # Above a tenth of the length the rivals are on different branches: not a clear test.
         if difference > 0.1 * first.model.cable.length:
             continue
         if best is None or difference > best[0]:
@@ -251,7 +251,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
 
 
 def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
-    """Which reading tells two predictions of a pose apart best."""
+    """The wrench measurement that best separates two predictions of a pose."""
     tolerances, noise = fit.problem.priors.tolerances, fit.noise.readings
     found = []
     for name, at in reaction_rows(fit.model.node).items():
@@ -267,7 +267,7 @@ def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
 
 
 def _separation(fit: Fit, end: FloatArray, curves: tuple[NodeCurve, NodeCurve]) -> float:
-    """Difference of two curves in standard deviations of one line, measured as that nearest."""
+    """Difference of two curves in standard deviations of one line like that of the nearest pose."""
     problem = fit.problem
     ends = np.array([problem.measured[j].pose.end for j in problem.used])
     k = int(((ends - end) ** 2).sum(axis=1).argmin())

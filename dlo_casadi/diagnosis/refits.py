@@ -1,13 +1,12 @@
 """From a candidate to a fit with it: where it starts, the refit, and how it compares.
 
-A refit starts from the candidate's one-step estimate at the minimum without it. Where the shapes
-there are too far from the measured ones to follow any effect, it starts in another way.
+A refit starts from the candidate's one-step estimate at the minimum without it. If the shapes there
+are too far from the measured ones to follow any effect, there are two other starts.
 
-An unknown force may fit the shapes, with a force f_j in every pose at one place r_j of the
-cable; a load is its cause if its own law gives these forces. All are linear in their parameters
-once the place is known (a tether in k and k a: f = k a - k r): least squares tell where to start.
-
-Or the fit begins at the measured shapes, see `diagnosis.from_data`.
+One is an unknown force that fits the shapes: a force f_j in every pose at one place r_j of the
+cable. A load is its cause if the load's own law gives these forces. Once the place is known, all
+loads are linear in their parameters (a tether in k and k a: f = k a - k r), and least squares give
+the start. The other start is at the measured shapes, see `diagnosis.from_data`.
 """
 
 from __future__ import annotations
@@ -50,14 +49,14 @@ from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import REFITTED
 
-# Shares of the one-step estimate from which a refit is tried.
+# Shares of the one-step estimate from which a refit is tried, in this order.
 SHARES = (1.0, 0.5, 0.2, 0.05)
-# Share of the gain that the score promises, from which on a refit that creeps is not tried again.
+# Share of the gain predicted by the score above which a slowly converging refit is not repeated.
 PROMISED = 0.5
-# Starts whose objectives end so near to one another have led to one place, and smaller shares begin
-# nearer to the base still. Reports of eighteen sessions were the same without that limit.
+# Starts whose objectives differ by less count as one minimum: smaller shares would start nearer to
+# the base still. Without this limit the reports of eighteen sessions were the same.
 ONE_PLACE = 1.0
-# Gauss-Newton steps of one refit, and of one from forces that scatter from pose to pose.
+# Maximum number of Gauss-Newton steps of a refit, and of one that starts from scattered forces.
 MOST_STEPS, STEPS_FROM_FORCES = 25, 60
 
 
@@ -70,7 +69,7 @@ class Confirmed:
     gain : float
         Decrease of twice the objective.
     beside : tuple of Screened
-        Other candidates that the fit has and its base has not.
+        Other candidates that the fit has and its base lacks.
     """
 
     screened: Screened
@@ -83,7 +82,7 @@ class Confirmed:
     def of(
         cls, screened: Screened, base: Fit, fit: Fit | None, beside: tuple[Screened, ...] = ()
     ) -> Confirmed | None:
-        """Compare a fit with a candidate, if there is one, with the base, the fit without it."""
+        """Compare the fit with a candidate, if there is one, with its base."""
         if fit is None:
             return None
         gain = 2 * (base.point.objective - fit.point.objective)
@@ -96,16 +95,16 @@ class Confirmed:
 
     @property
     def each(self) -> tuple[Screened, ...]:
-        """All candidates that the base has not."""
+        """All candidates that the base lacks."""
         return (*self.beside, self.screened)
 
     @property
     def name(self) -> str:
-        """Their names."""
+        """Names of these candidates."""
         return " and ".join(x.candidate.name for x in self.each)
 
     def beside_others(self) -> list[Confirmed]:
-        """Each of its candidates beside the others."""
+        """One entry per candidate, each with the others beside it."""
         return [
             replace(self, screened=x, beside=tuple(y for y in self.each if y is not x))
             for x in self.each
@@ -119,13 +118,13 @@ class NearData:
     Parameters
     ----------
     screened : list of Screened
-        All, best first.
+        All candidates, best first.
     nearest : list of Screened
-        Those that came nearest to the shapes; of pairs the second.
+        Those that fit the shapes best; of pairs the second candidate.
     tried : list of Confirmed or None
         Their fits, and those of contacts.
     far : list of str
-        Names of likely ones that stayed far from the shapes.
+        Names of likely candidates that stayed far from the shapes.
     """
 
     screened: list[Screened]
@@ -145,10 +144,10 @@ def scored(
 
 
 def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screened:
-    """Test of a candidate that has no derivative where it vanishes: what a refit gains.
+    """Test a candidate without derivative where it vanishes, by the gain of a refit.
 
-    It starts from the base; and from the measured shapes, unless the base leaves no more than a
-    declared noise: else its noise may hold what it lacks.
+    The refit starts from the base. It also starts from the measured shapes, unless the base has a
+    declared noise and reaches it: an estimated noise may hide what the base lacks.
     """
     start = dict(candidate.scans[0])
     fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
@@ -167,14 +166,14 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
 
 
 def confirm(base: Fit, screened: Screened) -> Confirmed | None:
-    """Refit with a candidate added; None if no equilibria can be followed to it."""
+    """Refit with a candidate added; None if its equilibria cannot be followed."""
     return Confirmed.of(screened, base, screened.fit or refit_with(base, screened))
 
 
 def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirmed | None:
-    """Refit the base's model with a load in the place of the force; None if none can be followed.
+    """Refit the base's model with a load in place of the force; None if it cannot be followed.
 
-    The base has neither.
+    The base has neither of them.
     """
     values = start_from(force, screened.candidate)
     fit = _followed(force.fit, screened.candidate.add_to(base.model), values, STEPS_FROM_FORCES)
@@ -184,22 +183,22 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
 
 
 def explains(item: Confirmed | None) -> bool:
-    """Whether a refit comes to its points as near as their noise lets expect."""
+    """Whether a refit meets its points as closely as their noise allows."""
     if item is None or item.fit.noise.source == "misfit":
         return False
     return item.fit.chi2_per_dof < REACHED
 
 
 def _at_noise(fit: Fit, noise: NoiseModel) -> Fit:
-    """A fit that comes to its points, weighed by their noise instead of that of a misfit."""
+    """A fit that meets its points, weighed by their noise instead of that of a misfit."""
     priors = Priors.of(fit.problem.priors.tolerances, fit.model)
     return refine(fit.reweighed(noise, priors), first=True)
 
 
 def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
-    """Fit with a candidate added, from the relaxed base; None if that leads to no equilibrium.
+    """Fit with a candidate added, from the relaxed base; None if it reaches no equilibrium.
 
-    Weighed as the base where the candidate does not bring it to the noise of the points.
+    It keeps the base's weights if the candidate does not bring it to the noise of the points.
     """
     with suppress(EstimationError):
         fit = start.fit()
@@ -219,10 +218,10 @@ def near_data(
     *,
     pairs: bool,
 ) -> NearData:
-    """Fits from the measured shapes of the candidates, or `pairs`, that come nearest to them.
+    """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
 
-    Beside a misfit scores tell nothing, and a refit leads where the declared model has gone. Where
-    the nearest does not explain the shapes its end is rolled anew, then that of the next.
+    In a misfit scores are useless, and a refit follows the declared model's error. If the best
+    candidate does not explain the shapes, its end roll is searched again, then that of the next.
     """
     near, softness = from_data(base)
     screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
@@ -237,7 +236,7 @@ def near_data(
     tried = list(map_in_order(executor, partial(confirm_from_data, base), kept))
     for k, start in () if explained else enumerate(kept):
         item = tried[k]
-        # What a wrongly rolled end leaves may pass for a scatter from pose to pose.
+        # The error of a wrong end roll may look like a scatter from pose to pose.
         if item is None or not explains(item) or item.fit.problem.priors.pose_scatter.std:
             tried[k] = confirm_rolled(base, start, item)
         if explains(tried[k]):
@@ -250,7 +249,7 @@ def near_data(
 
 
 def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
-    """The likelier one of `found` and a fit from the start with its end rolled anew."""
+    """The likelier of `found` and a fit from the start with the end roll searched again."""
     rolled = start.rolled()
     other = confirm_from_data(base, rolled) if rolled else None
     both = [item for item in (found, other) if item is not None]
@@ -260,10 +259,10 @@ def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> C
 def confirm_contacts(
     base: Fit, begun: Sequence[RelaxedStart], executor: Executor
 ) -> list[Confirmed]:
-    """`confirm_from_data` of those without derivative where they vanish, scored by their gains.
+    """`confirm_from_data` of effects without derivative where they vanish, scored by gain.
 
-    Of a contact a soft balance tells less than a fit does. Gains are those under the noise of the
-    base, which may hold what the base lacks: a fit gains that much at least.
+    For a contact, a soft balance is less informative than a fit. Gains are computed with the
+    noise of the base, which may hide what the base lacks: they are at least this large.
     """
     found = map_in_order(executor, partial(_confirm_contact, base), begun)
     return [item for item in found if item is not None]
@@ -284,7 +283,7 @@ def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
 def _followed(
     start: Fit, model: CableModel, values: Mapping[str, float], steps: int = 40
 ) -> Fit | None:
-    """The refit of a model with new parameters at these values; None without equilibria."""
+    """Refit of a model with new parameters at these values; None without equilibria."""
     with suppress(EstimationError):
         return refit(start, model, values=values, steps=steps)
     return None
@@ -313,12 +312,12 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
 
 
 def refit_without(fit: Fit, candidate: Candidate, before: CableModel) -> Fit | None:
-    """Fit without a candidate, a nuisance held as in the declared model `before`; None if none."""
+    """Fit without a candidate; a nuisance is held as in `before`. None without equilibria."""
     return _followed(fit, candidate.remove_from(fit.model, before), {})
 
 
 def start_from(force: UnknownForce, candidate: Candidate) -> dict[str, float]:
-    """Qualified parameters of a load at one place that come closest to the given forces."""
+    """Qualified parameters of a load at one place that reproduce the given forces best."""
     fit, model = force.fit, force.fit.model
     effect = candidate.effect.linear()
     assert isinstance(effect, PointLoad)

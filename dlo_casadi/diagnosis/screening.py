@@ -5,9 +5,9 @@ nominal values, a candidate's columns c and those b of the fit itself give
 
     I = H_cc - H_cb H_bb^-1 H_bc,   u = -g_c + H_cb H_bb^-1 g_b,   T = u^T I^-1 u
 
-the fit's own directions, nuisances and deviations projected out. T is the predicted decrease of
-twice the objective, and follows chi-square with as many degrees of freedom as the candidate has
-linear parameters where nothing is missing.
+with the fit's own directions, nuisances and deviations projected out. T is the predicted decrease
+of twice the objective. If nothing is missing it follows chi-square, with one degree of freedom per
+linear parameter of the candidate.
 
 References
 ----------
@@ -51,11 +51,11 @@ class Screened:
     score : float
         T, the predicted decrease of twice the objective, at the best scan.
     p_value : float
-        Corrected for the places scanned, not for the number of candidates.
+        Corrected for the number of places scanned, not for that of candidates.
     start : dict
         One-step estimate of the candidate's parameters.
     fit : Fit, optional
-        The refit that is the test of one that has no derivative where it vanishes.
+        The refit that tests a candidate without derivative where it vanishes.
     """
 
     candidate: Candidate
@@ -78,10 +78,10 @@ def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
 
 @dataclass(frozen=True)
 class _Moving:
-    """Candidates that are scanned along the cable together, alone in the fit's model.
+    """Candidates scanned along the cable together, in a model without the other candidates.
 
-    A local effect that is not there yet changes no shape wherever it is moved: only the
-    derivatives by its own parameters have to be taken again, without the other candidates.
+    Moving a local effect that is still absent changes no shape, so only the derivatives by its own
+    parameters have to be recomputed.
     """
 
     problem: Problem
@@ -98,7 +98,7 @@ class _Moving:
         return cls(problem, carried_shapes(problem, fit), names)
 
     def by_names(self, fit: Fit, scan: Mapping[str, float]) -> list[FloatArray]:
-        """Whitened derivatives (R_j, names) of each pose's residuals, at a scan."""
+        """Whitened derivatives (R_j, names) of each pose's residuals, at one scan."""
         problem, unknowns = self.problem, self.problem.unknowns
         theta = unknowns.pack(fit.values_in(unknowns.model, scan), fit.coefficients)
         columns = [unknowns.names.index(name) for name in self.names]
@@ -120,12 +120,12 @@ def _scan(active: Sequence[Candidate], k: int) -> dict[str, float]:
 def _derivatives(
     fit: Fit, listed: Sequence[Candidate], scans: Sequence[int]
 ) -> list[dict[tuple[str, ...], list[FloatArray]]]:
-    """For each of the scans: derivatives by candidates, by their names; none at the first."""
+    """For each scan: derivatives by the candidates' parameters, by names; none at the first."""
     moving: dict[tuple[str, ...], _Moving] = {}
     out = []
     for k in scans:
         found = {}
-        # What a pose leaves behind acts through all later ones, at a cost.
+        # Effects on the state act through all later poses, which costs more: separate them.
         for state in (False, True):
             moved = [c for c in listed if 0 < k < len(c.scans)]
             active = [c for c in moved if isinstance(c.effect, StateEffect) == state]
@@ -153,7 +153,7 @@ class AtScan:
 class Screen:
     """All candidates in one model, evaluated at a fit."""
 
-    # Whether scans between those first tried are, too, next to the best of a likely candidate.
+    # Whether a likely candidate is also scanned between the first scans, next to its best one.
     between = True
 
     def __init__(self, fit: Fit, listed: Sequence[Candidate]) -> None:
@@ -164,14 +164,14 @@ class Screen:
 
     @property
     def n_scans(self) -> int:
-        """Largest number of scans of a candidate."""
+        """Largest number of scans of any candidate."""
         return max(len(candidate.scans) for candidate in self.listed)
 
     def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
         """Normal equations at scans.
 
-        If the first is among them it has to come first: later ones overwrite its derivatives. They
-        are dealt out in as many parts as there are workers, for what a part needs is made once.
+        If the first scan is among them it has to come first: later ones overwrite its derivatives.
+        Scans are split into one part per worker, because each part has a fixed cost.
         """
         workers = max(1, min(getattr(executor, "workers", 1), len(scans)))
         parts = [scans[i::workers] for i in range(workers)]
@@ -193,7 +193,7 @@ class Screen:
         """The fit's model with candidates at their nominal values, linearised at the fit."""
         problem = self.fit.problem
         p = self.fit.values_in(self.model, _scan(self.listed, 0))
-        # Nuisances that are candidates enter twice: with their prior, and free.
+        # Nuisances that are candidates appear twice: with their prior, and without.
         free = self.fit.free_in(self.model)
         unknowns = Unknowns(self.model, free, p)
         larger = replace(problem, unknowns=unknowns)
@@ -206,7 +206,7 @@ class Screen:
         """Score all candidates, best first.
 
         `noise_dof`: degrees of freedom of the noise estimate; inf where it is declared. `executor`:
-        where scans are done; in this process by default.
+        runs the scans; in this process by default.
         """
         best: dict[str, tuple[Screened, int]] = {}
 
@@ -234,7 +234,7 @@ class Screen:
         h_cc = hessian[np.ix_(columns, columns)]
         u = -gradient[columns]
         if candidate.nuisance:
-            # The same direction once more, without its prior.
+            # The same direction again, without its prior.
             prior = self.fit.problem.precision
             own = [self.fit.problem.unknowns.names.index(name) for name in candidate.screened]
             h_cc = h_cc - prior[np.ix_(own, own)]
@@ -265,9 +265,9 @@ class Screen:
         return Screened(candidate, score, p_value, candidate.of_linear(self.model.cable, values))
 
     def _below(self, candidate: Candidate, step: FloatArray) -> NDArray[np.bool_]:
-        """Which parameters would fall below a bound at which they vanish.
+        """Whether each parameter would fall below a bound at which it vanishes.
 
-        Steps beyond other bounds are left to a refit.
+        Steps beyond other bounds are left to the refit.
         """
         below = []
         for name, change in zip(candidate.screened, step, strict=True):
@@ -278,14 +278,14 @@ class Screen:
 
 
 class RelaxedScreen(Screen):
-    """The same at a relaxed fit, whose shapes are those measured and whose forces do not balance.
+    """Screen at a relaxed fit: its shapes are the measured ones, its forces do not balance.
 
     Parameters
     ----------
     near : Fit
-        Relaxed, see `estimation.relaxation`.
+        The relaxed fit, see `estimation.relaxation`.
     softness : float [rad]
-        Of the balance.
+        Softness of its balance.
     """
 
     def __init__(self, near: Fit, listed: Sequence[Candidate], softness: float) -> None:
@@ -295,7 +295,7 @@ class RelaxedScreen(Screen):
     between = False  # Only which candidates come nearest is asked.
 
     def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
-        """Normal equations at scans, everything of a pose's own eliminated."""
+        """Normal equations at scans, with each pose's own unknowns eliminated."""
         fit, begun = self.fit, dict[tuple[str, ...], tuple[Problem, Shapes]]()
         for k in scans:
             active = [c for c in self.listed if k < len(c.scans)]
@@ -314,7 +314,7 @@ class RelaxedScreen(Screen):
 
 
 def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, FloatArray, int]:
-    """Largest gain of 2 slope . x - x . information x: (gain, x, directions that are seen)."""
+    """Largest gain of 2 slope . x - x . information x: (gain, x, number of directions seen)."""
     values, vectors = np.linalg.eigh(information)
     seen = values > COLLINEAR
     along = vectors.T @ slope
@@ -323,10 +323,10 @@ def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, Float
 
 
 def survival(score: float, dof: int, noise_dof: float) -> float:
-    """Probability of a larger score where nothing is missing: chi-square, or F.
+    """Probability of a larger score if nothing is missing: chi-square, or F.
 
-    `dof`: of the score, at least one. `noise_dof`: with which the noise is known; inf where it is
-    declared.
+    `dof`: degrees of freedom of the score, at least one. `noise_dof`: those with which the noise is
+    known; inf if it is declared.
     """
     if np.isinf(noise_dof):
         return float(chdtrc(dof, score))

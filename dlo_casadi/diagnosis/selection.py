@@ -23,19 +23,19 @@ from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
 
 @dataclass(frozen=True)
 class AddedEffect:
-    """An effect that the data ask for.
+    """An effect for which the data give evidence.
 
     Parameters
     ----------
     p_value : float
-        Score test, corrected for places and candidates. Where the noise is estimated, the larger
-        of it and of the test under the noise that is left once the effect is in the model.
+        p-value of the score test, corrected for places and candidates. If the noise is estimated,
+        the larger of this and of the test under the noise left once the effect is in the model.
     before, after : CrossValidation
-        Without and with the effect.
+        Cross-validation without and with the effect.
     rivals : tuple of Confirmed
-        Candidates that could not be told apart from it.
+        Candidates that the data could not distinguish from it.
     equivalents : tuple of str
-        What it may stand for, see `equivalents`.
+        Other possible causes, see `candidates.equivalents`.
     """
 
     candidate: Candidate
@@ -47,15 +47,15 @@ class AddedEffect:
 
     @property
     def rival_candidates(self) -> list[Candidate]:
-        """Candidates that could not be told apart from it."""
+        """Candidates that the data could not distinguish from it."""
         return [rival.candidate for rival in self.rivals]
 
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate in the list of all that were tried.
+    """A candidate in the list of all candidates tried.
 
-    `reason`: why one that was refitted is neither added nor a rival; empty of others.
+    `reason`: why a refitted candidate is neither added nor a rival; empty for the others.
     """
 
     name: str
@@ -67,7 +67,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Found:
-    """Where a search has ended."""
+    """Result of one search."""
 
     fit: Fit
     added: tuple[AddedEffect, ...]
@@ -85,10 +85,10 @@ class Found:
         poses: int,
         significance: float,
     ) -> Self:
-        """A fit with effects, and whether it explains what was measured in so many poses."""
+        """A fit with effects, and whether it explains what was measured in that number of poses."""
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
         limit = UNSEEN * max(fit.expected_error, validation.expected)
-        # From one pose alone another one is not predicted to first order of the covariance.
+        # One pose alone does not predict another one to first order of the covariance.
         told = bool(added) or poses > 2
         unpredicted = told and validation.error_of_most > limit
         unexplained = structure.p_noise < significance or unpredicted
@@ -96,7 +96,7 @@ class Found:
         return cls(fit, tuple(added), ranked, validation, structure, unexplained)
 
     def or_better(self, other: Self | None) -> Self:
-        """Itself, or what another search has found if only that explains the data, or it better."""
+        """The other search's result if only that explains the data, or better; else this one."""
         if other is None:
             return self
         candidates = max(len(self.ranked), len(other.ranked))
@@ -118,39 +118,39 @@ class Found:
         return replace(other, ranked=(*other.ranked, *rest))
 
     def _sets(self, candidates: int) -> float:
-        """Logarithm of the number of sets of as many effects, all of which are equally likely."""
+        """Log of the number of sets of this many effects, all taken as equally likely."""
         return log(comb(candidates, min(len(self.added), candidates)))
 
 
 def likelier_by(fit: Fit, other: Fit) -> float:
-    """How much larger the log evidence of another fit is, on the finer one of both meshes."""
+    """Log evidence of the other fit minus that of the first, on the finer of both meshes."""
     n = max(fit.model.n, other.model.n)
     return _on_mesh(other, n).log_evidence - _on_mesh(fit, n).log_evidence
 
 
 def _on_mesh(fit: Fit, n: int) -> Fit:
-    """The fit on n elements; as it is where that has no equilibria near the measured shapes."""
+    """The fit on n elements; unchanged if that has no equilibria near the measured shapes."""
     with suppress(EstimationError):
         return refine_mesh(fit, n) if n > fit.model.n and fit.noise.source != "misfit" else fit
     return fit
 
 
 def sidak(p_value: float, tried: int) -> float:
-    """Probability that the best of so many independent tests is as good (Sidak)."""
+    """Probability that the best of `tried` independent tests is as good (Sidak)."""
     return float(-np.expm1(tried * np.log1p(-min(p_value, 1 - 1e-16))))
 
 
 def p_values_of(screened: Sequence[Screened]) -> dict[str, float]:
-    """Probability of each score where nothing is missing, as the best of all, by names."""
+    """p-value of each score as the best of all, by name."""
     return {item.candidate.name: sidak(item.p_value, len(screened)) for item in screened}
 
 
 def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) -> float:
     """Significance of an effect under the noise that is left once it is in the model.
 
-    The noise estimated without the effect holds a part of the effect, or, where it was kept out,
-    lacks a part of the noise. Where nothing else is missing all that is left is noise, its slow
-    modes included; where something is, the noise is too large and the significance too low.
+    Noise estimated without the effect includes part of the effect or, where it was kept out, lacks
+    part of the noise. If nothing else is missing, all that is left is noise, including its slow
+    modes; otherwise the noise is too large and the significance too low.
     """
     try:
         noise, pose_scatter = errors_of(
@@ -171,12 +171,12 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
 
 
 def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
-    """How much likelier a refit makes the data than its base does: a mean of two logarithms.
+    """Log of how much likelier a refit makes the data than its base: a mean of two measures.
 
-    Of the marginal likelihood, and of the predictive density of poses that are left out (that of
-    the base is in `validation`). Both agree where nothing else is missing. A wrong effect bends to
-    what is fitted, and predicts what is left out badly: the mean is harmonic, so that the smaller
-    decides; that one alone if it is not positive.
+    The two are the gains in marginal likelihood and in the predictive density of left-out poses
+    (`validation` is that of the base). They agree if nothing else is missing. A wrong effect
+    adapts to the fitted data but predicts left-out data badly. The mean is harmonic, so the
+    smaller gain decides; if that is not positive, it is returned alone.
     """
     one = item.fit.log_evidence - base.log_evidence
     other = item.validation.log_density - validation.log_density
@@ -187,11 +187,11 @@ def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
 def shortcoming(
     item: Confirmed, base: Fit, validation: CrossValidation, doubt: float | None
 ) -> str:
-    """Why a refit is no better than its base; empty if it is.
+    """Why a refit is no better than its base; empty if it is better.
 
-    Repeats of one or two poses have in common whatever is wrong with their measurement. There
-    whole repeats decide: a gain as large must have less than the probability `doubt` if those
-    left out are predicted no better (Student's t).
+    Repeats of one or two poses share any error of their measurement. For these, whole repeats
+    decide: if left-out repeats were predicted no better, a gain as large must have a
+    probability below `doubt` (Student's t).
     """
     if item.validation.loses_more_than(validation):
         return "with it a pose that is left out cannot be predicted"
@@ -209,9 +209,9 @@ def choose(
     validation: CrossValidation,
     doubt: float | None,
 ) -> tuple[list[Confirmed], dict[str, str]]:
-    """The best of some refits by `support` and its rivals, and why the others are not, by names.
+    """The best refit by `support` and its rivals; by name, why the others are not among them.
 
-    Both gains have to be positive. Rivals are those that fall short by less than EVIDENCE_APART.
+    Both gains have to be positive. Rivals fall short of the best by less than EVIDENCE_APART.
     """
     refits = [item for item in tried if item is not None]
     why = {item.name: shortcoming(item, base, validation, doubt) for item in refits}
@@ -235,7 +235,7 @@ def added_by(
     before: CrossValidation,
     after: CrossValidation,
 ) -> list[AddedEffect]:
-    """The effects of a refit; rivals of one are the refits that differ in it alone."""
+    """The effects of a refit; rivals of an effect are refits that differ in that effect alone."""
     others = [turned for rival in rivals for turned in rival.beside_others()]
     return [
         AddedEffect(
@@ -260,7 +260,7 @@ def ranking(
     base: Fit,
     validation: CrossValidation,
 ) -> list[Ranked]:
-    """All candidates: those refitted by `support`, the rest by score."""
+    """All candidates: the refitted ones by `support`, then the rest by score."""
     refits = [x for item in tried if item is not None for x in item.beside_others()]
     refits.sort(key=lambda item: support(item, base, validation))
     refitted = {item.candidate.name: item for item in refits}

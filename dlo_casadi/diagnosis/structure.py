@@ -1,4 +1,4 @@
-"""Is the residual noise, and what limits a prediction: slow modes, repeats, values alike."""
+"""Whether the residual is noise, and what limits a prediction: slow modes, repeats, nuisances."""
 
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
@@ -23,37 +23,37 @@ from dlo_casadi.thresholds import (
     REPEATS,
 )
 
-# Largest normal score of a test: tails beyond a probability of 1e-12 tell no more.
+# Smallest tail probability of a test: smaller ones carry no more information.
 _TAIL = 1e-12
 LARGEST_SCORE = -float(ndtri(_TAIL))
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Tests of the residual of a fit.
+    """Tests for structure in the residual of a fit.
 
     Parameters
     ----------
     statistic, dof, p_value : float
         Energy of the residual in slow modes along the arcs, over what the noise explains, with
-        the fit's own directions taken into account: chi-square, or F where the noise has been
-        estimated.
+        the fit's own directions taken into account. It follows chi-square, or F if the noise has
+        been estimated.
     chi2_per_dof : float
-        Of all points.
+        Chi-square per degree of freedom of all points.
     runs_z : float
-        Runs of equal sign along the arcs against independent points, as a normal score;
-        negative = fewer, longer runs. Whitened residuals of points, component by component.
+        Runs test along the arcs, as a normal score; negative = fewer, longer runs of equal sign
+        than for independent points. Taken of whitened residuals of points, per component.
     order_z, span_z : float
-        Rank correlation of the poses' slow energy with their order and with their span, as a
-        normal score, at most LARGEST_SCORE.
+        Rank correlations of the poses' slow energy with their order and with their span, as
+        normal scores of at most LARGEST_SCORE.
     position_z : float
-        Score test of a displacement that is a parabola in the measured place (a lens, a board out
-        of its plane, a scale), the same in all poses; as a normal score, at most LARGEST_SCORE.
+        Score test of a displacement quadratic in the measured place, the same in all poses (a
+        lens, a board out of its plane, a scale); as a normal score of at most LARGEST_SCORE.
     per_pose : dict
         Slow energy per degree of freedom by pose name.
     p_systematic : float or None
-        Where the cable does not repeat: probability of as much that poses which are alike have in
-        common, if each repeat has a rest curvature of its own and nothing else is missing.
+        For a cable that does not repeat: probability that alike poses share that much if each
+        repeat has a rest curvature of its own and nothing else is missing.
     """
 
     statistic: float
@@ -69,25 +69,25 @@ class Structure:
 
     @property
     def p_noise(self) -> float:
-        """Probability of the residual if it is noise and rest curvatures of each repeat's own.
+        """Probability of the residual if it is noise and each repeat's own rest curvature.
 
-        Of the less likely of the tests that were made, for as many (Sidak).
+        That of the less likely of the tests made, corrected for their number (Sidak).
         """
         made = [p for p in (self.p_value, self.p_systematic) if p is not None]
         return 1 - (1 - min(made)) ** len(made)
 
 
 def noise_degrees(fit: Fit) -> float:
-    """Degrees of freedom with which the noise of slow modes is known; inf where declared."""
+    """Degrees of freedom with which the noise of slow modes is known; inf if it is declared."""
     return max(LEAST_NOISE_DEGREES, min(fit.noise.slow_dof, fit.problem.priors.pose_scatter.dof))
 
 
 def screening_degrees(fit: Fit) -> float:
-    """Degrees of freedom for a fit whose slow modes were kept out of the noise's estimate.
+    """Degrees of freedom for a fit whose slow modes were kept out of the noise estimate.
 
-    Their noise is extrapolated from that of fast modes. It counts as if every correlation length
-    of cable told it, which is too much: what is found so has to pass a second test, under the
-    noise that is left once it is in the model.
+    The noise of slow modes is extrapolated from that of fast ones. Each correlation length of cable
+    is counted as one degree, which is too many. An effect found with them therefore has to pass a
+    second test, under the noise that is left once it is in the model.
     """
     rest_dof = fit.problem.priors.pose_scatter.dof
     if fit.noise.known:
@@ -99,7 +99,7 @@ def screening_degrees(fit: Fit) -> float:
 
 
 def structure_of(fit: Fit, noise_dof: float) -> Structure:
-    """Test the residual of a fit for what the noise, known so well, does not explain."""
+    """Test the residual of a fit for what noise with these degrees of freedom cannot explain."""
     problem, lin, normal = fit.problem, fit.linearization, fit.normal
     model = fit.model
     coefficients, own, arms = [], [], []
@@ -142,7 +142,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
 
 
 def _position_score(fit: Fit, noise_dof: float) -> float:
-    """Score test of a displacement field's terms of first and second degree, in the plane ten."""
+    """Score test of a displacement field's terms of first and second degree: ten in the plane."""
     problem, lin, inner = fit.problem, fit.linearization, fit.normal.inner
     observed = problem.observed(fit.point)
     d = observed[0].curve.d
@@ -201,7 +201,7 @@ def _rank_score(a: FloatArray, b: FloatArray) -> float:
 
 
 def limiting_spread(fit: Fit) -> float | None:
-    """How badly the same pose repeats [m], where that is what limits a prediction, else None."""
+    """Difference between repeats [m] if it is what limits a prediction, else None."""
     if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
         return None
     spread = repeatability(fit.problem.history, fit.model.cable.length)
@@ -212,9 +212,9 @@ def limiting_spread(fit: Fit) -> float | None:
 
 
 def alike(fit: Fit) -> list[tuple[str, ...]]:
-    """Groups of nuisances (length, scale, fixture, clamps) with one and the same effect.
+    """Groups of nuisances (length, scale, fixture, clamps) whose effects are the same.
 
-    Read off the correlations of the estimates that the data alone would give.
+    Taken from the correlations of the estimates that the data alone would give.
     """
     names = fit.problem.unknowns.names
     held = [k for k, name in enumerate(names) if name in fit.model.priors]

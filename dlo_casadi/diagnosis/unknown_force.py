@@ -1,4 +1,4 @@
-"""The missing load without a cause: where the cable is pulled, and how in each pose."""
+"""A missing load without an assumed cause: where the cable is pulled, and how in each pose."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -21,12 +21,12 @@ from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import NORMAL_95
 
-# Places kept from the scan for a full fit.
+# Number of places that remain after the scan and get a full fit.
 TRIED = 3
 PLACES = tuple(float(share) for share in np.linspace(0.1, 0.9, 9))
 # Standard deviation of a force about the mean of the poses, in weights of the cable.
 FORCE_WEIGHTS = 1.0
-# Gauss-Newton steps along the flat valley of stiffness against force.
+# Maximum number of Gauss-Newton steps in the flat valley of stiffness against force.
 MOST_STEPS = 150
 
 
@@ -37,12 +37,12 @@ class UnknownForce:
     Parameters
     ----------
     force_per_pose : (m_fit, 2) [N]
-        Of each fit pose, in the board frame.
+        Force in each fit pose, in the board frame.
     position : float [m]
     interval : (float, float) [m]
         95 %.
     gain : float
-        Decrease of twice the objective against the fit without it.
+        Decrease of twice the objective compared with the fit without it.
     poses : tuple of str
         Names of the fit poses.
     """
@@ -56,17 +56,17 @@ class UnknownForce:
 
     @property
     def force(self) -> FloatArray:
-        """Mean (d,) [N] over the poses."""
+        """Mean force (d,) [N] over the poses."""
         return np.asarray(self.force_per_pose.mean(axis=0))
 
 
 def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> UnknownForce | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
-    The fit without it may have gone far off, so that it is no place to start from: on a coarse mesh
-    places along the cable are searched from the measured shapes, the best refitted with the place
-    along with everything else, and the best of those on the base's mesh. `base`: without the load.
-    `executor`: where the places are tried, a second or two each; in this process by default.
+    The fit without the load may be too far off to start from. Places along the cable are therefore
+    tried from the measured shapes on a coarse mesh; the best are refitted with the place free, and
+    the best of those on the base's mesh. `base`: fit without the load. `executor`: runs the trial
+    places, a second or two each; in this process by default.
     """
     effect = UnknownPull()
     model = base.model.with_effect(effect)
@@ -97,7 +97,7 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
 class _Search:
     """Fits with the load on a coarse mesh, from places along the cable.
 
-    Of a base without the load; `position` names the parameter that holds its place in the model.
+    The base lacks the load; `position` is the name of the parameter that holds its place.
     """
 
     base: Fit
@@ -115,7 +115,7 @@ class _Search:
         return sorted((fit for fit in fits if fit), key=lambda fit: fit.point.objective)
 
     def relaxed_at(self, begun: Values, share: float) -> tuple[float, float, Values]:
-        """What is left of a relaxed balance with the load at a share of the length, and there."""
+        """Relaxed fit with the load at a share of the length: objective, that share, values."""
         problem = self.held_at(share)
         values = relaxed(problem, begun, SOFTNESS[:3])
         return Relaxation(problem, SOFTNESS[2]).objective(values), share, values
@@ -139,11 +139,11 @@ class _Search:
         return self._problem(Unknowns(self.model, free, values))
 
     def _problem(self, unknowns: Unknowns) -> Problem:
-        """With the scatter of ends as in the base, of the force about its mean the cable's weight.
+        """Problem with the base's scatter of ends, and with a std of the force about its mean.
 
-        Shapes tell the ratio of forces to stiffness and, by the weight, how large both are; where
-        the weight hardly shows, a force of a hundred times the weight would fit as well. And a
-        force along a taut cable hardly shows: there it should be like that of the other poses.
+        Shapes determine the ratio of forces to stiffness; only the weight determines their size. If
+        the weight hardly shows, a force of a hundred times the weight would fit as well. A force
+        along a taut cable hardly shows either: it should then be like that of the other poses.
         """
         problem, model = self.base.problem, self.model
         scatter, cable = problem.priors.scatter.copy(), model.cable
