@@ -1,8 +1,8 @@
 """Equilibria of many poses at once: one Newton method over the stacked poses.
 
 All poses share the parameters; a state carries the rest curvature from pose to pose. A Newton step
-eliminates the band matrices of all poses together, then passes changes of the rest curvature from
-pose to pose.
+eliminates the band matrices of all poses at once, then passes the changes of the rest curvature
+from pose to pose.
 """
 
 from collections.abc import Sequence
@@ -29,13 +29,13 @@ from dlo_casadi.rod.band import BandMatrix, Vector
 
 # Largest distance of a node from the start of Newton's method [rad].
 REACH = 1.5
-# Largest ratio of successive steps with the same matrix, and longest step [rad] after which it may
-# be kept; otherwise it is evaluated again. Five gradients cost less than one matrix.
+# The matrix is kept while successive steps shrink by this ratio and the step is below NEAR [rad];
+# otherwise it is evaluated again. Five gradients cost less than one matrix.
 CONTRACTION = 0.2
 NEAR = 0.1
-# Depth [lengths] of obstacles here, see `contact.DEPTH`: they are then as soft as the cable between
-# two of 80 nodes, so that contacts hardly depend on each other, and a cable that lies on a table
-# with all its weight sinks in by a millionth of its length.
+# Depth [lengths] of obstacles here, see `contact.DEPTH`. They are as soft as the cable between two
+# of 80 nodes, so contacts hardly depend on each other, and a cable that lies on a table with all
+# its weight sinks in by a millionth of its length.
 SOFT_DEPTH = 1e-4
 # Maximum number of iterations of a descent to a minimum: poses of a session in space took 7 to 23.
 DOWNHILL = 40
@@ -60,7 +60,7 @@ class BatchEquilibrium:
         self.used_deviations = [model.deviation_names.index(name) for name in model.deviations]
 
     def start_shapes(self, x: FloatArray) -> Shapes:
-        """Shapes of these nodes (m, n_nodes, coordinates), without forces and deviations."""
+        """Shapes with these nodes (m, n_nodes, coordinates), without forces and deviations."""
         border = [border_of(self.model, *each) for each in zip(self.poses, x, strict=True)]
         return Shapes.declared(x, np.array(border).reshape((self.m, -1)), len(self.model.clips))
 
@@ -69,14 +69,14 @@ class BatchEquilibrium:
     def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Rest curvature (m, n_rests) before each pose, from that before the first one.
 
-        A `rest` that is given for each pose, (m, n_rests), is returned unchanged.
+        If `rest` is already given for each pose, (m, n_rests), it is returned unchanged.
         """
         if rest.ndim == 2:
             return rest
         out = np.repeat(rest[None], self.m, axis=0)
         if not self.model.has_state:
             return out
-        # Where poses leave the rest curvature unchanged, all of them have the same.
+        # If poses leave the rest curvature unchanged, it is the same for all of them.
         after = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))[0]
         for j in range(self.m - 1 if np.any(after != out) else 0):
             out[j + 1] = self._after(j, shapes, p, out)[0]
@@ -98,17 +98,17 @@ class BatchEquilibrium:
         return np.asarray(np.linalg.norm(self.assembly.chain.curvatures(bends), axis=1))
 
     def given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Inputs:
-        """What the equilibria depend on, the rest curvature that each pose finds."""
+        """Inputs of the equilibria, with the rest curvature before each pose."""
         return Inputs.of(p, self.rests(shapes, p, rest), self._ends)
 
     # ---- equilibria ------------------------------------------------------------------------------
 
     def balance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> tuple[Vector, BandMatrix]:
-        """Imbalance and tangent matrices; `rest` is that before the first pose, or of each."""
+        """Imbalance and tangent matrices; `rest` is that before the first pose, or each pose's."""
         return self.assembly.balance(shapes, self.given(shapes, p, rest))[1:]
 
     def imbalance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Vector:
-        """Imbalance alone, which costs far less."""
+        """Imbalance alone, at far lower cost."""
         return self.assembly.imbalance(shapes, self.given(shapes, p, rest))
 
     def moved(self, shapes: Shapes, step: Vector) -> Shapes:
@@ -125,27 +125,27 @@ class BatchEquilibrium:
         tolerance: float = TOLERANCE,
         reach: float = REACH,
     ) -> tuple[Shapes, BoolArray]:
-        """Newton's method from nearby shapes, for each pose until it has converged or is lost.
+        """Newton's method from nearby shapes; each pose ends when it has converged or is lost.
 
-        A pose's tangent matrix is kept while its steps shrink fivefold; see `CONTRACTION`.
+        The tangent matrix of a pose is kept while its steps shrink fivefold; see `CONTRACTION`.
 
         Parameters
         ----------
         shapes : Shapes
-            Where to start; deviations are kept.
+            Start; deviations are kept.
         p : (n_parameters,) or (m, n_parameters)
         rest : (n_rests,) or (m, n_rests) [1/m]
-            Before the first pose, or of each pose.
+            Before the first pose, or for each pose.
         tolerance : float [rad]
             Largest step at convergence.
         reach : float [rad]
-            A pose whose nodes move farther is lost: its way leads to another equilibrium, or none.
+            A pose whose nodes move farther is lost: it would reach another equilibrium, or none.
 
         Returns
         -------
         Shapes, (m,) bool
-            The shapes, and which poses have converged; the others stay where they started. Where
-            a state couples the poses, all have converged or none.
+            The shapes, and whether each pose has converged; the others are as at the start. If a
+            state couples the poses, either all have converged or none.
         """
         now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
         converged = np.zeros(self.m, dtype=bool)
@@ -169,7 +169,7 @@ class BatchEquilibrium:
             now.x[active], now.lam[active] = stepped(self.assembly, here, step, taken)
             done = _settled(size, last[active], tolerance, fresh)
             stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
-            # A contact that begins or ends changes the matrix.
+            # A contact that starts or ends changes the matrix.
             stale[active] |= (size > NEAR) | bool(self.model.surfaces)
             way = self.node.difference(shapes.x[active], now.x[active])
             lost = ~(np.abs(way).max(axis=(1, 2)) <= reach)
@@ -186,9 +186,9 @@ class BatchEquilibrium:
     def solve_or_descend(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any
     ) -> tuple[Shapes, BoolArray]:
-        """As `solve`; the energy of lost poses descends to a minimum from their start.
+        """As `solve`, but for lost poses the energy is minimised from their start.
 
-        Newton's method alone loses one pose of ten wherever frames have far to rotate.
+        Newton's method alone loses one pose in ten when frames have far to rotate.
         """
         now, converged = self.solve(shapes, p, rest, **options)
         lost = np.flatnonzero(~converged)
@@ -211,7 +211,7 @@ class BatchEquilibrium:
         fresh: BoolArray,
         matrix: BandMatrix | None,
     ) -> tuple[Vector, BandMatrix]:
-        """Imbalance of the active poses, and all poses' matrices, of some of them evaluated."""
+        """Imbalance of the active poses, and matrices of all poses, evaluated again for some."""
         if matrix is not None and not fresh.any():
             return self.assembly.imbalance(here, given), matrix
         if fresh.all():
@@ -223,7 +223,7 @@ class BatchEquilibrium:
 
     @staticmethod
     def _newton(force: Vector, matrix: BandMatrix, active: IntArray) -> Vector:
-        """Newton step, one column, of the active poses; not finite where the shape is not."""
+        """Newton step, one column, of the active poses; not finite for a shape that is not."""
         finite = np.isfinite(matrix.diagonal[active]).all(axis=(1, 2, 3))
         step = Vector(np.full_like(force.x, np.nan), np.full_like(force.y, np.nan))
         right = Vector(-force.x[finite], -force.y[finite])
@@ -232,7 +232,7 @@ class BatchEquilibrium:
         return step
 
     def _handed_on(self, here: Shapes, given: Inputs, matrix: BandMatrix, step: Vector) -> Vector:
-        """Newton step that includes the change of the rest curvature by the poses before."""
+        """Newton step including the change of the rest curvature by the poses before."""
         after = self.assembly.state_after(here, given)
         if not after[1].any():
             return step
@@ -266,8 +266,8 @@ class BatchEquilibrium:
         Returns
         -------
         Tangents
-            Columns: the unknowns, then, with `deviations`, the model's; where poses leave a state
-            behind, those of the first pose, of the second, ...
+            Columns: the unknowns, then, with `deviations`, the model's deviations; if poses leave a
+            state behind, those of the first pose, of the second, ...
         """
         given = self.given(shapes, p, rest)
         used = self.used_deviations if deviations else []
@@ -287,7 +287,7 @@ class BatchEquilibrium:
             _, _, matrix = self.assembly.balance(shapes, given)
             found = self._in_order(shapes, given, matrix, still, after)
             return replace(found, tangent=matrix)
-        # A state without effect so far passes the rest curvature on, and its parameters change it.
+        # A state effect that is still zero leaves the rest unchanged, but its parameters change it.
         left = after[3] @ still.p
         still.rest[1:] += left[:-1].cumsum(axis=0)
         return self._solved(shapes, given, still)
@@ -315,7 +315,7 @@ class BatchEquilibrium:
         by_p: FloatArray | None = None,
         by_deviation: FloatArray | None = None,
     ) -> Tangents:
-        """Directions (rows, q), the same for all poses, at fixed nodes and multipliers."""
+        """Directions (rows, q) at fixed nodes and multipliers, the same for all poses."""
         a, q = self.assembly, by_rest.shape[1]
         counts = (given.p.shape[1], len(by_rest), len(self.model.deviation_names))
         p, rest, deviation = (
@@ -328,7 +328,7 @@ class BatchEquilibrium:
     def _solved(
         self, shapes: Shapes, given: Inputs, still: Tangents, matrix: BandMatrix | None = None
     ) -> Tangents:
-        """Directions with the change of nodes and multipliers along them."""
+        """Directions, completed by the resulting change of nodes and multipliers."""
         matrix = self.assembly.balance(shapes, given)[2] if matrix is None else matrix
         found = matrix.factor().solve(self.assembly.imbalance_by(shapes, given, still))
         return replace(still, x=still.x - found.x, lam=still.lam - found.y, tangent=matrix)
@@ -341,12 +341,12 @@ class BatchEquilibrium:
         along: Tangents,
         after: tuple[FloatArray, ...],
     ) -> Tangents:
-        """As `_solved`; the rest curvature of each pose follows from the pose before."""
+        """As `_solved`; the rest curvature of each pose is computed from the pose before."""
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
         for j in range(self.m):
             one = np.array([j])
             parts = (x[one], lam[one], along.p[one], rest[one], along.deviation[one])
-            # Deviations of later poses move nothing yet.
+            # Deviations of later poses do not move this one.
             moving = np.any([part.any(axis=tuple(range(part.ndim - 1))) for part in parts], axis=0)
             now = Tangents(*(part[..., moving] for part in parts))
             if now.p.any() or now.rest.any() or now.deviation.any():
@@ -361,7 +361,7 @@ class BatchEquilibrium:
     def observe(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Tangents
     ) -> list[tuple[Observed, ObservedChange]]:
-        """Predicted measurements of each pose, and their change along directions."""
+        """Predicted measurements of each pose, and their derivatives along directions."""
         given, length = self.given(shapes, p, rest), self.model.cable.length
         slopes = self.assembly.curve_slopes(shapes, given)
         each = zip(
@@ -394,10 +394,10 @@ class BatchEquilibrium:
 
 
 def _settled(size: FloatArray, last: FloatArray, tolerance: float, fresh: BoolArray) -> BoolArray:
-    """Whether Newton's method has converged, by the sizes of this step and of the last one.
+    """Whether Newton's method has converged, given the sizes of this step and the last one.
 
-    Steps shrink quadratically with a fresh matrix and linearly with a kept one, so that the size of
-    the next step is predicted and it need not be made; steps at rounding no longer shrink.
+    Steps shrink quadratically with a fresh matrix and linearly with a kept one. This predicts the
+    size of the next step, which need not be made; steps at rounding level no longer shrink.
     """
     rate = size / last
     ahead = size * np.where(fresh, rate**2, rate)

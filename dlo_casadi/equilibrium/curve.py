@@ -126,8 +126,8 @@ class NodeCurve:
     ) -> FloatArray:
         """Arc lengths (K,) [m] after Newton steps from a guess, within [0, L].
 
-        No step is longer than half an element; the last is below `tolerance` times the length. On
-        a curve that is not finite, as a fit may try one, the guess stays.
+        No step is longer than half an element; the last is below `tolerance` times the length. If
+        the curve is not finite, which may happen in a fit, the guess is returned.
         """
         s, limit = guess.copy(), 0.5 * self.length / self.n
         for _ in range(_NEWTON_STEPS):
@@ -176,9 +176,9 @@ class NodeCurve:
 
 
 def across(t: FloatArray) -> FloatArray:
-    """Unit normals (K, d - 1, d) of tangents (K, d): in the plane to the left of them.
+    """Unit normals (K, d - 1, d) of tangents (K, d); in the plane, to their left.
 
-    In space the pair is transported from each point to the next without twist.
+    In space the pair of normals is transported from each point to the next without twist.
     """
     if t.shape[1] == 2:
         return np.stack([-t[:, 1], t[:, 0]], axis=1)[:, None]
@@ -199,11 +199,11 @@ def across(t: FloatArray) -> FloatArray:
 def chord_places(points: FloatArray, pose: HeldPose, length: float) -> FloatArray:
     """First guess of the points' arc lengths (K,) [m]: running chord length, scaled to L.
 
-    Chords across gaps are shorter than the cable: with two fixtures, lengths are scaled to L.
+    Chords are shorter than the cable across gaps: with two fixtures, they are scaled to L.
     """
     polyline = pose.joined(points)
     steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
-    # Noise lengthens a dense polyline: lengths are those of a smoothed one.
+    # Noise lengthens a dense polyline, so lengths are those of a smoothed one.
     s = _denoised_length(polyline, steps)
     places = s[1 : len(points) + 1]
     if pose.end is not None:

@@ -49,8 +49,8 @@ class Equilibrium:
     start_force : (dimension,) [N]
         Force of the cable on whatever holds its start.
     moments : (2, increment) [N m]
-        Of the cable on its clamps (start, end), in space about the world's axes; zero at pins.
-        In a plane (2,).
+        Of the cable on its clamps (start, end); zero at pins. In space about the world's axes. In
+        a plane (2,).
     multipliers : (n_border,)
         Of the end conditions, then unknowns of springs and clips: see `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
@@ -60,8 +60,8 @@ class Equilibrium:
     twist : (n_cells,) [1/m]
         Mean twist of each cell; zero in a plane.
     min_bend_radius : float [m]
-        Smallest radius of curvature along the cable: of the cells' mean curvatures, continued
-        linearly to both ends and to clamped clips; of second order in the cells' length.
+        Smallest radius of curvature along the cable, from the cells' mean curvatures, continued
+        linearly to both ends and to clamped clips. Its error is of second order in the cell length.
     residual : float
         Largest violation of an end condition [m or rad].
     status : Status
@@ -95,7 +95,7 @@ class Equilibrium:
 
     @property
     def shapes(self) -> Shapes:
-        """As stacked unknowns of one pose, its ends where they are declared."""
+        """Stacked unknowns of this one pose, with its ends as declared."""
         return Shapes.declared(self.x[None], self.multipliers[None], len(self.clips))
 
     @property
@@ -135,8 +135,8 @@ def curvatures_along(
     """Sizes (..., K) [1/m] of curvatures (..., axes n_cells) that are means over cells.
 
     They are continued linearly to both ends of each stretch, see `Equilibrium.min_bend_radius`; the
-    curvature jumps at clamped clips. `cells` (..., n_cells, 2) [m]. `clamped`: numbers of the cells
-    that begin at clamped clips.
+    curvature jumps at clamped clips. `cells` (..., n_cells, 2) [m]. `clamped`: indices of the cells
+    that start at clamped clips.
     """
     widths = np.diff(cells, axis=-1)[..., 0]
     inner = curvature.reshape((*curvature.shape[:-1], -1, widths.shape[-1]))

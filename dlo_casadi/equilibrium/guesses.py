@@ -1,6 +1,6 @@
 """First guesses of the nodes of a cable held at the ends of a pose, or along a measured line.
 
-The generated solver tries the same ones with the same numbers: codegen/templates/*_guesses.c.in.
+The generated solver tries the same guesses with the same numbers: codegen/templates/*_guesses.c.in.
 """
 
 from collections.abc import Sequence
@@ -19,20 +19,20 @@ from dlo_casadi.rod.node import Frame, same_sign
 Clamps = tuple[FloatArray | None, FloatArray | None]
 Turned = tuple[Rotation | None, Rotation | None]
 
-# Angles [rad] below which some first guesses are left out, see `guesses`: they seldom lead to the
-# lowest equilibrium. Of 300 random problems with a clamp at the end or both ends none is lost.
+# Angles [rad] below which some first guesses are left out, see `guesses`, because they seldom lead
+# to the lowest equilibrium. None is lost in 300 random problems with a clamp at the end or both.
 FAR, CURVED = 1.5, 1.0
 # Largest joint angle of a first guess [rad]: 0.9 of the bound of an equilibrium.
 LARGEST_BEND = 0.9 * np.pi / 2
-# Power of the decay (1 - s/L)^5 of a clamp's bend. In 1200 random problems with clamps the lowest
-# equilibrium was missed 9, 2, 0, 0, 1 times with the power 3, 4, 5, 6, 8; high ones converge less.
+# Power of the decay (1 - s/L)^5 of a clamp's bend. In 1200 random problems with clamps the powers
+# 3, 4, 5, 6, 8 missed the lowest equilibrium 9, 2, 0, 0, 1 times; high powers converge less often.
 _DECAY = 5
-# Distance of a roll from half a turn [rad] within which it is tried both ways round: rolls of arcs
-# to four sides differ by as much, 1.2 rad in a pose whose lowest equilibrium is the other one.
+# A roll within this distance [rad] of half a turn is tried both ways round: the rolls of arcs to
+# four sides differ by that much, by 1.2 rad in a pose whose lowest equilibrium is the other way.
 HALF_TURN = 1.0
-# Rounding error allowed when twists are compared [turns]: two may be equally near to half a turn.
+# Rounding error allowed in comparing twists [turns]: two may be equally near to half a turn.
 _ROUNDING = 1e-6
-# Coefficients of half_angle^2 / (1 - ratio) in powers of 1 - ratio, by least squares; to 2e-4 rad.
+# Coefficients of half_angle^2 / (1 - ratio) in powers of 1 - ratio: least squares, 2e-4 rad error.
 _HALF_ANGLE = (
     *(5.9998487866413575, 1.818549938733748, 0.45541329964829563, 3.159529741805951),
     *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
@@ -45,7 +45,7 @@ def _held(
 ) -> tuple[FloatArray, FloatArray | None, Clamps]:
     """Inputs of guesses: arc lengths of the nodes, end minus start, and frames of clamps.
 
-    Lengths are relative to the cable's; the chord of a free end and the frame of a pin are None.
+    Lengths are relative to the cable's. The chord is None for a free end, the frame for a pin.
     """
     (start, end), clamps, length = true_ends(model, p, pose)
     chord = None if model.end == "free" else (end - start) / length
@@ -55,7 +55,7 @@ def _held(
 def true_ends(
     model: CableModel, p: FloatArray, pose: HeldPose
 ) -> tuple[tuple[FloatArray, FloatArray], Clamps, float]:
-    """Places [m] of the ends; frames of clamps, None of a pin or a tip; length [m]."""
+    """Positions [m] of the ends; frames of clamps, None for a pin or a free end; length [m]."""
     ends, length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
@@ -95,8 +95,8 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) 
     4. the cable falling down the other way round: where the nearer one turns by more than 1.5 rad,
        or the rest shape by more than 1 rad.
 
-    In all of them bends are cut at 0.9 of the joints' bound, and clamps keep their headings. `p`
-    (n_parameters,). `rest` (n_rests,) [1/m].
+    In all of them bends are limited to 0.9 of the joints' bound, and clamps keep their headings.
+    `p` (n_parameters,). `rest` (n_rests,) [1/m].
     """
     u, chord, clamps = _held(model, p, pose)
     bent = resting_headings(model.chain, rest)
@@ -119,7 +119,7 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) 
 
 
 def resting_headings(chain: Chain, rest: FloatArray) -> FloatArray:
-    """Headings (n_nodes,) of the cable at rest, counted from its start [rad]."""
+    """Headings (n_nodes,) [rad] of the cable at rest, relative to its start."""
     cells = chain.cells
     turn = np.concatenate([[0.0], np.cumsum(rest * np.diff(cells, axis=1).ravel())])
     edges = np.concatenate([cells[:1, 0], cells[:, 1]])
@@ -127,10 +127,10 @@ def resting_headings(chain: Chain, rest: FloatArray) -> FloatArray:
 
 
 def arc_half_angle(chord: float, length: float) -> float:
-    """Half the turning of a circular arc: sin(a) / a = chord / length, a in [0, pi].
+    """Half the turning angle of a circular arc: sin(a) / a = chord / length, a in [0, pi].
 
-    By a polynomial, to 2e-4 rad. `chord`, `length` [m]: 0 <= chord; a chord longer than the arc
-    gives 0.
+    Computed by a polynomial, to 2e-4 rad. `chord`, `length` [m]: 0 <= chord; the result is 0 if the
+    chord is longer than the arc.
     """
     y = max(1.0 - chord / length, 0.0)
     total = 0.0
@@ -163,7 +163,7 @@ def arc_into_clamps(
 
         phi(u) = arc(u) + t + (1 - u)^5 (first - arc(0) - t) + u^5 (last - arc(1) - t),  t = 2 pi k
 
-    Headings are continuous along the cable, so that whole turns k of the arc count.
+    Headings are continuous along the cable, so the arc may need k whole turns.
 
     Parameters
     ----------
@@ -172,17 +172,17 @@ def arc_into_clamps(
     chord : (2,)
         End minus start, over length.
     clamps : (1,) [rad] or None, each
-        First and last heading; None where the cable may turn, not both.
+        First and last heading; None where the cable may turn, but not both.
     side : +1 or -1
 
     Returns
     -------
     (k,) [rad]
-        With the k that bends the cable least at its clamps.
+        Headings with the k that bends the cable least at its clamps.
     (k,) [rad]
-        With the next k, which bends it the other way.
+        Headings with the next k, which bends it the other way.
     float [rad]
-        Bend of the first at the clamps, the mean over them, at most pi.
+        Bend of the first result at the clamps: the mean over them, at most pi.
     """
     arc = arc_headings(np.concatenate([[0.0], u, [1.0]]), 1.0, chord, side)
     excess = [
@@ -202,7 +202,7 @@ def arc_into_clamps(
 
 
 def limited(phi: FloatArray) -> FloatArray:
-    """Headings (k,) whose bends are cut at LARGEST_BEND; the first heading stays."""
+    """Headings (k,) with bends limited to LARGEST_BEND; the first heading is kept."""
     bends = np.clip(np.diff(phi), -LARGEST_BEND, LARGEST_BEND)
     return phi[0] + np.concatenate([[0.0], np.cumsum(bends)])
 
@@ -245,9 +245,9 @@ def guessed_frames(
 
     Between two ends: four arcs of the cable's length, the first sagging along gravity, the others
     rotated about the chord by quarter turns. They are bent into the clamps; the roll of the end
-    clamp nearest to `turns` is spread evenly. Without turns, a roll of nearly half a turn is tried
-    both ways round. With a free end: the rest shape, the cable fallen down, and straight on.
-    Turns are counted along the first arc, and to the nearest value along the others.
+    clamp nearest to `turns` is spread evenly. Without `turns`, a roll of nearly half a turn is
+    tried both ways round. With a free end: the rest shape, the cable fallen down, and straight on.
+    `turns` refers to the first arc; the other arcs use the nearest value.
     """
     u, chord, frames = _held(model, p, pose)
     clamps = frame_rotation(frames[0]), frame_rotation(frames[1])
@@ -273,7 +273,7 @@ def guessed_frames(
 
 
 def frame_rotation(frame: Sequence[float] | FloatArray | None) -> Rotation | None:
-    """Rotation of a frame; None of none."""
+    """Rotation of a frame; None for None."""
     return None if frame is None else Rotation.from_quat(frame)
 
 
@@ -289,7 +289,7 @@ def smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
 
 
 def sagging(along: FloatArray, down: FloatArray) -> FloatArray:
-    """Vector (3,) across a unit vector along which gravity pulls; any where it pulls along it."""
+    """Unit vector's normal (3,) along which gravity pulls; any normal if it pulls along it."""
     side = down - (down @ along) * along
     if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
         return cross(along, np.eye(3)[np.argmin(np.abs(along))])
@@ -326,7 +326,7 @@ def _hanging_frames(
 def carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotation, float]:
     """Frames (k,) without twist along tangents bent into the clamps, and the end clamp's roll.
 
-    The roll is the angle [rad] about the cable from the last frame to the clamp, in (-pi, pi].
+    The roll is the angle [rad] about the cable's axis from last frame to clamp, in (-pi, pi].
     """
     bends = [
         decay[:, None] * smallest_turn(tangents[end], clamp.apply(_FORWARD)).as_rotvec()
@@ -385,7 +385,7 @@ def frames_along(
 def nearest_roll(roll: float, aimed: float) -> float:
     """The roll [rad], up to full turns, that is nearest to `aimed` [turns].
 
-    The larger of two that are equally near up to rounding.
+    If two are equally near up to rounding, the larger one.
     """
     return roll + 2 * np.pi * float(np.floor(aimed - roll / (2 * np.pi) + 0.5 + _ROUNDING))
 
@@ -397,8 +397,8 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
     """Nodes (n_nodes, coordinates) along a measured line, from its chords.
 
     The chords are some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In
-    a plane headings are continuous along the cable; in space the rolls of clamped clips, and that
-    of the end clamp nearest to `turns`, are spread evenly.
+    a plane headings are continuous along the cable. In space the rolls of clamped clips, and the
+    roll of the end clamp nearest to `turns`, are spread evenly.
     """
     last = [] if pose.end is None else [chain.length]
     at = np.maximum.accumulate(np.concatenate([[0.0], places, last]))

@@ -1,15 +1,15 @@
 """The equilibrium as a node of CasADi graphs, with exact derivatives of first and second order.
 
-The search for an equilibrium is no smooth operation, the equilibrium it finds is: z(u) with
-g(z(u), u) = 0 for the numbers u of the pose. In the graph a node without derivatives returns the
-equilibrium z_0 of the present u, and two steps of the chord method follow from there,
+The search for an equilibrium is not a smooth operation, but the equilibrium is a smooth function
+z(u) with g(z(u), u) = 0 of the numbers u of the pose. In the graph a node without derivatives
+returns the equilibrium z_0 of the present u, followed by two steps of the chord method,
 
-    z_(k+1) = z_k - K^-1 g(z_k, u),    K = dg/dz (z_0, u), taken for a constant.
+        z_(k+1) = z_k - K^-1 g(z_k, u),    K = dg/dz (z_0, u), treated as constant.
 
-At the present u they stay where they are. Their error at u + du is O(du^(k+1)), so that two steps
-have the first and second derivatives of z exactly (implicit function theorem), whatever CasADi does
-to differentiate them, and one matrix serves all orders. In space z are increments about the frames
-of the equilibrium itself.
+At the present u these steps change nothing. Their error at u + du is O(du^(k+1)), so two steps have
+the exact first and second derivatives of z (implicit function theorem), however CasADi
+differentiates them, and one matrix serves all orders. In space z are increments about the frames of
+the equilibrium itself.
 
 References
 ----------
@@ -34,7 +34,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, tangent
 from dlo_casadi.rod.ends import EndConditions
 
-# Equilibria that a search keeps: an optimiser asks for value, gradient and Hessian of one pose.
+# Number of equilibria that a search caches: an optimiser asks for value, gradient, Hessian.
 KEPT = 1024
 
 
@@ -46,7 +46,7 @@ def pose_size(model: CableModel) -> int:
 
 
 def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> HeldPose:
-    """The pose whose numbers are laid out as dlo_pose; what is not held is left out."""
+    """The pose with its numbers laid out as in dlo_pose; what is not held is left out."""
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last, turns = np.split(numbers, np.cumsum([d, d, c, c]))
     held: dict[str, Any] = {}
@@ -66,7 +66,7 @@ def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None
 def symbols_of(
     model: CableModel, rest: FloatArray, x: Any, multipliers: Any, pose: Any, p: Any
 ) -> PoseSymbols:
-    """Arguments of the expressions of a pose; `pose` as dlo_pose, quaternions of any length."""
+    """Arguments of the expressions of a pose; `pose` as in dlo_pose, quaternions of any length."""
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last, _ = ca.vertsplit(
         pose, np.cumsum([0, d, d, c, c, pose.numel() - 2 * (d + c)]).tolist()
@@ -130,7 +130,7 @@ def _solved(
     numbers: FloatArray,
     branch: Branch | None,
 ) -> Equilibrium | int:
-    """The stable equilibrium of a pose, or the number of the reason why there is none."""
+    """The stable equilibrium of a pose, or the number of the reason that there is none."""
     pose = pose_of(model, numbers, branch)
     if not np.all(np.isfinite([*pose.vector, pose.turns, *p])):
         return 3
@@ -147,7 +147,7 @@ def _solved(
 
 @cache
 def search_of(model: CableModel, rest: bytes, branch: Branch | None) -> _SearchCallback:
-    """A node for the life of the process: graphs that contain it do not keep it alive."""
+    """Search node, kept until the process ends: graphs that contain it do not keep it alive."""
     return _SearchCallback(model, np.frombuffer(rest), branch)
 
 
@@ -168,7 +168,7 @@ def detached(function: ca.Function) -> ca.Function:
 def chord(model: CableModel, rest: FloatArray) -> ca.Function:
     """(x, multipliers, pose, p) -> (x, multipliers) after two chord steps, see the module.
 
-    And the longest step of a node [rad]: none from an equilibrium.
+    A further output is the longest step of a node [rad]: zero at an equilibrium.
     """
     node, count, k = model.node, model.chain.n_nodes, model.n_border
     x = ca.MX.sym("x", node.coordinates, count)
@@ -188,7 +188,7 @@ def chord(model: CableModel, rest: FloatArray) -> ca.Function:
     )
     matrix = tangent(model, symbols_of(model, rest, x, lam, pose, p))
     if model.may_spin and not rest.any():
-        # Such a cable may roll about its own axis: the first node is kept from it.
+        # The cable may roll freely about its axis: block this for the first node.
         matrix[0, 0] += ca.mmax(ca.fabs(matrix))
     arguments: list[Any] = [x, lam, pose, p]
     matrix = detached(ca.Function("tangent", arguments, [matrix]))(*arguments)

@@ -1,7 +1,7 @@
-"""What a cable must not exceed, and how likely a new repeat of a pose exceeds it.
+"""Limits for a cable, and the probability that a new repeat of a pose exceeds them.
 
-Of a curvature [1/m] the limit is one over the least bend radius. A probability is of first order
-where shapes that are solved anew agree with it; elsewhere it is counted among such shapes.
+A least bend radius sets the limit of the curvature [1/m], which is one over it. A probability is
+computed to first order if newly solved shapes agree with it; otherwise it is counted among them.
 """
 
 from collections.abc import Mapping
@@ -25,12 +25,12 @@ from dlo_casadi.model.contact import outwards
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
 
-# Draws that are solved to see if first order suffices, and where it does not; draws of the
-# linearised shapes, which cost next to nothing; and shapes that are solved at a time.
+# Number of draws that are solved to check the first order; number if it does not suffice; number
+# of draws of the linearised shapes, which cost next to nothing; number of shapes solved at a time.
 PAIRED, DRAWN, LINEAR, CHUNK = 600, 2000, 4000, 500
-# Probabilities of first order between which solved draws decide if a limit is kept.
+# First-order probabilities between which solved draws decide whether a limit is kept.
 IN_DOUBT = SAFE / 10, SAFE + FIRST_ORDER
-# Largest step [rad] of a node at which a draw counts as solved: draws are counted, not measured.
+# Largest step [rad] of a node at which a draw counts as solved: its size need not be exact.
 _TOLERANCE = 1e-6
 # Step of finite differences along a derivative of the shape, in standard deviations.
 _STEP = 1e-3
@@ -47,7 +47,7 @@ class Fixture(NamedTuple):
 
 
 def fixtures_of(model: CableModel, pose: HeldPose, found: Equilibrium) -> list[Fixture]:
-    """All that holds a cable in a pose: the ends that are held, then the clips."""
+    """All that holds a cable in a pose: the held ends, then the clips."""
     ends = (("start", 0.0, model.start), ("end", model.cable.length, model.end))
     held = [Fixture(name, at, kind == "clamped") for name, at, kind in ends if kind != "free"]
     clips = zip(pose.clips, found.clips, strict=True)
@@ -59,7 +59,7 @@ def places_of(
 ) -> tuple[FloatArray, list[str]]:
     """Arc lengths (K,) [m] at which a quantity has values, and the names of what is there.
 
-    These are fixtures, and of a clearance the nearest obstacles.
+    The names are those of fixtures; for a clearance, those of the nearest obstacles.
     """
     if quantity in ("force", "moment"):
         held = fixtures_of(model, pose, found)
@@ -79,9 +79,9 @@ def places_of(
 
 
 def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) -> FloatArray:
-    """Sizes (m, K) at `places_of` in repeats of a pose.
+    """Sizes (m, K) of a quantity at `places_of`, in repeats of a pose.
 
-    Curvature, twist [1/m]; force [N], moment [N m] on fixtures; of a clearance [m] its negative.
+    Curvature, twist [1/m]; force [N] and moment [N m] on fixtures; minus the clearance [m].
     """
     assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
     if quantity == "clearance":
@@ -113,7 +113,7 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
 
 
 def _along(model: CableModel, points: FloatArray, x: FloatArray) -> FloatArray:
-    """Places (..., K, d) [m] along cables, four to an element, from their nodes."""
+    """Places (..., K, d) [m] along cables, four per element, interpolated from their nodes."""
     slopes = model.chain.h * tangents(model.node, x)
     u = np.arange(4)[:, None] / 4
     start, end, out, into = (
@@ -137,16 +137,16 @@ class Exceedance:
     std : float
         Standard deviation of the greatest size, to first order.
     probability, error : float
-        That a size exceeds its bound, by the parameters' covariance, the fixtures and the cable's
-        own scatter; and the standard error of that; 0 to first order.
+        Probability that a size exceeds its bound, given the parameters' covariance, the fixtures
+        and the cable's own scatter; standard error of that, 0 if it is of first order.
     draws : int
-        Shapes among which it was counted; 0 where it is of first order.
+        Number of shapes among which it was counted; 0 if it is of first order.
     lost : int
-        Those of them at which the cable has no stable shape near the predicted one: it snaps.
-        They count as exceeding.
+        Number of these shapes that lose stability near the predicted one: the cable snaps. They
+        count as exceeding.
     shares : mapping of str to float
-        Parts of the variance by their causes, see `Uncertainty.causes_in`; the largest first.
-        Empty where nothing is uncertain.
+        Shares of the variance by cause, see `Uncertainty.causes_in`; the largest first. Empty if
+        nothing is uncertain.
     """
 
     std: float
@@ -159,7 +159,7 @@ class Exceedance:
 
 @dataclass(frozen=True)
 class Varied:
-    """A cable in a pose, and all in which a new repeat of it may differ.
+    """A cable in a pose, and every way in which a new repeat of it may differ.
 
     Parameters
     ----------
@@ -175,19 +175,19 @@ class Varied:
     uncertainty: Uncertainty
 
     def exceedances(self, bounds: Mapping[str, float]) -> dict[str, Exceedance]:
-        """How near and how likely each quantity of `sizes_of` exceeds its bound.
+        """Distance to the bound and probability of exceeding it, for each quantity of `sizes_of`.
 
-        The sizes g_k(z) depend on standard normal z: on the fitted unknowns, the fixtures, the rest
-        curvature of a repeat. To first order g(z) = g + J z at all places together, so that one of
-        several equal bends may become the sharpest:
+        The sizes g_k(z) depend on standard normal z: the fitted unknowns, the fixtures, the rest
+        curvature of a repeat. To first order g(z) = g + J z. This is taken at all places together,
+        because any one of several equal bends may become the sharpest:
 
             P = E[Phi(t_low) + Phi(-t_high)]    (line sampling)
 
         over z across the direction of the likeliest place; on its line, g stays within the bound
-        between t_low and t_high. Draws that are solved anew tell whether that suffices: where they
-        give a probability that differs by more than `thresholds.FIRST_ORDER`, two standard errors
-        included, or where the verdict hangs on it, it is their share, of more draws, corrected by
-        what the same draws give to first order (`_counted`).
+        between t_low and t_high. Newly solved draws show whether this suffices. It does not if
+        their probability differs by more than `thresholds.FIRST_ORDER`, two standard errors
+        included, or if the verdict depends on it. The probability is then counted among more solved
+        draws and corrected by the first-order result of the same draws (`_counted`).
 
         References
         ----------
@@ -205,7 +205,7 @@ class Varied:
         likely = {x: _crossing(sizes[x], slopes[x], bounds[x], z) for x in names}
         softer: dict[str, FloatArray] = dict.fromkeys(names, np.zeros(1))
         if self.model.surfaces:
-            # Obstacles of draws are softer: they sink in as far as the predicted shape then does.
+            # Draws use softer obstacles: allow for how far the predicted shape then sinks in.
             (same, _) = self._solved(0 * z[:1], names)
             softer = {x: same[x] - sizes[x] for x in names}
         anew = {x: _beyond(solved[x] - softer[x], bounds[x]) | lost for x in names}
@@ -284,7 +284,7 @@ class Varied:
     def _solved(
         self, z: FloatArray, names: tuple[str, ...]
     ) -> tuple[dict[str, FloatArray], BoolArray]:
-        """Sizes (m, K) of repeats z (m, q), solved anew, and which of them (m,) are lost."""
+        """Sizes (m, K) of repeats z (m, q), newly solved, and which repeats (m,) are lost."""
         near, given = self._near(z), self._given(z)
         parts: dict[str, list[FloatArray]] = {name: [] for name in names}
         lost = []
@@ -317,23 +317,23 @@ def _crossing(sizes: FloatArray, slopes: FloatArray, bound: float, z: FloatArray
 
 
 def _beyond(sizes: FloatArray, bound: float) -> BoolArray:
-    """Whether a size of each draw (m,), at any of its places, exceeds its bound."""
+    """Whether any size of each draw (m,) exceeds the bound."""
     return np.asarray((sizes > bound).any(axis=1))
 
 
 def _agree(anew: BoolArray, linear: BoolArray) -> bool:
-    """Whether draws solved anew give the first-order probability, within two standard errors."""
+    """Whether solved draws confirm the first-order probability, within two standard errors."""
     apart = anew.astype(float) - linear
     error = float(np.sqrt((apart**2).mean() / len(apart)))
     return bool(abs(apart.mean()) + 2 * error <= FIRST_ORDER)
 
 
 def _counted(anew: BoolArray, linear: BoolArray, expected: float) -> tuple[float, float]:
-    """Probability counted among draws (m,) solved anew, and its standard error.
+    """Probability counted among newly solved draws (m,), and its standard error.
 
         P = mean(anew) + b (expected - mean(linear)),   b = cov(anew, linear) / var(linear)
 
-    The same draws to first order are a control variate, of which the expectation is known.
+    The same draws to first order serve as control variate, because their expectation is known.
     """
     a, c = anew - anew.mean(), linear - linear.mean()
     b = float(a @ c / max(c @ c, 1e-300))
@@ -344,10 +344,10 @@ def _counted(anew: BoolArray, linear: BoolArray, expected: float) -> tuple[float
 def resolved(
     model: CableModel, p: FloatArray, coefficients: FloatArray, pose: HeldPose, found: Equilibrium
 ) -> list[tuple[CableModel, Equilibrium]]:
-    """The same shape on finer meshes, the last of which resolves its sharpest bend.
+    """The same shape on finer meshes; the last mesh resolves its sharpest bend.
 
-    Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`. The
-    radius of the segments, and also the curve's, are too large on a coarse mesh: beside a clamp of
+    Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`. On a
+    coarse mesh the radius of the segments, like that of the curve, is too large: beside a clamp of
     a soft cable by tens of percent. `coefficients` (n_coefficients,) [1/m]: of the rest curvature.
     """
     meshes, settled = [(model, found)], False

@@ -5,10 +5,10 @@ Each step of Newton's method on many poses or first guesses solves
     [ A + tau I   B ] [ dx   ]     [ dL/dx   ]
     [ B^T         C ] [ dlam ] = - [ dL/dlam ]
 
-with the least tau found for which the matrix has as many negative eigenvalues as there are
-multipliers: dx then lowers the energy along the end conditions, and a shape that converges with
-tau = 0 is a strict minimum under them. IPOPT solves the poses for which this gives no minimum
-within the bounds of the joints.
+tau is the least value found for which the matrix has as many negative eigenvalues as there are
+multipliers. Then dx lowers the energy along the end conditions, and a shape that converges with
+tau = 0 is a strict minimum under them. IPOPT solves the remaining poses, for which this finds no
+minimum within the bounds of the joints.
 
 References
 ----------
@@ -47,27 +47,27 @@ from dlo_casadi.runtime.executors import interrupts_held
 LONGEST_STEP = 0.5
 # Longest step at convergence [rad].
 TOLERANCE = 1e-10
-# Shift tau relative to the largest entry of the diagonal: the first, its factors of growth and
-# shrinkage, and the smallest before it becomes zero.
+# Shift tau relative to the largest entry of the diagonal: first value, factors of growth and
+# shrinkage, and smallest value before it becomes zero.
 FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
-# Growth of the Hessian from the first guess beyond which the multipliers diverge: the stiffness of
-# the cable is then below rounding. Four of 336 descents of very soft cables with a tether came
-# back from beyond 1e6.
+# Growth of the Hessian since the first guess above which multipliers count as diverging: the
+# cable's stiffness is then below rounding. Four of 336 descents of very soft cables with a tether
+# returned from beyond 1e6.
 RUNAWAY = 1e16
-# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard; the number of
-# these that a given start skips to stay on its side, one more where a pose names it: 16 elements in
-# space found it in none of three poses otherwise; maximum number of steps of each.
+# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard. Number of these
+# depths that a given start skips to stay on its side, one more if the pose names it (without it, 16
+# elements in space found the side in none of three poses). Maximum number of steps at each depth.
 SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
-# How often the way from one depth to the next is halved where contacts change to and fro. Beyond
-# the depth by which the cable bends between two nodes they change no more.
+# Number of times that the change from one depth to the next is halved if contacts alternate. They
+# no longer alternate beyond the depth by which the cable bends between two nodes.
 HALVINGS = 4
-# Contacts that change to and fro make steps of one size: of a step that is longer than SAME_SIZE
-# times the one before, the share SHORTER is taken. What is left of it is the next step, so that the
-# ratio has to be more than a half.
+# Alternating contacts give steps of equal size. Of a step longer than SAME_SIZE times the one
+# before, only the share SHORTER is made. The rest of it is the next step, so that SAME_SIZE has to
+# exceed a half.
 SHORTER, SAME_SIZE = 0.5, 0.75
-# How often a step that carries a cable through a bar is halved.
+# Maximum number of halvings of a step that carries a cable through a bar.
 SHORTENED = 6
-# Depth [lengths] of a node in hard obstacles from which on no room is left for the cable.
+# Depth [lengths] of a node in hard obstacles above which there is no room for the cable.
 NO_ROOM = 1e-6
 # Maximum number of Newton steps after IPOPT.
 NEWTON_STEPS = 8
@@ -99,7 +99,7 @@ class Minima:
 
     @property
     def parts(self) -> tuple[NDArray[Any], ...]:
-        """Its arrays."""
+        """The arrays of the result."""
         return (
             self.shapes.x,
             self.shapes.lam,
@@ -113,7 +113,7 @@ class Minima:
 def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
     """Minimise the energy of each of m shapes under its end conditions.
 
-    `shapes`: first guesses; deviations are kept. `given`: what each of them depends on.
+    `shapes`: first guesses; their deviations are kept. `given`: inputs of each of them.
     """
     m = len(shapes.x)
     wanted = assembly.model.n_multipliers
@@ -140,7 +140,7 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
         last[active] = size
         own = here, taken, length, given.subset(active)
         now.x[active], now.lam[active] = _on_their_sides(assembly, *own)
-        # A shift makes steps small even where forces do not balance.
+        # A shift makes steps small even if forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
         iterations[active[done]] = iteration + 1
@@ -189,10 +189,10 @@ def _hardened(
     max_iterations: int,
     halvings: int,
 ) -> Minima:
-    """Minima from shapes in obstacles of a larger depth, `softer`.
+    """Minima from shapes that balanced in obstacles of a larger depth, `softer`.
 
-    Where contacts change so much that this finds none, half of the way, of the logarithm of the
-    depth, comes first.
+    If this finds none because contacts change too much, the change of log depth is halved: an
+    intermediate depth is solved first.
     """
     found = descend(assembly, shapes, given, max_iterations)
     lost = np.flatnonzero(~found.balanced)
@@ -215,8 +215,8 @@ def _convex(
 ) -> tuple[BandFactor, FloatArray]:
     """Factors of the matrices, shifted until their inertia is that of a minimum, and the shifts.
 
-    `turns` (k,): see `Assembly.turn_per_slip`. No shift exceeds the one that makes the nodes' part
-    positive definite: if the inertia is wrong even then, the conditions are the cause.
+    `turns` (k,): see `Assembly.turn_per_slip`. The largest shift makes the nodes' part positive
+    definite: if the inertia is wrong even then, the conditions are the cause.
     """
     scale, most = matrix.scale, matrix.row_sum
     shift = np.where(before > LEAST_SHIFT * scale, before / SHRINKAGE, 0.0)
@@ -246,7 +246,7 @@ def _convex(
 def damped(
     assembly: Assembly, step: Vector, size: FloatArray, last: FloatArray
 ) -> tuple[Vector, FloatArray]:
-    """Steps of one column and their sizes (m,), shorter where contacts change to and fro."""
+    """Steps of one column and their sizes (m,), shortened if contacts alternate."""
     if not assembly.model.surfaces:
         return step, size
     share = np.where(size > SAME_SIZE * last, SHORTER, 1.0)
@@ -256,10 +256,10 @@ def damped(
 def stepped(
     assembly: Assembly, shapes: Shapes, step: Vector, size: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Nodes and border of shapes after a step of one column, cut at LONGEST_STEP.
+    """Nodes and border of shapes after a step of one column, limited to LONGEST_STEP.
 
-    `size` (m,) [rad] is the longest step of each shape, see `Assembly.size`. No eyelet leaves the
-    cable.
+    `size` (m,) [rad] is the longest step of each shape, see `Assembly.size`. Eyelets stay within
+    the cable.
     """
     share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
     x = assembly.node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
@@ -272,9 +272,9 @@ def stepped(
 def _on_their_sides(
     assembly: Assembly, shapes: Shapes, step: Vector, size: FloatArray, given: Inputs
 ) -> tuple[FloatArray, FloatArray]:
-    """As `stepped`, of steps that are halved while they carry a cable through a bar.
+    """As `stepped`, but a step that carries a cable through a bar is halved.
 
-    Bars in which the cable's weight alone sinks in by more than their radius are no hindrance.
+    Bars so soft that the cable sinks in by more than their radius under its weight are ignored.
     """
     depth, size = assembly.depth * assembly.chain.length, np.maximum(size, LONGEST_STEP)
     bars = bars_of(assembly.model.surfaces, assembly.model.gravity)
@@ -339,10 +339,9 @@ def by_ipopt(
 ) -> Equilibrium | None:
     """Equilibrium of a planar cable that IPOPT reaches from one first guess; None if it does not.
 
-    IPOPT minimises the potential under the end conditions and the bounds of the joints: the same
-    functions of segments as everywhere, stated as one problem of the whole pose; that no node is
-    inside of an obstacle are inequalities. Newton's method on the Lagrangian then converges to
-    rounding.
+    IPOPT minimises the potential under the end conditions and the bounds of the joints. It uses the
+    same functions of segments as the rest, assembled to one problem of the whole pose; inequalities
+    keep nodes out of obstacles. Newton's method on the Lagrangian then converges to rounding.
 
     Parameters
     ----------
@@ -382,8 +381,8 @@ def _balanced(
     """Newton's method from IPOPT's minimum, on a Lagrangian that keeps compressed bubbles stiff.
 
     Joints at their bound are held there, and released if their multiplier has the wrong sign. The
-    status of IPOPT does not count (on fine meshes of stiff cables its tolerance lies below
-    rounding), only the balance of the shape: None if it does not balance.
+    status of IPOPT is ignored, because on fine meshes of stiff cables its tolerance lies below
+    rounding. Only the balance of the shape counts: the result is None if it does not balance.
     """
     assembly, node = assembly_of(model), model.node
 

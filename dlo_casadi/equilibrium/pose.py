@@ -12,7 +12,7 @@ from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.node import Frame, Heading, Node, quaternion_product
 
 Branch = Literal["ccw", "cw"]
-# In a session a pose may also continue the one before it, see `solve.continued`.
+# In a session, a pose may also continue the pose before it, see `solve.continued`.
 PoseBranch = Branch | Literal["previous"]
 
 # Sign of the turning from start to end on a branch.
@@ -32,19 +32,19 @@ class HeldPose:
     start_orientation, end_orientation : (4,) or None
         Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable.
     turns : float
-        In space, selects the twist about the cable's axis that brings its end into the clamp: the
-        one nearest to this number of full turns; +-0.5 select either way of half a turn. With 0,
-        and a clamp rolled by half a turn within 1 rad, the way of lower energy.
+        In space, selects the twist about the cable's axis with which its end fits the clamp: the
+        one nearest to this number of full turns; +-0.5 select either direction of half a turn. For
+        0 and a clamp rolled by half a turn within 1 rad, the direction of lower energy is taken.
     branch : "ccw", "cw" or "previous", optional
-        Which way the cable turns from start to end: the sign of `Equilibrium.turn`; or "previous",
-        the equilibrium that follows from the pose before, see `solve.continued`.
+        Which way the cable turns from start to end: the sign of `Equilibrium.turn`. "previous"
+        is the equilibrium that follows from the pose before, see `solve.continued`.
     name : str
     camera_center : (float, float, float), optional [m]
-        Where the camera stood: x, y in the board frame, z in front of the cable's declared plane.
+        Position of the camera: x, y in the board frame, z in front of the cable's declared plane.
     clips : tuple of HeldClip
         What holds the cable between its ends, in the order along it.
     over : bool or mapping of str to bool, optional
-        Whether the cable passes over or under bars, see `Capsule.passed`: all, or some by name.
+        Whether the cable passes over or under bars, see `Capsule.passed`: for all, or by name.
     """
 
     start: tuple[float, ...]
@@ -62,7 +62,7 @@ class HeldPose:
 
     @property
     def node(self) -> type[Node]:
-        """The kind of nodes of a cable that is held so: headings in a plane, frames in space."""
+        """Kind of the nodes of a cable held in this way: headings in a plane, frames in space."""
         return Heading if len(self.start) == 2 else Frame
 
     @property
@@ -71,7 +71,7 @@ class HeldPose:
 
     @property
     def directions(self) -> dict[str, Any]:
-        """Directions of the ends by their keys in a session."""
+        """Directions of the ends, by their keys in a session file."""
         known = {name: getattr(self, name) for name in self._direction_names}
         known = {name: list(x) if isinstance(x, tuple) else x for name, x in known.items()}
         return {**known, "turns": self.turns} if self.node.twists else known
@@ -84,7 +84,7 @@ class HeldPose:
 
     @property
     def span(self) -> float:
-        """Distance [m] of the end from the start; 0 of a free end."""
+        """Distance [m] of the end from the start; 0 for a free end."""
         return 0.0 if self.end is None else math.dist(self.start, self.end)
 
     @property
@@ -95,14 +95,14 @@ class HeldPose:
         return first, last
 
     def moved(self, start: FloatArray, end: FloatArray, frames: Sequence[FloatArray]) -> Self:
-        """The same pose with other ends; what is free stays free."""
+        """The same pose with other ends; a free end stays free."""
         values = map(self.node.declared, frames)
         held: dict[str, Any] = dict(zip(self._direction_names, values, strict=True))
         end_place = None if self.end is None else tuple(end)
         return replace(self, start=tuple(start), end=end_place, **held)
 
     def joined(self, points: FloatArray) -> FloatArray:
-        """Points (K, d) [m] along the cable with its start before and its end, if held, after."""
+        """Points (K, d) [m] along the cable, with its start before them and its held end after."""
         end = [] if self.end is None else [np.array(self.end)[None]]
         return np.concatenate([np.array(self.start)[None], points, *end])
 

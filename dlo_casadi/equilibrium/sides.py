@@ -1,7 +1,7 @@
-"""Sides on which a cable may hang or pass, across which its energy alone does not lead it.
+"""Sides on which a cable may hang or pass; minimising its energy does not change the side.
 
-A cable passes each bar on one of two sides: where a cable without obstacles comes near a bar, first
-guesses push it to either side. A pose may name the side.
+A cable passes each bar on one of two sides. If a cable without obstacles comes near a bar, first
+guesses are moved to either side. A pose may name the side.
 """
 
 from collections.abc import Mapping
@@ -18,14 +18,14 @@ from dlo_casadi.model.clips import tangents
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 
-# Distance of a bar [lengths] from a cable without obstacles beyond which it has one side alone.
+# Distance [lengths] between bar and cable without obstacles above which only one side is tried.
 NEAR_BAR = 0.1
-# Maximum number of bars, the nearest ones, whose sides are combined.
+# Maximum number of bars, the nearest ones, whose sides are tried in all combinations.
 MOST_BARS = 3
 
 
 def named_sides(model: CableModel, pose: HeldPose) -> list[tuple[Capsule, FloatArray, bool]]:
-    """The bars whose sides a pose names: each with `Capsule.up`, and whether it is passed over."""
+    """Bars whose side a pose names: each with `Capsule.up`, and whether it is passed over."""
     found = []
     for bar, up in bars_of(model.surfaces, model.gravity):
         over = pose.over if not isinstance(pose.over, Mapping) else pose.over.get(bar.name)
@@ -35,7 +35,7 @@ def named_sides(model: CableModel, pose: HeldPose) -> list[tuple[Capsule, FloatA
 
 
 def on_named_sides(model: CableModel, pose: HeldPose, points: FloatArray) -> BoolArray:
-    """Whether cables through points (m, n, d) [m] pass all bars on the sides that a pose names."""
+    """Whether cables through points (m, n, d) [m] pass all bars on the sides named by a pose."""
     kept = np.ones(len(points), dtype=bool)
     for bar, up, over in named_sides(model, pose):
         above, below = bar.passed(up, points)
@@ -44,10 +44,10 @@ def on_named_sides(model: CableModel, pose: HeldPose, points: FloatArray) -> Boo
 
 
 def beside_bars(model: CableModel, x: FloatArray, points: FloatArray) -> list[FloatArray]:
-    """Nodes x (n_nodes, coordinates), and the same pushed to all combinations of sides of bars.
+    """Nodes x (n_nodes, coordinates), and the same moved to each combination of sides of bars.
 
-    Places beside a bar move across the cable by a Gaussian of the arc length as wide as the bar;
-    the nodes turn with the line through them. `points` (n_nodes, dimension) [m]: places of the
+    Places beside a bar are moved across the cable by a Gaussian of the arc length, as wide as the
+    bar; the nodes turn with the line through them. `points` (n_nodes, dimension) [m]: places of the
     nodes x.
     """
     s, ahead, found = model.chain.places, tangents(model.node, x), []
@@ -75,8 +75,8 @@ def on_other_side(
 ) -> BoolArray:
     """Whether other shapes (m, n_nodes, coordinates) hang on the other side of a shape.
 
-    With a free end these turn the other way; between two clamps, where twists differ by full
-    turns, by more than half a turn. None does if the pose names its side or there are no two.
+    With a free end, they turn the other way. Between two clamps, where twists differ by full turns,
+    their twist differs by more than half a turn. False if the pose names its side or has no two.
     """
     turn, turns = float(model.node.turning(x)), model.node.turning(others)
     least = 0.0 if pose.end is None else np.pi
@@ -85,7 +85,7 @@ def on_other_side(
 
 
 def touchdowns(model: CableModel, points: FloatArray) -> list[FloatArray]:
-    """Places (d,) [m] where a cable may touch planes: above its deepest one of points (n, d)."""
+    """Places (d,) [m] where a cable may touch planes: above the deepest of points (n, d)."""
     found = []
     for plane in model.surfaces:
         if isinstance(plane, Plane):
@@ -97,7 +97,7 @@ def touchdowns(model: CableModel, points: FloatArray) -> list[FloatArray]:
 
 
 def _turned(model: CableModel, x: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:
-    """Nodes x turned as the line through their places turns; both ends stay."""
+    """Nodes x rotated like the line through their places; both ends are kept."""
     before, after = (np.gradient(points, axis=0) for points in (old, new))
     out = x.copy()
     if model.node is Frame:

@@ -35,15 +35,15 @@ from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.node import Frame
 
-# Largest move of an end in one step [lengths, rad], so that shapes are followed up to a fold.
+# Largest move of an end in one step [lengths, rad], so that a shape can be followed up to a fold.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
-# Number of lowest minima of the coarse mesh, in space, that are solved on the model's own mesh,
-# beside the lowest on the other side.
+# Number of lowest minima of the coarse mesh, in space, that are solved on the model's own mesh, in
+# addition to the lowest one on the other side.
 FEW = 2
-# Values of `HeldPose.turns` for the two ways round of half a turn.
+# Values of `HeldPose.turns` for the two directions of half a turn.
 WAYS_ROUND = (0.5, -0.5)
-# Largest difference [turns] of a twist from the one asked for before turns count as shed. Of 7,500
-# random problems with up to four turns 1,369 differ by more than 1.35, 7 by 1.15 to 1.35.
+# Largest difference [turns] between a twist and that asked for before turns count as shed. In 7,500
+# random problems with up to four turns 1,369 differ by more than 1.35, and 7 by 1.15 to 1.35.
 MOST_SHED = 1.3
 
 
@@ -59,11 +59,11 @@ def solve_equilibrium(
 
         min V(phi)   s.t.   r(L) = end, clamped headings, |phi_(i+1) - phi_i| <= pi/2
 
-    Of the equilibria that the first guesses lead to (see `guesses`), the stable one of lowest
-    energy is returned, an unstable one if no other is found. For a pose that names its branch it
-    is on that branch, or an error; between two pins the first stable one, as a rule that of the
-    branch's own arc. For one that names sides of bars the cable passes them there. With `x_init` it
-    is the equilibrium reached from there, on any branch or side.
+    Among the equilibria reached from the first guesses (see `guesses`), the stable one of lowest
+    energy is returned, or an unstable one if no other is found. If the pose names its branch, the
+    result is on that branch, or an error; between two pins it is the first stable one, as a rule
+    that of the branch's own arc. If it names sides of bars, the cable passes them there. With
+    `x_init` it is the equilibrium reached from there, on any branch or side.
 
     Parameters
     ----------
@@ -78,8 +78,8 @@ def solve_equilibrium(
     Raises
     ------
     EquilibriumError
-        If the end is out of reach or not finite, no start leads to an equilibrium, or none to one
-        on the branch that the pose names.
+        If the end is out of reach or not finite, or if no start leads to an equilibrium, or none to
+        one on the branch that the pose names.
 
     References
     ----------
@@ -99,10 +99,10 @@ def solve_equilibria(
     poses: Sequence[HeldPose],
     starts: Sequence[FloatArray | None] | None = None,
 ) -> list[Equilibrium | EquilibriumError]:
-    """`solve_equilibrium` for many poses at once: for each its shape, or why there is none.
+    """`solve_equilibrium` for many poses at once: each pose's shape, or why there is none.
 
-    The energy descends from all first guesses of all poses together. In a plane, IPOPT solves the
-    guesses from which that gives no minimum within the bounds of the joints.
+    The energy is minimised from all first guesses of all poses together. In a plane, IPOPT then
+    solves the guesses from which this gives no minimum within the bounds of the joints.
 
     Parameters
     ----------
@@ -141,13 +141,13 @@ def solve_equilibria(
 
 
 def ways_of(model: CableModel, pose: HeldPose) -> list[HeldPose]:
-    """Copies of a pose with each branch, or way round, that it may name; ccw first."""
+    """Copies of a pose, one for each branch or direction of twist it may name; ccw first."""
     named = [replace(pose, branch=name) for name in SIGNS if name in pose.node.branches]
     return named or ways_round(model, pose)
 
 
 def ways_round(model: CableModel, pose: HeldPose) -> list[HeldPose]:
-    """Copies of a pose with each way round of half a turn, if it may name them by its `turns`."""
+    """Copies of a pose with each direction of half a turn, if its `turns` may name it."""
     twists = pose.node.twists and model.tipped_by is not None
     return [replace(pose, turns=turns) for turns in WAYS_ROUND] if twists else []
 
@@ -157,7 +157,7 @@ def _chosen(
 ) -> Equilibrium | EquilibriumError:
     """The equilibrium chosen among those found from a pose's first guesses, or the error.
 
-    See `solve_equilibrium`; an error also if none is on the branch that the pose names.
+    See `solve_equilibrium`; also an error if none is on the branch that the pose names.
     """
     named = None if start is not None or pose.branch == "previous" else pose.branch
     where = "its end free" if pose.end is None else f"its end at {pose.end} m"
@@ -222,7 +222,7 @@ class _PoseSearch:
     def reached(
         self, poses: Sequence[HeldPose], starts: Sequence[FloatArray | None]
     ) -> list[list[Equilibrium]]:
-        """Equilibria of each pose, in the order of the first guesses that lead to them."""
+        """Equilibria of each pose, in the order of the first guesses that led to them."""
         found: list[list[Equilibrium]] = [[] for _ in poses]
         free = [j for j, start in enumerate(starts) if start is None]
         if free and self.model.in_space and self.model.n > self.model.coarse.n:
@@ -245,7 +245,7 @@ class _PoseSearch:
     def _first(
         self, poses: Sequence[HeldPose], starts: Sequence[FloatArray | None]
     ) -> tuple[IntArray, Shapes]:
-        """First guesses of all poses, or the given starts, and the pose of each."""
+        """First guesses of all poses, or the given starts, and the pose index of each."""
         model = self.model
         rows = [
             list(first_guesses(model, self.p, self.rest, pose))
@@ -258,10 +258,10 @@ class _PoseSearch:
         return of, Shapes.declared(np.array(x), np.array(border), len(model.clips))
 
     def _beside(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
-        """Guesses beside obstacles, and the pose of each: first ones, and without obstacles.
+        """Guesses with obstacles, and the pose of each: first ones, and minima without obstacles.
 
-        All minima without obstacles are lifted out of them; of the lowest, see `sides`, and where
-        it is deepest below a plane it touches down, with its slack on either side.
+        All these minima are pushed out of the obstacles. The lowest one also gets both sides of
+        bars, see `sides`, and touches a plane where it is deepest, with its slack on either side.
         """
         model, none = self.model, [None] * len(poses)
         alone, p = replace(model, obstacles=()).without_kind(ContactEffect, self.p)
@@ -291,7 +291,7 @@ class _PoseSearch:
     def _descended(
         self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool
     ) -> list[list[Equilibrium]]:
-        """Equilibria to which the energy descends from shapes `of` poses; see `_descend`."""
+        """Equilibria reached by minimising the energy from shapes `of` poses; see `_descend`."""
         given, minima = self._descend(poses, of, shapes, near=near)
         kept = minima.balanced
         if not self.model.in_space:
@@ -315,7 +315,7 @@ class _PoseSearch:
         return out
 
     def _likely(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
-        """The lowest distinct minima of a coarse mesh on the model's mesh, and the pose of each."""
+        """Lowest distinct minima of a coarse mesh, on the model's mesh, and the pose of each."""
         model, coarse = self.model, self.model.coarse
         search = _PoseSearch(coarse, self.p, coarse_rest(model, coarse, self.rest))
         touching = bool(model.surfaces)
@@ -344,7 +344,7 @@ class _PoseSearch:
 
 
 def _distinct(model: CableModel, shapes: Sequence[FloatArray] | FloatArray) -> list[int]:
-    """Indices of shapes (n_nodes, coordinates) that differ from all before them."""
+    """Indices of shapes (n_nodes, coordinates) that differ from all shapes before them."""
     found: list[int] = []
     for k, x in enumerate(shapes):
         if all(not model.node.same(x, shapes[other], NEARBY) for other in found):
@@ -353,19 +353,19 @@ def _distinct(model: CableModel, shapes: Sequence[FloatArray] | FloatArray) -> l
 
 
 def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> FloatArray:
-    """Rest strains (n_rests,) of the coarse cells: means over the fine ones."""
+    """Rest strains (n_rests,) of the coarse cells: means over the fine cells."""
     (low, high), (start, end) = model.chain.cells.T, coarse.chain.cells.T[..., None]
     shares = np.clip(np.minimum(high, end) - np.maximum(low, start), 0.0, None) / (end - start)
     return np.concatenate([shares @ part for part in np.split(rest, len(model.node.strains))])
 
 
 def _twists(model: CableModel, twist: FloatArray) -> FloatArray:
-    """Twist (m,) [turns] of whole cables from that of their cells (m, n_cells) [1/m]."""
+    """Twist (m,) [turns] of whole cables, from that of their cells (m, n_cells) [1/m]."""
     return twist.mean(axis=1) * model.cable.length / (2 * np.pi)
 
 
 def _holds(twist: FloatArray, turns: FloatArray | float) -> BoolArray:
-    """Whether cables of these twists [turns] have shed none of the turns asked for."""
+    """Whether cables of these twists [turns] have kept all the turns asked for."""
     return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
 
 
@@ -376,7 +376,7 @@ def solve_after(
     pose: HeldPose,
     before: tuple[HeldPose, FloatArray] | None,
 ) -> Equilibrium:
-    """Shape in a pose, continued from that of the pose before, its nodes known, where it says so.
+    """Shape in a pose; where the pose says so, continued from the nodes of the pose before.
 
     Raises
     ------
@@ -398,8 +398,8 @@ def continued(
 ) -> Equilibrium:
     """Shape of a cable whose ends are moved quasi-statically from another pose.
 
-    Ends and frames move evenly from one pose to the other. Where the shape loses its stability on
-    the way, the cable snaps to the equilibrium reached from its last shape.
+    Ends and frames move evenly from one pose to the other. If the shape loses its stability on the
+    way, the cable snaps to the equilibrium reached from its last shape.
 
     Parameters
     ----------
@@ -415,7 +415,7 @@ def continued(
     """
     ends = np.array([before.ends, pose.ends])[:, : 2 * model.node.dimension]
     frames = np.array([before.frames, pose.frames])
-    # The increment between frames half a turn apart is unbounded.
+    # The increment between frames half a turn apart is infinite: limit it.
     turned = min(float(np.abs(model.node.difference(*frames)).max()), 2 * np.pi)
     moved = float(np.abs(np.diff(ends, axis=0)).max()) / model.cable.length
     count = int(np.ceil(max(turned / MOST_TURNED, moved / MOST_MOVED, 1.0)))

@@ -1,8 +1,8 @@
-"""First guesses of a cable that clips hold between its ends: arcs, span by span.
+"""First guesses of a cable held by clips between its ends: arcs, span by span.
 
 A span reaches from one holder to the next; bars whose sides a pose names count as holders here. In
 a plane the arc of a span turns either way; in space it bulges along gravity or is rotated about its
-chord by quarter turns. The spans also tell whether a pose is in reach.
+chord by quarter turns. The spans also determine whether a pose is within reach.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,23 +34,23 @@ from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.node import Frame
 
-# Half angle [rad] of an arc below which its sides are not told apart.
+# Half angle [rad] of an arc below which its sides are not distinguished.
 _TAUT = 0.3
-# Maximum number of combinations of the spans' sides in a plane.
+# Maximum number of combinations of sides of the spans in a plane.
 MOST_SIDES = 16
-# Shares of the slack between two fixed arc lengths that the first of two spans takes.
+# Shares of the slack between two fixed arc lengths given to the first of two spans.
 _SLACK = (0.5, 0.15, 0.85)
-# Least length of a span beside an eyelet, relative to its chord.
+# Smallest length of a span beside an eyelet, relative to its chord.
 _LEAST = 1.0 + 1e-3
-# Number of places along the axis of a bar of which one is passed.
+# Number of candidate places along the axis of a bar at one of which the cable passes it.
 _ALONG = 21
 
 
 @dataclass(frozen=True)
 class _Holder:
-    """One that holds the cable: an end, a clip, or a bar that it passes.
+    """Something that holds the cable: an end, a clip, or a bar that it passes.
 
-    `at` is None of an eyelet and a bar, `place` of a tip.
+    `at` is None for an eyelet or a bar, `place` is None for a free end.
     """
 
     at: float | None
@@ -76,13 +76,13 @@ class Span:
 
     @property
     def taut(self) -> bool:
-        """Whether the sides of its arc are hardly apart."""
+        """Whether the span is so taut that the sides of its arc hardly differ."""
         size = 0.0 if self.chord is None else float(np.linalg.norm(self.chord))
         return arc_half_angle(size, self.length) < _TAUT
 
 
 def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
-    """All that holds the cable, from start to end; arc lengths relative to the declared length."""
+    """All holders of the cable, from start to end; arc lengths relative to the declared length."""
     (start, end), clamps, _ = true_ends(model, p, pose)
     found = [_Holder(0.0, start, clamps[0])]
     places, at = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
@@ -94,7 +94,7 @@ def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
 
 
 def _with_bars(model: CableModel, pose: HeldPose, held: Sequence[_Holder]) -> list[_Holder]:
-    """All that holds the cable and the bars whose sides a pose names, see `named_sides`."""
+    """All holders, including the bars whose sides a pose names, see `named_sides`."""
     found = list(held)
     for bar, up, over in named_sides(model, pose):
         clear = (bar.radius + model.cable.diameter / 2) * (1 if over else -1)
@@ -105,9 +105,9 @@ def _with_bars(model: CableModel, pose: HeldPose, held: Sequence[_Holder]) -> li
 
 
 def _insert(held: list[_Holder], places: FloatArray) -> int:
-    """Put one of places (K, d) [m] between the holders, where the way gets longer by least.
+    """Insert one of places (K, d) [m] between the holders where it lengthens the path least.
 
-    Returns where it stands among them.
+    Returns its index among them.
     """
     longer: list[FloatArray] = []
     for before, beyond, apart in zip(held, held[1:], chords(held), strict=False):
@@ -123,7 +123,7 @@ def arches(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """First guesses of a cable that touches down at a place (d,) [m], as `first_guesses`.
 
-    Its slack is in an arch against gravity on either side of the place; all other spans sag.
+    The slack forms an arch against gravity on each side of the place; all other spans sag.
     """
     held = holders(model, p, pose)
     k = _insert(held, place[None])
@@ -133,7 +133,7 @@ def arches(
 
 
 def chords(held: Sequence[_Holder]) -> list[float]:
-    """Distances [m] from each holder to the next; zero to a free tip."""
+    """Distances [m] from each holder to the next; zero to a free end."""
     return [
         0.0 if a.place is None or b.place is None else float(np.linalg.norm(b.place - a.place))
         for a, b in pairwise(held)
@@ -147,7 +147,7 @@ def fixed_stretches(held: Sequence[_Holder]) -> list[tuple[int, int, float]]:
 
 
 def _arc_lengths(held: Sequence[_Holder], share: float) -> list[float]:
-    """Arc lengths [m] of all holders; eyelets share the slack evenly, or as _SLACK says."""
+    """Arc lengths [m] of all holders; eyelets share the slack evenly, or as in _SLACK."""
     at, apart = [one.at or 0.0 for one in held], chords(held)
     for low, high, length in fixed_stretches(held):
         own = np.array(apart[low:high])
@@ -175,8 +175,8 @@ def first_guesses(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """First guesses of a pose, one by one: nodes (n_nodes, coordinates), and border (n_border,).
 
-    Of a cable without clips `guesses` or `guessed_frames`; with clips arcs span by span. If the
-    pose names sides of bars, arcs by way of these come first.
+    Without clips these are `guesses` or `guessed_frames`; with clips, arcs span by span. If the
+    pose names sides of bars, arcs past these bars come first.
     """
     none, held = np.zeros(model.n_border), holders(model, p, pose)
     if named_sides(model, pose):
@@ -196,7 +196,7 @@ def _span_guesses(
     shares: Sequence[float],
     sides: Sequence[tuple[int, ...]] | None = None,
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Arcs span by span, for shares of the slack; `sides`: combinations of sides of the spans."""
+    """Arcs span by span, for shares of the slack; `sides`: combinations of the spans' sides."""
     rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
     clips = [k for k, one in enumerate(held) if not one.passed][1:]
     for share in shares:
@@ -215,7 +215,7 @@ def _span_guesses(
 
 
 def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
-    """First guess of the border (n_border,) of nodes x: eyelets are nearest to their places."""
+    """First guess of the border (n_border,) for nodes x: each eyelet is nearest to its place."""
     border, places = np.zeros(model.n_border), model.chain.places
     if not model.sliding:
         return border
@@ -231,7 +231,7 @@ def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
 
 
 def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
-    """Combinations of the sides of spans; of many, those that differ in one span alone."""
+    """Combinations of the spans' sides; if there are too many, those that differ in one span."""
     free = [1 if span.taut else choices for span in spans]
     if np.prod(free) <= MOST_SIDES:
         return list(product(*(range(count) for count in free)))
@@ -273,7 +273,7 @@ def _sagging(span: Span, gravity: FloatArray) -> int:
 
 
 def _headings(model: CableModel, span: Span, side: int) -> tuple[FloatArray, FloatArray]:
-    """Arc lengths and headings inside a span, its ends a little inside so that kinks stay apart."""
+    """Arc lengths and headings inside a span; its ends lie slightly inside to keep kinks apart."""
     u = np.linspace(0.0, 1.0, max(round(span.length / model.chain.h), 4) + 1)
     inner = span.start + span.length * (1e-9 + (1 - 2e-9) * u)
     if span.chord is None:
@@ -312,7 +312,7 @@ def _frames(
     clamps: Sequence[tuple[float, FloatArray | None]],
     combinations: Sequence[tuple[int, ...]],
 ) -> Iterator[FloatArray]:
-    """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all that hold the roll, too."""
+    """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all holders that fix the roll."""
     places, length = model.chain.places, model.chain.length
     for sides in combinations:
         axes = np.zeros((len(places), 3))
@@ -358,7 +358,7 @@ def no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
 
 
 def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
-    """Why a pose has no equilibrium: its end is missing or too far, or a number is not finite."""
+    """Why a pose is out of reach: its end is missing or too far, or a number is not finite."""
     if pose.end is None and model.end != "free":
         what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
         return no_equilibrium(pose, what, "Pose(start, end).")
@@ -387,7 +387,7 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
 
 
 def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
-    """Why obstacles leave no equilibrium, and what to try: a fixture is inside of one."""
+    """Why obstacles leave no equilibrium, and what to try: a fixture is inside an obstacle."""
     held = [("start", pose.start), *((clip.name, clip.place) for clip in pose.clips)]
     held += [("end", pose.end)] if pose.end is not None else []
     surfaces = surfaces_at(model, p)
@@ -402,9 +402,9 @@ def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str]
 
 
 def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
-    """Why clips leave no equilibrium, and what to try: other kinds, no room on the mesh or cable.
+    """Why clips leave no equilibrium, and what to try: wrong kinds, no room on mesh or cable.
 
-    Eyelets are taken to be anywhere between the clips beside them.
+    Eyelets may be anywhere between the clips beside them.
     """
     if tuple(clip.kind for clip in pose.clips) != model.clips:
         own, others = (", ".join(x) or "none" for x in ([c.kind for c in pose.clips], model.clips))

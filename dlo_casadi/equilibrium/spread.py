@@ -1,4 +1,4 @@
-"""Uncertainty of a prediction: the spread of a new repeat of a pose, and its side."""
+"""Uncertainty of a prediction: the spread of new repeats of a pose, and the side it takes."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.thresholds import EITHER
 
-# Share of new repeats inside the band, and half its width in standard deviations.
+# Share of new repeats inside the band, and its half width in standard deviations.
 COVERED = 0.9
 EDGE = -float(ndtri((1 - COVERED) / 2))
 # Step of finite differences of energies, as a share of a standard deviation.
@@ -29,22 +29,22 @@ _SHARE = 1e-3
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What makes a prediction uncertain.
+    """Causes of uncertainty in a prediction.
 
     Parameters
     ----------
     names : tuple of str
         Fitted parameters and `rest_curvature[k]`.
     covariance : (N, N)
-        Of these, in SI units.
+        Covariance of these, in SI units.
     scatter : mapping of str to float
         Standard deviation of the fixtures from pose to pose, by the deviation's name.
     repeat_std : float [m]
         Standard deviation of a coordinate between repeats of one pose, root mean square along the
         cable; 0 where no pose was repeated.
     added : mapping of str to float
-        Standard deviations of parameters beyond the covariance, by name: where the cable is
-        installed again, its length and roll between the fixtures are new.
+        Standard deviations of parameters in addition to the covariance, by name: if the cable is
+        installed again, its length and roll between the fixtures change.
     """
 
     names: tuple[str, ...]
@@ -77,8 +77,8 @@ class Uncertainty:
         """Independent directions in which a new repeat of a pose may differ, one std each.
 
         Changes of the parameters (n_parameters, q) of `pose_scatter.within(model)`, the rest
-        strains (n_rests, q) and the deviations (n_deviations, q) without unknown forces: by the
-        fitted unknowns, the fixtures, what each repeat has of its own, and what is `added`.
+        strains (n_rests, q) and the deviations (n_deviations, q), without unknown forces. Causes:
+        the fitted unknowns, the fixtures, each repeat's own random quantity, and what is `added`.
         """
         by_p, by_rest = (by @ self.root for by in self.unknowns_in(model))
         scattered, modes = self.pose_scatter.ways(model)
@@ -100,20 +100,20 @@ class Uncertainty:
         return np.hstack([by_p, new]), np.pad(by_rest, none), np.pad(by_deviation, none)
 
     def causes_in(self, model: CableModel) -> tuple[str, ...]:
-        """Cause of each of `ways_in`.
+        """Cause of each direction of `ways_in`.
 
-        "parameters" of the fit, the "end" fixture's place, directions of clamps such as
-        "end_heading" and "end_rotation", the "repeat", or the name of an added parameter.
+        It is "parameters" for the fit, "end" for the end fixture's place, a clamp's direction such
+        as "end_heading" or "end_rotation", "repeat", or the name of an added parameter.
         """
         fixtures = (cause_of(model, name) for name in model.deviations)
         repeat = ["repeat"] * self.pose_scatter.ways(model)[0].shape[1]
         return (*["parameters"] * len(self.names), *fixtures, *repeat, *self.added)
 
     def installed(self, model: CableModel, tolerances: Mapping[str, float]) -> Self:
-        """The same cable between other fixtures, of these standard deviations by `tolerances_of`.
+        """The same cable between other fixtures, with these standard deviations by `tolerances_of`.
 
-        Deviations of the ends replace the scatter of the session's fixtures; those of parameters
-        are added to what is known of them. Names that the model does not have are left out.
+        Deviations of the ends replace the scatter of the session's fixtures. Those of parameters
+        are added to the parameters' uncertainty. Names unknown to the model are ignored.
         """
         scatter, added = dict(self.scatter), dict(self.added)
         for name, std in tolerances.items():
@@ -123,12 +123,12 @@ class Uncertainty:
 
 
 def cause_of(model: CableModel, deviation: str) -> str:
-    """What deviates: the name of a deviation without the axis along or about which it does."""
+    """Name of a deviation without the axis along or about which it deviates."""
     return re.sub(f"_({'|'.join(model.node.axes)})$", "", deviation)
 
 
 def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
-    """Deviations or parameters of a model that a tolerance is about, by the tolerance's name."""
+    """Deviations or parameters of a model that each tolerance covers, by the tolerance's name."""
     places = {"end": "end"} | {f"clip_{k}": "clip" for k in range(len(model.clips))}
     turned = model.node.tolerance
     named = [(places.get(cause_of(model, name), turned), name) for name in model.deviations]
@@ -155,9 +155,9 @@ def displacements(
 ) -> tuple[NodeCurve, FloatArray]:
     """Curve of a pose, and displacements (K, d, q) [m] of its places s [m] in a new repeat.
 
-    They are independent, of one standard deviation each. Derivatives of the equilibrium carry the
-    covariance of the fitted parameters, the fixtures' scatter and what a single repeat has of its
-    own to the shape; the measured difference of repeats is added, the same all along.
+    The displacements are independent, of one standard deviation each. They are the covariance of
+    the fitted parameters, the fixtures' scatter and each repeat's own random quantity, propagated
+    through the equilibrium. The measured difference of repeats is added, equal at all places.
     """
     by_p, by_rest, by_deviation = uncertainty.ways_in(model)
     scatter = uncertainty.pose_scatter
@@ -172,7 +172,7 @@ def displacements(
 def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatArray:
     """Standard deviation (K, d - 1) [m] across the cable of `displacements` at places s [m].
 
-    The noise of a measurement comes on top.
+    The noise of a measurement is not included.
     """
     return np.linalg.norm(np.einsum("knd,kdq->knq", curve.normals(s), moved), axis=2)
 
@@ -181,7 +181,7 @@ def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatAr
 
 
 def tipping(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
-    """Angle [rad] by which the clamp must turn until two sides are equally low, to first order.
+    """Angle [rad] by which the clamp must turn to make two sides equally low, to first order.
 
     dV/d(angle) of a clamp is the moment on it.
     """
@@ -189,7 +189,7 @@ def tipping(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
 
 
 def _lever(model: CableModel, eq: Equilibrium, other: Equilibrium) -> float:
-    """Difference [N m] of the moments on the clamp that tips the cable."""
+    """Difference [N m] between the moments of two equilibria on the clamp that tips the cable."""
     assert model.tipped_by is not None
     k = model.border_names.index(model.tipped_by)
     return max(abs(float(other.multipliers[k] - eq.multipliers[k])), 1e-300)
@@ -202,7 +202,7 @@ class Tipping:
     Parameters
     ----------
     angle, std : float [rad]
-        That distance, and its standard deviation.
+        The difference of the clamp's angle from that one, and its standard deviation.
     """
 
     angle: float
@@ -223,10 +223,10 @@ def tipping_of(
     other: Equilibrium,
     uncertainty: Uncertainty,
 ) -> Tipping:
-    """Tipping of a pose, from the two equilibria on its sides.
+    """Tipping of a pose, from the equilibria on its two sides.
 
-    First order in all that makes a prediction uncertain: the derivative of an equilibrium's energy
-    by any input is that of the Lagrangian at fixed nodes and multipliers.
+    It is of first order in all uncertainties of a prediction: the derivative of an equilibrium's
+    energy by any input is that of the Lagrangian at fixed nodes and multipliers.
     """
     std = float(np.linalg.norm(_gap_slopes(model, p, rest, pose, (eq, other), uncertainty)))
     return Tipping(tipping(model, eq, other), std / _lever(model, eq, other))
@@ -240,9 +240,9 @@ def gap_std_of_repeats(
     pair: tuple[Equilibrium, Equilibrium],
     uncertainty: Uncertainty,
 ) -> float:
-    """Standard deviation [J] of the difference in energy of a pose's two equilibria.
+    """Standard deviation [J] between repeats of the energy difference of a pose's two equilibria.
 
-    From repeat to repeat, by its fixtures and what it has of its own, at known parameters.
+    Causes are the fixtures and each repeat's own random quantity; the parameters are exact.
     """
     slopes = _gap_slopes(model, p, rest, pose, pair, uncertainty)
     return float(np.linalg.norm(slopes[len(uncertainty.names) :]))
@@ -273,7 +273,7 @@ def energy_slope(
 ) -> FloatArray:
     """Derivative (q,) [J] of an equilibrium's energy along q directions.
 
-    That of the Lagrangian at a fixed shape, by central differences.
+    It is that of the Lagrangian at a fixed shape, by central differences.
 
     Parameters
     ----------
@@ -282,7 +282,7 @@ def energy_slope(
     along : sequence of (n_parameters, q), (n_rests, q) and, optionally, (n_deviations, q)
         Directions of these, and of the pose's deviations.
     step : float
-        Share of a direction that is taken to both sides.
+        Step to both sides, as a share of a direction.
     """
     by_p, by_rest, *by_deviation = (step * np.hstack([by, -by]).T for by in along)
     m, q = len(by_p), len(by_p) // 2
@@ -295,7 +295,7 @@ def energy_slope(
 
 
 def sides_of(model: CableModel, pose: HeldPose, *pair: Equilibrium) -> list[HeldPose]:
-    """Copies of a pose that name the side of each of two equilibria."""
+    """Two copies of a pose; each names the side of one of the equilibria."""
     ways = ways_of(model, pose)
     turned = [float(model.node.turning(eq.x)) for eq in pair]
     return ways if turned[0] > turned[1] else ways[::-1]

@@ -1,4 +1,4 @@
-"""A cable whose parameters have values as CasADi functions, for problems of one's own."""
+"""A cable with fixed parameter values as CasADi functions, for the user's own problems."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -40,7 +40,7 @@ class PoseUnknowns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CasadiCable:
-    """A cable whose parameters have values, for CasADi problems of one's own.
+    """A cable with fixed parameter values, for the user's own CasADi problems.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class CasadiCable:
         branch: Branch | None = None,
         search: ca.Function | None = None,
     ) -> ca.Function:
-        """The shape as a differentiable function of the pose, for CasADi problems of one's own.
+        """The shape as a differentiable function of the pose, for the user's own CasADi problems.
 
         (pose[, parameters]) -> (points, end_force, end_moment, energy, min_bend_radius, curvature,
         status), with exact first and second derivatives: for `ca.Opti` with IPOPT, `.map(n)`, any
@@ -82,11 +82,11 @@ class CasadiCable:
         branch : "ccw" or "cw", optional
             In a plane, which way the cable turns from start to end.
         search : casadi.Function, optional
-            What finds equilibria in place of Python: `casadi.external("dlo_equilibrium", library)`,
-            or `dlo_equilibrium_ccw`, `_cw`, of this cable's generated C, compiled into a shared
-            library. A pose then takes about 1 ms in place of 30 (20 elements, both ends clamped),
-            the function can be serialised, and CasADi writes it and its derivatives as C
-            (`Function.generate`).
+            Function that finds equilibria in place of Python: `casadi.external("dlo_equilibrium",
+            library)`, or `dlo_equilibrium_ccw`, `_cw`, of this cable's generated C, compiled into a
+            shared library. A pose then takes about 1 ms instead of 30 (20 elements, both ends
+            clamped), the function can be serialised, and CasADi can write it and its derivatives as
+            C (`Function.generate`).
 
         Returns
         -------
@@ -99,20 +99,20 @@ class CasadiCable:
             end_force : (d,) [N] of the cable on whatever holds its end.
             end_moment : (1,) or (3,) [N m] of the cable on its end clamp, world axes; zero at pins.
             energy : [J]
-            min_bend_radius : [m]. Where the tightest place jumps along the cable, it has a kink at
-            which IPOPT stalls: as a constraint, bound the curvature instead.
+            min_bend_radius : [m]. It has a kink where the tightest place jumps along the cable, and
+            IPOPT stalls there: as a constraint, bound the curvature instead.
             curvature : (n_cells + 2,) [1/m], not negative: at the start, in the middle of each cell
             and at the end. `curvature <= 1 / radius` is `min_bend_radius >= radius`, and smooth.
-            status : 0 for a stable equilibrium; otherwise all other outputs and their derivatives
-            are NaN, and it is the reason, a dlo_status of the C header: 1 out of reach, 2 none
+            status : 0 for a stable equilibrium. Otherwise all other outputs and derivatives are
+            NaN, and the status is the reason, a dlo_status of the C header: 1 out of reach, 2 none
             found, 3 a number is not finite, 4 none that is stable, 6 a quaternion is zero, a joint
-            of links is at its bound, or `search` is that of another cable.
+            of links is at its bound, or `search` belongs to another cable.
 
         Raises
         ------
         DloError
-            If a parameter or the branch is unknown, or `search` has other sizes, or stands beside
-            parameters or a branch, which it has itself. The function itself raises nothing.
+            If a parameter or the branch is unknown, or if `search` has other sizes or is given with
+            parameters or a branch, which it already has. The function itself raises nothing.
 
         Notes
         -----
@@ -137,11 +137,11 @@ class CasadiCable:
         return _function("cable", inputs, outputs | {"status": status})
 
     def equations(self, *, parameters: bool | str | Sequence[str] = False) -> ca.Function:
-        """The equations of an equilibrium, to transcribe many poses in one problem of one's own.
+        """The equations of an equilibrium, to transcribe many poses in one problem of the user's.
 
         (x, multipliers, pose[, parameters]) -> (residual, balance, conditions, lengths, points,
-        ...): as many equations as unknowns, every stationary point of the energy a root, stable or
-        not. `initial` gives a first guess. The unknowns need no bounds.
+        ...): as many equations as unknowns. Every stationary point of the energy is a root, stable
+        or not. `initial` gives a first guess. The unknowns need no bounds.
 
         Parameters
         ----------
@@ -203,7 +203,7 @@ class CasadiCable:
         EquilibriumError
             If the pose has no equilibrium.
         DloError
-            If it has another number of numbers.
+            If the pose has the wrong number of entries.
         """
         try:
             numbers = np.asarray(pose, float).ravel()
@@ -263,7 +263,7 @@ def _function(name: str, inputs: dict[str, Any], outputs: dict[str, Any]) -> ca.
 
 
 def _outputs(model: CableModel, symbols: PoseSymbols) -> dict[str, Any]:
-    """What a user asks of a shape, by name."""
+    """Output quantities of a shape for users, by name."""
     found = shape(model, symbols)
     curvature = _curvature(model)(found.strains)
     return {
