@@ -1,8 +1,8 @@
 """A model's functions, evaluated for many poses at once and assembled into band matrices.
 
-One CasADi function of a segment is mapped over the segments of a pose; its blocks are added up to
-the gradient of the Lagrangian, its Hessian (block-tridiagonal, with the multipliers as border), and
-the derivatives of both and of the measured curve.
+One CasADi function of a segment is mapped over the segments of a pose. Its blocks are summed to the
+gradient of the Lagrangian, to its Hessian (block-tridiagonal, with the multipliers as border), and
+to the derivatives of both and of the measured curve.
 """
 
 from __future__ import annotations
@@ -28,43 +28,43 @@ from dlo_casadi.model.stacked import Tangents as Tangents
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
 
-# Step of differences by slips of clips, relative to the length.
+# Step of finite differences by slips of clips, relative to the length.
 _SLIP = 1e-6
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
 
 
 def _repeated(rows: FloatArray, count: int) -> FloatArray:
-    """Rows (m, k) of poses, the same for `count` segments or stations (m, count, k)."""
+    """Rows (m, k) of poses, repeated for `count` segments or stations (m, count, k)."""
     return np.broadcast_to(rows[:, None], (len(rows), count, rows.shape[1]))
 
 
 class Assembly:
-    """A model evaluated over poses."""
+    """Evaluation of a model over poses."""
 
     def __init__(self, model: CableModel) -> None:
         self.model = model
         self.chain, self.node = model.chain, model.chain.kind.node
         self.n, self.b, self.k = self.chain.n_nodes, self.node.increment, model.n_border
-        # Rows of the first node, of the last, and of the border.
+        # Rows of the first node, of the last node, and of the border.
         self._parts = slice(0, self.b), slice(self.b, 2 * self.b), slice(2 * self.b, None)
-        # Rows, in derivatives of a segment, of a force at the end of the cable.
+        # Rows of a force at the end of the cable, in derivatives of a segment.
         self._pull = [2 * self.b + row for row in model.end_pull]
         self._segments, self.n_lam = self.chain.n_segments, model.n_lam
-        # Numbers that tell the rest strains inside a segment.
+        # Number of values that determine the rest strains inside a segment.
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self._functions: dict[tuple[str, int, bool], Mapped] = {}
         self.depth, self.everywhere, self._outwards = DEPTH, False, outwards(model)
 
     def softened(self, depth: float) -> Assembly:
-        """The same with softer obstacles, see `contact.DEPTH`."""
+        """A copy with softer obstacles, see `contact.DEPTH`."""
         other = copy(self)
         other.depth = depth
         return other
 
     def felt_everywhere(self) -> Assembly:
-        """The same where forces of obstacles are felt whatever the gaps."""
+        """A copy in which forces of obstacles act whatever the gaps."""
         other = copy(self)
         other.everywhere = True
         return other
@@ -75,12 +75,12 @@ class Assembly:
 
     @cached_property
     def turn_per_slip(self) -> FloatArray:
-        """Turn [rad/m] that an eyelet's change of arc length counts as; zero of others (k,)."""
+        """Turn [rad/m] equivalent to a change of an eyelet's arc length; zero for others (k,)."""
         slide = np.isin(np.arange(self.k), list(self.model.sliding.values()))
         return slide * (_TURN / self.chain.length)
 
     def size(self, step: Vector) -> FloatArray:
-        """Largest turn (m,) [rad] of a step of one column."""
+        """Largest turn (m,) [rad] in a step of one column."""
         nodes = np.abs(step.x).max(axis=(1, 2, 3))
         slips = (np.abs(step.y[..., 0]) * self.turn_per_slip).max(axis=1, initial=0.0)
         return np.maximum(nodes, slips)
@@ -97,13 +97,13 @@ class Assembly:
     def _call_segments(
         self, name: str, shapes: Shapes, given: Inputs, touching: Touching | None = None
     ) -> list[FloatArray]:
-        """A function of a segment for all segments: outputs (m, n_segments, rows, columns)."""
+        """Evaluate a function for all segments: outputs (m, n_segments, rows, columns)."""
         touching = touching or self.touching(shapes, given)
         lam = touching.lam if touching else _repeated(shapes.lam, self._segments)
         return self._under(lam, name, shapes, given)
 
     def _under(self, lam: FloatArray, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
-        """The same under forces lam (m, n_segments, n_lam)."""
+        """As `_call_segments`, under forces lam (m, n_segments, n_lam)."""
         count, clipped = self._segments, self.clipped(shapes, given)
         own = clipped.rest(self.chain.rest_inside(given.rest[..., None]))[..., 0]
         p, deviation = (_repeated(one, count) for one in (given.p, shapes.deviation))
@@ -142,11 +142,11 @@ class Assembly:
         return Touching.of(self.model, shapes.lam, start, offsets, *soft, advances)
 
     def _both(self, nodes: FloatArray) -> FloatArray:
-        """Rows (m, n_segments, 2 k, ...) of both nodes of segments, of (m, n_nodes, k, ...)."""
+        """Rows (m, n_segments, 2 k, ...) of both nodes of segments, from (m, n_nodes, k, ...)."""
         return np.concatenate([nodes[:, : self._segments], nodes[:, self._next]], axis=2)
 
     def _call_ends(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
-        """A function of both ends: outputs (m, rows, columns)."""
+        """Evaluate a function of both ends: outputs (m, rows, columns)."""
         both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
         others = (shapes.lam[:, : self.n_lam], given.p, given.poses, shapes.deviation)
         rows = [both, *(one[:, None] for one in others)]
@@ -155,7 +155,7 @@ class Assembly:
     def _at_nodes(
         self, first: FloatArray, last: FloatArray, start: FloatArray, end: FloatArray
     ) -> FloatArray:
-        """Blocks of both nodes of segments (m, n_segments, ...) and of the ends, at the nodes."""
+        """Blocks of segments' nodes (m, n_segments, ...) and of the ends, summed at the nodes."""
         count = self._segments
         total = np.zeros((len(first), max(count + 1, self.n), *first.shape[2:]))
         total[:, :count] += first
@@ -166,7 +166,7 @@ class Assembly:
         return total
 
     def _added(self, segments: FloatArray, ends: FloatArray) -> Vector:
-        """Rows (2b + k, q) of the segments and the ends, added up to nodes and border."""
+        """Rows (2b + k, q) of the segments and the ends, summed at nodes and border."""
         first, last, border = self._parts
         x = self._at_nodes(
             segments[:, :, first], segments[:, :, last], ends[:, first], ends[:, last]
@@ -206,10 +206,10 @@ class Assembly:
         return self.clipped(shapes, given).loads(self.model.clips, forces, by_turns)
 
     def _held(self, matrix: BandMatrix, given: Inputs) -> BandMatrix:
-        """Add a stiffness against roll of the first node to cables free to roll about their axis.
+        """For cables free to roll about their axis, add a stiffness against roll of the first node.
 
         Such a cable, straight at rest, has the null vector (1, 0, 0) at every node. The stiffness
-        changes inertia and Newton steps along that vector alone, which may be taken off any step.
+        changes inertia and Newton steps only along that vector, which may be removed from any step.
         """
         if not self.model.may_spin:
             return matrix
@@ -240,13 +240,13 @@ class Assembly:
     def energy(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Potential energy (m,) [J]: the Lagrangian without the work of the multipliers.
 
-        Contacts store some of it, see `Touching.given_way`.
+        Contacts store part of it, see `Touching.given_way`.
         """
         total, gradient, _ = self.balance(shapes, given)
         return total - self.work(shapes, gradient)
 
     def work(self, shapes: Shapes, gradient: Vector) -> FloatArray:
-        """Work (m,) [J] of the multipliers in the Lagrangian, whose gradient is given."""
+        """Work (m,) [J] of the multipliers in the Lagrangian, given its gradient."""
         own = shapes.lam * gradient.y[:, :, 0] * self.model.are_multipliers
         return np.asarray(own.sum(axis=1))
 
@@ -272,7 +272,7 @@ class Assembly:
     def slipped(
         self, given: Inputs, along: Tangents
     ) -> Iterator[tuple[FloatArray, tuple[Inputs, Inputs]]]:
-        """Inputs whose difference, times factors (m, q), is the change by slips of clips."""
+        """Pairs of inputs whose difference, times factors (m, q), is the change by clip slips."""
         step = _SLIP * self.chain.length
         for k in np.flatnonzero(functions_of(self.model).slips.any(axis=0)):
             unit = step * np.eye(given.p.shape[1])[k]
@@ -283,7 +283,7 @@ class Assembly:
     def add_by_numbers(
         self, total: FloatArray | float, blocks: FloatArray, along: Tangents, clipped: Clipped
     ) -> FloatArray:
-        """Add the change along p, rest and deviation to a total, given derivatives of segments."""
+        """Add the change along p, rest and deviation to a total, given segments' derivatives."""
         n_p = along.p.shape[1]
         n_r = n_p + self.n_inside
         total = total + blocks[..., :n_p] @ along.p[:, None]
@@ -294,7 +294,7 @@ class Assembly:
     # ---- the curve ------------------------------------------------------------------------------
 
     def _stations(self, advance: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (m, n + 1, d, ...) and rates (m, n + 1, rates, ...) of element boundaries."""
+        """Places (m, n + 1, d, ...) and rates (m, n + 1, rates, ...) at the element boundaries."""
         steps, d = advance[:, self.chain.layout.advancing], self.node.dimension
         places = np.concatenate([start[:, None], steps[:, :, :d]], axis=1).cumsum(axis=1)
         rates = steps[:, :, d:]
@@ -313,7 +313,7 @@ class Assembly:
         return clipped.evenly(moved)[:, :, : self.node.dimension, 0]
 
     def curve(self, shapes: Shapes, given: Inputs) -> FloatArray:
-        """Measured places, and dr/ds of smooth elements, (m, n + 1, d or 2 d)."""
+        """Measured places (m, n + 1, d), for smooth elements with dr/ds (m, n + 1, 2 d)."""
         (advance,) = self._call_segments("segment_curve", shapes, given)
         (rows,) = self._call_stations("station", advance[..., 0], shapes, given)
         return self.clipped(shapes, given).evenly(rows)[..., 0]
@@ -343,7 +343,7 @@ class Assembly:
         return touching.held(found) if touching else found
 
     def readings(self, shapes: Shapes, given: Inputs) -> FloatArray:
-        """`reactions` as measured by sensors."""
+        """`reactions` as the sensors measure them."""
         found = self._call_ends("readings", shapes, given)[0][..., 0]
         touching = self.touching(shapes, given)
         return touching.held(found) if touching else found
@@ -379,10 +379,10 @@ class Assembly:
         return by_strain.reshape((m, n_cells * strains, *columns))
 
     def state_after(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, ...]:
-        """Rest strains (m, n_rests) after poses, and their derivatives.
+        """Rest strains (m, n_rests) after the poses, and their derivatives.
 
-        These are by both nodes (m, n_rests, 2b), by the cell's own rest strains (m, n_rests,
-        strains), and by p (m, n_rests, n_parameters).
+        The derivatives are by both nodes (m, n_rests, 2b), by the cell's own rest strains (m,
+        n_rests, strains), and by p (m, n_rests, n_parameters).
         """
         found = self._call_segments("segment_state", shapes, given)
         after, *by = (self._stacked(part[:, self.chain.layout.bends]) for part in found)

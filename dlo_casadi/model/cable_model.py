@@ -1,4 +1,4 @@
-"""CableModel: a cable, its mesh, boundaries and effects; and tolerances of declared values."""
+"""CableModel: a cable with mesh, boundaries and effects; tolerances of declared values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -29,9 +29,9 @@ StartKind = Literal["pinned", "clamped"]
 EndKind = Literal["pinned", "clamped", "free"]
 
 BENDING_STIFFNESS = "bending_stiffness"
-# Prior std of log EI, ln(1000): a first guess may be off by three decades.
+# Prior std of log EI, ln(1000): a first guess may be wrong by three decades.
 STIFFNESS_PRIOR_STD = float(np.log(1e3))
-# Prior std of log(GJ / EI), ln(3): 1 / (1 + nu) in a solid round rod, other values with strands.
+# Prior std of log(GJ / EI), ln(3): a solid round rod has 1 / (1 + nu), strands differ.
 STIFFNESS_RATIO_STD = float(np.log(3.0))
 # Prior std of the end roll [rad]: the twist at which the cable was gripped is unknown.
 ROLL_STD = 1.0
@@ -39,11 +39,11 @@ TORSIONAL_STIFFNESS = "torsional_stiffness"
 STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
 # Number of elements of `CableModel.coarse`.
 COARSE_MESH = 10
-# Least mean number of its elements between two clips.
+# Smallest mean number of elements of `CableModel.coarse` between two clips.
 COARSE_SPAN = 6
-# Name of the parameter: roll of the end clamp against the declared one [rad], as by a rest twist.
+# Parameter name: true minus declared roll of the end clamp [rad], equivalent to a rest twist.
 END_ROLL = "end_roll"
-# Size of the camera's part of `HeldPose.vector`.
+# Size of the camera part of `HeldPose.vector`.
 VIEWPOINT_SIZE = 3
 
 
@@ -69,16 +69,16 @@ class CableModel:
     gravity : (dimension,) [m/s^2]
         In the board frame; three numbers for a cable in space.
     effects : tuple of Effect
-        In the order in which those of one kind are applied.
+        Those of one kind are applied in this order.
     n_rest : int
         Number of spline coefficients of the rest curvature; 0 = straight at rest.
     priors : dict
-        Standard deviations of Gaussian priors on effect parameters by qualified name: these
+        Standard deviations of Gaussian priors on effect parameters, by qualified name. These
         effects are nuisances within a declared tolerance, not findings.
     clips : tuple of ClipKind
         Kinds of the clips between the ends, in the order along the cable.
     obstacles : tuple of Obstacle
-        What the cable may touch in all poses, without friction.
+        What the cable may touch in any pose, without friction.
 
     Notes
     -----
@@ -138,7 +138,7 @@ class CableModel:
 
     @property
     def force_scale(self) -> float:
-        """A scale of forces [N]: the cable's weight, and what bends it."""
+        """Scale of forces [N]: the cable's weight plus the force that bends it."""
         return self.weight + self.cable.bending_stiffness / self.cable.length**2
 
     @property
@@ -186,7 +186,7 @@ class CableModel:
         listed = [_stiffness(BENDING_STIFFNESS, self.cable.bending_stiffness)]
         if self.cable.torsional_stiffness is not None:
             torsion = _stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness)
-            # Its prior is on the ratio to the bending stiffness, see `Unknowns.prior_precision`.
+            # Its prior is on the ratio to the bending stiffness, see `Unknowns.prior`.
             listed.append(replace(torsion, prior_std=np.inf))
             if self.start == self.end == "clamped":
                 std = self.priors.get(END_ROLL, ROLL_STD)
@@ -222,13 +222,13 @@ class CableModel:
         )
 
     def without_effect(self, label: str) -> Self:
-        """Return this model without the effect of that label."""
+        """Return this model without the effect that has this label."""
         kept = tuple(effect for effect in self.effects if effect.label != label)
         priors = {k: v for k, v in self.priors.items() if not k.startswith(f"{label}.")}
         return replace(self, effects=kept, priors=priors)
 
     def without_kind(self, kind: type[Effect], p: FloatArray) -> tuple[Self, FloatArray]:
-        """The model without the effects of a kind, and its part of `p`."""
+        """The model without the effects of one kind, and the remaining part of `p`."""
         effects = tuple(x for x in self.effects if not isinstance(x, kind))
         if effects == self.effects:
             return self, p
@@ -258,7 +258,7 @@ class CableModel:
     def may_spin(self) -> bool:
         """Whether only a rest curvature determines the roll of the cable about its own axis.
 
-        That is so in space between ball joints, with one bending stiffness about all axes.
+        This is so in space between ball joints, with one bending stiffness about all axes.
         """
         held = "clamped" in (self.start, self.end, *self.clips)
         laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
@@ -266,7 +266,7 @@ class CableModel:
 
     @property
     def coarse(self) -> Self:
-        """The same model on a coarse mesh, its elements no longer than a bar is thick."""
+        """The same model on a coarse mesh, with elements no longer than the thickness of a bar."""
         count = max(COARSE_MESH, COARSE_SPAN * (len(self.clips) + 1))
         if self.surfaces:
             thin = min((x.radius for x in self.surfaces if isinstance(x, Capsule)), default=np.inf)
@@ -290,7 +290,7 @@ class CableModel:
 
     @cached_property
     def surfaces(self) -> tuple[Obstacle, ...]:
-        """All that the cable may touch: what is declared, then what effects add."""
+        """All that the cable may touch: declared obstacles, then those added by effects."""
         own = (x.surface(self.gravity) for x in self.effects if isinstance(x, ContactEffect))
         return (*self.obstacles, *(one for one in own if one is not None))
 
@@ -301,15 +301,15 @@ class CableModel:
 
     @property
     def n_lam(self) -> int:
-        """Number of unknowns of the border on which segments depend: all but contact forces."""
+        """Number of border unknowns on which segments depend: all except contact forces."""
         return self.n_border - self.n_contacts
 
     @property
     def end_pull(self) -> list[int]:
         """Rows of the border (dimension,) of a force at the end of the cable, if there are any.
 
-        With obstacles a free end has them, too, and they are zero: all forces beyond a segment
-        act on it as one at its end would.
+        With obstacles a free end has these rows, too, with values of zero: all forces beyond a
+        segment act on it like one force at its end.
         """
         free = self.end == "free"
         if free and not self.surfaces:
@@ -319,17 +319,17 @@ class CableModel:
 
     @property
     def no_pull(self) -> list[int]:
-        """Those of `end_pull` that are zero: of a free end."""
+        """Those rows of `end_pull` that are zero, for a free end."""
         return self.end_pull if self.end == "free" else []
 
     @cached_property
     def border_kinds(self) -> dict[str, Literal["distance", "angle", "place"]]:
-        """Unknowns beside the nodes by their names: of end conditions, springs, clips, contacts.
+        """Kinds of unknowns beside the nodes, by name: end conditions, springs, clips, contacts.
 
-        A multiplier is that of a condition on a distance [m] or an angle [rad]. A spring's place y
-        [m] is an unknown of its own, held on the cable by a multiplier [N]: the Hessian then
-        couples neighbouring nodes only, see `SpringAt`. An eyelet's arc length [m] is one, too. The
-        multiplier of a contact is the size of its force [N]; they differ from mesh to mesh.
+        A multiplier belongs to a condition on a distance [m] or an angle [rad]. A spring's place y
+        [m] is an unknown, held on the cable by a multiplier [N]; the Hessian then couples only
+        neighbouring nodes, see `SpringAt`. An eyelet's arc length [m] is an unknown, too. The
+        multiplier of a contact is the size of its force [N]; contacts differ from mesh to mesh.
         """
         places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
         kinds: dict[str, Literal["distance", "angle", "place"]] = {}
@@ -363,7 +363,7 @@ class CableModel:
 
     @cached_property
     def sliding(self) -> dict[int, int]:
-        """Index of each eyelet among the clips -> row of its arc length in the border."""
+        """Index of each eyelet among the clips -> border row of its arc length."""
         eyelets = [k for k, kind in enumerate(self.clips) if kind == "eyelet"]
         return {k: self.border_names.index(f"clip_{k}.place_s") for k in eyelets}
 
@@ -379,7 +379,7 @@ class CableModel:
 
     @cached_property
     def are_multipliers(self) -> BoolArray:
-        """Which of the border's unknowns are multipliers (n_border,); the others are places."""
+        """Whether each border unknown (n_border,) is a multiplier; the others are places."""
         return np.array([kind != "place" for kind in self.border_kinds.values()], dtype=bool)
 
     @cached_property
@@ -392,7 +392,7 @@ class CableModel:
         return tuple(f"end_position_{axis}" for axis in self.node.axes)
 
     def _held(self, place: str) -> tuple[str, ...]:
-        """Names of the held components: of the end's place, which is called so, and of clamps."""
+        """Names of the held components: of the end's place, named `place`, and of clamps."""
         names = [] if self.end == "free" else [f"{place}_{axis}" for axis in self.node.axes]
         for side, kind in (("start", self.start), ("end", self.end)):
             names += [f"{side}_{turn}" for turn in self.node.turns if kind == "clamped"]
@@ -402,8 +402,8 @@ class CableModel:
     def tipped_by(self) -> str | None:
         """The end condition whose angle decides which of two sides has the lower energy.
 
-        A free end falls to either side of a clamp that points up; between two clamps in space, one
-        rolled by half a turn, the cable is twisted either way round. Others have no two sides.
+        A free end falls to either side of a clamp that points up. Between two clamps in space, one
+        rolled by half a turn, the cable is twisted either way. Other cables have no two sides.
         """
         turned = {("clamped", "free"): "start_heading", ("clamped", "clamped"): "end_rotation_x"}
         name = turned.get((self.start, self.end))
@@ -411,7 +411,7 @@ class CableModel:
 
     @cached_property
     def deviations(self) -> tuple[str, ...]:
-        """Which deviations of a pose can matter for these boundaries."""
+        """Deviations of a pose that matter for these boundaries."""
         own = [name for effect in self.effects for name in effect.per_pose(self.cable)]
         clips = self.deviation_names[len(deviation_names(self.node)) :]
         return (*self._held("end"), *own, *clips)

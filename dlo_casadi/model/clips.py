@@ -1,10 +1,10 @@
 """Clips: what holds a cable between its ends.
 
-A clip k at the arc length s_k adds lam_k . (r(s_k) - place_k) to the Lagrangian. On every segment
-r(s_k) advances by the share of it that lies before s_k, as under a point force: arc lengths need
-not be nodes. Of an eyelet s_k is an unknown, too, and dL/ds_k = lam_k . t = 0: no force along the
-cable. A clamped clip bends the cable by a moment: the nearest node is moved to it and carries its
-frame, so that no element has a jump of curvature inside.
+A clip k at the arc length s_k adds lam_k . (r(s_k) - place_k) to the Lagrangian. In every segment
+r(s_k) advances by the share of the segment before s_k, as for a point force: arc lengths need not
+be nodes. For an eyelet s_k is also an unknown, and dL/ds_k = lam_k . t = 0: no force along the
+cable. A clamped clip bends the cable by a moment. The nearest node is moved to it and carries its
+frame, so that the curvature does not jump inside an element.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from dlo_casadi.rod.node import Heading, Node, quaternion_product
 # A swivel is a clamp in space in which the cable may roll about its axis.
 ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
 CLAMPS = ("clamped", "swivel")
-# Axes along which outputs of functions of segments are derivatives by nodes and border.
+# Axes along which outputs of segment functions are derivatives by nodes and border.
 _BORDER_AXES = {
     "segment": ((), (2,), (2, 3)),
     "segment_slope": ((2,),),
@@ -39,7 +39,7 @@ class HeldClip:
     ----------
     place : (dimension,) [m]
     at : float [m] or None
-        Arc length from the start at which it holds the cable; None of an eyelet.
+        Arc length from the start at which it holds the cable; None for an eyelet.
     heading : float [rad], optional
         Direction of a clamped clip in a plane, continuous along the cable.
     orientation : (4,), optional
@@ -55,7 +55,7 @@ class HeldClip:
 
     @property
     def frame(self) -> FloatArray | None:
-        """Its frame (coordinates,) as a node carries it; None where the cable may turn."""
+        """Its frame (coordinates,) in the form of a node; None if the cable may turn."""
         if self.kind not in CLAMPS:
             return None
         if self.orientation is None:
@@ -111,7 +111,7 @@ def clip_size(node: type[Node]) -> int:
 class ClampNode:
     """The nodes of m poses that carry the frame of one clamped clip.
 
-    `index` (m,) of the node, `frame` (m, coordinates), `held` (increment,): which rotations.
+    `index` (m,) of the node, `frame` (m, coordinates), `held` (increment,): rotations it blocks.
     """
 
     index: IntArray
@@ -128,7 +128,7 @@ class Clipped:
     at : (m, k) [m]
         Arc lengths of the clips.
     places : (m, n + 1) [m]
-        Arc lengths of the nodes, those of clamped clips moved to them.
+        Arc lengths of the nodes; nodes of clamped clips are moved to these.
     """
 
     chain: Chain
@@ -147,8 +147,8 @@ class Clipped:
     ) -> "Clipped":
         """Clips at the arc lengths `at` (m, k) [m] of shapes x (m, n_nodes, coordinates).
 
-        `declared` (m, k, clip_size) determines which node is the nearest, so that it stays the same
-        while an unknown slip changes.
+        `declared` (m, k, clip_size) determines the nearest node, which then stays the same while an
+        unknown slip changes.
         """
         node, rows = chain.kind.node, np.arange(len(x))
         places, clamps = np.tile(chain.places, (len(x), 1)), []
@@ -167,7 +167,7 @@ class Clipped:
 
     @property
     def in_order(self) -> BoolArray:
-        """Whether the clips (m,) follow each other along the cable, eyelets within it."""
+        """Whether the clips (m,) are in order along the cable, and the eyelets within it."""
         low, high = np.zeros(len(self.at)), np.full(len(self.at), self.chain.length)
         return np.asarray(np.all(np.diff(np.column_stack([low, self.at, high])) > 0, axis=1))
 
@@ -183,7 +183,7 @@ class Clipped:
         return [int(clamp.index[pose]) for clamp in self.clamps]
 
     def carried(self, both: FloatArray) -> FloatArray:
-        """Nodes (m, n_segments, 2 coordinates) of segments, with the frames of clamped clips."""
+        """Nodes (m, n_segments, 2 coordinates) of segments; clamped ones have the clips' frames."""
         c, rows = both.shape[2] // 2, np.arange(len(both))
         for clamp in self.clamps:
             before, after = clamp.index - 1, clamp.index
@@ -221,9 +221,9 @@ class Clipped:
         return own
 
     def hold(self, force: Vector, x: FloatArray, stiffness: FloatArray) -> None:
-        """Hold the nodes x at clamped clips in their frames: by a stiffness (m,) [N m].
+        """Hold the nodes x at clamped clips in their frames by a stiffness (m,) [N m].
 
-        Nothing else feels it: in place of such a node the cable feels the frame, see `carried`.
+        This affects nothing else: the cable uses the clip's frame instead, see `carried`.
         """
         rows = np.arange(len(x))[:, None]
         for clamp in self.clamps:
@@ -261,7 +261,7 @@ class Clipped:
         ]
 
     def evenly(self, stations: FloatArray) -> FloatArray:
-        """Places and dr/ds (m, n + 1, 2 d, q) at even arc lengths, from those at moved nodes."""
+        """Places and dr/ds (m, n + 1, 2 d, q) at even arc lengths, given those at moved nodes."""
         out, rows = stations.copy(), np.arange(len(stations))
         for clamp in self.clamps:
             s = self.chain.places[clamp.index]
@@ -279,18 +279,18 @@ class Clipped:
 
 @dataclass(frozen=True)
 class Unheld:
-    """Segments with no clip inside, on which all forces beyond them act as one at their end.
+    """Segments with no clip inside; all forces beyond them act like one force at their end.
 
     Functions of a segment take several times as long with clips inside as without.
 
     Parameters
     ----------
     beyond : (m, n_segments, k)
-        1 where a segment lies before a clip, else 0; of the segments inside of which it is any.
+        1 if a segment lies before a clip, else 0; arbitrary for segments with the clip inside.
     inside : (m, j)
-        Segments in which the j clips are that hold no node.
+        Segments that contain the j clips that hold no node.
     rows : (1 + k, dimension)
-        Rows of the border of the forces on the end's holder, -1 of a free end, and on the clips.
+        Border rows of the forces on the end's holder (-1 for a free end) and on the clips.
     """
 
     beyond: FloatArray
@@ -301,13 +301,13 @@ class Unheld:
     def of(
         cls, table: FloatArray, kinds: Sequence[str], rows: list[list[int]], width: float | None
     ) -> "Unheld":
-        """From the rows of `Clipped.segments`; `width` [m] of all segments, if it is one."""
+        """From rows of `Clipped.segments`; `width` [m] of the segments, if all have the same."""
         count = len(kinds)
         share = (table[..., -count:] - table[..., :1]) / (width or table[..., 1:2])
         nodes = [k for k, kind in enumerate(kinds) if kind not in CLAMPS]
         dimension = len(rows[-1])
         ends = rows if rows[0] else [[-1] * dimension, *rows[1:]]
-        # One segment, also of a clip at a node: the derivatives by its arc length are one-sided.
+        # A clip at a node also counts in one segment: derivatives by its arc length are one-sided.
         inside = np.maximum((share >= 0).sum(axis=1)[:, nodes] - 1, 0)
         return cls((share > 0.5).astype(float), inside, np.array(ends))
 
@@ -320,8 +320,8 @@ class Unheld:
     ) -> list[FloatArray]:
         """Outputs (m, n_segments, rows, columns) of a function of segments.
 
-        `mapped` (name, number of segments, unheld) -> the function; the second of its arguments is
-        the border, whose rows begin at `first` where outputs have them.
+        `mapped` (name, number of segments, unheld) -> the function. Its second argument is the
+        border, whose rows start at `first` in outputs that have them.
         """
         both, lam, *others = arguments
         found = mapped(name, lam.shape[1], True)(both, self.summed(lam), *others)
@@ -336,7 +336,7 @@ class Unheld:
         return found
 
     def summed(self, lam: FloatArray) -> FloatArray:
-        """Border (m, n_segments, n_lam) with the sum of the forces beyond as the first clip's."""
+        """Border (m, n_segments, n_lam) with the sum of all forces beyond as first clip's force."""
         own, (end, *clips) = lam.copy(), self.rows
         total = np.zeros(lam.shape[:2] + end.shape) if end[0] < 0 else lam[..., end]
         for k, rows in enumerate(clips):
@@ -345,7 +345,7 @@ class Unheld:
         return own
 
     def _spread(self, out: FloatArray, axis: int, first: int) -> None:
-        """Derivatives by the sum, from row `first` on of an axis, to those by all forces."""
+        """Expand derivatives by that sum, from row `first` of an axis, to those by each force."""
         rows = np.moveaxis(out, axis, 0)
         end, *clips = first + self.rows
         total = rows[clips[0]].copy()
@@ -372,13 +372,13 @@ def moved_rest(chain: Chain, inside: ca.SX, low: ca.SX, width: ca.SX) -> ca.SX:
 
 
 def clamped_nodes(chain: Chain, clips: Sequence[HeldClip]) -> tuple[int, ...]:
-    """Nodes that the clamped clips hold: the nearest ones."""
+    """Nodes held by the clamped clips: those nearest to them."""
     at = np.array([clip.at for clip in clips if clip.kind in CLAMPS], dtype=float)
     return tuple(np.rint(at / chain.h).astype(int).clip(1, chain.n - 1).tolist())
 
 
 def node_places(chain: Chain, clips: Sequence[HeldClip]) -> FloatArray:
-    """Arc lengths (n_nodes,) [m] of the nodes, those that clamped clips hold moved to them."""
+    """Arc lengths (n_nodes,) [m] of the nodes; nodes of clamped clips are moved to these."""
     places = chain.places.copy()
     held = [clip.at for clip in clips if clip.kind in CLAMPS]
     places[list(clamped_nodes(chain, clips))] = held
@@ -386,14 +386,14 @@ def node_places(chain: Chain, clips: Sequence[HeldClip]) -> FloatArray:
 
 
 def _alike(frame: FloatArray, beside: FloatArray) -> FloatArray:
-    """Frames (m, coordinates) with the signs of quaternions beside them; headings as they are."""
+    """Frames (m, coordinates) with quaternion signs as in `beside`; headings unchanged."""
     if frame.shape[1] == 1:
         return frame
     return frame * np.where((frame * beside).sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
 
 def _rolled_with(frame: FloatArray, x: FloatArray) -> FloatArray:
-    """Frames (m, 4) rolled about their x axes as quaternions x (m, 4) are against them."""
+    """Frames (m, 4) rolled about their x axes as the quaternions x (m, 4) are, relative to them."""
     a, _, _, w = quaternion_product((*-frame.T[:3], frame.T[3]), x.T)
     size = np.maximum(np.hypot(a, w), 1e-300)
     zero = np.zeros_like(a)

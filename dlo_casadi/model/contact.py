@@ -5,13 +5,13 @@ No node may come nearer to an obstacle than the cable's own radius. Node i has t
     g_i = distance of r_i from the surface - diameter / 2 >= 0,   lam_i >= 0,   lam_i g_i = 0
 
 and adds -lam_i g_i to the Lagrangian: lam_i is the size of the force on the obstacle, along the
-surface's normal n. The force acts on each segment before the node as one at the end of the cable
-would. Contacts that are active (lam_i / c - g_i > 0: a primal-dual active set) are conditions of a
-Newton step, others have no force. That the normal of a round obstacle turns as a node moves adds
-outer products to the Hessian: internal columns of the band matrix.
+surface's normal n. On each segment before the node the force acts like one at the end of the cable.
+Active contacts (lam_i / c - g_i > 0: a primal-dual active set) are conditions of a Newton step; the
+others have no force. As a node moves, the normal of a round obstacle turns; this adds outer
+products to the Hessian: internal columns of the band matrix.
 
-Between nodes a cable of the curvature k relative to the surface may be deeper by h^2 k / 8; where
-it lies along a surface by far less.
+Between nodes, a cable of curvature k relative to the surface may sink in deeper by h^2 k / 8, and
+by far less where it lies along a surface.
 
 References
 ----------
@@ -34,17 +34,18 @@ from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.obstacles import Obstacle, Surface, surfaces_near
 
-# Depth [lengths] under a force as large as the cable's weight: it keeps apart contacts that depend
-# on each other. Energies are without it (`Touching.given_way`): those of 481 of 500 random cables,
-# which touch where IPOPT's do, are the same to 3e-11 of m g L + EI/L (`scripts/check_contact.py`).
+# Depth [lengths] under a force as large as the cable's weight; it separates contacts that depend
+# on each other. Energies do not include it (`Touching.given_way`): those of 481 of 500 random
+# cables, which touch where IPOPT's do, are the same to 3e-11 of m g L + EI/L
+# (`scripts/check_contact.py`).
 DEPTH = 1e-10
-# Gap [lengths] that counts as much as such a force in deciding whether a contact is active: larger
-# than what the force bends segments.
+# Gap [lengths] that counts as much as a force of the cable's weight in deciding whether a contact
+# is active: it exceeds what this force bends segments.
 BALANCED = 1.0
-# Maximum number of evaluations of the gaps under forces that depend on them, and their change
-# [lengths] at which it ends.
+# Maximum number of evaluations of the gaps, which change with the forces on them; change [lengths]
+# of the gaps at which they end.
 LOOKS, SAME_GAP = 8, 1e-12
-# Nodes so near to a surface [lengths] belong to the same contact as those beside them that press.
+# A node this near to a surface [lengths] belongs to the same contact as its pressing neighbours.
 CLOSE = 1e-4
 
 
@@ -55,8 +56,8 @@ class Contact:
     Parameters
     ----------
     start, end : float [m]
-        Arc lengths where it begins and ends; equal where the cable touches in a point. Between
-        nodes they follow from the forces beside them: evenly spread in between, points at both.
+        Arc lengths where it begins and ends; equal if the cable touches at a point. Between nodes
+        they follow from the nearby forces: evenly spread in between, points at both ends.
     force : (dimension,) [N]
         Of the cable on the obstacle.
     """
@@ -75,15 +76,15 @@ class Contact:
 
 @dataclass(frozen=True)
 class Touching:
-    """Nodes of m poses that may touch obstacles: K on each cable, one obstacle after the other.
+    """Nodes of m poses that may touch obstacles: K per cable, one obstacle after the other.
 
     Parameters
     ----------
     border : (m, k)
-        All unknowns beside the nodes, the sizes of the forces [N] last.
+        All unknowns beside the nodes; the sizes of the forces [N] come last.
     start : (m, d) [m]
     offsets : (m, surfaces) [m]
-        How far the surfaces are outwards of the declared ones.
+        Outward shifts of the surfaces from the declared ones.
     depth : float
         See `DEPTH`.
     normal : (m, K, d)
@@ -114,12 +115,12 @@ class Touching:
         everywhere: bool,
         advances: Callable[[FloatArray], FloatArray],
     ) -> Touching:
-        """Which nodes touch.
+        """Determine which nodes touch.
 
         `advances`: those of the segments (m, n, d) [m] under forces (m, n, n_lam). The forces on
-        obstacles bend the segments, and round surfaces turn these forces: gaps are found by
-        fixed-point iteration, first under all that push. `everywhere`: forces are felt whatever the
-        gaps.
+        obstacles bend the segments, and round surfaces turn these forces. Gaps are therefore found
+        by fixed-point iteration, starting with all positive forces. `everywhere`: forces act
+        whatever the gaps.
         """
         m, d = start.shape
         count, sizes = model.n_contacts, border[:, model.n_lam :]
@@ -154,7 +155,7 @@ class Touching:
 
     @cached_property
     def felt(self) -> FloatArray:
-        """Sizes (m, K) [N] of the forces, zero where a contact is not active."""
+        """Sizes (m, K) [N] of the forces; zero if a contact is not active."""
         return np.where(self.active, self.sizes, 0.0)
 
     @cached_property
@@ -175,7 +176,7 @@ class Touching:
 
     @property
     def lam(self) -> FloatArray:
-        """Unknowns (m, n, n_lam) beside the nodes as each segment feels them."""
+        """Unknowns (m, n, n_lam) beside the nodes, with contact forces added, for each segment."""
         found = np.repeat(self.border[:, None, : self.model.n_lam], self.model.n, axis=1)
         found[:, :, self.model.end_pull] += self.beyond
         return found
@@ -189,20 +190,20 @@ class Touching:
         return found
 
     def held(self, reactions: FloatArray) -> FloatArray:
-        """Reactions (m, n_reactions), at the start without what obstacles hold."""
+        """Reactions (m, n_reactions); the start's force is reduced by what obstacles carry."""
         found, rows = reactions.copy(), reaction_rows(self.model.node)["start_force"]
         found[:, rows] -= self.pulls.sum(axis=1)
         return found
 
     @property
     def softness(self) -> FloatArray:
-        """Gap per force (m, K) [m/N] of active contacts, and of others the row's own scale."""
+        """Gap per force (m, K) [m/N] of active contacts; for others the scale of their row."""
         depth, balanced = (gap_per_force(self.model, size) for size in (self.depth, BALANCED))
         return np.where(self.active, depth, balanced)
 
     @property
     def given_way(self) -> FloatArray:
-        """Energy (m,) [J] by which the depth under the forces lowers that of a pose."""
+        """Energy (m,) [J] by which the depth under the contact forces lowers that of a pose."""
         return np.asarray((self.felt**2 * self.softness).sum(axis=1) / 2)
 
     def _near(self, advances: FloatArray) -> Surface:
@@ -215,10 +216,10 @@ class Touching:
     def added(
         self, total: FloatArray, force: Vector, advances: FloatArray
     ) -> tuple[FloatArray, Vector]:
-        """The Lagrangian (m,) [J] and its gradient with contacts.
+        """The Lagrangian (m,) [J] and its gradient, contacts included.
 
-        The gradient ends with their conditions: -g - lam / c of active ones, those of others bring
-        their forces to zero [m].
+        The gradient ends with the contacts' conditions [m]: -g - lam / c for active ones; those of
+        the others drive their forces to zero.
         """
         gaps = np.where(self.active, self._near(advances).distance, 0.0)
         y = np.concatenate([force.y, (-gaps - self.sizes * self.softness)[..., None]], axis=1)
@@ -254,29 +255,29 @@ class Touching:
 
     @cached_property
     def _used(self) -> IntArray:
-        """Contacts that are active in any pose."""
+        """Contacts that are active in at least one pose."""
         return np.flatnonzero(self.active.any(axis=0))
 
     def _along(self, vectors: FloatArray) -> FloatArray:
-        """Vectors (m, K, d) at the nodes `_used`, as those of the advances (m, a, n, d) to them."""
+        """Vectors (m, K, d) at the nodes `_used`, given for each segment's advance (m, a, n, d)."""
         used = self._used
         return np.asarray(vectors[:, used, None] * self.before[used, :, None])
 
     @cached_property
     def _normals(self) -> FloatArray:
-        """The gaps' change with the advances, of the contacts `_used`, where active."""
+        """Change of the gaps `_used` with the advances, if active."""
         return self._along(self.normal * self.active[..., None])
 
     @property
     def _turning(self) -> FloatArray:
-        """Functions of the advances whose squares are the second derivatives lam d^2 g."""
+        """Functions of the advances whose squares sum to the second derivatives lam d^2 g."""
         bends = self.bends * np.sqrt(np.maximum(self.felt, 0.0))[..., None, None]
         each = [self._along(own) for own in np.moveaxis(bends, -1, 0)]
         found = np.concatenate(each, axis=1)
         return np.asarray(found[:, found.any(axis=(0, 2, 3))])
 
     def matrix(self, plain: BandMatrix, bend: FloatArray) -> BandMatrix:
-        """The Hessian, from that without contacts and from that of the segments (m, n, ...)."""
+        """The Hessian with contacts, from that without and from the segments' (m, n, ...)."""
         turning = self._turning
         inner, n_lam = turning.shape[1], self.model.n_lam
         k = n_lam + self.sizes.shape[1]
@@ -301,7 +302,7 @@ class Touching:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Derivatives of functions of the advances by nodes (m, N, b, a) and border (m, k, a).
 
-        And by each other (m, a, a), where they are forces.
+        Also by each other (m, a, a), taken as forces.
         """
         b, pull = self.model.node.increment, self.model.end_pull
         by_pull = bend[..., 2 * b + np.array(pull)]
@@ -316,8 +317,8 @@ class Touching:
     def along(self, change: Vector, moved: FloatArray, offsets: FloatArray) -> Vector:
         """Add contacts to the gradient's change at fixed nodes and multipliers.
 
-        `moved` (m, n, d, q): the change of the advances; `offsets` (m, surfaces, q) [m]: that of
-        the surfaces. That these turn the normals of round obstacles is left out.
+        `moved` (m, n, d, q): change of the advances; `offsets` (m, surfaces, q) [m]: change of the
+        surfaces. It is neglected that these changes turn the normals of round obstacles.
         """
         rows = np.repeat(offsets, _count(self.model), axis=1) * self.active[..., None]
         rows[:, self._used] -= np.einsum("masd,msdq->maq", self._normals, moved)
@@ -327,11 +328,11 @@ class Touching:
 
 
 def _inwards(force: FloatArray, h: float) -> float:
-    """How far [m] inside the first of the nodes with these forces [N] a contact begins.
+    """Distance [m] from the first node with these forces [N] inwards to where the contact begins.
 
-    At the distance x outside the fourth node, a point force Q and inwards of it the even force q of
-    the nodes that follow have the same sum F and moment about that node as the first four forces:
-    F = Q + q (x + h/2), M = Q x + q (x^2/2 - h^2/8).
+    A point force Q acts at the distance x outside the fourth node, and the even force q of the
+    following nodes inwards of it. Both together have the same sum F and moment about the fourth
+    node as the first four forces: F = Q + q (x + h/2), M = Q x + q (x^2/2 - h^2/8).
     """
     if len(force) < 8:
         return 0.0
@@ -344,7 +345,7 @@ def _inwards(force: FloatArray, h: float) -> float:
 
 
 def outwards(model: CableModel) -> FloatArray:
-    """Moves (surfaces, n_parameters) [m] of the surfaces outwards, per unit of parameters."""
+    """Outward shift (surfaces, n_parameters) [m] of the surfaces per unit of each parameter."""
     found = np.zeros((len(model.surfaces), len(model.parameters)))
     declared = len(model.obstacles)
     for effect in model.effects:
@@ -359,13 +360,13 @@ def outwards(model: CableModel) -> FloatArray:
 
 
 def surfaces_at(model: CableModel, p: FloatArray) -> tuple[Obstacle, ...]:
-    """All surfaces that the cable may touch, moved outwards as parameters p (n_parameters,) say."""
+    """All surfaces that the cable may touch, shifted outwards by parameters p (n_parameters,)."""
     offsets = (outwards(model) @ p).tolist()
     return tuple(x.grown(y) for x, y in zip(model.surfaces, offsets, strict=True))
 
 
 def forces_on_other_mesh(lam: FloatArray, model: CableModel, other: CableModel) -> FloatArray:
-    """Sizes (m, K) [N] of the forces on obstacles at another mesh's nodes: as many per length."""
+    """Forces on obstacles (m, K) [N] at another mesh's nodes, with the same force per length."""
     old, new = (one.chain.h * (np.arange(_count(one)) + 1) for one in (model, other))
     sizes = np.maximum(lam[:, model.n_lam :], 0.0).reshape((-1, _count(model)))
     there = [np.interp(new, old, row, 0.0, 0.0) for row in sizes]
@@ -378,5 +379,5 @@ def _count(model: CableModel) -> int:
 
 
 def gap_per_force(model: CableModel, gap: float) -> float:
-    """A gap in lengths for a force as large as the cable's weight and bending forces, [m/N]."""
+    """Gap per force [m/N]: a gap in lengths for the cable's weight plus bending forces."""
     return gap * model.cable.length / model.force_scale

@@ -1,6 +1,6 @@
 """CasADi functions of one segment, of the ends, and of one element boundary.
 
-Every stage differentiates the same expressions, see `lagrangian`; the functions are mapped over the
+Every stage differentiates the same expressions, see `lagrangian`. The functions are mapped over the
 cable, see `assembly`.
 """
 
@@ -34,8 +34,8 @@ class Functions:
         rest, place = self.terms.rest_strains, self.terms.place
         self._segment_arguments = [x, lam, p, rest, place, deviation]
         self._end_arguments = [x, lam, p, self.terms.pose, deviation]
-        # Variables of the first and second derivatives, and the numbers by which gradients of
-        # segments are differentiated, too. Arc lengths of eyelets stand in `place`.
+        # Variables of the first and second derivatives; values by which gradients of segments are
+        # also differentiated. Arc lengths of eyelets are part of `place`.
         border = ca.vertsplit(lam) if lam.numel() else []
         self._sliding = [(row, place[LAYOUT_SIZE + k]) for k, row in model.sliding.items()]
         for row, s in self._sliding:
@@ -46,10 +46,10 @@ class Functions:
     def _here(
         self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
     ) -> ca.Function:
-        """A function at increments of zero, its outputs dense.
+        """A function at zero increments, with dense outputs.
 
-        With `often`, common subexpressions are eliminated: a fifth of the operations is saved. For
-        derivatives of many effects the search takes longer than it saves.
+        With `often`, common subexpressions are eliminated, which saves a fifth of the operations.
+        For derivatives of many effects, finding them takes longer than it saves.
         """
         still = ca.SX.zeros(self.terms.delta.shape)
         found = ca.substitute(outputs, [self.terms.delta], [still])
@@ -89,7 +89,7 @@ class Functions:
 
     @cached_property
     def segment_slope(self) -> ca.Function:
-        """As `segment` -> its gradient alone, which takes far fewer operations."""
+        """As `segment` -> its gradient alone, in far fewer operations."""
         return self._of_segment("segment_slope", self._gradient)
 
     @cached_property
@@ -104,7 +104,7 @@ class Functions:
         """(x, lam, p, rest, place, deviation, inner) -> energy [J] to minimise, and conditions.
 
         The segment's part (n_border,) of the conditions on places is the gradient by the
-        multipliers. The internal unknowns are those of the element and, of an extensible cable,
+        multipliers. The internal unknowns are those of the element and, for an extensible cable,
         a_e with the axial strain sqrt(C) a_e and the energy h a_e^2 / 2.
         """
         kind, inner = self.kind, self.terms.inner
@@ -125,7 +125,7 @@ class Functions:
 
     @cached_property
     def _framed(self) -> SegmentInFrame:
-        """The segment in space, at this model's own symbols."""
+        """The segment in space, in terms of this model's own symbols."""
         free, lam = not self.terms.end_pull, self.terms.lam
         multipliers = [ca.SX.zeros(3)] * free + [lam[rows] for rows in self._force_rows]
         _, _, p, rest, place, deviation = self._segment_arguments
@@ -134,7 +134,7 @@ class Functions:
 
     @property
     def _force_rows(self) -> list[list[int]]:
-        """Rows, in the border, of the forces on the end's holder, on springs and on clips."""
+        """Border rows of the forces on the end's holder, on springs and on clips."""
         return [rows for rows in (self.terms.end_pull, *self.terms.pulls) if rows]
 
     @cached_property
@@ -164,9 +164,9 @@ class Functions:
 
     @cached_property
     def end_shape(self) -> ca.Function:
-        """As `at_ends` -> Lagrangian of the ends, forces on both holders and moments on clamps.
+        """As `at_ends` -> Lagrangian of the ends, forces on both holders, moments on clamps.
 
-        Forces (dimension, 2) [N] and moments (increment, 2) [N m] are those of `Equilibrium`.
+        The forces (dimension, 2) [N] and moments (increment, 2) [N m] are those of `Equilibrium`.
         """
         node, rows = self.node, reaction_rows(self.node)
         forces = [self._reactions[rows[f"{side}_force"]] for side in ("start", "end")]
@@ -226,7 +226,7 @@ class Functions:
         """As `segment` -> the same, derivatives by increments, lam, and by p, rest, deviation."""
         by = (self._by, self._numbers)
         if self.kind.framed:
-            # The advance is the Lagrangian's derivative by the force on the end's holder.
+            # The advance is the derivative of the Lagrangian by the force on the end's holder.
             by_nodes = (self._of_forces @ self._about_nodes.hessian)[:, 6:9].T
             for row, s in self._sliding:
                 by_nodes[:, 6 + row] = ca.jacobian(self._about_nodes.by_lam[:3], s)
@@ -307,10 +307,10 @@ class Functions:
     def _reactions(self) -> ca.SX:
         """Forces [N] and moments [N m] of the cable on its fixtures, see `ends.reaction_rows`.
 
-        Forces on ends are minus the gradient of the Lagrangian by the ends' places at fixed nodes
-        and multipliers; those on clips are multipliers. Moments, about the world's axes, are the
-        gradient of the holders' part of it (multipliers of clamps, springs of pins) by rotations
-        of the first and last node.
+        Forces on ends are minus the gradient of the Lagrangian by the ends' places, at fixed nodes
+        and multipliers; those on clips are multipliers. Moments are about the world's axes: the
+        gradient of the holders' part of the Lagrangian (multipliers of clamps, springs of pins) by
+        rotations of the first and last node.
         """
         node, x, delta = self.node, self.terms.x, self.terms.delta
         places = -ca.gradient(self.terms.ends_lagrangian, self.terms.pose)[: 2 * node.dimension]
@@ -361,7 +361,7 @@ class Functions:
     def true_clips(self) -> ca.Function:
         """(p, pose) -> true places (dimension, n_clips) and arc lengths (n_clips,) of clips [m].
 
-        Without a pose's own deviations; the arc lengths of eyelets are zero.
+        They exclude a pose's own deviations; the arc lengths of eyelets are zero.
         """
         clips = self.terms.true_ends.clips
         places = ca.horzcat(ca.SX(self.node.dimension, 0), *(place for place, _ in clips))
@@ -372,7 +372,7 @@ class Functions:
 
     @cached_property
     def slips(self) -> FloatArray:
-        """Derivatives of arc lengths by parameters (n_clips, n_parameters): numbers."""
+        """Derivatives of clips' arc lengths by parameters (n_clips, n_parameters), as numbers."""
         _, at = self.true_clips(self.terms.p, self.terms.pose)
         return np.array(ca.evalf(ca.jacobian(at, self.terms.p)))
 
@@ -390,14 +390,14 @@ class Functions:
 
     @cached_property
     def bent_stiffness(self) -> ca.Function:
-        """(p) -> logarithm of the bending stiffness M / k at one turn per length; gradient by p."""
+        """(p) -> log of the bending stiffness M / k at one turn per length; its gradient by p."""
         p, bend = self.terms.p, self.model.cable.curvature_scale
         stiffness = ca.log(self.section_moment(bend, p) / bend)
         return ca.Function("bent_stiffness", [p], [stiffness, ca.gradient(stiffness, p)])
 
     @cached_property
     def dead_load(self) -> ca.Function:
-        """(p) -> sum of the dead loads (dimension,) [N], without those of single poses."""
+        """(p) -> sum of the dead loads (dimension,) [N], excluding forces of single poses."""
         still = ca.SX.zeros(len(self.model.deviation_names))
         load = ca.substitute(self.terms.total_load, self.terms.deviation, still)
         return ca.Function("dead_load", [self.terms.p], [ca.densify(load)])

@@ -1,9 +1,9 @@
-"""The Lagrangian of a segment, of the ends, and what they are written in.
+"""The Lagrangian of a segment and of the ends, and the expressions it consists of.
 
     L(x, lam) = sum_e L_e(x_e, x_(e+1), lam) + L_ends(x_0, x_N, lam)
 
-with the energy of bending, weight and loads and the end conditions times their multipliers. An
-equilibrium is a stationary point.
+It contains the energy of bending, weight and loads, and the end conditions times their
+multipliers. An equilibrium is a stationary point.
 """
 
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentInFrame
 
-# Number of models whose expressions and functions are cached: a diagnosis compares some thirty.
+# Number of models whose expressions and functions are cached: a diagnosis compares about thirty.
 MODELS = 64
 
 
@@ -64,7 +64,7 @@ class Lagrangian:
     Parameters
     ----------
     unheld : bool
-        Of a segment with no clip inside: its end is pulled by the first clip's force; `Unheld`.
+        True for a segment with no clip inside: the first clip's force pulls its end; `Unheld`.
 
     Attributes
     ----------
@@ -73,11 +73,11 @@ class Lagrangian:
     pose : (n_pose,)
         A declared pose, see `HeldPose.vector`.
     deviation : (n_deviations,)
-        Unknowns of one pose of its own, see `deviation_names`.
+        Unknowns that this pose has of its own, see `deviation_names`.
     lam : (n_lam,)
         Border: multipliers of the end conditions, then unknowns of springs and of clips.
     x, delta : (2 coordinates,), (2 increment,)
-        Coordinates of the two nodes of a segment, or of the first and last; their increments.
+        Coordinates of a segment's two nodes, or of the first and last node; their increments.
     rest_strains : (3 strains,) [1/m]
         Rest strains inside a segment, see `Chain.rest_stencils`.
     place : (5 + n_clips,)
@@ -122,7 +122,7 @@ class Lagrangian:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """Where the camera of a pose stands."""
+        """Position of the camera for a pose."""
         size = EndConditions.size(self.node)
         x, y, inverse = ca.vertsplit(self.pose[size : size + VIEWPOINT_SIZE])
         start = EndConditions.of(self.declared_ends, self.node).start
@@ -187,7 +187,7 @@ class Lagrangian:
 
     @cached_property
     def felt_gravity(self) -> ca.SX:
-        """Gravity [m/s^2] with the effects that change it."""
+        """Gravity [m/s^2] after the effects that change it."""
         gravity = ca.SX(ca.DM(self.model.gravity))
         for effect, local in self.effects_of(Load):
             gravity = effect.gravity(gravity, local)
@@ -220,7 +220,7 @@ class Lagrangian:
     def segment(
         self, ratio: ca.SX, inner: ca.SX, square: ca.SX, local: ca.SX | None = None
     ) -> Segment:
-        """The segment's symbols; numbers that all segments share are constants."""
+        """The segment's symbols; values that all segments share are constants."""
         table = self.model.chain.layout.segments
         alike = np.all(table == table[0], axis=0)
         if self.model.clamped_between:  # their nodes are moved along the cable
@@ -262,7 +262,7 @@ class Lagrangian:
         return self.elastic_energy(segment) - self.work_along(segment, self.forces_on(segment))
 
     def work_along(self, segment: Segment, forces: list[ca.SX]) -> ca.SX:
-        """Work of `forces_on` a segment along it [J]."""
+        """Work [J] along a segment of `forces_on` it."""
         (nodes, weights), work = self.kind.rule, ca.SX(0)
         shares = ca.vertsplit(self.share_symbols)
         for force, u, weight in zip(forces, nodes, weights, strict=False):
@@ -301,7 +301,7 @@ class Lagrangian:
         return ca.substitute(expressions, [self.share_symbols], [self.shares(self.p, self.place)])
 
     def work_of_multipliers(self, segment: Segment) -> ca.SX:
-        """Work of the multipliers of places, of the end, springs and clips, along a segment [J]."""
+        """Work [J] along a segment of the multipliers of places: end, springs and clips."""
         work = ca.SX(0)
         if self.end_pull:
             work = ca.dot(self.lam[self.end_pull], self.kind.advance(segment))
@@ -343,7 +343,7 @@ class Lagrangian:
             lagrangian -= self.axial_compliance * h * tension**2 / 2
             stretched = self.stretch + self.axial_compliance * tension
         true = self.segment(stretched, condensed.inner, condensed.square)
-        # The derivative of the Lagrangian by the multipliers holds the end of this curve.
+        # The end of this curve is in the Lagrangian's derivative by the multipliers.
         return _SegmentTerms(lagrangian, kind.advance(true), stretched)
 
     def in_frame(self, x: ca.SX, multipliers: ca.SX, numbers: SegmentNumbers) -> SegmentInFrame:
@@ -381,9 +381,9 @@ class Lagrangian:
     def segment_in_frame(self) -> ca.Function:
         """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a segment.
 
-        Its minimum over the internal unknowns is that of `segment_by_share`. Forces are arguments:
-        the energy does not change when a segment and the forces on it are rotated together.
-        Multipliers of the end's place, springs and clips are such forces, too, see `in_frame`.
+        Its minimum over the internal unknowns is that of `segment_by_share`. Forces are arguments,
+        because the energy does not change if a segment and the forces on it are rotated together.
+        The multipliers of the end's place, springs and clips are such forces, too, see `in_frame`.
         """
         kind, h, inner = self.kind, self.length, self.inner
         ratio, local = ca.SX.sym("ratio"), ca.SX.sym("local", self.local.numel())

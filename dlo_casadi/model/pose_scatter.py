@@ -1,4 +1,4 @@
-"""What differs at random from pose to pose, however often a pose is taken again."""
+"""Random differences between poses, which also occur when the same pose is taken again."""
 
 from dataclasses import dataclass, replace
 
@@ -18,12 +18,12 @@ LABEL = "from_pose_to_pose"
 
 @dataclass(frozen=True)
 class PoseScatter:
-    """One quantity that each pose has of its own: normal, zero on average.
+    """One random quantity of each pose: normally distributed, zero on average.
 
     Parameters
     ----------
     std : float
-        Standard deviation of each component, see `unit`; 0 where the cable repeats. Of a rest
+        Standard deviation of each component, see `unit`; 0 if the cable repeats. For a rest
         curvature [1/m] the root mean square along the cable.
     smoothness : float
         Correlation length of a rest curvature, as a share of the cable's.
@@ -32,7 +32,7 @@ class PoseScatter:
     source : str
         `rest_curvature`, or the name of one of the RANDOM effects, whose parameters differ.
     rivals : tuple of PoseScatter
-        What the data do not tell from it.
+        Other random quantities that the data cannot distinguish from it.
     """
 
     std: float = 0.0
@@ -65,12 +65,12 @@ class PoseScatter:
         return "1/m" if effect is None else effect.parameters(model.cable)[0].unit
 
     def within(self, model: CableModel) -> CableModel:
-        """Return the model with the effect that differs from pose to pose, absent on average."""
+        """Return the model with the random effect added; the effect is zero on average."""
         effect = effect_of(self.source, model)
         return model if effect is None or effect in model.effects else model.with_effect(effect)
 
     def values(self, p: FloatArray, model: CableModel) -> FloatArray:
-        """Parameters of `within(model)` by those of the model."""
+        """Parameters of `within(model)`, given those of the model."""
         return np.concatenate([p, np.zeros(len(self.within(model).names) - len(p))])
 
     def ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
@@ -87,12 +87,12 @@ class PoseScatter:
 
 
 def sources_in(model: CableModel) -> list[str]:
-    """What may differ from pose to pose beside the rest curvature."""
+    """Names of the effects that may differ from pose to pose, besides the rest curvature."""
     return [name for name in RANDOM if effect_of(name, model) is not None]
 
 
 def effect_of(source: str, model: CableModel) -> Effect | None:
-    """The RANDOM effect of that name, as it suits a model; None where it does not apply."""
+    """The RANDOM effect of that name, with options for a model; None if it does not apply."""
     setup = Setup(model.cable, model.start, model.end, model.gravity)
     kind = RANDOM.get(source)
     if kind is None or not kind.applies(setup):

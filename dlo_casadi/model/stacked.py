@@ -36,7 +36,7 @@ class Shapes:
 
     @classmethod
     def declared(cls, x: FloatArray, lam: FloatArray, clips: int = 0) -> Shapes:
-        """Shapes without deviations from the declared ends and that number of clips."""
+        """Shapes with ends and that number of clips as declared, without deviations."""
         return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]], clips)))))
 
     def subset(self, index: Any) -> Shapes:
@@ -57,14 +57,14 @@ class Inputs:
 
     @classmethod
     def of(cls, p: FloatArray, rest: FloatArray, poses: FloatArray) -> Inputs:
-        """Parameters and rest curvature of each pose, or the same for all."""
+        """Inputs from parameters and rest curvature of each pose, or the same for all."""
         m = len(poses)
         return cls(
             np.broadcast_to(p, (m, p.shape[-1])), np.broadcast_to(rest, (m, rest.shape[-1])), poses
         )
 
     def subset(self, index: Any) -> Inputs:
-        """Those of some of the poses."""
+        """Inputs of some of the poses."""
         return Inputs(self.p[index], self.rest[index], self.poses[index])
 
 
@@ -73,8 +73,8 @@ class Tangents:
     """Derivatives of the shapes and inputs of m poses along q directions.
 
     `x` (m, n_nodes, b, q) increments of the nodes, `lam` (m, k, q), `p` (m, n_parameters, q),
-    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q). `tangent`: the tangent matrices from
-    which those of the shapes were solved, if they were.
+    `rest` (m, n_rests, q), `deviation` (m, n_deviations, q). `tangent`: the tangent matrices with
+    which the derivatives of the shapes were solved, if any.
     """
 
     x: FloatArray
@@ -85,15 +85,15 @@ class Tangents:
     tangent: BandMatrix | None = None
 
 
-# Poses that are evaluated in one call, which costs as much as the evaluation of a few segments.
+# Number of poses evaluated in one call; a call costs as much as evaluating a few segments.
 TOGETHER = 64
 
 
 class Mapped:
     """A CasADi function of a segment (or node), mapped over the segments of poses.
 
-    It reads and writes NumPy's memory: a conversion to CasADi's matrices takes several times as
-    long as the evaluation.
+    It reads and writes NumPy's memory, because conversion to CasADi's matrices takes several times
+    as long as the evaluation.
     """
 
     def __init__(self, function: ca.Function, count: int) -> None:

@@ -1,7 +1,7 @@
 """CasADi expressions of a whole pose: sums of the functions of segments.
 
-Symbols are SX for one's own IPOPT, MX in functions for others' problems: an expression of MX calls
-the functions of segments, so that graphs and their derivatives stay small.
+Symbols are SX for this package's own IPOPT problems and MX in functions for users' problems: an
+expression of MX calls the functions of segments, so that graphs and their derivatives stay small.
 """
 
 from dataclasses import dataclass
@@ -50,8 +50,8 @@ class PoseSymbols:
 class Potential:
     """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
 
-    The parameters stack p, rest curvature of the cells, pose, deviation. `by_segment` (n_lam,
-    n_segments): what each segment adds to the conditions, that on the end's place its advance [m].
+    The parameters stack p, rest curvature of the cells, pose and deviation. `by_segment` (n_lam,
+    n_segments): what each segment adds to the conditions; for the end's place its advance [m].
     """
 
     coordinates: ca.SX
@@ -64,9 +64,9 @@ class Potential:
 def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
 
-    The coordinates are the nodes', the places of springs and eyelets, the unknowns inside the
-    segments, then those of clamps that give way: a clamp of the compliance c turns by sqrt(c) a and
-    stores a^2/2. `clamped`: the nodes that the clamped clips hold, see `clips.clamped_nodes`.
+    The coordinates are those of the nodes, places of springs and eyelets, unknowns inside segments,
+    and those of compliant clamps: a clamp of the compliance c turns by sqrt(c) a and stores a^2/2.
+    `clamped`: the nodes that the clamped clips hold, see `clips.clamped_nodes`.
     """
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
@@ -84,7 +84,7 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     given.append(reached)
     energy, conditions, reached = ca.substitute(given, [s.lam[multipliers]], [zero])
     for node, frame in zip(clamped, _clip_frames(model, s, clamped), strict=True):
-        # Nothing else depends on the own coordinates of a node that a clip holds.
+        # Nothing else depends on the coordinates of a node that a clip holds.
         energy += ca.sumsqr(s.x[_rows(model, node)] - frame) / 2
     coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
     parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
@@ -109,8 +109,8 @@ def tangent(model: CableModel, s: PoseSymbols) -> Any:
     b, count, functions = model.node.increment, model.chain.n_nodes, functions_of(model)
     *_, segments = functions.segment(*_segment_arguments(model, s))
     *_, ends = functions.at_ends(*_end_arguments(model, s))
-    # Unknowns of each block: of two nodes, and the border. There may be a segment after the last
-    # node; what it has of a next one is left out.
+    # Unknowns of each block: those of two nodes, and the border. A segment after the last node is
+    # possible; its entries for a next node are left out.
     first = np.append(np.arange(model.chain.n_segments), 0)
     last = np.append(first[:-1] + 1, count - 1)
     border = b * (count + 1) + np.arange(model.n_border)
@@ -142,7 +142,7 @@ class ShapeExpressions:
 
 
 def shape(model: CableModel, s: PoseSymbols) -> ShapeExpressions:
-    """True shape and reactions. The energy is the Lagrangian: equal where conditions hold."""
+    """True shape and reactions. The energy is the Lagrangian, equal if the conditions hold."""
     layout, count, functions = model.chain.layout, model.n + 1, functions_of(model)
     energy, advance, strains = functions.segment_shape(*_segment_arguments(model, s))
     ends, forces, moments = functions.end_shape(*_end_arguments(model, s))
@@ -193,9 +193,9 @@ def _rows(model: CableModel, node: int) -> list[int]:
 
 
 def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) -> list[Any]:
-    """Frames of clamped clips, from the pose; swivels are rolled as the nodes that they hold are.
+    """Frames of clamped clips, from the pose; swivels take the roll of the nodes that they hold.
 
-    As `clips.Clipped.of`.
+    As in `clips.Clipped.of`.
     """
     size, c, count = clip_size(model.node), model.node.coordinates, len(model.clips)
     held, frames = [k for k, kind in enumerate(model.clips) if kind in CLAMPS], []
@@ -216,7 +216,7 @@ def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) ->
 def _segment_arguments(
     model: CableModel, s: PoseSymbols, clamped: tuple[int, ...] = ()
 ) -> list[Any]:
-    """A column for each segment, or a single column of what all segments share."""
+    """One column for each segment, or a single column if all segments share it."""
     chain = model.chain
     x = ca.reshape(s.x, model.node.coordinates, chain.n_nodes)
     inside = chain.rest_inside(np.eye(chain.n_rests)).reshape((-1, chain.n_rests))

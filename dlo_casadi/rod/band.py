@@ -4,9 +4,9 @@
     [ B^T  C ] [ y ] = [ g ]
 
 A couples neighbouring nodes; B and C belong to the unknowns of the whole pose: the multipliers of
-the end conditions. Block cyclic reduction eliminates every other node, log2(n) times: the work
-grows linearly with the nodes, and one array operation does a level of all nodes and poses. It is a
-congruence of A: the signs of the pivots give the inertia (Sylvester, Haynsworth).
+the end conditions. Block cyclic reduction eliminates every other node, log2(n) times. Its work
+grows linearly with the nodes, and one array operation handles a level of all nodes and poses. The
+elimination is a congruence of A: the signs of the pivots give the inertia (Sylvester, Haynsworth).
 
 References
 ----------
@@ -22,13 +22,13 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 
-# Smallest pivot, relative to the largest entry; a smaller one is shifted by this. The square root
-# of rounding: half of the digits are lost, and one step of refinement restores them.
+# Smallest pivot, relative to the largest entry; a smaller one is shifted by this. As it is the
+# square root of rounding, half of the digits are lost, and one step of refinement restores them.
 LEAST_PIVOT = 1e-8
 # Maximum number of steps of iterative refinement, and the relative residual at which they end.
 REFINEMENTS = 3
 RESIDUAL = 1e-13
-# Eigenvalues below this share of the largest entry count as zero: rounding of the elimination.
+# Eigenvalues below this share of the largest entry count as zero: that is the rounding error.
 ZERO_PIVOT = 1e-13
 
 
@@ -53,13 +53,13 @@ class Vector:
 
     @classmethod
     def of(cls, rows: FloatArray, n: int, b: int) -> Vector:
-        """Rows (m, n b + k, q): those of the nodes, then those of the border."""
+        """From rows (m, n b + k, q): those of the nodes, then those of the border."""
         m, _, q = rows.shape
         return cls(rows[:, : n * b].reshape((m, n, b, q)), rows[:, n * b :])
 
     @property
     def rows(self) -> FloatArray:
-        """All rows (m, n b + k, q), as given to `of`."""
+        """All rows (m, n b + k, q), in the order of `of`."""
         m, n, b, q = self.x.shape
         return np.concatenate([self.x.reshape((m, n * b, q)), self.y], axis=1)
 
@@ -87,7 +87,7 @@ class _Level:
         return self.left.shape[1], self.right.shape[1]
 
     def reduced(self, diagonal: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Diagonal and couplings of the even nodes without the odd ones."""
+        """Diagonal and couplings of the even nodes after elimination of the odd ones."""
         even, (odd, inner) = diagonal[:, 0::2].copy(), self.counts
         to_left = _product(self.left, self.inverse)
         even[:, :odd] -= _product(to_left, _transposed(self.left))
@@ -108,8 +108,8 @@ class BandMatrix:
     border : (m, n, b, k)
     corner : (m, k, k)
     internal : int
-        How many unknowns, the last of the border, stand for outer products that A is to have in
-        addition: they are eliminated, and neither right-hand sides nor solutions have them.
+        Number of auxiliary unknowns, the last ones of the border, that stand for outer products
+        added to A. They are eliminated; right-hand sides and solutions do not contain them.
     """
 
     diagonal: FloatArray
@@ -128,7 +128,7 @@ class BandMatrix:
         return BandMatrix(diagonal, upper, border, corner, self.internal)
 
     def replaced(self, index: IntArray, other: BandMatrix) -> BandMatrix:
-        """Matrices of all poses, those of some taken from `other`."""
+        """Matrices of all poses, with those at `index` taken from `other`."""
         internal = max(self.internal, other.internal)
         parts = [part.copy() for part in self._widened(internal)._parts]
         for part, new in zip(parts, other._widened(internal)._parts, strict=True):
@@ -137,7 +137,7 @@ class BandMatrix:
         return BandMatrix(diagonal, upper, border, corner, internal)
 
     def _widened(self, internal: int) -> BandMatrix:
-        """The same matrices with `internal` internal unknowns, the new ones without effect."""
+        """The same matrices with `internal` internal unknowns; the new ones have no effect."""
         more = internal - self.internal
         if not more:
             return self
@@ -148,7 +148,7 @@ class BandMatrix:
         return BandMatrix(self.diagonal, self.upper, border, corner, internal)
 
     def with_border(self, columns: FloatArray) -> BandMatrix:
-        """Return the matrices with more conditions, columns (m, n, b, k'), in the border."""
+        """Return the matrices with further conditions, columns (m, n, b, k'), in the border."""
         more = (0, columns.shape[3])
         border = np.concatenate([self.border, columns], axis=3)
         return replace(self, border=border, corner=np.pad(self.corner, [(0, 0), more, more]))
@@ -203,7 +203,7 @@ class BandMatrix:
 
     @property
     def coupled(self) -> BoolArray:
-        """Which unknowns of the border (k,) depend on any other, in some pose."""
+        """Whether each unknown of the border (k,) depends on any other, in any pose."""
         others = np.asarray(self.corner.any(axis=0))
         others[np.diag_indices(len(others))] = False
         unsure = (np.diagonal(self.corner, axis1=1, axis2=2) == 0).any(axis=0)
@@ -216,8 +216,8 @@ class BandMatrix:
     def negative(self) -> IntArray:
         """Number of negative eigenvalues of each matrix (m,), border included.
 
-        Eigenvalues of A that are zero to rounding count as negative, so that a neutral shape is
-        not a stable one; -1 where conditions in the border depend on each other.
+        Eigenvalues of A that are zero to rounding count as negative, so that a neutral shape does
+        not count as stable. The result is -1 if conditions in the border depend on each other.
         """
         rounding = ZERO_PIVOT * self.scale[:, None, None, None] * np.eye(self.diagonal.shape[2])
         return replace(self, diagonal=self.diagonal - rounding).factor().negative
@@ -231,7 +231,7 @@ class BandFactor:
         self._coupled, self._alone = np.flatnonzero(coupled), np.flatnonzero(~coupled)
         own = np.diagonal(matrix.corner, axis1=1, axis2=2)
         self._of_alone = own[:, self._alone]
-        # Internal unknowns are no negative eigenvalues.
+        # Internal unknowns do not count as negative eigenvalues.
         self._internal = matrix.internal
         self._not_counted = (own[:, own.shape[1] - matrix.internal :] < 0).sum(axis=1)
         if len(self._alone):
@@ -248,7 +248,7 @@ class BandFactor:
             self._levels.append(level)
             diagonal, upper = level.reduced(diagonal)
         self._top = self._inverse(diagonal)
-        # Border columns eliminated once: their solution serves every right-hand side.
+        # The border columns are eliminated once; the result serves every right-hand side.
         self._arm = self._nodes(matrix.border)
         arm = self._arm.reshape(matrix.columns.shape)
         self.schur = matrix.corner - _transposed(matrix.columns) @ arm
@@ -299,7 +299,7 @@ class BandFactor:
 
     @cached_property
     def _conditions(self) -> tuple[FloatArray, FloatArray]:
-        """Eigenvalues (m, k) and vectors (m, k, k) of the Schur complement, scaled to ones."""
+        """Eigenvalues (m, k) and vectors (m, k, k) of the Schur complement, scaled to unit size."""
         size = np.sqrt(np.abs(np.diagonal(self.schur, axis1=1, axis2=2)))
         size = np.where(size > 0, size, 1.0)
         values, vectors = np.linalg.eigh(self.schur / (size[:, :, None] * size[:, None, :]))
@@ -308,8 +308,8 @@ class BandFactor:
     def solve(self, right: Vector) -> Vector:
         """Solution of each pose for columns (m, n, b, q), (m, k, q), refined to rounding.
 
-        Conditions that depend on each other share their multiplier, the least one. Right-hand sides
-        have no rows of internal unknowns. Raises numpy.linalg.LinAlgError if a matrix is not
+        Conditions that depend on each other share the smallest possible multiplier. Right-hand
+        sides have no rows for internal unknowns. Raises numpy.linalg.LinAlgError if a matrix is not
         finite.
         """
         k = right.y.shape[1]
@@ -331,7 +331,7 @@ class BandFactor:
 
     @cached_property
     def negative(self) -> IntArray:
-        """Number of negative eigenvalues (m,), see `BandMatrix.negative`; without its shift."""
+        """Number of negative eigenvalues (m,), see `BandMatrix.negative`, but without its shift."""
         total = np.zeros(len(self.schur), dtype=np.intp)
         singular = np.zeros(len(self.schur), dtype=bool)
         for values in self._eigenvalues:

@@ -89,20 +89,20 @@ class Chain:
 
     @property
     def n_rests(self) -> int:
-        """Number of rest strains; they are ordered by component first, then by cell."""
+        """Number of rest strains; they are ordered by component, then by cell."""
         return self.n_cells * len(self.kind.node.strains)
 
     @cached_property
     def rest_stencils(self) -> tuple[IntArray, FloatArray]:
-        """Cells (n_segments, 3) that determine the rest curvature inside a segment, with weights.
+        """Cells (n_segments, 3) and weights that determine the rest curvature inside a segment.
 
         The weights are (n_segments, 3, 3). From means m over a cell and its neighbours, |x| <= 1/2,
 
             kappa_0(x) = m_e + a x + c (x^2 - 1/12),
             a = (m_(e+1) - m_(e-1)) / 2,   c = (m_(e+1) - 2 m_e + m_(e-1)) / 2
 
-        which is exact for parabolas on equal cells. The first and last cell continue their
-        neighbour's. Weights are zero where a segment has no cell.
+        which is exact for parabolas on equal cells. The first and last cell use their neighbour's
+        parabola. Weights are zero if a segment has no cell.
         """
         count = self.n_cells
         cells = np.zeros((self.n_segments, 3), dtype=np.intp)
@@ -120,13 +120,13 @@ class Chain:
         return cells, weights
 
     def rest_inside(self, means: FloatArray) -> FloatArray:
-        """Rest strains inside (..., n_segments, 3 strains, q) of means (..., n_rests, q)."""
+        """Rest strains inside (..., n_segments, 3 strains, q), from means (..., n_rests, q)."""
         cells, weights = self.rest_stencils
         by_strain = [weights @ part[..., cells, :] for part in self.by_strain(means)]
         return np.concatenate(by_strain, axis=-2)
 
     def by_strain(self, means: FloatArray) -> list[FloatArray]:
-        """Parts (..., n_cells, q) of means (..., n_rests, q), one for each strain."""
+        """Means (..., n_rests, q) split into parts (..., n_cells, q), one for each strain."""
         count = means.shape[-2] // len(self.kind.node.strains)
         return [means[..., k : k + count, :] for k in range(0, means.shape[-2], count)]
 
@@ -171,8 +171,8 @@ class RestCurvature:
     def cell_means(self, cells: FloatArray) -> FloatArray:
         """Means (n_cells, n_coefficients) of the basis functions over cells (n_cells, 2) [m].
 
-        The mean, not the value in the middle, makes int (kappa - kappa_0)^2 ds of a curve of
-        constant curvature per cell exact up to a constant.
+        The mean, unlike the value in the middle, makes int (kappa - kappa_0)^2 ds exact up to a
+        constant for a curve of constant curvature per cell.
         """
         if self.n_coefficients == 0:
             return np.zeros((len(cells), 0))

@@ -16,7 +16,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.rod.node import Node
 
-# Numbers of a segment in `Layout.segments`.
+# Number of values per segment in `Layout.segments`.
 LAYOUT_SIZE = 5
 
 
@@ -24,7 +24,7 @@ LAYOUT_SIZE = 5
 class Cell:
     """Interval of the cable on which one discrete strain acts: `width` [m], beginning at `low` [m].
 
-    `mesh` [m] is the largest width of such a cell; kinks are rounded over a share of it.
+    `mesh` [m] is the largest width of such a cell; kinks are rounded over a share of this width.
     """
 
     low: ca.SX
@@ -59,8 +59,8 @@ class Section:
 
         W = a (b(|k|) k^T B k + GJ tau^2) / 2                           [N]
 
-    of the curvature k and the twist tau beyond those at rest [1/m], with the products a and b of
-    the section laws' factors, see `SectionLaw`.
+    for the curvature k and the twist tau beyond those at rest [1/m]; a and b are products of the
+    section laws' factors, see `SectionLaw`.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ class Section:
     along : callable
         Cell -> a.
     of_bend, tangent : callable
-        Square of the bend -> b, and -> the factor on the stiffness against a small change of
-        that bend, which is exact for a single law.
+        Square of the bend -> b; and -> the factor on the stiffness against a small change of that
+        bend, which is exact for a single law.
     """
 
     bending: ca.SX
@@ -90,17 +90,17 @@ class Section:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the nodes and segments of a chain are.
+    """Positions of the nodes and segments of a chain.
 
     Parameters
     ----------
     nodes : (N,) [m]
         Arc lengths of the nodes.
     segments : (S, 5) [m, m, m, m, 1]
-        For each segment: start and length of the cable that it advances along, start and width of
-        its bending cell, and whether it has one (1 or 0).
+        For each segment: start and length of the piece of cable it covers, start and width of its
+        bending cell, and whether it has a cell (1 or 0).
     stations : (n + 1, 2) int
-        Nodes whose mean direction is the cable's at each element boundary.
+        The two nodes whose mean direction is that of the cable at each element boundary.
     """
 
     nodes: FloatArray
@@ -133,19 +133,19 @@ class Segment:
     local : (n_local,)
         Local coordinates of its nodes, see `Element.local`.
     rest : (3 strains,) [1/m]
-        Rest strains of the cell: mean, and linear and quadratic variation inside, of each.
+        Rest strains of the cell: for each strain the mean, linear and quadratic variation.
     place : (5,)
         A row of `Layout.segments`.
     mesh : float [m]
         Declared length of an element.
     stretch : scalar
-        True length over declared length, the same everywhere, without tension.
+        True length over declared length without tension, the same for all segments.
     ratio : scalar
-        True length over declared length of this segment, with its axial strain under tension.
+        True length over declared length of this segment, including axial strain under tension.
     inner : (n_inner,)
         Internal unknowns of the element.
     square : scalar
-        Square of the internal unknown, or the expression that replaces it, see `_stiffening`.
+        Square of the internal unknown, or the expression used in its place, see `_stiffening`.
     """
 
     local: ca.SX
@@ -174,7 +174,7 @@ class Segment:
 
     @property
     def length(self) -> ca.SX:
-        """Declared length of the cable that it advances along [m]."""
+        """Declared length of the piece of cable it covers [m]."""
         return self.place[1]
 
     @property
@@ -190,7 +190,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Condensed:
-    """A Lagrangian with the internal unknowns eliminated, and their values."""
+    """A Lagrangian after elimination of the internal unknowns, and the values of these."""
 
     lagrangian: ca.SX
     inner: ca.SX
@@ -210,12 +210,12 @@ class Element(ABC):
     order : int
         Order of the shape's error in the element's length, measured.
     smooth : bool
-        Whether the cable has a tangent at element boundaries. The curve between them is then a
-        cubic Hermite interpolant, else a chord.
+        Whether the cable has a tangent at element boundaries. If so, the curve between them is a
+        cubic Hermite interpolant, otherwise a chord.
     plain : str
-        Name of the element without the internal unknowns, on the same nodes.
+        Name of the element without internal unknowns, on the same nodes.
     framed : bool
-        Whether its Lagrangian is differentiated in the frame in its middle, see `in_frame`.
+        Whether its Lagrangian is differentiated in the frame of its middle, see `in_frame`.
     n_inner : int
         Number of internal unknowns, which are eliminated.
     rule : (nodes, weights)
@@ -230,15 +230,15 @@ class Element(ABC):
     nodes_are: ClassVar[str] = "at the nodes"
     framed: ClassVar[bool] = False
     n_inner: ClassVar[int] = 0
-    # Three Gauss points integrate cos and sin of a heading that turns by d in one element with an
-    # error below d^6 / 2e6.
+    # Three Gauss points integrate cos and sin of a heading that turns by d within one element, with
+    # an error below d^6 / 2e6.
     rule: ClassVar[tuple[FloatArray, FloatArray]] = (
         np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)]),
         np.array([5.0, 8.0, 5.0]) / 18.0,
     )
 
     def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
-        """Nodes and segments of a cable of n elements; `clamped`: its start, its end.
+        """Nodes and segments of a cable of n elements; `clamped`: whether its start, its end is.
 
         Nodes are at the element boundaries.
         """
@@ -253,7 +253,7 @@ class Element(ABC):
 
     @abstractmethod
     def strain(self, segment: Segment) -> ca.SX:
-        """Mean strains of the cell [1/m], see `Node.strains`; 0 without one."""
+        """Mean strains of the cell [1/m], see `Node.strains`; 0 if it has no cell."""
 
     @abstractmethod
     def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:

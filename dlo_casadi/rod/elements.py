@@ -40,9 +40,9 @@ _COSINE = tuple((-1) ** k / factorial(2 * k + 2) for k in range(7))
 
 
 class Link(Element):
-    """Straight links; nodes are in their middles, a clamp is a node of its own.
+    """Straight links: a node in the middle of each link, and one more for each clamp.
 
-    Segment j is link j and the hinge at its end, which stands for the cell between the middles of
+    Segment j is link j with the hinge at its end, which represents the cell between the middles of
     links j and j + 1. A clamp bends the half cell between itself and the middle of a link.
     """
 
@@ -54,7 +54,7 @@ class Link(Element):
     rule = (np.array([0.5]), np.array([1.0]))
 
     def layout(self, length: float, n: int, clamped: tuple[bool, bool]) -> Layout:
-        """One node a link, and one a clamp."""
+        """One node per link, and one per clamp."""
         h = length / n
         nodes = (np.arange(n) + 0.5) * h
         links = np.stack([np.arange(n) * h, np.full(n, h)], axis=1)
@@ -66,7 +66,7 @@ class Link(Element):
         if clamped[1]:
             nodes = np.concatenate([nodes, [length]])
             links = np.concatenate([links, [[length, 0.0]]])
-        # There is no cell behind the last node; its numbers repeat those of the cell before.
+        # No cell follows the last node; its values repeat those of the cell before.
         low = np.concatenate([nodes[:-1], nodes[-2:-1]])
         width = np.concatenate([np.diff(nodes), nodes[-1:] - nodes[-2:-1]])
         has_cell = np.ones(len(nodes))
@@ -142,7 +142,7 @@ class Quadratic(Arc):
         # The bubble's curvature is 4 b (1 - 2u) / h: at the Gauss points, +- 4/sqrt(3) b / h.
         bowed = 4 / np.sqrt(3) * segment.inner * (1 / (segment.length * segment.stretch))
         mean = section.of_bend(bend**2) * bend**2 + section.tangent(bend**2) * bowed**2
-        # Where the stiffness of the halves differs, a mean bend drives the bubble.
+        # If the stiffness of the two halves differs, a mean bend drives the bubble.
         density = (first + second) / 2 * mean + (first - second) * moment * bowed
         return segment.cell.width * section.bending / 2 * density * segment.stretch
 
@@ -169,11 +169,11 @@ class Quadratic(Arc):
 
 
 def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Relative stiffness of a bubble and its derivative: 1 + x to x = -1/2, above 1/4 for any x.
+    """Relative stiffness of a bubble and its derivative: 1 + x for x >= -1/2, above 1/4 for any x.
 
-    x is positive under tension. Without the lower bound elements of a limp cable buckle one by one
-    on the way to an equilibrium. Twice differentiable. Equilibria that obstacles press reach
-    x = -0.03, where already an error of O(x^3) changed energies by 3e-8 of m g L + EI/L.
+    x is positive under tension. Without the lower bound, elements of a limp cable buckle one by one
+    on the way to an equilibrium. The function is twice differentiable. Equilibria pressed by
+    obstacles reach x = -0.03; there an error of O(x^3) changed energies by 3e-8 of m g L + EI/L.
     """
     a = 4 * ca.fmin(x + 0.5, 0)
     pressed = 1 - a + a**2
@@ -190,7 +190,7 @@ class Helix(Element):
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
         """Frame in the middle (4,), and the rotation vector phi (3,) [rad] from node to node."""
         x, y, z, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
-        # The angle is halved once more: the series of the arc sine then needs few terms.
+        # Halve the angle once more: the series of the arc sine then needs few terms.
         vector, halves = ca.vertcat(x, y, z), []
         for _ in range(2):
             cosine = ca.sqrt((1 + w) / 2)
@@ -228,8 +228,8 @@ class QuadraticHelix(Helix):
 
         h omega(x) = phi - 8 x beta + 2/3 phi x beta,      -1/2 <= x <= 1/2
 
-    turns the frame at x, against the helix, by (1 - 4 x^2) (beta - x/3 phi x beta) about its own
-    axes. Positions are expanded to first order in the bubble beta, which minimises the elastic
+    turns the frame at x, relative to the helix, by (1 - 4 x^2) (beta - x/3 phi x beta) about its
+    own axes. Positions are expanded to first order in the bubble beta, which minimises the elastic
     energy minus the work of the loads at given nodes; the error is of fifth order in h per element.
     """
 
@@ -238,7 +238,7 @@ class QuadraticHelix(Helix):
     n_inner = 3
 
     def bends(self, segment: Segment) -> list[ca.SX]:
-        """At the two Gauss points."""
+        """Strains minus rest strains at the two Gauss points."""
         phi, beta = segment.local[4:], segment.inner
         mean = phi + 2 / 3 * ca.cross(phi, beta)
         width = segment.length * segment.stretch
@@ -257,7 +257,7 @@ class QuadraticHelix(Helix):
     def condensed(
         self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> Condensed:
-        """Minimum over the bubble, whose stiffness is that of the section alone."""
+        """Minimum over the bubble; the bubble's stiffness is that of the section alone."""
         given, torque, own = self._of_bubble(segment, lagrangian, elastic)
         bubble = -ca.mtimes(inverse_of(own), torque)
         return Condensed(given + ca.dot(torque, bubble) / 2, bubble, segment.square)

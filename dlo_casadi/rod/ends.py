@@ -7,17 +7,17 @@ import casadi as ca
 
 from dlo_casadi.rod.node import Node, quaternion_product
 
-# Forces and moments of the cable on its ends' fixtures, in the order of `Assembly.reactions`.
+# Forces and moments of the cable on the fixtures of its ends, in the order of `Assembly.reactions`.
 REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
 
 
 def clip_force(number: int) -> str:
-    """Name of the force of the cable on a clip; `number` is 1 of the first one from the start."""
+    """Name of the force of the cable on a clip; `number` is 1 for the first clip from the start."""
     return f"clip_{number}_force"
 
 
 def reaction_rows(node: type[Node], clips: int = 0) -> dict[str, slice]:
-    """Where REACTIONS and the forces on clips stand in the vector of `Assembly.reactions`.
+    """Slices of REACTIONS and of the forces on clips in the vector of `Assembly.reactions`.
 
     Forces (dimension,) [N], moments (increment,) [N m].
     """
@@ -30,8 +30,8 @@ def reaction_rows(node: type[Node], clips: int = 0) -> dict[str, slice]:
 def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
     """Names of the unknowns that each pose has of its own, in the order of `deviation`.
 
-    How the ends deviate from what is declared [m, rad], a force of unknown cause [N], and how a
-    number of clips deviates [m].
+    These are deviations of the ends from declared values [m, rad], a force of unknown cause [N],
+    and deviations of the clips [m].
     """
     axes, turns = node.axes, node.turns
     parts = [("end", axes), ("start", turns), ("end", turns), ("unknown_force", axes)]
@@ -43,8 +43,8 @@ def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
 class EndConditions:
     """Where and how the ends are held: symbols of one pose.
 
-    `start`, `end` (dimension,) [m]; `start_frame`, `end_frame` (coordinates,): the clamps as a
-    node would carry them, in a plane their headings [rad]. `node` is what the nodes carry. `clips`:
+    `start`, `end` (dimension,) [m]; `start_frame`, `end_frame` (coordinates,): the clamps in the
+    form of a node, in a plane their headings [rad]. `node` is the kind of the nodes. `clips`:
     places (dimension,) [m] and arc lengths [m] of the clips between the ends.
     """
 

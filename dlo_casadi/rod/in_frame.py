@@ -1,10 +1,10 @@
-"""A segment between two frames, differentiated in stages, which takes fewer operations.
+"""Derivatives of a segment between two frames, in stages, which takes fewer operations.
 
-The Lagrangian of a segment does not change when the segment and the forces on it are rotated
+The Lagrangian of a segment does not change if the segment and the forces on it are rotated
 together. It is therefore a function of the rotation vector phi from node to node and of the forces
-c = R^T F in the frame R in its middle. CasADi differentiates it by phi, the internal unknowns and
-c; these are eliminated, and the chain rule to the nodes is in closed form. With increments
-alpha, beta of both nodes about the axes of R,
+c = R^T F in the frame R in its middle. CasADi differentiates this function by phi, c and the
+internal unknowns. The internal unknowns are eliminated, and the chain rule to the nodes is in
+closed form. With increments alpha, beta of both nodes about the axes of R,
 
     sigma = (alpha + beta) / 2,   epsilon = beta - alpha,
     R -> R exp(mu),               phi -> phi + psi,
@@ -32,7 +32,7 @@ from dlo_casadi.rod.node import conjugate, quaternion_product
 # (rotation vector phi (3,), internal unknowns, forces (3, m) [N]) -> energy of a segment [J].
 Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
 
-# Keeps 0 / 0 of two squared angles finite where an element is straight.
+# Keeps 0 / 0 of two squared angles finite if an element is straight.
 _TINY = 1e-30
 
 
@@ -40,8 +40,8 @@ _TINY = 1e-30
 class SegmentDerivatives:
     """A segment's Lagrangian and its derivatives by rotations of its nodes and by multipliers.
 
-    Rotations are about the axes of the middle frame, or about those given to `about`;
-    multipliers are q vectors (3,) in world axes, one after the other.
+    Rotations are about the axes of the middle frame, or about those passed to `about`.
+    Multipliers are q vectors (3,) in world axes, one after the other.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class SegmentDerivatives:
     lam_lam: ca.SX
 
     def about(self, first: ca.SX, last: ca.SX) -> "SegmentDerivatives":
-        """The same by rotations about other axes, given by matrices (3, 3) from these to those."""
+        """The same for rotations about other axes, given by matrices (3, 3) from these to those."""
         (g, h), (aa, ab, bb), (al, bl) = self.slopes, self.bends, self.mixed
         return replace(
             self,
@@ -126,12 +126,12 @@ class SegmentInFrame:
         resisting = ca.jacobian(self._by_inner, inner)
         start = [self._moved.phi, ca.SX.zeros(inner.shape), self._body]
         torque, resisting = ca.substitute([self._by_inner, resisting], self._symbols, start)
-        # Quadratic in the internal unknowns: one Newton step from zero gives the minimum.
+        # The energy is quadratic in the internal unknowns: one Newton step gives the minimum.
         self._inverse = inverse_of(resisting) if inner.numel() else ca.SX(0, 0)
         self._there = [self._moved.phi, -self._inverse @ torque, self._body]
 
     def _at(self, expressions: list[ca.SX]) -> list[ca.SX]:
-        """Insert the segment's rotation vector and forces, and the internal unknowns' minimum."""
+        """Insert the segment's rotation vector and forces, and the optimal internal unknowns."""
         return list(ca.substitute(expressions, self._symbols, self._there))
 
     def derivatives(self) -> SegmentDerivatives:
@@ -148,7 +148,7 @@ class SegmentInFrame:
         body, to_lam, to_world = self._body, self._to_lam, self._to_world
         by_force = ca.reshape(by_force, body.shape)
         pairs = list(zip(ca.horzsplit(by_force), ca.horzsplit(body), strict=True))
-        # A turn mu of the frame turns the forces by -mu: c + c x mu + (c x mu) x mu / 2.
+        # A rotation mu of the frame turns the forces by -mu: c + c x mu + (c x mu) x mu / 2.
         by_mu = sum((ca.cross(a, b) for a, b in pairs), start=ca.SX.zeros(3))
         form = sum((a @ b.T for a, b in pairs), start=ca.SX.zeros(3, 3))
         turned = ca.vertcat(*(ca.skew(b) for b in ca.horzsplit(body)))
@@ -161,7 +161,7 @@ class SegmentInFrame:
         lam_phi, lam_lam = to_lam.T @ force_phi, to_lam.T @ force_lam
         phi_phi = bend[:3, :3]
         if inner.numel():
-            # The internal unknowns follow.
+            # The internal unknowns follow at their minimum.
             whole = [
                 [mu_mu, mu_phi, mu_lam],
                 [mu_phi.T, phi_phi, lam_phi.T],

@@ -1,4 +1,4 @@
-"""The state of a node of the rod; it moves by an increment, never by its coordinates."""
+"""The state of a node of the rod, which is changed by an increment, never by its coordinates."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -16,19 +16,19 @@ _CASADI = (ca.SX, ca.MX, ca.DM)
 # Coefficients of sin(x) / x in powers of x^2: error 2e-15 at x = 0.65, 3e-14 at pi/4.
 SINE = tuple((-1) ** k / factorial(2 * k + 1) for k in range(7))
 
-# Smallest curvature [1/m] that is told from none: the norm of two has no derivative at zero.
+# Smallest curvature [1/m] distinguished from zero: the norm of two has no derivative at zero.
 STRAIGHT = 1e-8
 
 
 class Node(ABC):
-    """The state of a node: `coordinates` numbers that move by increments of `increment` numbers.
+    """The state of a node: `coordinates` numbers, changed by increments of `increment` numbers.
 
-    Nothing outside this contract adds a step to coordinates or interpolates them.
+    Only this contract adds a step to coordinates or interpolates them.
 
     Attributes
     ----------
     coordinates, increment, dimension : int
-        Numbers of a node, of its increment, and of a position.
+        Size of a node's state, of its increment, and of a position.
     axes, turns : tuple of str
         Names of the components of a position, and of an increment.
     strains, curvatures : tuple of str
@@ -39,19 +39,19 @@ class Node(ABC):
     identity : tuple of float
         Coordinates of the node whose tangent is the world's x axis.
     where : str
-        Where such a cable lies.
+        Where such a cable lies, in words.
     direction, tolerance : str
-        What a session calls the direction of a clamp, and how well it is known.
+        Names in a session for the direction of a clamp, and for its tolerance.
     columns : tuple of str
-        Ends of the names of a table's columns with that direction.
+        Suffixes of the names of a table's columns with that direction.
     branches : tuple of str
         Branches that a pose may name: which way the cable turns from start to end.
     twists : bool
-        Whether the cable twists. Frames of clamps leave open how often: a pose tells it by a
-        number of its own, `turns`.
+        Whether the cable twists. Frames of clamps leave the number of turns open: a pose gives it
+        separately as `turns`.
     sides : int
-        Number of directions, evenly around the chord, to which a first guess of a span bulges; the
-        first is along gravity.
+        Number of directions, evenly spaced around the chord, in which a first guess of a span
+        bulges; the first is along gravity.
     """
 
     coordinates: ClassVar[int]
@@ -76,21 +76,21 @@ class Node(ABC):
     def moved(x: Any, delta: Any) -> Any:
         """Nodes (..., coordinates) moved by increments (..., increment) [rad].
 
-        Arrays, or expressions of one node; the same holds for `difference` and `to_world`.
+        For arrays, or for expressions of one node; likewise `difference` and `to_world`.
         """
 
     @staticmethod
     def excess(x: Any) -> Any:
-        """Squares of the nodes' lengths less one, where length is no part of a node's state.
+        """Squares of the nodes' lengths minus one, for nodes whose length is not part of the state.
 
-        (..., 1) of nodes (..., coordinates) or, of an expression (coordinates, n), (n, 1); of
-        headings there are none.
+        (..., 1) for nodes (..., coordinates); (n, 1) for an expression (coordinates, n). Headings
+        have no such length.
         """
         return type(x)(0, 1) if isinstance(x, _CASADI) else x[..., :0]
 
     @staticmethod
     def normalised(x: Any) -> Any:
-        """Nodes of any length, as `excess` takes them, with that of a node; zeros stay zeros."""
+        """Nodes of any length, as for `excess`, scaled to that of a node; zeros stay zero."""
         return x
 
     @staticmethod
@@ -101,7 +101,7 @@ class Node(ABC):
     @staticmethod
     @abstractmethod
     def declared(x: FloatArray) -> Any:
-        """A node (coordinates,) as a pose declares the direction of a clamp."""
+        """A node (coordinates,) in the form in which a pose declares the direction of a clamp."""
 
     @staticmethod
     def bend(curvatures: ca.SX) -> ca.SX:
@@ -111,7 +111,7 @@ class Node(ABC):
     @staticmethod
     @abstractmethod
     def difference(x: Any, y: Any) -> Any:
-        """Increments (..., increment) [rad] that move x to y: of headings, whole turns included."""
+        """Increments (..., increment) [rad] from x to y; for headings, whole turns included."""
 
     @staticmethod
     @abstractmethod
@@ -222,8 +222,8 @@ class Frame(Node):
 
         q -> q * (delta / 2, 1) / sqrt(1 + |delta|^2 / 4)
 
-    a rotation by 2 atan(|delta| / 2): the exponential map to second order, smooth everywhere, and
-    rational. Neighbouring nodes carry quaternions of the same sign, which increments keep.
+    which is a rotation by 2 atan(|delta| / 2): the exponential map to second order, smooth
+    everywhere, and rational. Quaternions of neighbouring nodes keep the same sign.
 
     References
     ----------
@@ -260,7 +260,7 @@ class Frame(Node):
 
     @staticmethod
     def excess(x: Any) -> Any:
-        """Of the quaternions."""
+        """Squared lengths of the quaternions minus one."""
         if isinstance(x, _CASADI):
             return ca.sum1(x**2).T - 1
         return (x**2).sum(axis=-1, keepdims=True) - 1
@@ -285,7 +285,7 @@ class Frame(Node):
 
     @staticmethod
     def bend(curvatures: ca.SX) -> ca.SX:
-        """Length of the components, rounded off below STRAIGHT."""
+        """Norm of the components, rounded off below STRAIGHT."""
         return ca.sqrt(ca.sum1(curvatures**2) + STRAIGHT**2)
 
     @staticmethod
@@ -294,7 +294,7 @@ class Frame(Node):
         *vector, w = quaternion_product(conjugate(components(x)), components(y))
         if isinstance(x, _CASADI):
             return ca.vertcat(*(2 * v / w for v in vector))
-        # Half a turn has no finite increment; it is cut at a very long one.
+        # Half a turn has an infinite increment; it is limited to a very long one.
         w = np.where(np.abs(w) < 1e-12, np.where(w < 0, -1e-12, 1e-12), w)
         return np.stack([2 * v / w for v in vector], axis=-1)
 

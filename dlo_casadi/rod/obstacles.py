@@ -1,8 +1,8 @@
 """Rigid obstacles without friction: planes, and capsules, of which spheres are a special case.
 
-Of a place X the distance g(X) from the surface, its gradient n (a unit normal, away from the
-obstacle) and its Hessian, which of a plane is zero and of a capsule (I - n n^T) / distance from the
-axis, without the axis's own direction where the nearest point of the axis is none of its ends.
+At a place X these give the distance g(X) from the surface, its gradient n (a unit normal, away from
+the obstacle) and its Hessian. The Hessian is zero for a plane. For a capsule it is (I - n n^T) /
+distance from the axis, without the axis's direction unless the nearest point is an end of the axis.
 """
 
 from collections.abc import Sequence
@@ -14,9 +14,9 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 
-# Least distance [m] from an axis at which a normal is known.
+# Smallest distance [m] from an axis at which a normal is defined.
 _ON_AXIS = 1e-12
-# Least share of gravity across the axis of a bar that a cable passes over or under.
+# Smallest share of gravity across the axis of a bar that a cable can pass over or under.
 _ACROSS = 0.1
 
 
@@ -36,7 +36,7 @@ class Surface(NamedTuple):
 class Plane:
     """A plane through `point` (d,) [m]; the cable is on the side of its unit `normal` (d,).
 
-    `touch`: whether the cable is meant to touch it, which a limit of its clearance leaves out.
+    `touch`: whether the cable is meant to touch it; a limit on clearance then ignores it.
     """
 
     point: tuple[float, ...]
@@ -45,7 +45,7 @@ class Plane:
     touch: bool = False
 
     def grown(self, offset: float) -> "Plane":
-        """The same with its surface farther outwards by an offset [m]."""
+        """The same plane with its surface moved outwards by an offset [m]."""
         point = np.array(self.point) + offset * np.array(self.normal)
         return replace(self, point=tuple(point.tolist()))
 
@@ -71,7 +71,7 @@ class Plane:
 class Capsule:
     """All places within `radius` [m] of the line from `a` to `b` (d,) [m]; a sphere where a = b.
 
-    In a plane it is a disc or a stadium. `touch` as of a plane.
+    In a plane it is a disc or a stadium. `touch` as for a plane.
     """
 
     a: tuple[float, ...]
@@ -81,7 +81,7 @@ class Capsule:
     touch: bool = False
 
     def grown(self, offset: float) -> "Capsule":
-        """The same with its surface farther outwards by an offset [m]."""
+        """The same capsule with its surface moved outwards by an offset [m]."""
         return replace(self, radius=self.radius + offset)
 
     def near(self, places: FloatArray) -> Surface:
@@ -110,7 +110,7 @@ class Capsule:
     def up(self, gravity: Sequence[float]) -> FloatArray | None:
         """Unit vector (d,) against gravity and across the axis.
 
-        None where nothing passes over or under it: without gravity, and in space of a sphere or of
+        None if nothing passes over or under it: without gravity; in space also for a sphere or for
         an axis along gravity.
         """
         up, axis = -np.array(gravity, dtype=float), np.subtract(self.b, self.a)
@@ -124,8 +124,8 @@ class Capsule:
     def passed(self, up: FloatArray, points: FloatArray) -> tuple[BoolArray, BoolArray]:
         """Whether lines (m, n, d) [m] pass over it, and whether under it.
 
-        A line passes over it that crosses the half-plane (in a plane: the half-line) which stands
-        on the axis an odd number of times, and the one that hangs from it an even number of times.
+        A line passes over it if it crosses the upper half-plane (in a plane: half-line), which
+        stands on the axis, an odd number of times, and the lower one an even number of times.
         """
         axis, middle = np.subtract(self.b, self.a), np.add(self.a, self.b) / 2
         across = np.array([up[1], -up[0]]) if len(up) == 2 else np.cross(axis, up)
@@ -166,12 +166,12 @@ def _across(normal: FloatArray, axis: FloatArray) -> FloatArray:
 def bars_of(
     obstacles: Sequence[Obstacle], gravity: Sequence[float]
 ) -> list[tuple[Capsule, FloatArray]]:
-    """Those of obstacles over or under which a cable passes, each with `Capsule.up`."""
+    """Obstacles over or under which a cable passes, each with `Capsule.up`."""
     capsules = [(one, one.up(gravity)) for one in obstacles if isinstance(one, Capsule)]
     return [(bar, up) for bar, up in capsules if up is not None]
 
 
 def surfaces_near(obstacles: Sequence[Obstacle], places: FloatArray) -> Surface:
-    """Surfaces near places (m, n, d) [m]: those of one obstacle after the other (m, n k)."""
+    """Surfaces near places (m, n, d) [m]: one obstacle after the other (m, n k)."""
     each = [obstacle.near(places) for obstacle in obstacles]
     return Surface(*(np.concatenate(part, axis=1) for part in zip(*each, strict=True)))
