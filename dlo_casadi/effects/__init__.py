@@ -72,16 +72,16 @@ EFFECTS: dict[str, type[Effect]] = {
     )
 }
 
-# The effect that estimates a mass that is not declared.
+# Effect that estimates the mass if it is not declared.
 UNKNOWN_MASS: type[Effect] = MassError
-# The effect whose parameter moves a clip along the cable, for derivatives by its arc length.
+# Effect whose parameter moves a clip along the cable, for derivatives by the clip's arc length.
 ALONG_CABLE = ClipSlip
 
 # Effects that may differ at random from pose to pose.
 _KINDS: list[type[Effect]] = [PinMoment, *EFFECTS.values()]
 RANDOM = {kind.name: kind for kind in _KINDS if kind.at_random}
 
-# Effects of every measurement that are estimated with the others, never declared or diagnosed.
+# Effects of every measurement, estimated together with the others, never declared or diagnosed.
 NUISANCES: dict[str, type[Effect]] = {kind.name: kind for kind in (EdgeBias, SensorBias)}
 
 

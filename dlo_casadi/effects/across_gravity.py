@@ -13,7 +13,7 @@ from dlo_casadi.rod.node import rotated, rotation
 
 @dataclass(frozen=True)
 class LoadAcrossGravity(Load):
-    """A load with a component for each direction across gravity: one in a plane, two in space.
+    """A load with one component per direction across gravity: one in a plane, two in space.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ class SideLoad(LoadAcrossGravity):
 
         V = - int (q . r(s)) ds,   q = sum_i force_per_length_i e_i     [J]
 
-    In a plane e is +x. In space e_x, e_y are the unit vectors across gravity that are nearest to
-    the world's axes x and y, if gravity is most along z; they are named alike where it is not.
+    In a plane e is +x. In space e_x, e_y are the unit vectors across gravity nearest to the world's
+    axes x and y, if gravity is mostly along z; otherwise they are named in the same way.
 
     Parameters
     ----------
@@ -81,8 +81,8 @@ class GravityTilt(LoadAcrossGravity):
 
         g' = R(angle) g
 
-    In space R is that of a rotation vector with two components: about the world's axes that
-    gravity is not most along.
+    In space R is the rotation of a vector with two components, about the two world axes that are
+    not the one nearest to gravity.
 
     Parameters
     ----------

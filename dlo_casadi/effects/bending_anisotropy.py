@@ -25,7 +25,7 @@ class BendingAnisotropy(SectionLaw):
         Stiffness about d_2 over that about d_1; vanishes at 1.
     angle : scalar [rad]
         From the axis y of the start clamp to d_1, about the cable's axis x. A diagnosis takes d_1
-        within an eighth of a turn from y: a quarter turn more is 1 / ratio.
+        within an eighth of a turn from y, since a quarter turn more is the same as 1 / ratio.
 
     References
     ----------
@@ -42,7 +42,7 @@ class BendingAnisotropy(SectionLaw):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where a clamp or a rest curvature determines the roll of the section."""
+        """True if a clamp or a rest curvature determines the roll of the section."""
         told = "clamped" in (setup.start, setup.end) or setup.curved
         return super().applies(setup) and told
 
@@ -70,7 +70,7 @@ class BendingAnisotropy(SectionLaw):
 class _LinearAnisotropy(SectionLaw):
     """The same law in parameters a, b in which it is linear: EI (1 + a, b; b, 1 - a).
 
-    EI is here the mean stiffness; its fit absorbs the change of the mean with the ratio.
+    EI is the mean stiffness here; the fit of EI absorbs the change of the mean with the ratio.
     """
 
     name = "linear_anisotropy"

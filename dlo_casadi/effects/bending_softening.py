@@ -25,8 +25,8 @@ class BendingSoftening(SectionLaw):
 
         W = f(|k|) k^T B k / 2,   M = dW/dk
 
-    so that the size of the bend softens the section, whatever its direction; torsion keeps its
-    stiffness. Estimated as `softness` = 1/c, which vanishes at 0.
+    so that the size of the bend softens the section, whatever its direction. Torsion keeps its
+    stiffness. The estimated parameter is `softness` = 1/c, which vanishes at 0.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from dlo_casadi.errors import DloError
 
 # Bounds of a bending stiffness [N m^2]: below that of a carbon fibre, above that of a steel bar.
 STIFFNESS_BOUNDS = (1e-12, 1e9)
-# Largest distance of a declared value from the nominal one, in `scale`, for an unbounded parameter.
+# Largest deviation of a declared value from the nominal one, in `scale`, if it is unbounded.
 _FARTHEST = 1e6
 
 
@@ -33,7 +33,7 @@ class CableData:
     straight : bool
         True if no rest curvature is fitted.
     torsional_stiffness : float [N m^2], optional
-        Crude prior of GJ; a cable that has one is in space, others stay in a plane.
+        Crude prior of GJ. A cable that has one is in space; others stay in a plane.
     """
 
     length: float
@@ -100,7 +100,7 @@ class Parameter:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Lowest and highest value that may be declared; finite even where a bound is not."""
+        """Lowest and highest value that may be declared; finite even if a bound is not."""
         away = _FARTHEST * self.scale
         return max(self.lower, self.nominal - away), min(self.upper, self.nominal + away)
 
@@ -113,7 +113,7 @@ class Parameter:
 
 
 def height_of(places: ArrayLike, gravity: ArrayLike) -> Any:
-    """Heights (...) [m] of places (..., d) along the vertical from the origin; 0 without one."""
+    """Heights (...) [m] of places (..., d) above the origin along the vertical; 0 without one."""
     size = float(np.linalg.norm(gravity))
     return -np.array(places) @ np.array(gravity) / size if size else 0.0 * np.array(places)[..., 0]
 
@@ -132,7 +132,7 @@ class Setup:
         Whether a rest curvature is fitted.
     n_poses : int
         Number of fitted poses. A change of the rest curvature, or of a force with the shape, is
-        visible only with two or more.
+        visible only in two or more poses.
     center : (float, float), optional [m]
         Middle of the photographs in the board frame; absent without photographs.
     pixel : float, optional [m]
@@ -140,7 +140,7 @@ class Setup:
     camera : bool
         Whether the place of the camera is known.
     readings : tuple of str
-        Which forces and moments on the fixtures were measured, of `ends.reaction_rows`.
+        Names of the measured forces and moments on the fixtures, see `ends.reaction_rows`.
     tolerances : mapping
         Standard deviations of declared values, by the names of `tolerances` in a configuration.
     directions : (float, float) [rad]
@@ -154,7 +154,7 @@ class Setup:
     level : float [m]
         Height of the first pose's start fixture, along the vertical from the origin.
     resting : float, optional [m]
-        Lowest height that several shapes have in common; absent where none do.
+        Lowest height that several shapes have in common; absent if there is none.
     """
 
     cable: CableData

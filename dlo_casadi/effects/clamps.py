@@ -13,7 +13,7 @@ from dlo_casadi.rod.node import quaternion_product, rotation
 
 @dataclass(frozen=True)
 class ClampEffect(BoundaryEffect):
-    """Something about the clamps that is the same in all poses.
+    """An effect of the clamps that is the same in all poses.
 
     Parameters
     ----------
@@ -31,16 +31,16 @@ class ClampEffect(BoundaryEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where an end is clamped."""
+        """True if an end is clamped."""
         return super().applies(setup) and "clamped" in (setup.start, setup.end)
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """With the errors of those ends that are clamped."""
+        """The effect with errors of the clamped ends."""
         return cls(start=setup.start == "clamped", end=setup.end == "clamped")
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
-        """Without a clamp it has no parameters."""
+        """Without a clamp the effect has no parameters."""
         if self.start or self.end:
             return super().refusal(setup, values)
         return (
@@ -49,7 +49,7 @@ class ClampEffect(BoundaryEffect):
         )
 
     def may_be(self, found: Fitted) -> bool:
-        """A local effect beside a clamp may be the clamp's."""
+        """A local effect next to a clamp may be caused by the clamp."""
         return any(found.near(side) for side in self.sides)
 
 
@@ -58,7 +58,7 @@ class ClampTurn(ClampEffect):
 
     at_random = "clamps turned by an angle of its own"
 
-    # Parameters of one clamp, behind the name of its end.
+    # Parameters of one clamp, appended to the name of its end.
     errors: ClassVar[tuple[str, ...]]
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
@@ -94,7 +94,7 @@ class ClampRotation(ClampTurn):
         R' = R exp(0, y, z)
 
     The rotation vector is about the clamp's own axes. Its part about x, along the cable, is
-    `end_roll`: rolls of the two clamps act by their difference alone.
+    `end_roll`, because only the difference between the rolls of both clamps matters.
 
     Parameters
     ----------
@@ -122,8 +122,8 @@ class ClampCompliance(ClampEffect):
 
         heading of the cable in the clamp = heading of the clamp + compliance * moment
 
-    In space by the rotation vector compliance * moment about the clamp's axes, its twist, too
-    (of second order: the increment is 2 tan(angle / 2) about the axis).
+    In space the rotation vector is compliance * moment about the clamp's axes, including twist (to
+    second order: the increment is 2 tan(angle / 2) about the axis).
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class ClampCompliance(ClampEffect):
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the compliances of the clamped ends."""
-        # A tenth of what the whole cable turns by under an even moment.
+        # A tenth of the angle by which a uniform moment turns the whole cable.
         scale = 0.1 * cable.length / cable.bending_stiffness
         return tuple(Parameter(side, "rad/(N m)", scale=scale, lower=0.0) for side in self.sides)
 

@@ -11,7 +11,7 @@ from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vec
 
 @dataclass(frozen=True)
 class _OfOneClip(BoundaryEffect):
-    """An effect of one clip, the same in all poses; `clip` is its number, 0 of the first."""
+    """An effect of one clip, the same in all poses; `clip` is its index, 0 for the first."""
 
     clip: int = 0
 
@@ -22,17 +22,17 @@ class _OfOneClip(BoundaryEffect):
 
     @classmethod
     def numbers(cls, setup: Setup) -> list[int]:
-        """Clips that may have it."""
+        """Indices of the clips that may have it."""
         return list(range(len(setup.clips)))
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where there is such a clip."""
+        """True if there is such a clip."""
         return super().applies(setup) and bool(cls.numbers(setup))
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """Of the first clip that may have it."""
+        """The effect of the first clip that may have it."""
         return cls(clip=next(iter(cls.numbers(setup)), 0))
 
     @classmethod

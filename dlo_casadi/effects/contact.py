@@ -16,8 +16,8 @@ class ObstacleOffset(ContactEffect):
 
         g' = g - offset
 
-    of the cable's distance g [m] from the declared surface. `obstacle` is its number, 0 of the
-    first.
+    for the cable's distance g [m] from the declared surface. `obstacle` is the obstacle's index, 0
+    for the first.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class ObstacleOffset(ContactEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where there are obstacles."""
+        """True if there are obstacles."""
         return super().applies(setup) and setup.obstacles > 0
 
     @classmethod
@@ -54,14 +54,14 @@ class ContactPlane(ContactEffect):
 
         g = (r - r_start) . up - height - diameter / 2 >= 0
 
-    of all places r of the cable, the same plane in all poses, without friction. There is no
-    derivative where nothing touches: a fit has to begin where something does.
+    for all places r of the cable. The plane is the same in all poses and has no friction. There is
+    no derivative where nothing touches, so a fit has to start where something does.
 
     Parameters
     ----------
     height : scalar [m]
-        Along the vertical, from the start fixture of the first pose; negative. Vanishes where
-        nothing touches.
+        Along the vertical, from the start fixture of the first pose; negative. The effect vanishes
+        where nothing touches.
     """
 
     name = "contact_plane"
@@ -75,21 +75,21 @@ class ContactPlane(ContactEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where there is a vertical."""
+        """True if there is a vertical."""
         return super().applies(setup) and any(setup.gravity)
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """With the start fixture where it is."""
+        """The effect with the height of the start fixture."""
         return cls(level=setup.level)
 
     @classmethod
     def each_for(cls, setup: Setup) -> tuple[Self, ...]:
-        """One where several shapes have the same lowest place."""
+        """One plane if several shapes have the same lowest height."""
         return () if setup.resting is None else (cls.made_for(setup),)
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Try the plane at the lowest place of several shapes."""
+        """Try the plane at the lowest height of several shapes."""
         height = (setup.resting or 0.0) - setup.cable.diameter / 2 - self.level
         return ({"height": min(height, 0.0)},)
 

@@ -1,9 +1,9 @@
 """The contract of an effect and its seven kinds.
 
-An effect declares parameters and is of one kind. It sees the curve, never the solver's coordinates;
-it creates no symbol, keeps no state and calls no solver. It also says where it applies, which
-values a diagnosis tries, and which other effects may stand for it. All of that has defaults: most
-effects declare only `name`, `parameters` and their law.
+An effect declares parameters and belongs to one kind. It sees the curve, never the solver's
+coordinates; it creates no symbol, keeps no state and calls no solver. It also states where it
+applies, which values a diagnosis tries, and which other effects may be mistaken for it. All of that
+has defaults: most effects declare only `name`, `parameters` and their law.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,12 +24,12 @@ from dlo_casadi.thresholds import NEAR_END
 Params = Mapping[str, ca.SX]
 Scan = dict[str, float]
 
-# Places at which point loads are tried, as shares of the length.
+# Trial places of point loads, as shares of the length.
 PLACES = np.linspace(0.06, 0.94, 23)
 
 
 def vector(params: Params, prefix: str) -> ca.SX:
-    """Vector (dimension,) of the parameters `prefix`x, `prefix`y and in space `prefix`z."""
+    """Vector (dimension,) of the parameters `prefix`x, `prefix`y and, in space, `prefix`z."""
     return ca.vertcat(*(params[prefix + axis] for axis in "xyz" if prefix + axis in params))
 
 
@@ -43,11 +43,11 @@ class PointForceAt:
 
 @dataclass(frozen=True)
 class SpringAt:
-    """A spring on the cable at the arc length `position` [m], whose place is y (dimension,) [m].
+    """A spring on the cable at the arc length `position` [m]; its place is y (dimension,) [m].
 
         V(y) = stiffness |y|^2 / 2 - force . y + constant               [J]
 
-    of the stiffness k [N/m] and the force (dimension,) [N] at y = 0: k times the anchor.
+    with the stiffness k [N/m] and the force (dimension,) [N] at y = 0, which is k times the anchor.
     """
 
     stiffness: ca.SX
@@ -66,7 +66,7 @@ class SpringAt:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where the camera of a pose stands: symbols of one pose.
+    """Position of the camera of a pose: symbols of one pose.
 
     Parameters
     ----------
@@ -90,24 +90,24 @@ class Effect:
     Parameters
     ----------
     label : str, optional
-        Prefix of the parameters' names; the effect's name unless a model has two of a kind.
+        Prefix of the parameters' names: the effect's name unless a model has two of that kind.
     """
 
     name: ClassVar[str]
     kind: ClassVar[str]
-    # Parameters with a declared tolerance -> the tolerance's name. Such an effect is a nuisance of
-    # every model that it applies to, unless larger values are needed.
+    # Parameters with a declared tolerance -> name of the tolerance. Such an effect is a nuisance in
+    # every model to which it applies, unless larger values are needed.
     tolerances: ClassVar[Mapping[str, str]] = {}
-    # Parameter -> name and unit of its inverse, for those that are better known by it.
+    # Parameter -> name and unit of its inverse, for parameters whose inverse is better known.
     inverses: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    # What each pose has of its own where the parameters differ from pose to pose; empty if they are
-    # never tried so.
+    # Words for what differs between poses if the parameters are random from pose to pose; empty if
+    # this is never tried.
     at_random: ClassVar[str] = ""
-    # Whether it is listed in tables of parameters while it is a nuisance.
+    # Whether tables of parameters list it while it is a nuisance.
     shown: ClassVar[bool] = True
     # Whether the effect applies in the plane (2), in space (3).
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
-    # Whether derivatives where the effect vanishes tell of it.
+    # Whether derivatives taken where the effect vanishes reveal it.
     gradual: ClassVar[bool] = True
 
     # Parameters that do not depend on the cable, see `parameters`.
@@ -126,26 +126,26 @@ class Effect:
         return self.declared
 
     def per_pose(self, cable: CableData) -> tuple[str, ...]:
-        """Names of its unknowns in each pose, out of `deviation_names`."""
+        """Names of its unknowns in each pose, taken from `deviation_names`."""
         return ()
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Whether the effect is possible in a setup, and visible in its measurements."""
+        """Whether the effect is possible in a setup and visible in its measurements."""
         return len(setup.gravity) in cls.dimensions
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """Return the effect with the options that suit a setup."""
+        """Return the effect with options that suit a setup."""
         return cls()
 
     @classmethod
     def each_for(cls, setup: Setup) -> tuple[Self, ...]:
-        """All that a setup may have beside each other, of different labels."""
+        """All such effects that a setup may have at once, with different labels."""
         return (cls.made_for(setup),)
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
-        """Why it cannot be declared with these values, and what to try; empty if it can."""
+        """Why it cannot be declared with these values, and what to try; empty if it can be."""
         count, where = len(setup.gravity), {2: "a plane", 3: "space"}
         if count in self.dimensions:
             return ""
@@ -172,14 +172,14 @@ class Effect:
         return None
 
     def may_be(self, found: "Fitted") -> bool:
-        """Whether another effect that was found may have the same cause, judged by the shapes."""
+        """Whether this effect may be the cause of another one that was found, judged by shapes."""
         return False
 
     def linear(self) -> "Effect":
         """Return the same effect, of the same label, in the parameters of its score test.
 
-        They differ where the derivative by a parameter is zero when the effect vanishes, although
-        the effect is linear in a combination of several parameters.
+        They differ if the derivative by a parameter is zero where the effect vanishes, although the
+        effect is linear in a combination of several parameters.
         """
         return self
 
@@ -193,8 +193,8 @@ class SectionLaw(Effect):
 
         W = along (of_bend k^T B k + GJ tau^2) / 2                      [N]
 
-    of the curvature k and the twist tau beyond those at rest. `along` changes both stiffnesses with
-    the arc length; `of_bend` changes the bending stiffness with the bend.
+    for the curvature k and the twist tau beyond those at rest. `along` changes both stiffnesses
+    with the arc length; `of_bend` changes the bending stiffness with the bend.
     """
 
     kind: ClassVar[str] = "section"
@@ -248,7 +248,7 @@ class Load(Effect):
     """Kind `load`: forces with a potential. Loads add; all share one gravity."""
 
     kind: ClassVar[str] = "load"
-    # Whether it is an added weight, beside the cable's own.
+    # Whether it is an added weight, in addition to the cable's own.
     carried: ClassVar[bool] = False
     # Number of `springs`.
     n_springs: ClassVar[int] = 0
@@ -259,7 +259,7 @@ class Load(Effect):
         return self.n_springs == 0
 
     def gravity(self, gravity: ca.SX, params: Params) -> ca.SX:
-        """Return the direction and size of gravity (dimension,) [m/s^2] that every weight feels."""
+        """Return gravity (dimension,) [m/s^2], in direction and size, as every weight feels it."""
         return gravity
 
     def resultant(
@@ -268,7 +268,7 @@ class Load(Effect):
         """Force (dimension,) [N] of a distributed load on the part of the cable beyond s [m].
 
         A dead load has the energy V = - int resultant . dr/ds ds, a sum over elements, plus a term
-        of the place of the start.
+        that depends on the start's place.
         """
         return 0.0
 
@@ -285,7 +285,7 @@ class PointLoad(Load):
     """A load at one place of the cable, its parameter `position` [m]."""
 
     def position(self, cable: CableData) -> Parameter:
-        """Arc length of the place from the start fixture."""
+        """Parameter `position`: arc length of the place from the start fixture."""
         length = cable.length
         return Parameter("position", "m", length / 2, 0.1 * length, 0.0, length)
 
@@ -294,11 +294,11 @@ class PointLoad(Load):
         return tuple({"position": float(share * setup.cable.length)} for share in PLACES)
 
     def place(self, values: Mapping[str, float]) -> float:
-        """Its place."""
+        """Arc length of its place [m]."""
         return values["position"]
 
     def force(self, place: ca.SX, gravity: ca.SX, params: Params) -> ca.SX:
-        """Force (dimension,) [N] on the cable when its place is at `place` (dimension,) [m]."""
+        """Force (dimension,) [N] on the cable if its place is at `place` (dimension,) [m]."""
         dead = (item.force for item in self.forces(gravity, params))
         elastic = (spring.on_cable(place) for spring in self.springs(params))
         return sum((*dead, *elastic), start=ca.SX.zeros(place.numel()))
@@ -314,7 +314,7 @@ class BoundaryEffect(Effect):
         return ends
 
     def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX | float:
-        """Energy stored in the holders [J], by the cable's first and last node. Energies add."""
+        """Energy stored in the holders [J], given the cable's first and last node. Energies add."""
         return 0.0
 
     def compliance(self, params: Params) -> tuple[ca.SX | float, ca.SX | float]:
@@ -324,24 +324,24 @@ class BoundaryEffect(Effect):
 
 @dataclass(frozen=True)
 class ContactEffect(Effect):
-    """Kind `contact`: where an obstacle is. Its one parameter is how far it is outwards [m].
+    """Kind `contact`: where an obstacle is. Its one parameter is its shift outwards [m].
 
     Parameters
     ----------
     obstacle : int
-        Its number, 0 of the first, among those declared or, with a `surface`, among the effects'.
+        Its index, 0 for the first, among declared obstacles or, with a `surface`, among effects'.
     """
 
     kind: ClassVar[str] = "contact"
     obstacle: int = 0
 
     def surface(self, gravity: tuple[float, ...]) -> Obstacle | None:
-        """The effect's own obstacle, at the parameter's zero; None of one that is declared."""
+        """The effect's own obstacle with the parameter at zero; None if it is a declared one."""
         return None
 
 
 class MeasurementEffect(Effect):
-    """Kind `measurement`: from true points of the cable, and true forces, to measured ones."""
+    """Kind `measurement`: from true points of the cable and true forces to measured ones."""
 
     kind: ClassVar[str] = "measurement"
 
@@ -350,14 +350,13 @@ class MeasurementEffect(Effect):
 
         Parameters
         ----------
-        frame : (coordinates,)
-            State of a node at that point: in a plane its heading [rad]. Only in a plane are maps
-            that depend on it differentiated along the cable.
+        State of a node at that point: in a plane its heading [rad]. Maps that depend on it are
+        differentiated along the cable in a plane only.
         """
         return point
 
     def feel(self, reactions: Mapping[str, ca.SX], params: Params) -> dict[str, ca.SX]:
-        """Measured from true forces and moments on the fixtures, by `ends.reaction_rows`."""
+        """Measured forces and moments on the fixtures, given true ones, by `ends.reaction_rows`."""
         return dict(reactions)
 
 
@@ -367,7 +366,7 @@ class StateEffect(Effect):
     kind: ClassVar[str] = "state"
 
     def next_rest(self, rest: ca.SX, strain: ca.SX, cable: CableData, params: Params) -> ca.SX:
-        """Rest strain [1/m] of a cell after a pose of this strain has been held.
+        """Rest strain [1/m] of a cell after a pose with this strain has been held.
 
         The curvature in a plane; in space the twist, then curvatures about the axes y and z.
         """
@@ -375,7 +374,7 @@ class StateEffect(Effect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where there is a rest curvature, and more than one pose."""
+        """True if there is a rest curvature and more than one pose."""
         return super().applies(setup) and setup.n_poses > 1 and setup.curved
 
 

@@ -29,7 +29,7 @@ class EndOffset(BoundaryEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where the end is held."""
+        """True if the end is held."""
         return super().applies(setup) and setup.end != "free"
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:

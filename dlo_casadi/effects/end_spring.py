@@ -8,7 +8,7 @@ import casadi as ca
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import BoundaryEffect, Fitted, Params, Scan
 
-# Trial headings of the relaxed spring, relative to the mean heading of the cable there [rad].
+# Trial headings of the relaxed spring, relative to the cable's mean heading there [rad].
 HEADINGS = (-1.2, -0.6, 0.0, 0.6, 1.2)
 
 
@@ -39,16 +39,16 @@ class _PinSpring(BoundaryEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where that end is a pin."""
+        """True if that end is a pin."""
         return super().applies(setup) and getattr(setup, cls.side) == "pinned"
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Try headings about the cable's mean one at that end."""
+        """Try headings around the cable's mean heading at that end."""
         mean = setup.directions[self.side == "end"]
         return tuple({"heading": mean + turn} for turn in HEADINGS)
 
     def may_be(self, found: Fitted) -> bool:
-        """A local effect beside the pin may be caused by the pin."""
+        """A local effect next to the pin may be caused by the pin."""
         return found.near(self.side)
 
     def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
@@ -77,7 +77,7 @@ class PinMoment(BoundaryEffect):
 
         V = -start phi(0) - end phi(L)                                [J]
 
-    They differ from pose to pose: nobody declares them.
+    They differ from pose to pose, so they cannot be declared.
 
     Parameters
     ----------
@@ -92,12 +92,12 @@ class PinMoment(BoundaryEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where an end is a pin."""
+        """True if an end is a pin."""
         return super().applies(setup) and "pinned" in (setup.start, setup.end)
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """With the moments at those ends that are pins."""
+        """The effect with moments at the pinned ends."""
         ends = {"start": setup.start, "end": setup.end}
         return cls(sides=tuple(side for side, held in ends.items() if held == "pinned"))
 

@@ -41,12 +41,12 @@ class ImageDistortion(MeasurementEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where there are photographs."""
+        """True if there are photographs."""
         return super().applies(setup) and setup.center is not None
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
-        """About the middle of the photographs."""
+        """The effect with the middle of the photographs as centre."""
         return cls(center=setup.center or (0.0, 0.0))
 
     def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:

@@ -38,7 +38,7 @@ class AxialStretch(Kinematics):
 
         V = int N^2 / (2 EA) ds                                         [J]
 
-    Estimated as `compliance` = 1/EA, which vanishes at 0, where the cable is inextensible.
+    The parameter is `compliance` = 1/EA; it vanishes at 0, where the cable is inextensible.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ class LumpedMass(PointLoad):
 
         V = -m g . r(s)                                               [J]
 
-    Its own size and moment of inertia are neglected: good while it is shorter than L / 10.
+    Its size and moment of inertia are neglected, which is accurate if it is shorter than L / 10.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class LumpedMass(PointLoad):
         return (PointForceAt(params["mass"] * gravity, params["position"]),)
 
     def may_be(self, found: Fitted) -> bool:
-        """A dead force is a weight if it is along gravity, within two standard deviations."""
+        """A dead force may be a weight if it is along gravity, within two standard deviations."""
         effect, gravity = found.effect, np.array(found.setup.gravity)
         if not isinstance(effect, PointLoad) or not effect.dead:
             return False

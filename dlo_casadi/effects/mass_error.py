@@ -14,8 +14,8 @@ class MassError(Load):
 
         true mass = factor mass
 
-    Without other loads shapes depend on the ratio of mass and bending stiffness alone: it takes a
-    measured force to tell them apart.
+    Without other loads, shapes depend only on the ratio of mass to bending stiffness: a measured
+    force is needed to separate the two.
 
     Parameters
     ----------
@@ -28,9 +28,9 @@ class MassError(Load):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where forces are measured, and the cable has weight."""
+        """True if forces are measured and the cable has weight."""
         return super().applies(setup) and bool(setup.readings) and any(setup.gravity)
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: CableData, params: Params) -> ca.SX:
-        """Weight of the part beyond s, over the declared one."""
+        """Weight of the part beyond s, in addition to the declared one."""
         return (params["factor"] - 1) * cable.mass * gravity * (1 - s / cable.length)

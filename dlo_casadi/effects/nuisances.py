@@ -19,16 +19,16 @@ class SensorBias(MeasurementEffect):
 
         measured = true + bias
 
-    in world axes, the same in all poses: a nuisance of all wrench measurements, with the prior
-    tolerances.force_bias and moment_bias, and never a finding of a diagnosis.
+    in world axes, the same in all poses. It is a nuisance of all wrench measurements, with the
+    prior tolerances.force_bias and moment_bias, and never a finding of a diagnosis.
 
     Parameters
     ----------
     start_force, start_moment, end_force, end_moment : bool
-        Which of them are measured. Each has its components in world axes, start_force_x [N] and so
-        on; a moment in a plane is one number [N m]. They vanish at 0.
+        Which of them are measured. Each has components in world axes, start_force_x [N] and so on;
+        a moment in a plane is one number [N m]. They vanish at 0.
     clips : tuple of int
-        Clips on which the force is measured, 1 of the first one: clip_1_force_x [N] and so on.
+        Clips on which the force is measured, 1 for the first: clip_1_force_x [N] and so on.
     """
 
     name = "sensor_bias"
@@ -60,7 +60,7 @@ class SensorBias(MeasurementEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where forces or moments are measured."""
+        """True if forces or moments are measured."""
         return super().applies(setup) and bool(setup.readings)
 
     @classmethod
@@ -86,11 +86,11 @@ class SensorBias(MeasurementEffect):
         }
 
 
-# Harmonics of the cable's direction: light from one side shifts all of its picture, which is the
-# first; the grid of pixels has the fourth. Of the three rendered sessions of photographs, without
-# any all have a wrong EI (1 to 2 %, outside of its interval) and one an effect that is not there;
-# with one, or up to the third, two of them are `unexplained`; with four all are as they should be,
-# and six are no closer.
+# Harmonics of the cable's direction: light from one side shifts the whole picture, which is the
+# first; the grid of pixels has the fourth. Evidence from three rendered sessions of photographs:
+# without any harmonic, all have a wrong EI (1 to 2 %, outside its interval) and one an effect that
+# does not exist. With one, or up to the third, two of them are `unexplained`. With four all are
+# correct, and six are no more accurate.
 HARMONICS = range(1, 5)
 # Standard deviation of each harmonic, in pixels.
 PIXELS = 0.05
@@ -101,9 +101,9 @@ class EdgeBias(MeasurementEffect):
 
         measured = true + N(phi) sum_k (a_k cos k phi + b_k sin k phi)
 
-    with the normal N to the left of the cable's direction phi. Light from one side, the grid of
-    pixels and the sharpening of a camera do that. It is a nuisance of every photograph, the same
-    in all of them, and never blamed for a residual.
+    with the normal N to the left of the cable's direction phi. Causes are light from one side, the
+    grid of pixels and the sharpening of a camera. It is a nuisance of every photograph, the same in
+    all of them, and never a finding.
 
     Parameters
     ----------
@@ -118,11 +118,11 @@ class EdgeBias(MeasurementEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where there are photographs."""
+        """True if there are photographs."""
         return super().applies(setup) and setup.pixel is not None
 
     def prior(self, setup: Setup) -> dict[str, float]:
-        """A share of a pixel for each coefficient; none without pixels."""
+        """A share of a pixel for each coefficient; no prior without pixels."""
         std = PIXELS * (setup.pixel or 0.0)
         return {q.name: std for q in self.parameters(setup.cable)} if std else {}
 

@@ -37,8 +37,8 @@ class UnknownPull(PointLoad):
 
         V_j = - (f + f_j) . r(s)                                      [J]
 
-    It assumes no cause: where no effect explains the residual, it gives the place and the size of
-    an unknown force. The forces are unknowns of the poses, not parameters of the cable: they
+    It assumes no cause: if no effect explains the residual, it gives the place and size of an
+    unknown force. The forces are unknowns of the poses, not parameters of the cable, so they
     predict nothing.
 
     Parameters
@@ -56,7 +56,7 @@ class UnknownPull(PointLoad):
         return (*Parameter.symmetric(names, "N", scale, 10 * scale), self.position(cable))
 
     def per_pose(self, cable: CableData) -> tuple[str, ...]:
-        """f_j."""
+        """Deviation f_j of the pose's force from the mean."""
         return tuple(f"unknown_force_{axis}" for axis in cable.axes)
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:

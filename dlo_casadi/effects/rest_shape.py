@@ -5,8 +5,8 @@ import casadi as ca
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import Params, Scan, StateEffect
 
-# A kink max(x, 0) is rounded to (x + sqrt(x^2 + d^2)) / 2 with d this share of one turn per length:
-# off by d / 2 at the kink, by d^2 / (4 |x|) away from it.
+# A kink max(x, 0) is rounded to (x + sqrt(x^2 + d^2)) / 2, where d is this share of one turn per
+# length. The error is d / 2 at the kink and d^2 / (4 |x|) away from it.
 _ROUNDING = 0.01
 # Trial yield curvatures, as shares of the largest bend.
 YIELDS = (0.15, 0.3, 0.45, 0.6, 0.75)
@@ -17,7 +17,7 @@ class RestCurvatureDrift(StateEffect):
 
         kappa_0 <- kappa_0 + rate (kappa - kappa_0)
 
-    In space so has the rest twist.
+    In space the rest twist moves in the same way.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class PlasticSet(StateEffect):
         b = kappa - kappa_0
         kappa_0 <- kappa_0 + share max(|b| - y, 0) b / |b|
 
-    with the size |b| of the bend; in space it is a vector, and twist leaves nothing behind. At
+    with the size |b| of the bend. In space b is a vector, and twist leaves nothing behind. With
     y = 0 it is a drift of the rest curvature. The kink is rounded over a hundredth of a turn per
     length, smoothly and oddly in b.
 
@@ -74,8 +74,8 @@ class PlasticSet(StateEffect):
     def next_rest(self, rest: ca.SX, strain: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Rest strain after the pose [1/m].
 
-        With the kinks rounded, (ramp(|b| - y) - ramp(-|b| - y)) / |b| is 1 - 2 y / (S_- + S_+),
-        S = sqrt((|b| -+ y)^2 + d^2): written in |b|^2, which is smooth at 0.
+        With rounded kinks, (ramp(|b| - y) - ramp(-|b| - y)) / |b| is 1 - 2 y / (S_- + S_+) with
+        S = sqrt((|b| -+ y)^2 + d^2). This is written in |b|^2, which is smooth at 0.
         """
         bend, limit = strain - rest, params["yield_curvature"]
         if bend.numel() > 1:

@@ -11,15 +11,15 @@ from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 class StandoffError(MeasurementEffect):
     """The cable's axis lies nearer to the camera than declared, or farther.
 
-    The camera sees a point P of the cable, d in front of the declared plane, along the ray from
-    its centre C, z in front of that plane, and takes it for where the ray meets the plane:
+    Let a point P of the cable be d in front of the declared plane, and the camera's centre C be z
+    in front of it. The camera takes P for the place where the ray from C through P meets the plane:
 
         measured = C + (P - C) z / (z - d) = P + (P - C) d / (z - d)
 
-    With one camera that does not move this is `image_scale` about C instead of the start fixture,
-    by the factor z / (z - d): the two differ by a shift of (factor - 1) (start - C) alone. A camera
-    that looks straight down on the start fixture cannot tell them apart, and one beside it only as
-    well as the fixtures are known; photographs from several places can.
+    With one fixed camera this is `image_scale` about C instead of the start fixture, by the factor
+    z / (z - d): the two differ only by a shift of (factor - 1) (start - C). A camera straight above
+    the start fixture cannot distinguish them; one beside it can only as well as the fixtures are
+    known; photographs from several places can.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class StandoffError(MeasurementEffect):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """Where the place of the camera is known."""
+        """True if the position of the camera is known."""
         return super().applies(setup) and setup.camera
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:

@@ -36,9 +36,9 @@ class StiffSection(SectionLaw):
 
         EI(s) = EI factor     for start <= s <= end,   EI elsewhere; in space GJ(s) alike
 
-    A cell that the section covers by the share c has the compliance (1 - c + c / factor) / EI:
-    the moment is continuous, so compliances are averaged, not stiffnesses. The edges of c are
-    rounded over a quarter of a cell, which keeps it smooth in start and end.
+    A cell of which the section covers the share c has the compliance (1 - c + c / factor) / EI: the
+    moment is continuous, so compliances are averaged, not stiffnesses. The edges of c are rounded
+    over a quarter of a cell, so that it is smooth in start and end.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class StiffSection(SectionLaw):
         )
 
     def place(self, values: Mapping[str, float]) -> float:
-        """Its middle."""
+        """Arc length of its middle [m]."""
         return (values["start"] + values["end"]) / 2
 
     def along(self, cell: Cell, cable: CableData, params: Params) -> ca.SX:

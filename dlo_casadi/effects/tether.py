@@ -9,7 +9,7 @@ from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import Effect, Params, PointLoad, SpringAt, vector
 
 # Largest distance of an anchor from the board's origin, in lengths of the cable: its force then
-# changes by a tenth in direction and size where the cable moves by its own length.
+# changes by a tenth in direction and size if the cable moves by its own length.
 FARTHEST = 10.0
 
 
@@ -18,7 +18,7 @@ class Tether(PointLoad):
 
         V = k |r(s) - a|^2 / 2                                        [J]
 
-    No dead load: its force k (a - r(s)) depends on the shape.
+    It is no dead load: its force k (a - r(s)) depends on the shape.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Tether(PointLoad):
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
-        """In one pose it is a point force."""
+        """True with several poses; in a single pose it is a point force."""
         return super().applies(setup) and setup.n_poses > 1
 
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
@@ -55,7 +55,7 @@ class Tether(PointLoad):
         return _LinearTether(label=self.label)
 
     def of_linear(self, cable: CableData, values: Mapping[str, float]) -> dict[str, float]:
-        """Stiffness, place and anchor a = f / k; k is raised where a would lie too far away."""
+        """Stiffness, place and anchor a = f / k; k is increased if a would lie too far away."""
         force = {axis: values[f"f{axis}"] for axis in cable.axes}
         least = math.hypot(*force.values()) / (FARTHEST * cable.length)
         stiffness = max(values["stiffness"], least)
@@ -66,8 +66,8 @@ class Tether(PointLoad):
 class _LinearTether(PointLoad):
     """The same spring in parameters in which its energy is linear: V = k |r(s)|^2 / 2 - f . r(s).
 
-    With f = k a it differs from the tether's energy by a constant; at k = 0, where the anchor has
-    no effect, f is a dead force.
+    With f = k a it differs from the tether's energy by a constant. At k = 0 the anchor has no
+    effect, and f is a dead force.
     """
 
     name = "linear_tether"

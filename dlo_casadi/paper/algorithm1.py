@@ -3,9 +3,9 @@
     repeat   theta_j = argmin V(theta, alpha) + beta r_p(theta)   for every pose j   (Eq. 13)
              alpha = argmin |q - q_hat(alpha)|^2                                     (Eq. 15)
 
-with alpha = [k_theta, theta_0] and the chain of straight links. Corrected against the printed
-text: the loop runs while alpha changes by more than the tolerance; theta_1 is a heading and has
-no bound; every pose starts from the arc through its ends. Kept: Eq. 9 measures each node from its
+with alpha = [k_theta, theta_0] and the chain of straight links. Corrections to the printed text:
+the loop runs while alpha changes by more than the tolerance; theta_1 is a heading and has no bound;
+every pose starts from the arc through its ends. Kept as printed: Eq. 9 measures each node from its
 nearest point, and the balance of Eq. 14 neglects the reaction of the held end. The latter makes
 k_theta diverge on many data; the result then says so.
 
@@ -37,24 +37,24 @@ from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
-# Successive iterations without a change of alpha at convergence, the paper asks for several; and
-# the largest change of ln(k_theta) and of theta_0 [rad] that counts as none.
+# Number of successive iterations without a change of alpha at convergence (the paper asks for
+# several); largest change of ln(k_theta) and of theta_0 [rad] that counts as none.
 UNCHANGED, TOLERANCE = 3, 1e-4
-# Factor from its prior, up or down, beyond which k_theta has diverged.
+# Factor from its prior, up or down, above which k_theta has diverged.
 RUNAWAY = 1e3
-# It has also diverged after this number of successive changes in one direction, by more than the
-# factor GROWTH in all, the last one of ln(k_theta) larger than LAST_STEP.
+# k_theta has also diverged after this number of successive changes in one direction, if they exceed
+# the factor GROWTH in total and the last one of ln(k_theta) exceeds LAST_STEP.
 STEADY, GROWTH, LAST_STEP = 12, 3.0, 0.01
-# Maximum number of iterations, four times STEADY. On rendered sessions the loop converges after 5
-# iterations or diverges after 1; slow divergence is detected after STEADY.
+# Maximum number of iterations, four times STEADY. On rendered sessions the loop either converges
+# after 5 iterations or diverges after 1; slow divergence is detected after STEADY.
 ITERATIONS = 50
-# Weight of the distances: beta = WEIGHT n [J/m^2]. The paper's c, chosen there by hand.
+# Weight of the distances: beta = WEIGHT n [J/m^2]. It is the paper's c, chosen there by hand.
 WEIGHT = 1e4
-# Maximum number of times that the nearest points are chosen; they are fixed while IPOPT runs.
+# Maximum number of updates of the nearest points, which are fixed during an IPOPT run.
 ASSIGNMENTS = 20
 # Maximum number of IPOPT iterations, ten times the 18 that Eq. 13 takes on the same sessions.
 IPOPT_ITERATIONS = 200
-# COBYLA: first change of a joint angle [rad], last one, and number of evaluations.
+# COBYLA: first and last change of a joint angle [rad], and maximum number of evaluations.
 COBYLA_STEP, COBYLA_TOLERANCE, COBYLA_EVALUATIONS = 0.1, 1e-6, 4000
 
 
@@ -132,7 +132,7 @@ class Target:
     def nearest(self, nodes: FloatArray) -> tuple[IntArray, BoolArray]:
         """Index of the nearest point of each node, and whether the node is in view.
 
-        A node whose nearest point lies beside a gap is in the gap and is left out of r_p.
+        A node whose nearest point is beside a gap lies in the gap and is left out of r_p.
         """
         square = ((nodes[:, None, :] - self.points[None]) ** 2).sum(axis=-1)
         index = square.argmin(axis=1)
@@ -208,7 +208,7 @@ class InnerProblem:
     def solve_ipopt(
         self, phi: FloatArray, target: Target, k_theta: float, theta_0: FloatArray
     ) -> tuple[FloatArray, bool]:
-        """Minimise by IPOPT in absolute headings; nearest points are chosen again after each run.
+        """Minimise by IPOPT in absolute headings; nearest points are updated after each run.
 
         Returns headings (n,) [rad], and whether IPOPT converged.
         """
@@ -259,7 +259,7 @@ class InnerProblem:
 
 
 def applies(model: CableModel) -> bool:
-    """Whether the paper's method applies to the cable: in a plane, pinned at both ends alone."""
+    """Whether the paper's method applies: a cable in a plane, pinned at both ends, nothing else."""
     return model.node is Heading and model.start == model.end == "pinned" and not model.clips
 
 
@@ -340,7 +340,7 @@ def run_algorithm1(
     Parameters
     ----------
     cable : CableData
-        Its `bending_stiffness` is where k_theta starts; theta_0 starts at zero.
+        Its `bending_stiffness` gives the start of k_theta; theta_0 starts at zero.
     poses : sequence of MeasuredPose
         Those held out, unreadable or out of reach are not used.
     gravity : (float, float) [m/s^2]
@@ -352,7 +352,7 @@ def run_algorithm1(
     Returns
     -------
     Algorithm1Result
-        Of the last iteration, also where k_theta has diverged: see its `status`.
+        Result of the last iteration, even if k_theta has diverged: see its `status`.
 
     Raises
     ------
@@ -416,7 +416,7 @@ def _usable(
 
 
 def _runs_away(history: list[float]) -> bool:
-    """Whether k_theta is far from its prior, or moves away from it steadily."""
+    """Whether k_theta is far from its prior or steadily moves away from it."""
     if abs(np.log(history[-1] / history[0])) > np.log(RUNAWAY):
         return True
     steps = np.diff(np.log(history[-STEADY - 1 :]))

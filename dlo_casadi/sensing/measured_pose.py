@@ -29,9 +29,9 @@ class MeasuredPose:
     held_out : bool
         Whether the pose is kept for the final test.
     line : Centerline or Markers, optional
-        Measured points of the cable from which distances are reported, if they differ from those
-        of the sensors: the common line of photographs, without points if there is none; or all
-        points where the sensors have means of them.
+        Measured points of the cable used to report distances, if they are not those of the
+        sensors: the common line of photographs, without points if there is none; or all points if
+        the sensors have means of them.
     """
 
     pose: HeldPose
@@ -57,9 +57,9 @@ class MeasuredPose:
         return cls(pose, (line_or_markers(points, weight, s),), held_out)
 
     def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
-        """The same pose with wrench measurements by names of `ends.reaction_rows`.
+        """The same pose with wrench measurements, named as in `ends.reaction_rows`.
 
-        An unreadable pose stays so.
+        An unreadable pose is returned unchanged.
         """
         if not readings or not self.readable:
             return self
@@ -70,7 +70,7 @@ class MeasuredPose:
 
     @property
     def readable(self) -> bool:
-        """Whether there is anything to compare with."""
+        """Whether the pose has any measurements."""
         return len(self.sensors) > 0
 
     @property
@@ -80,7 +80,7 @@ class MeasuredPose:
 
     @cached_property
     def traced(self) -> "MeasuredPose":
-        """The same pose with its line alone, or approximate places of its points without one."""
+        """The same pose with its line alone; without a line, with approximate places of points."""
         if self.line is None:
             return self
         line = self.line if self.has_line else line_or_markers(self.points)
@@ -99,7 +99,7 @@ class MeasuredPose:
 
     @property
     def relative_white(self) -> FloatArray:
-        """Relative standard deviations of white errors, smaller for means of points."""
+        """Relative standard deviations of white errors; they are smaller for means of points."""
         return np.concatenate([sensor.weight / np.sqrt(sensor.count) for sensor in self.sensors])
 
     @property
@@ -120,12 +120,12 @@ class MeasuredPose:
 
     @property
     def on_points(self) -> BoolArray:
-        """Which residuals (R,) are of points; the others are of wrenches."""
+        """Whether each residual (R,) belongs to a point; the others belong to wrenches."""
         return np.asarray(self.kinds == "point")
 
     @property
     def reactions(self) -> tuple[str, ...]:
-        """Which forces and moments on the fixtures were measured, of `ends.reaction_rows`."""
+        """Names of the measured forces and moments on the fixtures, see `ends.reaction_rows`."""
         return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.measured)
 
     def readings_beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
@@ -155,7 +155,7 @@ class MeasuredPose:
     def slow_rows(self, modes: FloatArray) -> FloatArray:
         """Residuals (R, c) of displacement modes (K, count), in each direction of the residuals.
 
-        Added to them are the errors that the residuals of a sensor share, and one mode for each
+        Further columns are the errors shared by the residuals of a sensor, and one mode for each
         residual that belongs to no point.
         """
         blocks = []
@@ -167,7 +167,7 @@ class MeasuredPose:
         return blocks[0] if len(blocks) == 1 else np.asarray(block_diag(*blocks))
 
     def _each(self, *per_point: FloatArray) -> Iterator[tuple[Any, ...]]:
-        """Each sensor with its part of arrays over the points (K, ...)."""
+        """Each sensor with its part of arrays over all points (K, ...)."""
         ends = np.cumsum([len(x.points) for x in self.sensors])[:-1]
         return zip(self.sensors, *(np.split(values, ends) for values in per_point), strict=True)
 
@@ -208,7 +208,7 @@ class MeasuredPose:
     def distances(self, curve: NodeCurve) -> FloatArray:
         """Distance [m] of each point of the line from its place on a curve.
 
-        For photographs without a common line: of each pixel, across its line of sight.
+        For photographs without a common line: distance of each pixel, across its line of sight.
         """
         if not self.has_line:
             return self.misses(curve)
@@ -228,7 +228,7 @@ class MeasuredPose:
         return np.sqrt(np.bincount(self.point_of, np.concatenate(rows) ** 2))
 
     def misread(self, seen: Observed, noise: NoiseModel) -> FloatArray:
-        """Errors of the wrenches, in metres by `NoiseModel.units`; empty without any."""
+        """Errors of the wrenches, converted to metres by `NoiseModel.units`; empty if none."""
         rows = [x.residual(seen, np.zeros(0)) for x in self.sensors if not len(x.points)]
         kinds = self.kinds[~self.on_points]
         return np.concatenate([np.zeros(0), *rows]) * noise.units(kinds)

@@ -3,9 +3,9 @@
     cov(d_i, d_k) = std^2 w_i w_k [ (1 - share) delta_ik / c_i + share k(|s_i - s_k| / l) ]
 
 for one component d of the errors at arc lengths s with relative weights w. A point may be the mean
-of c measured neighbours, whose white errors average out. Whether the correlated part is rough
-(exponential), once differentiable (Matern 3/2) or smooth (squared exponential) is chosen by
-likelihood.
+of c measured neighbours, whose white errors average out. The likelihood decides whether the
+correlated part is rough (exponential), once differentiable (Matern 3/2) or smooth (squared
+exponential).
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from dlo_casadi.arrays import FloatArray
 Kernel = Literal["exponential", "matern", "gaussian"]
 Count = FloatArray | float
 Source = Literal["declared", "repeats", "estimated", "misfit"]
-# Number of slow sines per pose: displacements that a missing effect may cause.
+# Number of slow sines per pose, the displacements that a missing effect may cause.
 SLOW_MODES = 6
 
 
@@ -47,7 +47,7 @@ def correlation_slope(kernel: Kernel, ratio: FloatArray) -> FloatArray:
 class ReadingNoise:
     """Standard deviations of one component of a measured force [N] and of a moment [N m].
 
-    `force_known`, `moment_known`: whether they were declared; otherwise they are estimated.
+    `force_known`, `moment_known`: whether they are declared; otherwise they are estimated.
     """
 
     force: float
@@ -58,7 +58,7 @@ class ReadingNoise:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Covariance of one component of the errors of one pose's points, and of readings.
+    """Covariance of one component of the errors of a pose's points, and of wrench measurements.
 
     Parameters
     ----------
@@ -70,15 +70,15 @@ class NoiseModel:
         Correlation length.
     kernel : "exponential", "matern" or "gaussian"
     source : "declared", "repeats", "estimated" or "misfit"
-        Origin: declared, the difference of repeated poses, or estimated from the residual. With
-        "misfit" it is no noise but the error of a model that lacks an effect, and weighs the
-        points in a fit of it.
+        Origin: declared, difference between repeated poses, or estimated from the residual. With
+        "misfit" it is not noise but the error of a model that lacks an effect, used to weigh the
+        points in a fit of that model.
     slow_dof : float
         Degrees of freedom of the chi-square distribution of the slow modes' estimated variance.
     readings : ReadingNoise, optional
-        Of forces and moments on the fixtures, where there are any.
+        Noise of forces and moments on the fixtures, if these are measured.
     before : NoiseModel, optional
-        Of a misfit: the noise itself.
+        For a misfit: the noise itself.
     """
 
     std: float
@@ -92,12 +92,12 @@ class NoiseModel:
 
     @property
     def of_points(self) -> Self:
-        """The known noise where this is a misfit, otherwise this noise itself."""
+        """The known noise if this is a misfit, otherwise this noise."""
         return self.before if self.before is not None and self.before.known else self
 
     @property
     def beside_repeats(self) -> float:
-        """Standard deviation of points [m] beside the scatter of repeats; 0 if that includes it."""
+        """Std of points [m] in addition to the scatter of repeats; 0 if that includes it."""
         return 0.0 if self.source == "repeats" else self.std
 
     @property
@@ -107,7 +107,7 @@ class NoiseModel:
 
     @property
     def known(self) -> bool:
-        """Whether it is independent of the model that is fitted."""
+        """Whether the noise does not depend on the model that is fitted."""
         return self.source != "estimated"
 
     def covariance(
@@ -122,8 +122,8 @@ class NoiseModel:
     ) -> FloatArray:
         """Covariance (K, K), over std^2, of points at distances (K, K) [m] along the cable.
 
-        Each is the mean of `count` measured ones. Over `correlation_length` [m] they share the
-        errors that are white otherwise, by a Gaussian.
+        Each point is the mean of `count` measured ones. Errors that are otherwise white are
+        correlated over `correlation_length` [m], by a Gaussian.
         """
         if self.share > 0:
             unit = self.share * correlation(self.kernel, distance / self.length)
@@ -151,13 +151,13 @@ class NoiseModel:
     def units(self, kinds: NDArray[np.str_]) -> FloatArray:
         """Metres (R,) per unit of each residual, such that its std becomes that of a point.
 
-        One of points, m/N of forces, 1/N of moments.
+        One for points, m/N for forces, 1/N for moments.
         """
         own = {"point": self.std, "force": self.readings.force, "moment": self.readings.moment}
         return self.std / np.array([own[kind] for kind in kinds])
 
     def doubted(self, std: float) -> "NoiseModel":
-        """White noise of this size [m] if it is larger, with that of wrenches scaled alike."""
+        """White noise of this size [m] if it is larger; noise of wrenches is scaled alike."""
         factor, own = std / self.std, self.readings
         if factor <= 1:
             return self

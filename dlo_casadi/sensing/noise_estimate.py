@@ -15,22 +15,22 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.sensing.noise import SLOW_MODES, Count, Kernel, NoiseModel, smooth_modes
 
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
-# Singular value, relative to the largest, below which directions are dependent: the square root of
-# the rounding error of their products, 1e-8, and two digits.
+# Singular value, relative to the largest, below which directions count as dependent: the square
+# root of the rounding error of their products, 1e-8, and two digits.
 _DEPENDENT = 1e-6
-# Correlated share of the variance above which noise counts as smooth, and points are thinned.
-# Points closer than the correlation length determine the kernel's shape, not the slow errors: on
-# rendered photographs the variance of slow errors was 0.9 with 80 points a pose, and 0.37 with 160,
-# of that with 54.
+# Correlated share of the variance above which noise counts as smooth and points are thinned,
+# because points closer than the correlation length determine the kernel's shape, not the slow
+# errors. On rendered photographs the variance of slow errors with 80 points a pose was 0.9 of that
+# with 54, and 0.37 of it with 160.
 SMOOTH = 0.9
-# Fewest points, beyond its own directions, of a pose used for the noise; and fewest degrees of
-# freedom of all poses together for a size and a correlation.
+# Smallest number of points, beyond its own directions, of a pose used for the noise; smallest
+# number of degrees of freedom of all poses for a size and a correlation.
 _SPARE_POINTS, _LEAST_DEGREES = 5, 6
-# Logit of the share and logarithm of the length over the cable's: where a search starts, and ends.
+# Logit of the share and log of length over the cable's: start of the search, then its limits.
 _START = np.log([0.5, 0.04])
 _LIMITS = np.array([[-8.0, np.log(0.002)], [8.0, np.log(0.1)]])
-# Step of the differences that give the spread: far enough to see the likelihood's width, where it
-# is no parabola. And the curvature of a prior that keeps a length beyond the limits unlikely.
+# Step of the differences that give the spread, large enough to cover the width of a likelihood that
+# is no parabola; curvature of a prior that makes a length beyond the limits unlikely.
 _STEP, _BEYOND = 0.4, 20.0
 # Maximum number of poses used for the correlation, evenly spaced; the size of the noise uses all.
 _MOST_POSES = 60
@@ -43,20 +43,20 @@ class NoiseSample:
     Parameters
     ----------
     residuals : (R,) [m]
-        Distances to a curve close to the measured one, `per_point` of each point, point by point.
+        Distances to a curve near the measured one, `per_point` for each point, point by point.
     places : (K,) [m]
         Arc lengths of the points.
     weight : (K,)
         Relative standard deviations.
     own : (R, a)
-        Directions in which the curve of this pose alone may change; projected out.
+        Directions in which this pose's curve alone may change; they are projected out.
     shared : (R, b)
-        Directions in which all poses change together; projected out. Stacked over the poses
-        they are independent of one another and of the poses' own directions.
+        Directions in which all poses change together; they are projected out. Stacked over the
+        poses they are independent of each other and of the poses' own directions.
     correlation_length : scalar [m]
         Length over which the otherwise white errors are correlated.
     count : (K,) or one for all
-        Measured points of which each is the mean.
+        Number of measured points of which each point is the mean.
     """
 
     residuals: FloatArray
@@ -70,7 +70,7 @@ class NoiseSample:
     def thinned(self, most: int) -> "NoiseSample":
         """Keep at most `most` points, evenly spaced, and the own directions that change them.
 
-        Some of a pose's directions may not change the points of one of its photographs.
+        Some directions of a pose may leave the points of one of its photographs unchanged.
         """
         step = max(1, -(-len(self.places) // most))
         kept = np.arange(0, len(self.places), step)
@@ -88,7 +88,7 @@ class NoiseSample:
 
     @property
     def per_point(self) -> int:
-        """Residuals of a point."""
+        """Number of residuals per point."""
         return len(self.residuals) // len(self.places)
 
     @cached_property
@@ -98,15 +98,15 @@ class NoiseSample:
 
     @cached_property
     def scaled(self) -> FloatArray:
-        """Residuals, shared, own directions (K, per_point, 1 + b + a) over the points' weights."""
+        """Residuals, shared and own directions (K, per_point, 1 + b + a), over the weights."""
         stacked = np.column_stack([self.residuals, self.shared, self.own])
         by_point = stacked.reshape((len(self.places), self.per_point, -1))
         return np.asarray(by_point / self.weight[:, None, None])
 
 
-# Slope at which a search ends, by parameters in units of their standard errors.
+# Slope at which a search ends, with parameters in units of their standard errors.
 _FLAT = 0.01
-# D of sizes whose sums are lost in rounding.
+# Deviance returned for sizes whose sums are lost in rounding.
 _LOST = 1e30
 
 
@@ -117,8 +117,8 @@ class Deviance:
         D = log |V| + log |X^T V^-1 X| + y^T P y,   P = V^-1 - V^-1 X (X^T V^-1 X)^-1 X^T V^-1
         dD/dq_j = tr(P V_j) - y^T P V_j P y,   d2D/dq_j dq_k ~ y^T P V_j P V_k P y
 
-    of observations y with covariance V(q), V_j = dV/dq_j, what any effect of X may explain left
-    out. The average of the observed and the expected second derivative needs no trace.
+    of observations y with covariance V(q), V_j = dV/dq_j; whatever effects of X may explain is
+    excluded. The average of the observed and the expected second derivative needs no trace.
 
     References
     ----------
@@ -136,10 +136,10 @@ Found = TypeVar("Found", bound=Deviance)
 def most_likely(
     deviance: Callable[[FloatArray], Found], start: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, Found]:
-    """Parameters (k,) of least deviance between bounds, logits or logarithms, and the deviance.
+    """Parameters (k,) of least deviance within bounds, as logits or logarithms; that deviance.
 
-    By L-BFGS-B. Newton steps with the average information take more evaluations: far from the
-    optimum it is a tenth of the second derivative. Raises EstimationError if rounding leaves no
+    Uses L-BFGS-B. Newton steps with the average information need more evaluations: far from the
+    optimum that is a tenth of the second derivative. Raises EstimationError if rounding leaves no
     covariance that can be factorised where the search ends.
     """
 
@@ -177,9 +177,9 @@ class Profile(Deviance):
 
 
 def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> Profile:
-    """Restricted deviance of noise of a correlation and any size, see `restricted`.
+    """Restricted deviance of noise with a given correlation, of any size, see `Deviance`.
 
-    The directions of the fitted curves are projected out and the degrees of freedom reduced
+    The directions of the fitted curves are projected out, and the degrees of freedom are reduced
     accordingly, so that a good fit does not make the noise look smaller.
     """
     logdet, count, kept = 0.0, 0, []
@@ -210,7 +210,7 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> Profile
     variance = float(gram[0, 0] - cross @ explained) / count
     gradient = np.zeros(len(kept[0][-1]))
     for white, left, own, slopes in kept if len(gradient) else ():
-        # Orthonormal basis of the directions that are projected out; last column: residuals.
+        # Orthonormal basis of the directions projected out; last column: the residuals.
         basis = np.column_stack([left[:, 1:] @ root, own, left[:, 0] - left[:, 1:] @ explained])
         weighed = white.T @ basis.reshape((len(white), -1))
         products = (weighed * (slopes @ weighed)).reshape((len(slopes), len(basis), -1)).sum(axis=1)
@@ -228,20 +228,20 @@ def estimate_noise(
     ----------
     cable_length : float [m]
     max_points : int
-        Maximum number of points used per pose, evenly spaced; fewer where the noise is smooth.
+        Maximum number of points used per pose, evenly spaced; fewer if the noise is smooth.
 
     See Also
     --------
-    tell_of_noise : whether there are enough points for it.
+    tell_of_noise : whether there are enough points for the estimate.
     """
     samples = [sample.thinned(max_points) for sample in _telling(samples)]
     everything, samples = samples, samples[:: max(1, -(-len(samples) // _MOST_POSES))]
-    # A weak correlation is kept: without it smooth residuals would look significant. The
-    # likelihood alone decides, without a penalty on the number of parameters.
+    # A weak correlation is kept, because without it smooth residuals would look significant.
+    # The likelihood alone decides, without a penalty on the number of parameters.
     found = [_white(samples, cable_length)]
     found += [_correlated(samples, cable_length, kernel) for kernel in KERNELS]
     best = min(found, key=lambda item: item.deviance)
-    # An average along the cable stands in `correlation_length`, not in the kernel.
+    # The average along the cable is part of `correlation_length`, not of the kernel.
     smooth = best.noise.share > SMOOTH and not samples[0].correlation_length
     apart = int(cable_length / best.noise.length) if smooth else max_points
     if apart < max_points and tell_of_noise([sample.thinned(apart) for sample in everything]):
@@ -255,14 +255,14 @@ def estimate_noise(
 def tell_of_noise(samples: list[NoiseSample], least: float = _LEAST_DEGREES) -> bool:
     """Whether enough degrees of freedom are left for `estimate_noise` after the projection.
 
-    `least`: fewest degrees of freedom.
+    `least`: smallest number of degrees of freedom.
     """
     kept = _telling(samples)
     return bool(kept) and _degrees(kept) >= least
 
 
 def _telling(samples: list[NoiseSample]) -> list[NoiseSample]:
-    """Poses with points to spare."""
+    """Samples of the poses that have enough points."""
     return [x for x in samples if len(x.residuals) > x.own.shape[1] + _SPARE_POINTS]
 
 
@@ -284,14 +284,14 @@ def _white(samples: list[NoiseSample], cable_length: float) -> _Estimate:
 
 
 def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel) -> _Estimate:
-    """Most likely share and length; the spread from the curvature of the deviance there."""
+    """Most likely share and length; their spread from the curvature of the deviance there."""
 
     def unit(q: FloatArray) -> NoiseModel:
         return NoiseModel(1.0, float(expit(q[0])), cable_length * float(np.exp(q[1])), kernel)
 
     def deviance(q: FloatArray) -> Profile:
-        # Uniform prior of the share: slow modes are projected out, and on photographs the
-        # likelihood alone gave slow errors of 0.11 mm instead of 0.015 mm, with a smooth kernel.
+        # Uniform prior of the share: as slow modes are projected out, the likelihood alone gave
+        # slow errors of 0.11 mm instead of 0.015 mm on photographs, with a smooth kernel.
         found, share = restricted_deviance(unit(q), samples), expit(q[0])
         value = found.value - 2 * float(np.log(4 * share * (1 - share)))
         return replace(found, value=value, gradient=found.gradient + np.array([4 * share - 2, 0.0]))
@@ -310,7 +310,7 @@ def _correlated(samples: list[NoiseSample], cable_length: float, kernel: Kernel)
         np.array([a[k] - b[k] for a, b in zip(ahead, behind, strict=True)]) / (2 * _STEP)
         for k in (0, 1)
     )
-    # The covariance is twice the inverse Hessian of -2 log likelihood, at least the prior's part.
+    # The covariance is twice the inverse Hessian of -2 log likelihood; at least the prior's.
     values, vectors = np.linalg.eigh((bend + bend.T) / 2)
     along = vectors.T @ slope
     spread = 2 / _degrees(samples) + 2 * float((along**2 / np.maximum(values, 0.04)).sum())
@@ -324,7 +324,7 @@ def _degrees(samples: list[NoiseSample]) -> float:
 
 
 def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float) -> float:
-    """Logarithm of the geometric mean of the variances of slow modes, taken of the middle pose."""
+    """Log of the geometric mean of the variances of slow modes, evaluated for the middle pose."""
     sample = samples[len(samples) // 2]
     # Points at the fixtures, where sines vanish, determine no mode.
     count = min(SLOW_MODES, max(1, len(sample.places) - 3))

@@ -15,9 +15,9 @@ from dlo_casadi.vision import CameraPose, ImageCurve, compare_pixels, nearest_in
 
 _TOLERANCE = 1e-5  # of the length: the residual's error is half the curvature times its square
 # Distance from an end of the line within which pixels are left out, in std of the average along the
-# cable. Rendered pixels are 0.014 px RMS off the true curve, 0.1 px within two, 0.03 within three.
+# cable. Rendered pixels are 0.014 px RMS off the true curve; 0.1 px within 2 std, 0.03 within 3.
 _REACH = 3.0
-# Largest std of a pixel over the median one: where stretches share an outline it is 0.2 to 0.4 px.
+# Largest std of a pixel over the median one: if stretches share an outline it is 0.2 to 0.4 px.
 _UNSURE = 2.0
 # Smallest sine of the angle between cable and line of sight. In ten rendered poses pixels are off
 # their neighbours' fitted line by 0.04 mm RMS below it, 0.02 mm up to twice it, 0.014 mm above.
@@ -36,7 +36,7 @@ class ViewInput:
     seen : ImageCurve
         The line found in it.
     places : (K, 3) [m]
-        Approximate places of its pixels in space; nan for those that are not of the cable.
+        Approximate places of its pixels in space; nan for pixels that do not belong to the cable.
     """
 
     name: str
@@ -51,12 +51,12 @@ class Pixels(Sensor):
 
         d_k = c n_k . (u_k - m(r(s_k)))                                      [m]
 
-    with the pixel u, the middle m of the projected outline, its normal n, and c the size of a pixel
-    at the cable's distance: the distance across the line of sight, in the units of other sensors.
-    The places s_k are nearest in the picture; there d does not change to first order with s.
+    with the pixel u, the middle m of the projected outline, its normal n, and the size c of a pixel
+    at the cable's distance. d is the distance across the line of sight, in the units of other
+    sensors. The places s_k are nearest in the picture, where d is stationary in s.
 
-    The pose of the camera is known from the board's markers; its error, a rotation and a shift,
-    moves all pixels of a photograph together and is part of their covariance.
+    The camera's pose is known from the board's markers. Its error, a rotation and a shift, moves
+    all pixels of a photograph together and is part of their covariance.
 
     Parameters
     ----------
@@ -76,9 +76,9 @@ class Pixels(Sensor):
         Change of the residuals by one standard deviation of each error of the camera's pose.
     correlation_length : scalar [m]
         Length over which the average along the cable correlates the pixels' errors. The noise model
-        has other correlations, such as by light that changes along the cable.
+        describes other correlations, such as by light that changes along the cable.
     on_line : bool
-        Whether the points are of a measured line in space, not guessed.
+        Whether the points are those of a measured line in space, not guessed.
     """
 
     viewpoint: CameraPose
@@ -105,7 +105,7 @@ class Pixels(Sensor):
     def nearest(self, curve: NodeCurve) -> FloatArray:
         """Arc lengths (K,) [m] of the pixels on a curve that may be far off, by global search.
 
-        The nearest in space; for a single photograph the nearest in the picture, in order.
+        The nearest in space; for a single photograph the nearest in the picture, in order along it.
         """
         if self.on_line:
             return self._nearest(curve, curve.nearest(self.points))
@@ -165,13 +165,13 @@ def pixel_std(views: Sequence[ViewInput]) -> float:
 
 
 def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | None:
-    """The sensor of a photograph; None if none of its pixels is of the cable.
+    """The sensor of a photograph; None if none of its pixels belongs to the cable.
 
-    Errors of neighbouring pixels are correlated over the length of the average along the cable:
-    pixels are taken at its integral's distance. None is taken where the average reaches beyond an
-    end of the line, into the holder, where another part of the cable hides an edge, or where the
-    cable runs along the line of sight. `view`: with the line found in it. `std` [m]: standard
-    deviation of a pixel of weight one.
+    Errors of neighbouring pixels are correlated over the length of the average along the cable, so
+    pixels are taken at that spacing. A pixel is left out if its average reaches beyond an end of
+    the line, into the holder; if another part of the cable hides an edge; or if the cable runs
+    along the line of sight. `view`: with the line found in it. `std` [m]: standard deviation of a
+    pixel of weight one.
     """
     curve = view.seen
     every = max(1, int(np.ceil(curve.correlation / curve.spacing)))
@@ -195,7 +195,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     error = np.linalg.cholesky(viewpoint.covariance)
     together = size * np.column_stack([by_turn, by_shift]) @ error
     weight = curve.std[kept] * size / std
-    # Errors of an average with a Gaussian are correlated over sqrt(2) times its own length.
+    # Errors of a Gaussian average are correlated over sqrt(2) times its own length.
     correlation_length = np.sqrt(2.0 / np.pi) * curve.correlation * size
     return Pixels(
         viewpoint,
@@ -211,7 +211,7 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
 
 
 def _across(view: ViewInput) -> FloatArray:
-    """Sine (K,) of the angle between cable and line of sight; 0 where no place is known."""
+    """Sine (K,) of the angle between cable and line of sight; 0 if no place is known."""
     places = view.seen.viewpoint.in_camera(view.places)
     along = np.gradient(places, axis=0)
     sizes = np.linalg.norm(along, axis=1) * np.linalg.norm(places, axis=1)

@@ -1,7 +1,7 @@
 """Sensors: measurements of a pose, their residuals, derivatives and covariance.
 
 A sensor's residual is measured minus predicted. Its own unknowns, such as the arc lengths of
-points, follow from the curve (`located`); derivatives are taken at fixed own unknowns.
+points, follow from the curve (`located`); derivatives are taken with these unknowns fixed.
 """
 
 from abc import ABC, abstractmethod
@@ -19,13 +19,13 @@ from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Node
 from dlo_casadi.sensing.noise import Count, NoiseModel
 
-# Chord over which the direction of a measured line is taken, as a share of its length: noise of
-# 2 mm turns it by 0.03 rad on a line of 1 m.
+# Chord used for the direction of a measured line, as a share of its length: noise of 2 mm turns it
+# by 0.03 rad on a line of 1 m.
 _CHORD = 0.06
 
 
 class Sensor(ABC):
-    """One measurement of one pose: `per_point` residuals of each of its K points, point by point.
+    """One measurement of one pose: `per_point` residuals for each of its K points, in order.
 
     A measurement without points (K = 0) has R residuals.
 
@@ -46,7 +46,7 @@ class Sensor(ABC):
     @property
     @abstractmethod
     def per_point(self) -> int:
-        """Residuals of a point."""
+        """Number of residuals per point."""
 
     @property
     def correlation_length(self) -> float:
@@ -55,7 +55,7 @@ class Sensor(ABC):
 
     @property
     def count(self) -> Count:
-        """Number (K,) of measured points of which each point is the mean, or one for all."""
+        """Number (K,) of measured points of which each point is the mean, or one number for all."""
         return 1.0
 
     @property
@@ -65,7 +65,7 @@ class Sensor(ABC):
 
     @property
     def together(self) -> FloatArray:
-        """Common errors (R, c) of its residuals, of one std each; none by default."""
+        """Errors (R, c) that its residuals share, of one std each; none by default."""
         return np.zeros((len(self.kinds), 0))
 
     def places(self, pose: HeldPose, length: float) -> FloatArray:
@@ -74,7 +74,7 @@ class Sensor(ABC):
 
     @abstractmethod
     def located(self, seen: Observed, places: FloatArray) -> FloatArray:
-        """Arc lengths (K,) [m] at which the points are compared with this curve, near those."""
+        """Arc lengths (K,) [m] at which the points are compared with this curve, near `places`."""
 
     @abstractmethod
     def nearest(self, curve: NodeCurve) -> FloatArray:
@@ -124,7 +124,7 @@ class _Known(Sensor):
 
 @dataclass(frozen=True)
 class _Points(Sensor):
-    """Points in the board's or the world's frame, compared where they are on the curve."""
+    """Points in the board's or the world's frame, compared with their places on the curve."""
 
     points: FloatArray
     weight: FloatArray
@@ -155,10 +155,10 @@ class Centerline(_Points):
     """Points somewhere along the cable, compared across its tangent: d - 1 residuals each.
 
     The arc lengths s of the points' projections onto the curve are the sensor's own unknowns. The
-    distance is stationary in s there, so that derivatives at fixed s are exact. In space the two
-    normals at a point are those of the measured line, without twist along it, turned by the
-    smallest rotation onto the curve's tangent: they hardly roll where the curve moves, as they
-    would if they were carried along it from its start.
+    distance is stationary in s there, so derivatives at fixed s are exact. In space the two normals
+    at a point are those of the measured line, transported along it without twist, then turned by
+    the smallest rotation onto the curve's tangent. When the curve moves they hardly roll, as they
+    would if they were transported along the curve from its start.
 
     Parameters
     ----------
@@ -253,13 +253,13 @@ def line_or_markers(
 
 @dataclass(frozen=True)
 class Wrench(_Known):
-    """Forces and moments on the fixtures, component by component: R residuals [N], [N m].
+    """Forces and moments on the fixtures, one residual per component: R residuals [N], [N m].
 
     Parameters
     ----------
     measured : dict
         Forces (dimension,) [N] and moments (increment,) [N m] of the cable on its fixtures, in
-        world axes, moments about the fixture; by names of `ends.reaction_rows`.
+        world axes, moments about the fixture; named as in `ends.reaction_rows`.
     clips : int
         Number of clips of the pose.
     """
