@@ -292,7 +292,7 @@ class RelaxedScreen(Screen):
         super().__init__(near, listed)
         self.softness = softness
 
-    between = False  # Only which candidates come nearest is asked.
+    between = False  # The screen only selects the nearest candidates.
 
     def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
         """Normal equations at scans, with each pose's own unknowns eliminated."""

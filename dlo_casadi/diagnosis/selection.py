@@ -159,7 +159,7 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
             estimated=not closed.noise.known,
             repeats=closed.problem.priors.pose_scatter.std == 0,
         )
-    except EstimationError:  # with the effect hardly a point is left over: nothing is shown
+    except EstimationError:  # too few points are left with the effect to show anything
         return 1.0
     priors = replace(open_.problem.priors, pose_scatter=pose_scatter)
     larger = closed.reweighed(noise, priors)

@@ -305,7 +305,7 @@ class _PoseSearch:
             iterations=minima.iterations[kept],
         )
         out: list[list[Equilibrium]] = [[] for _ in poses]
-        untold = self.model.end == "free" and bool(self.model.surfaces)  # IPOPT knows none
+        untold = self.model.end == "free" and bool(self.model.surfaces)  # not in IPOPT's problem
         for k, j in enumerate(of.tolist()):
             eq = equilibria.pop(0) if kept[k] else None
             if eq is None and not (self.model.in_space or untold):
@@ -425,6 +425,6 @@ def continued(
         held = [
             model.node.interpolated(share, np.arange(2.0), way)[0] for way in frames.swapaxes(0, 1)
         ]
-        with suppress(EquilibriumError):  # the way may lead out of reach
+        with suppress(EquilibriumError):  # poses on the way may be out of reach
             x = solve_equilibrium(model, p, rest, pose.moved(start, end, held), x_init=x).x
     return solve_equilibrium(model, p, rest, pose, x_init=x)

@@ -32,7 +32,7 @@ from dlo_casadi.thresholds import EVIDENCE_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
 
 # Probability below the upper end of a 95 % interval.
 BELOW_HIGH_END = 0.975
-# Largest search range for the interval's ends: this log ratio to the estimate, at most ln 3 a step.
+# Largest log ratio of an interval's end to the estimate; one trial at most triples that logarithm.
 LARGEST_LOG_STEP = float(np.log(1e4))
 FARTHEST_AIM, MOST_REFITS = 3.0, 12
 # Relative change of a crossing below which the search ends: the remaining error is of second order.

@@ -43,7 +43,7 @@ STUCK = 2.0
 # heavy cables, 0.1 to 0.3 1/m.
 FIRST_REST_TURNS = 0.05
 # Largest chi-square per degree of freedom at which a scatter from pose to pose explains a misfit:
-# clamp turns of 0.06 rad, treated to first order, left 1.25.
+# turns of 0.06 rad, treated to first order, left 1.25.
 EXPLAINED = 1.5
 FINEST_MESH = 160
 # Maximum number of elements in the search for missing effects, which takes a hundred refits.
@@ -111,7 +111,7 @@ def fit_model(
         loose = replace(problem, noise=noise, priors=replace(priors, pose_scatter=scatter))
         near = fit_from(*begin(loose, theta))
         with suppress(EstimationError):
-            # The rest of a point must vary between repeats, not systematically with their shapes.
+            # Residuals of a point must vary between repeats, not systematically with their shapes.
             if near and errors_of(near, estimated=not near.noise.known, repeats=False)[1].std > 0:
                 return max(fit, refine(near, first=True), key=lambda found: found.log_evidence)
     return fit

@@ -341,7 +341,7 @@ class Problem:
         return Point(values.theta, values.shapes, moved, objective, data, residuals)
 
     def objective(self, values: Values, residuals: list[FloatArray]) -> tuple[float, float]:
-        """Half the sum of squares, priors included; whole one of the whitened residuals alone."""
+        """Half the sum of squares with priors; full sum of squares of whitened residuals alone."""
         data = float(sum(white @ white for white in residuals))
         gap = values.theta - self.mean
         used = values.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]

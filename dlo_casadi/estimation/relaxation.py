@@ -127,7 +127,7 @@ class Relaxation:
         for kind in model.border_kinds.values():
             if kind == "place":  # its row is the balance of forces there [N]
                 border.append(1 / force)
-            else:  # a multiplier's is its condition
+            else:  # the row of a multiplier is its condition
                 border.append(1 / END / (model.cable.length if kind == "distance" else 1.0))
         moments = model.chain.h / np.exp(self._stiffness(theta)[0])
         return np.concatenate([moments, border]) / self.softness

@@ -120,7 +120,7 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
     if different_poses(measured, length) >= DIFFERENT:
-        return noise  # what differs between repeats has its own place there, see `pose_scatter`
+        return noise  # differences between repeats are then modelled by `pose_scatter`
     spread = repeatability(measured, length)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise

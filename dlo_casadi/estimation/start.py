@@ -395,7 +395,7 @@ def _kinematic_step(
     if item.has_line:
         towards = [*curve.moved(s, slopes).transpose((1, 0, 2))]
         gaps = [*(item.points - curve.at(s)).T]
-    else:  # a single photograph tells no depth
+    else:  # a single photograph does not show depth
         on = item.on_points
         residual, moved = item.linearized(now, s, change)
         towards, gaps = [-moved[on]], [residual[on]]

@@ -307,7 +307,7 @@ class Unheld:
         nodes = [k for k, kind in enumerate(kinds) if kind not in CLAMPS]
         dimension = len(rows[-1])
         ends = rows if rows[0] else [[-1] * dimension, *rows[1:]]
-        # A clip at a node also counts in one segment: derivatives by its arc length are one-sided.
+        # A clip at a node counts in one segment only: derivatives by its arc length are one-sided.
         inside = np.maximum((share >= 0).sum(axis=1)[:, nodes] - 1, 0)
         return cls((share > 0.5).astype(float), inside, np.array(ends))
 

@@ -101,7 +101,7 @@ class Mapped:
         self._shapes = [
             (count, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
         ]
-        # By numbers of poses. Any, here and below: by the stubs a buffer takes no NumPy memory.
+        # By number of poses. Any, here and below: CasADi's stubs do not allow NumPy memory.
         self._buffers: dict[int, tuple[Any, Any]] = {}
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
