@@ -23,7 +23,7 @@ from dlo_casadi.model.contact import Contact, outwards
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.show.text import millimetres, vector
 
-# Distances [m] between a fixture and the cable that a table reports.
+# Smallest distance [m] between a fixture and the cable that a table reports.
 _SHOWN = 5e-6
 
 

@@ -48,7 +48,7 @@ _ARGUMENTS = {
     "dlo_batch": "pnipppn",
     "dlo_path": "pnipppppn",
 }
-# Arguments before which obstacles are inserted, if the solver supports any.
+# Index of the argument before which obstacles are inserted, if the solver supports any.
 _AMONG = {"dlo_solve": 1, "dlo_step": 1, "dlo_sensitivity": 1, "dlo_batch": 2, "dlo_path": 2}
 
 

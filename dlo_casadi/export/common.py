@@ -8,7 +8,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EquilibriumError
 
-# Speed [m/s] below which a node is at rest, as a mean over two successive intervals [s].
+# Largest mean speed [m/s] of a node at rest, in each of two successive intervals [s].
 REST_SPEED, INTERVAL = 2e-5, 0.02
 # Simulated time [s] after which relaxation has failed.
 PATIENCE = 60.0

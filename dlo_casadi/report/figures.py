@@ -27,7 +27,7 @@ from dlo_casadi.thresholds import NORMAL_95
 
 # Colour of a candidate that was not refitted.
 _UNTRIED = "#C8C8C8"
-# Interval that contains 95 % of the noise, in standard deviations.
+# Colour of the band that contains 95 % of the noise.
 _BAND = "#E8EEF3"
 # Background of a number that may lie on a line.
 _PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}

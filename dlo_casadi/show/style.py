@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.io.files import write_file
 
-# Colours that colour-blind readers can distinguish, each with a contrast of at least 4.5 to 1.
+# Colours that the colour-blind can distinguish, each with contrast 4.5 to 1 or more on white.
 BLACK, GREY = "#1F2933", "#6B7280"
 ORANGE, BLUE, GREEN, VERMILLION = "#B35A00", "#0067A3", "#00805A", "#9E2A00"
 HELD_OUT = "#8C3B6C"  # poses not used in any fit

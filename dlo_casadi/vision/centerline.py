@@ -82,8 +82,8 @@ def trace_cable(
         shape = edge_shape(smooth, direction, usual, guess)
         rough = find_edges(smooth, direction, shape)
         sound = raw.inside & _is_usual(rough, usual, diameter)
-        # Not in front of the board: with local directions the interval of EI from ten rendered
-        # poses was half as wide and did not contain the truth.
+        # Not in front of the board: with it the interval of EI from ten rendered poses was half
+        # as wide as without, and did not contain the truth.
         if not varied:
             sound &= ~_beside_end(rough, t, sound, diameter)
         if sound.sum() < 8:
