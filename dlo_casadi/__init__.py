@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
 
-# Module -> its public names. They are imported when they are first asked for, so that the command
-# answers at once and an interrupt finds it ready.
+# Module -> its public names. They are imported on first use, so that the command responds at once
+# and handles an interrupt.
 _PUBLIC = {
     "api": "Result Session fit known_cable predict",
     "cable.estimate": "Covariance Estimate",

@@ -1,4 +1,4 @@
-"""What a notebook or a program calls: fit a session, and look at what came out.
+"""The interface for notebooks and programs: fit a session, and look at the result.
 
 import dlo_casadi as dlo
 
@@ -57,13 +57,13 @@ class Result(Outcome):
     verdict : "complete", "effect_found", "unexplained" or None
         None without a diagnosis.
     effects : tuple of FoundEffect
-        What was added to the declared model: name, parameters, p_value, indistinguishable_from.
+        Effects added to the declared model: name, parameters, p_value, indistinguishable_from.
     stages : tuple of Stage
         Fits in order, the last one with the effects: name, parameters, rmse_fit, rmse_held_out [m].
     warnings, doubts : tuple of str
-        What to know of the data, and why the numbers of the last stage may not hold.
+        Remarks on the data, and reasons why the numbers of the last stage may be unreliable.
     candidates, unexplained, next_pose
-        All effects that were tried; the unknown load that is left; the pose that separates rivals.
+        All effects tried; the remaining unknown load; the pose that best separates rivals.
     """
 
     def __str__(self) -> str:
@@ -75,22 +75,22 @@ class Result(Outcome):
         return outcome_html(self)
 
     def plot(self) -> Figure:
-        """All poses in one frame: measured points, and shapes predicted from their ends alone."""
+        """Draw all poses in one frame: measured points, and shapes predicted from ends alone."""
         return outcome_figure(self)
 
     @cached_property
     def params(self) -> dict[str, Estimate]:
         """All parameters of the last stage by name: value, std, interval_95, unit, fixed.
 
-        Those that are known within a tolerance, such as `length_error.length_difference`, stand
-        after the fitted ones. Intervals are profile likelihoods; a model that does not explain what
-        was measured has none.
+        Parameters known within a tolerance, such as `length_error.length_difference`, follow the
+        fitted ones. Intervals are profile likelihoods; a model that does not explain the
+        measurements has none.
         """
         return Named(estimates_of(self))
 
     @property
     def covariance(self) -> Covariance:
-        """Covariance of all fitted parameters by their names, the residual's excess included."""
+        """Covariance of all fitted parameters, by name, including the residual's excess."""
         return Covariance(*self.fit.named_covariance)
 
     @property
@@ -135,7 +135,7 @@ class Result(Outcome):
         Raises
         ------
         DloError
-            If the folder cannot be written, or holds files of these names from elsewhere.
+            If the folder cannot be written, or holds files of the same names from another source.
         """
         if not isinstance(folder, str | PathLike):
             raise DloError(f"folder: a path belongs here, found {folder!r}")
@@ -144,12 +144,12 @@ class Result(Outcome):
 
     @cached_property
     def cable(self) -> FittedCable:
-        """The fitted cable, as `load` reads it from what `write` has written."""
+        """The fitted cable, identical to what `load` reads after `write`."""
         return fitted_cable(self)
 
 
 class Session(Config):
-    """A cable, how it was held and what was measured: all that a fit starts from.
+    """A cable, how it was held and what was measured: the input of a fit.
 
     A configuration file makes the same object: `Session.load("session.yaml")`.
 
@@ -161,15 +161,15 @@ class Session(Config):
     gravity : (d,) [m/s^2]
         Two numbers put the cable in a plane, three in space.
     boundary : (str, str)
-        How start and end are held: pinned, clamped, or free (the end alone).
+        How start and end are held: pinned, clamped, or free (only the end).
     std : float [m], optional
         Standard deviation of one coordinate of a point; estimated when absent.
     force_std, moment_std : float [N], [N m], optional
         Of one component of a reading; estimated when absent.
     obstacles : sequence of Obstacle or mapping, optional
-        What the cable may touch, as in a configuration.
+        Obstacles that the cable may touch, as in a configuration.
     camera, board, reference : mapping, optional
-        Of photographs, as in a configuration.
+        For photographs, as in a configuration.
     tolerances, model, estimation, diagnosis, limits : mapping, optional
         As in a configuration: `diagnosis={"enabled": False}`.
 
@@ -240,14 +240,14 @@ class Session(Config):
         progress: Progress | None = None,
         executor: Executor | None = None,
     ) -> Result:
-        """Fit the cable to what was measured.
+        """Fit the cable to the measurements.
 
         Parameters
         ----------
         diagnosis : bool, optional
-            Whether to search for missing effects; as the session says by default.
+            Whether to search for missing effects; by default as the session declares.
         progress : Progress, optional
-            Told how far the run has come: an object with `step(name, done, total)`.
+            Receives the progress of the run: an object with `step(name, done, total)`.
         executor : Executor, optional
             Runs independent tasks at the same time; by default they run in this process. In a
             script, below `if __name__ == "__main__":`, `with open_executor(2, here=True) as
@@ -284,13 +284,13 @@ class Session(Config):
         return _as(Result, run_session(session, progress, executor))
 
 
-# What a session takes: neither `self` nor the unknown ones, which are refused.
+# Arguments of a session: without `self` and the unknown ones, which are refused.
 _KNOWN = list(signature(Session.__init__).parameters.values())[1:-1]
 Session.__signature__ = Signature(_KNOWN)
 
 
 def _given(**values: Any) -> dict[str, Any]:
-    """Those of the arguments that are not None."""
+    """The arguments that are not None."""
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -324,21 +324,21 @@ def known_cable(
     limits: Mapping[str, float] | None = None,
     **unknown: Any,
 ) -> FittedCable:
-    """A cable of which everything is known, without poses and without a fit.
+    """A cable with known data, without poses and without a fit.
 
-    It is what a fit returns, with standard deviations of zero.
+    It has the form of a fit's result, with standard deviations of zero.
 
     Parameters
     ----------
     cable : Cable
-        Its stiffnesses and its mass are taken as they are, no first guesses; in space it needs a
+        Its stiffnesses and its mass are exact values, not first guesses; in space it needs a
         torsional stiffness.
     gravity, boundary
         As of `Session`.
     rest_curvature : float or (K,), in space (2,) or (2, K) [1/m], optional
-        Curvature without load, at K <= 64 places evenly spaced from start to end, between them a
-        cubic spline; counter-clockwise, in space about the material axes y and z. Straight by
-        default.
+        Curvature without load at K <= 64 places, evenly spaced from start to end, with a cubic
+        spline between them; counter-clockwise, in space about the material axes y and z. By default
+        the cable is straight.
     model, limits : mapping, optional
         As in a configuration: {"n": 40, "effects": [...]}, each effect with all its values.
 
@@ -368,7 +368,7 @@ def predict(
     Parameters
     ----------
     parameters : str, Path or FittedCable
-        A parameters.yaml, the folder of results that holds it, or what was read from it.
+        A parameters.yaml, its folder of results, or what was read from it.
     end, **ends
         See `FittedCable.solve`.
 
@@ -384,5 +384,5 @@ def predict(
 
 
 def _as(kind: type[Kind], found: Any) -> Kind:
-    """The same values as an object of a class that can show itself."""
+    """Copy the values into an object of a class that can show itself."""
     return kind(**{field.name: getattr(found, field.name) for field in fields(found)})

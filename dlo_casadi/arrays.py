@@ -1,4 +1,4 @@
-"""Types of arrays, and a little geometry of many vectors at once."""
+"""Types of arrays, and vectorized geometry."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +9,13 @@ IntArray = NDArray[np.intp]
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross product along the last axis (..., 3); on a few vectors faster than `numpy.cross`."""
+    """Cross product along the last axis (..., 3); for a few vectors faster than `numpy.cross`."""
     ahead, behind = [1, 2, 0], [2, 0, 1]
     return np.asarray(a[..., ahead] * b[..., behind] - a[..., behind] * b[..., ahead])
 
 
 def unit(vectors: FloatArray) -> NDArray[np.float64]:
-    """Vectors (..., d) over their lengths; zero where they are."""
+    """Vectors (..., d) divided by their lengths; zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 
 def well_formed(text: str) -> str:
-    r"""Text that can be written anywhere: a lone surrogate as its escape, such as `\udce9`.
+    r"""Make text safe to write anywhere: a lone surrogate becomes its escape, such as `\udce9`.
 
-    File names that are no UTF-8 hold them (PEP 383), and YAML permits them.
+    File names that are not UTF-8 contain them (PEP 383), and YAML permits them.
     """
     return text.encode(errors="backslashreplace").decode()
 
@@ -29,7 +29,7 @@ class DloError(Exception):
     Attributes
     ----------
     poses : tuple of PoseInput
-        Of a session that has failed: its poses, with all that had been read of them.
+        For a failed session: its poses, with everything that was read of them.
     """
 
     def __init__(self, message: str) -> None:
@@ -90,7 +90,7 @@ class EquilibriumError(DloError):
     pose : str, optional
         Name of the pose.
     p_des : tuple of float, optional
-        Where the end was asked to be [m].
+        Requested position of the end [m].
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class EquilibriumError(DloError):
 
 
 def library(name: str, extra: str, user: str) -> Any:
-    """An optional library; without it a DloError names its `user` and the extra that has it."""
+    """Import an optional library; without it a DloError names its `user` and the extra to use."""
     try:
         return import_module(name)
     except ImportError:
@@ -116,7 +116,7 @@ def library(name: str, extra: str, user: str) -> Any:
 
 
 class EstimationError(DloError):
-    """An estimate that cannot be made from the poses at hand."""
+    """An estimate that the available poses do not allow."""
 
 
 class OutputError(DloError):
@@ -135,7 +135,7 @@ class OutputError(DloError):
         self.path = path
 
     def retold(self, draft: str, place: str) -> None:
-        """Replace the name of a draft by that of the place."""
+        """Replace the name of a draft in the message by that of its final place."""
         self.message = self.message.replace(draft, place)
         self.args = (self.message,)
         self.path = None if self.path is None else Path(str(self.path).replace(draft, place))

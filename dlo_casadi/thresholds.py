@@ -1,47 +1,47 @@
 """Every number that decides whether a result is accepted or refused, with its evidence.
 
-Numbers that only steer a search (trial places, steps, meshes) stand beside that search, those of
-the noise model in `estimation`. "Measured" means on the sessions of tests/data, by this program.
+Numbers that only steer a search (trial places, steps, meshes) are beside that search, those of the
+noise model in `estimation`. "Measured" means on the sessions of tests/data, by this program.
 """
 
 # ---- score tests -------------------------------------------------------------------------------
 
 # Probability of a false alarm in a complete model, over all candidates: one session in 200.
 SIGNIFICANCE = 0.005
-# Share of a direction's information that must be left after projection; below it the direction
-# cannot be told from the fit's own. It is above the root of double precision, 1.5e-8, and below
-# the share that effects keep: more than 1e-6 on twelve sessions of centre-lines.
+# Smallest share of a direction's information that remains after projection; below it the direction
+# cannot be separated from the fit's own. It is above the root of double precision, 1.5e-8, and
+# below the share that effects keep: more than 1e-6 on twelve sessions of centre-lines.
 COLLINEAR = 1e-7
-# Number of scanned places that count as one independent test: neighbouring ones, a few hundredths
-# of the length apart, are correlated.
+# Number of scanned places that count as one independent test: neighbouring places, a few
+# hundredths of the length apart, are correlated.
 SCANS_PER_TEST = 3
-# How far apart the scans are that are tried first. Those between are tried next to a candidate's
-# best where its p-value, over its places, is below IN_QUESTION, ten times the significance: a
-# fifth more of a score of 7.4 lowers it from 0.05 to 0.02. Scores of the leading candidates of two
-# sessions in space, 23 places each, were those of all scans.
+# Spacing of the places that are scanned first. Those between are scanned next to a candidate's best
+# place if its p-value, over its places, is below IN_QUESTION, ten times the significance: a score
+# higher by a fifth than 7.4 lowers it from 0.05 to 0.02. In two sessions in space, with 23 places
+# each, this gave the leading candidates the same scores as all places.
 SCANS_APART, IN_QUESTION = 2, 0.05
-# Fewest degrees of freedom assumed for an estimated noise: with 4 or less F has no variance. The
-# 95 % quantile of Student's t is then 2.8; intervals of a noise known worse are too short.
+# Fewest degrees of freedom assumed for an estimated noise: with 4 or fewer F has no variance. The
+# 95 % quantile of Student's t is then 2.8; intervals are too short if the noise is known worse.
 LEAST_NOISE_DEGREES = 4.0
 # Smallest share of the noise's variance left in a direction of the residual; below it the
 # direction is the fit's own. With 0.001 or 0.2, p in a complete session changes by less than 0.03.
 KEPT_VARIANCE = 0.05
-# The same for displacement fields, whose information is not whitened: a bound on rounding alone.
+# The same for displacement fields, whose information is not whitened: a bound on rounding only.
 KEPT_INFORMATION = 1e-6
 
 # ---- choice among candidates -------------------------------------------------------------------
 
 # Maximum number of candidates refitted in one step, and the smallest score for a refit relative to
-# the leading one. On ten sessions with a hidden effect its score is among the first three, and at
-# least 0.99 of the leading one. Of two, the smaller has 0.02, and is found in the next step.
+# the leading one. In ten sessions with a hidden effect its score is among the first three, and at
+# least 0.99 of the leading one. Of two effects the smaller has 0.02, and is found in the next step.
 REFITTED = 6
 WORTH = 0.1
-# The same where a model lacks something large and is scored at the measured shapes. Of the leading
-# score the true effect had all in six cables simulated by this program; in four sessions of another
-# simulator (space_pull, space_taper, space_drift, space_flat) 1, 1, 0.86 and 0.71.
+# The same for a model that lacks something large and is scored at the measured shapes. Relative to
+# the leading score, the true effect had 1 in six cables simulated by this program; in four sessions
+# of another simulator (space_pull, space_taper, space_drift, space_flat) 1, 1, 0.86 and 0.71.
 NEAR_LEADER = 0.3
-# Score of a candidate with fewer parameters than the chosen one, relative to that, from which on it
-# may be the larger of two effects that the chosen one stands for: of two the larger has half.
+# Smallest score, relative to the chosen candidate, at which one with fewer parameters may be the
+# larger of two effects that the chosen one combines: the larger of two has half.
 LARGER_OF_TWO = 0.5
 # Difference in log likelihood beyond which the data reject a rival: "very strong" evidence (Kass
 # and Raftery, J. Am. Stat. Assoc. 90, 1995).
@@ -51,21 +51,21 @@ EVIDENCE_APART = 5.0
 # ratio of 20. Moments of both pins and smooth rest curvatures differed by 2 to 9 in three sessions.
 SCATTER_APART = 6.0
 
-# Fewest different poses from which effects are judged by their change from pose to pose: fewer may
-# differ by chance, as repeats of one pose do. With 3, a missing force of 0.4 N passed for scatter
-# in five poses; 6 is a judgement above that case, its power in others is not measured.
+# Fewest different poses in which effects are judged by their change from pose to pose: in fewer, as
+# in repeats of one pose, such changes may be chance. With 3, a missing force of 0.4 N passed for
+# scatter in five poses; 6 is a judgement above that case, its power in others is not measured.
 DIFFERENT = 6
 
 # ---- what an explanation has to do -------------------------------------------------------------
 
-# Largest error of a left-out pose that a model may make and still explain the data, relative to
-# the error expected from noise, fixtures, parameters and the cable's scatter. Measured, a complete
-# model's error is 0.9 to 1.3 times the expected one (eight sessions); without the effect 0.85 and
-# 1.6 times where the effect is small, and 3 to 41 times on the eight others.
+# Largest error of a left-out pose with which a model still explains the data, relative to the error
+# expected from noise, fixtures, parameters and the cable's scatter. Measured: a complete model has
+# 0.9 to 1.3 times the expected error (eight sessions); a model without the effect has 0.85 and 1.6
+# times where the effect is small, and 3 to 41 times in the eight others.
 UNSEEN = 2.0
-# Largest share of the declared model's mean square error beyond the noise left by effects that are
-# reported beside an unexplained residual. Measured: a force for a drift leaves 0.38; gradient,
-# scale and offset for stretch 0.89; softening of a real glass-fibre strip 0.08.
+# Largest share of the declared model's mean square error beyond noise that effects may leave if
+# they are reported beside an unexplained residual. Measured: a force for a drift leaves 0.38;
+# gradient, scale and offset for stretch 0.89; softening of a real glass-fibre strip 0.08.
 LEFT = 0.1
 
 # ---- what cannot be told apart -----------------------------------------------------------------
@@ -79,39 +79,39 @@ ALONG_GRAVITY = 2.0
 # each is then five times, 1 / (1 - 0.9^2), what it would be if the other were known.
 ALIKE = 0.9
 
-# Difference of repeats over the noise beyond which repeatability limits every prediction. Noise
+# Ratio of repeat differences to noise beyond which repeatability limits every prediction. Noise
 # alone gives (simulated, white and correlated over 3 % of the length) 1.1 to 1.3 with five repeats,
 # 1.4 to 1.6 with two: half of the latter may be flagged without need.
 REPEATS = 1.5
-# Difference of repeats over the noise beyond which it is taken as the noise. Below, chi-square per
+# Ratio of repeat differences to noise beyond which they replace the noise. Below it, chi-square per
 # degree of freedom widens the intervals, and shapes are weighted by the noise of a single line.
 REPEATS_ARE_NOISE = 2.0
 
-# White errors of points over the declared noise beyond which they contradict it, and the fewest
-# degrees of freedom: three standard errors, 0.5 = 3 / sqrt(2 x 18). No shape of a cable is white:
-# on ten rendered sessions, most lacking an effect, the estimate was 0.97 to 1.02 of the truth.
+# Ratio of white point errors to the declared noise beyond which they contradict it, and the fewest
+# degrees of freedom: three standard errors, 0.5 = 3 / sqrt(2 x 18). A cable's shape is never white:
+# in ten rendered sessions, most lacking an effect, the estimate was 0.97 to 1.02 of the truth.
 SCATTERED, SCATTERED_DEGREES = 1.5, 18
 
 # ---- intervals ---------------------------------------------------------------------------------
 
 # Half width of the 95 % interval of a standard normal distribution.
 NORMAL_95 = 1.959964
-# Largest ratio of the upper to the lower end of the interval of an identifiable stiffness; a single
-# number would say too much about a wider one.
+# Largest ratio of the upper to the lower end of an identifiable stiffness's interval; for a wider
+# interval a single number would be misleading.
 IDENTIFIABLE = 10.0
 # Smooth error of lines, as a share of a declared noise that is taken as white: no number of points
-# averages it out, so it is added to the statistical error. An estimated correlation contains such
-# errors already.
+# averages it out, so it is added to the statistical error. An estimated correlation already
+# contains such errors.
 SYSTEMATIC_SHARE = 0.05
-# Error of a prediction due to the fixtures, over the noise, beyond which there is a warning: both
-# together are then a tenth more than the noise, sqrt(1 + 0.5^2).
+# Ratio of the prediction error due to fixtures to the noise, beyond which there is a warning: the
+# total is then a tenth more than the noise, sqrt(1 + 0.5^2).
 FIXTURES = 0.5
 # Largest error of the mesh, as a share of the noise: it adds half a percent to the error,
 # sqrt(1 + 0.1^2), and a hundredth to chi-square.
 MESH_SHARE = 0.1
 # The same for a model that lacks an effect, as a share of its misfit: it adds 3 percent to it,
-# sqrt(1 + 0.25^2), and the mesh is refined once the effect is in the model. A tenth gives the same
-# verdicts, effects and ties on 18 rendered sessions.
+# sqrt(1 + 0.25^2), and the mesh is refined once the effect is included. A limit of a tenth gives
+# the same verdicts, effects and ties on 18 rendered sessions.
 LACKING_SHARE = 0.25
 
 # ---- contradictions of the configuration -------------------------------------------------------
@@ -123,14 +123,14 @@ FITS, CONTRADICTS = 0.04, 0.1
 OUT_OF_STEP = 0.05
 # Largest share of the misfit that an explanation may leave.
 MUCH_BETTER = 0.35
-# Length of a line, in lengths of the cable, beyond which it does not follow the cable.
+# Length of a line, in cable lengths, beyond which it does not follow the cable.
 TOO_LONG = 1.5
-# RMS distance after a coarse fit, over the length. Noise, a coarse mesh and few unknowns leave less
-# than the first. Missing effects left up to 0.0083 in four sessions in space; a fit refuses a
-# session only beyond the second.
+# RMS distance after a coarse fit, relative to the length. Noise, a coarse mesh and few unknowns
+# leave less than the first value. Missing effects left up to 0.0083 in four sessions in space; only
+# beyond the second value does a fit refuse a session.
 UNEXPLAINED, BEYOND_EFFECTS = 2e-3, 0.01
-# Largest distance of neighbouring markers beyond the cable between them, in lengths of the cable:
-# room for five times a noise of 3 mm of both on a cable of 1 m.
+# Largest excess of the distance of neighbouring markers over the cable between them, in cable
+# lengths: room for five times a noise of 3 mm of both on a cable of 1 m.
 STRETCHED = FITS / 2
 # Relative distance of measured wrenches from a multiple of those that the shapes need: 0.02 in a
 # session in space with a wrong mass (space_wrench), 0.6 and more with another sign or frame.
@@ -138,7 +138,7 @@ MISREAD = 0.15
 # Fewest poses with wrench measurements to which turned axes or another reference point are fitted:
 # with two and three poses, 2 of 21 clean simulated sessions were refused, for -12 and 73 degrees.
 FITTED_READINGS = 4
-# Distance of an interpretation over the best one's, within which the more likely of them is chosen.
+# Distance of an interpretation relative to the best one's, within which the likelier one is chosen.
 READ_OTHERWISE = 1.5
 # Largest factor by which a mass may be wrong: the bound of `mass_error`.
 READ_SCALE = 5.0
@@ -146,30 +146,30 @@ READ_SCALE = 5.0
 NEAR_UNIT = 1.25
 # Smallest share of the poses that show a common mistake: one or two may be wrong by themselves.
 NEARLY_ALL = 0.8
-# Largest angle between a clamp and a line [rad], since a clamp that is askew is up to 0.9 off; and
-# the largest that an explanation of a larger one may leave.
+# Largest angle between a clamp and a line [rad]: a skewed clamp is off by up to 0.9; and the
+# largest angle that an explanation of a larger one may leave.
 HEADING_OFF, HEADING_NEAR = 1.0, 0.5
 
 # ---- words -------------------------------------------------------------------------------------
 
-# Normal score of structure in the residual beyond which it is mentioned: one in 370 by chance.
+# Normal score of residual structure beyond which it is reported: one in 370 by chance.
 NOTABLE = 3.0
-# Distance of a clamp from where both sides are equally low, in standard deviations, within which
+# Distance of a clamp from where both sides have equal energy, in standard deviations, within which
 # the side that a cable takes is unknown: 95 % of a normal distribution.
 EITHER = 2.0
-# Distance of rivals [standard deviations] beyond which they are told apart: one in 370 by chance.
+# Distance of rivals [standard deviations] beyond which they are separated: one in 370 by chance.
 APART = 3.0
 
 # ---- limits ------------------------------------------------------------------------------------
 
 # Probability of a violated limit below which it passes.
 SAFE = 0.01
-# Largest difference of a probability of first order from that of shapes solved anew, two standard
-# errors included, for which it is told. With 0.02, two of 30 were 2.2 and 2.5 points off the share
-# of 10,000 draws, whose own standard error is up to 0.5.
+# Largest difference, two standard errors included, at which a first-order probability is reported
+# instead of that of newly solved shapes. With 0.02, two of 30 differed by 2.2 and 2.5 points from
+# the share of 10,000 draws, whose own standard error is up to 0.5.
 FIRST_ORDER = 0.01
-# Relative change of the least bend radius on half the element size below which the mesh resolves
-# it: of second order, what is left is a third of it.
+# Relative change of the smallest bend radius on half the element size, below which the mesh
+# resolves it: with second order, a third of the change remains.
 RESOLVED = 0.01
 # Largest distance between the lowest places of two shapes that may rest on the same table: in
 # standard deviations of a point, and its bounds in lengths of the cable. It decides whether a plane

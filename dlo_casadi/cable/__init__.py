@@ -1,1 +1,1 @@
-"""A fitted cable: its file, its shapes in any pose, and the C that solves for them."""
+"""A fitted cable: its file, its shapes in any pose, and C code that solves for them."""

@@ -1,4 +1,4 @@
-"""Estimated parameters, how well they are known, and what else a fitted cable comes with."""
+"""Estimated parameters, their uncertainty, and other contents of a fitted cable's file."""
 
 import math
 from dataclasses import dataclass
@@ -30,18 +30,18 @@ class Estimate:
     Parameters
     ----------
     value, std : float
-        In `unit`; std is 0 where the parameter was not estimated. Infinite where the value is the
-        inverse of a parameter at zero.
+        In `unit`; std is 0 if the parameter was not estimated. Infinite if the value is the inverse
+        of a parameter at zero.
     unit : str
     interval_95 : (float or None, float or None), optional
-        Profile-likelihood interval; None in it = unbounded; absent = not computed.
+        Profile-likelihood interval; None for an unbounded side; absent if not computed.
     identifiable : bool, optional
-        False where the interval is unbounded or spans more than a factor of ten; of a parameter
-        without one, where the measurements tell less than its bounds do, whose width std then is.
+        False if the interval is unbounded or spans more than a factor of ten. Without an interval:
+        False if the measurements constrain it less than its bounds, whose width std then is.
     at_bound : bool
         Whether the value sits on a physical bound.
     fixed : bool
-        Whether it was kept at its value.
+        Whether the parameter was kept at its value.
     """
 
     value: float
@@ -71,14 +71,14 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of estimates by their names: `covariance["bending_stiffness", "end_roll"]`.
+    """Covariance of estimates, by name: `covariance["bending_stiffness", "end_roll"]`.
 
     Parameters
     ----------
     names : (N,) tuple of str
         Fitted parameters, and `rest_curvature[k]` [1/m], its spline coefficients.
     values : (N, N)
-        In the products of the units.
+        In products of the parameters' units.
     """
 
     names: tuple[str, ...]
@@ -108,7 +108,7 @@ class Covariance:
 
     @property
     def correlation(self) -> FloatArray:
-        """Correlations (N, N); zero beside what is known exactly."""
+        """Correlations (N, N); zero for exactly known values."""
         std = np.array(list(self.std.values()))
         scale = np.outer(std, std)
         return np.divide(self.values, scale, out=np.zeros_like(scale), where=scale > 0)
@@ -116,7 +116,7 @@ class Covariance:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Contents of a parameters.yaml beside the model.
+    """Contents of a parameters.yaml besides the model.
 
     Parameters
     ----------
@@ -126,20 +126,20 @@ class Metadata:
         All parameters of the model by name.
     covariance : Covariance
     uncertainty : Uncertainty
-        The same with the scatter from pose to pose.
+        The covariance together with the scatter from pose to pose.
     coefficients : (n_coefficients,) [1/m]
-        Of the rest curvature before the first pose; in space about the axis y, then about z.
+        Of the rest curvature before the first pose; in space first about axis y, then about z.
     fixtures : dict
-        Those of `start` [m] and `start_heading`, `end_heading` [rad], in space `start_orientation`,
-        `end_orientation`, that are the same in all poses of the session.
+        Those of `start` [m], `start_heading` and `end_heading` [rad], in space `start_orientation`
+        and `end_orientation`, that are the same in all poses of the session.
     limits : Limits
-        Those that the session declared.
+        Limits declared in the session.
     explains : bool or None
         Whether the model explains the shapes it was fitted to; None where that was not judged.
     model_hash : str
-        As written; see `parameters_hash`.
+        Hash in the file; see `parameters_hash`.
     edited : bool
-        Whether the model is no longer the one that was written.
+        Whether the model has changed since the file was written.
     config : str
         Name of the configuration.
     versions : dict

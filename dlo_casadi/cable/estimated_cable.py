@@ -1,4 +1,4 @@
-"""A fitted cable without its shapes: values, their errors, and its curve in a pose."""
+"""A fitted cable without its shapes: values, their uncertainty, and its curve in a pose."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from dlo_casadi.rod.node import Frame
 
 @dataclass(frozen=True, eq=False)
 class EstimatedCable(CasadiCable):
-    """The model of a cable with its fitted values, and what is known of their errors.
+    """The model of a cable with its fitted values and their uncertainty.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ class EstimatedCable(CasadiCable):
 
     @property
     def name(self) -> str:
-        """What the cable is called."""
+        """Name of the cable."""
         return self.model.cable.name
 
     @property
     def params(self) -> dict[str, Estimate]:
-        """All parameters of the model by name, as they were estimated."""
+        """All parameters of the model by name, with their estimates."""
         return Named(self.metadata.params)
 
     @property
@@ -76,36 +76,36 @@ class EstimatedCable(CasadiCable):
     ) -> Placing:
         """Find arc lengths and places of pinned clips that keep limits in several poses.
 
-        Maximizes the least margin of all limits in all poses, or minimizes the greatest force on
-        fixtures and clips within the limits. The shapes are the stable ones of lowest energy. The
-        optimum is local, the best of those found from several first guesses.
+        Maximizes the smallest margin of all limits in all poses, or minimizes the largest force on
+        fixtures and clips within the limits. Shapes are the stable ones of lowest energy. The
+        optimum is local: the best of those found from several first guesses.
 
         Parameters
         ----------
         count : int
             Number of clips.
         poses : sequence of mapping
-            How the ends are held in each pose, as keywords of `solve`: [{"end": (0.3, -0.1)}, ...].
+            End conditions in each pose, as keywords of `solve`: [{"end": (0.3, -0.1)}, ...].
         within : ((d,), (d,)) [m]
-            Two corners of the region in which clips may be: least and greatest coordinates. A wall
-            has the same coordinate in both.
+            Two corners of the region for clips: smallest and largest coordinates. For a wall both
+            corners share a coordinate.
         limits : Limits or mapping, optional
-            As of `Shape.check`; the session's by default.
+            As in `Shape.check`; by default the session's.
         aim : "margin" or "force"
-            What is optimized; "force" needs no limits.
+            The quantity to optimize; "force" needs no limits.
 
         Raises
         ------
         DloError
-            If no clips in the region keep the limits, an argument has no meaning for this cable, or
-            a span has no room.
+            If no clips in the region keep the limits, if an argument is meaningless for this cable,
+            or if a span has no room.
         EquilibriumError
-            If the cable has no shape in a pose without clips.
+            If the cable has no shape in one of the poses without clips.
         """
         return placed(self, self.metadata, count, poses, within, limits, aim)
 
 
-# Rounding error allowed in arc lengths beyond the ends, as a share of the length.
+# Rounding error allowed in arc lengths beyond the ends, relative to the length.
 _ROUNDING = 1e-9
 
 
@@ -118,7 +118,7 @@ class CableCurve(NodeCurve):
         Raises
         ------
         DloError
-            If an arc length lies outside the cable.
+            If an arc length is outside the cable.
         """
         try:
             places = np.atleast_1d(np.asarray(s, dtype=float)).ravel()
@@ -157,5 +157,5 @@ class CableCurve(NodeCurve):
 
 
 def without_camera(model: CableModel, p: FloatArray) -> tuple[CableModel, FloatArray]:
-    """The model without the effects of the camera, and its part of `p`."""
+    """The model without effects of the camera, and its part of `p`."""
     return model.without_kind(MeasurementEffect, p)

@@ -1,7 +1,7 @@
-"""parameters.yaml: a fitted cable, complete enough to compute with (schema "dlo-parameters/1").
+"""Read parameters.yaml: a fitted cable, complete enough to compute with ("dlo-parameters/1").
 
-Prediction, code generation and comparisons of cables read nothing else. Its text is made in
-`report.documents`.
+Prediction, code generation and comparisons of cables read only this file. `report.documents` makes
+its text.
 """
 
 import difflib
@@ -50,9 +50,9 @@ from dlo_casadi.rod.node import Frame
 
 FILE = "parameters.yaml"
 SCHEMA = "dlo-parameters/1"
-# Keys on which a prediction depends, beside the values of the parameters.
+# Keys on which a prediction depends, besides the values of the parameters.
 _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
-# Tolerance of a value at its bound, relative to the bound or the parameter's scale: for rounding of
+# Tolerance of a value at its bound, relative to the bound or the parameter's scale: for rounding in
 # value = nominal + scale x, or exp(x), about 1e-14, and for the tolerance of solvers.
 _ROUNDING = 1e-9
 # Relative tolerance of a covariance's symmetry and correlations: they are inverses of matrices.
@@ -63,7 +63,7 @@ _DAMAGED, _REMEDY = "damaged parameters", ".\n  Try: the file as a fit has writt
 
 
 def _wrong_effect(row: Mapping[str, Any]) -> list[ConfigProblem]:
-    """Problems of an effect and its options, by their keys."""
+    """Problems with an effect and its options, by key."""
     name = row.get("name")
     kind = known_effect(name) if isinstance(name, str) else None
     if kind is None:
@@ -81,14 +81,14 @@ def _wrong_effect(row: Mapping[str, Any]) -> list[ConfigProblem]:
 
 
 def _alike(value: Any, default: Any) -> bool:
-    """Whether a value is of a default's form; where that is empty, any list of whole numbers."""
+    """Whether a value has a default's form; if the default is empty, any list of whole numbers."""
     if default == ():
         return isinstance(value, list) and all(type(item) is int for item in value)
     return bool(_form(value) == _form(default))
 
 
 def _form(value: Any) -> Any:
-    """Type of a value, item by item: a finite number, text, true or false."""
+    """Form of a value, item by item: a finite number, text, true or false."""
     if isinstance(value, list | tuple):
         return [_form(item) for item in value]
     number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -183,7 +183,7 @@ class _Scatter(OpenSection):
 
 
 class ParametersFile(OpenSection):
-    """The keys of a parameters.yaml that are read, as `report.documents` writes them."""
+    """The keys that are read from a parameters.yaml written by `report.documents`."""
 
     cable: Annotated[
         _Cable, checked(lambda cable: implausible_sizes(cable.length, cable.mass, cable.diameter))
@@ -218,8 +218,8 @@ def load(path: str | Path) -> FittedCable:
     Raises
     ------
     ConfigError
-        If there is no such file, it is no parameters.yaml of this schema, or a value in it lies
-        outside of its bounds; the message names the key.
+        If there is no such file, if it is not a parameters.yaml of this schema, or if a value in it
+        is outside its bounds; the message names the key.
     """
     if not isinstance(path, str | os.PathLike):
         raise ConfigError(
@@ -255,7 +255,7 @@ def load(path: str | Path) -> FittedCable:
 
 
 def _results_near(path: Path) -> str:
-    """Advice for a wrong path: folders of results beside it, the most similar name first."""
+    """Advice for a wrong path: nearby folders of results, the most similar name first."""
     wanted = path.parent if path.suffix else path
     known = {
         folder.name: folder
@@ -321,7 +321,7 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
 
 
 def _beyond(q: Parameter, row: _Value) -> str:
-    """Message on a value outside its bounds, of the file and of the model; empty if inside."""
+    """Message on a value outside the bounds of the file or the model; empty if it is inside."""
     lower = max(q.lower, -math.inf if row.lower is None else row.lower)
     upper = min(q.upper, math.inf if row.upper is None else row.upper)
     bound = lower if lower > row.value else upper
@@ -333,7 +333,7 @@ def _beyond(q: Parameter, row: _Value) -> str:
 
 
 def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
-    """Contents of a document beside the model."""
+    """Contents of a document besides the model."""
     file = ParametersFile.model_validate(document)
     names = file.covariance.names
     covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
@@ -360,9 +360,9 @@ def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
 
 
 def parameters_hash(document: Mapping[str, Any]) -> str:
-    """SHA-256 of all that determines predictions, without bounds and standard deviations.
+    """SHA-256 of everything that determines predictions, without bounds and standard deviations.
 
-    It stands in the file as `model_hash`. A generated solver has its own: `codegen.solver_hash`.
+    The file has it as `model_hash`. A generated solver has a separate hash: `codegen.solver_hash`.
     """
     content = {key: document[key] for key in _MODEL_KEYS}
     content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
@@ -372,7 +372,7 @@ def parameters_hash(document: Mapping[str, Any]) -> str:
 
 
 def _as_floats(data: Any) -> Any:
-    """Every number as a float: 1 and 1.0 are the same model."""
+    """Convert every number to a float: 1 and 1.0 are the same model."""
     if isinstance(data, Mapping):
         return {str(key): _as_floats(value) for key, value in data.items()}
     if isinstance(data, list | tuple):

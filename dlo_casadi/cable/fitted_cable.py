@@ -37,16 +37,16 @@ from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.show.text import html_table, millimetres
 
-# Points of a shape.
+# Number of points of a shape.
 _POINTS = 101
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FittedCable(EstimatedCable):
-    """A fitted cable: its model with the fitted values, and what is known of their errors.
+    """A fitted cable: its model with the fitted values and their uncertainty.
 
-    From `Result.cable`, `dlo_casadi.load` of a folder of results, or without a fit from
-    `dlo_casadi.known_cable`. Its `function` and `equations` are for CasADi problems of one's own.
+    Made by `Result.cable`, by `dlo_casadi.load` from a folder of results, or without a fit by
+    `dlo_casadi.known_cable`. Use its `function` and `equations` in your own CasADi problems.
 
     Parameters
     ----------
@@ -77,42 +77,42 @@ class FittedCable(EstimatedCable):
         """Predict the shape of the cable in a pose.
 
         Of several equilibria this is the stable one of lowest energy, unless `branch`, `turns` or
-        `over` name one. Where it is unknown which of two sides is the lower one, `other_side` has
-        the other.
+        `over` selects one. If it is uncertain which of two sides is the lower one, the other shape
+        is in `other_side`.
 
         Parameters
         ----------
         end : (d,) [m]
             Where the end is held, d = 2 or 3 in space; None for a free end.
         start : (d,) [m], optional
-            Where the start is held; by default where all poses of the session had it, or the
+            Where the start is held; by default the place shared by all poses of the session, or the
             origin.
         start_heading, end_heading : float [rad], optional
-            Directions of clamped ends in a plane, continuous along the cable; those that all poses
-            of the session shared by default.
+            Directions of clamped ends in a plane, continuous along the cable; by default those that
+            all poses of the session share.
         start_orientation, end_orientation : (4,), optional
             Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the
-            cable; those that all poses of the session shared by default.
+            cable; by default those that all poses of the session share.
         turns : float
-            In space, the number of full turns to which the twist shall be nearest, see `Pose`. A
-            cable may shed two of them over a loop; that is an error.
+            In space: number of full turns to which the twist must be nearest, see `Pose`. A cable
+            may lose two of them over a loop; that is an error.
         branch : "ccw" or "cw", optional
-            In a plane, which way the cable turns from start to end.
+            In a plane: direction in which the cable turns from start to end.
         clips : sequence of Clip or dict
-            What holds the cable between its ends, in the order along it, see `Clip`; none by
-            default, whatever held it in the session.
+            Supports between the ends, in order along the cable, see `Clip`; none by default, even
+            if the session had clips.
         obstacles : sequence of Obstacle or dict
-            What the cable may touch, see `Obstacle`; none by default.
+            Obstacles that the cable may touch, see `Obstacle`; none by default.
         over : bool or mapping of str to bool, optional
             Whether the cable passes over or under the bars among the obstacles, see `Pose`.
 
         Raises
         ------
         EquilibriumError
-            If the pose has no equilibrium, e.g. because the end is out of reach, or none is found
-            on the branch or side.
+            If the pose has no equilibrium, e.g. because the end is out of reach, or if none is
+            found on the branch or side.
         DloError
-            If the ends are not held as the cable's boundary asks, or are no finite numbers.
+            If the ends are not held as the cable's boundary requires, or are not finite numbers.
         """
         asked = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
@@ -129,7 +129,7 @@ class FittedCable(EstimatedCable):
             eq = solve_equilibrium(self.model, self.p, self.rest, pose)
         except EquilibriumError as error:
             happened, _, advice = error.message.partition("\n  Try: ")
-            # There is no configuration here whose keys could be changed.
+            # A call has no configuration whose keys could be changed.
             if "cable.length" in advice or "model.n" in advice:
                 other = (
                     "headings or branch" if pose.node is Heading else "orientations, fewer turns"
@@ -152,14 +152,14 @@ class FittedCable(EstimatedCable):
         Parameters
         ----------
         flags : sequence of str
-            Of the compiler.
+            For the compiler.
         obstacles : int
             Maximum number of obstacles on which the cable may lie, see `CompiledSolver`.
 
         Raises
         ------
         DloError
-            If there is no C compiler, or it refuses the flags.
+            If there is no C compiler, or if it rejects the flags.
         """
         return CompiledSolver(self.model, self.p, self.rest, flags=flags, obstacles=obstacles)
 
@@ -173,15 +173,15 @@ class FittedCable(EstimatedCable):
         seed: int = 0,
         **held: Any,
     ) -> list[Path]:
-        """Write the cable, its ends `held` as in `solve`, for a simulator; return the files.
+        """Write the cable for a simulator, its ends `held` as in `solve`; return the files.
 
-        `target` is a name of `export.targets.TARGETS`; `samples` more are drawn from the fit's
-        covariance: <path>_001, ... Without `segments` joints turn by 0.1 rad at most.
+        `target`: one of `export.targets.TARGETS`. `samples`: number of further cables drawn from
+        the fit's covariance: <path>_001, ... Without `segments` joints turn by 0.1 rad at most.
 
         Raises
         ------
         DloError
-            If there is no such target, a file cannot be written, or as in `solve`.
+            If there is no such target, if a file cannot be written, or as in `solve`.
         """
         to, known, first = target_of(target), self.metadata, self.solve(**held).held
         fitted = (known.coefficients, known.covariance.names, known.covariance.values)
@@ -196,8 +196,8 @@ class FittedCable(EstimatedCable):
         Raises
         ------
         DloError
-            If its rest shape has changed from pose to pose: it is known on the fit's mesh alone;
-            or if there is no such mesh.
+            If there is no such mesh, or if the rest shape has changed from pose to pose: it is
+            known on the fit's mesh only.
         """
         if n is None and element is None:
             return self
@@ -219,27 +219,27 @@ class FittedCable(EstimatedCable):
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A fitted cable in one pose; in a notebook a short table, `print` gives the same as text.
+    """A fitted cable in one pose; a notebook shows a short table, `print` the same as text.
 
     Parameters
     ----------
     cable : FittedCable
         The fitted cable.
     pose : HeldPose
-        How its ends are held; with the `turns` or the `branch` of this shape where the cable may
-        hang on either of two sides.
+        End conditions; with the `turns` or the `branch` of this shape if the cable may hang on
+        either of two sides.
     equilibrium : Equilibrium
         Nodes, reactions, energy and stability.
     curve : CableCurve
-        The cable itself, at any arc length: `curve.at(s)`.
+        The true curve of the cable, at any arc length: `curve.at(s)`.
     seen : CableCurve
         The same curve as measured by the session's camera.
     other_side : Shape or None
-        The same pose on the other side: with a free end fallen to the other side, between two
-        clamps in space twisted the other way round. None unless it is uncertain, by the parameters
-        and fixtures, which side is the lower one, and the pose does not name its side.
+        The same pose on the other side: fallen to the other side with a free end, or twisted the
+        other way between two clamps in space. Set only if parameters and fixtures leave the lower
+        side uncertain and the pose does not select one.
     tipping : Tipping or None
-        Then, the angle of the clamp from where both sides are equally low.
+        Set with `other_side`: angle of the clamp from where both sides have equal energy.
     """
 
     cable: FittedCable
@@ -268,7 +268,7 @@ class Shape:
 
     @property
     def held(self) -> Held:
-        """What an export is cut from."""
+        """The state from which an export is made."""
         model, p = without_camera(self.cable.model, self.cable.p)
         return Held(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
 
@@ -297,13 +297,13 @@ class Shape:
 
     @property
     def clips(self) -> dict[str, ClipLoad]:
-        """Arc length, and force and moment of the cable on it, of each clip by its name."""
+        """Per clip, by name: arc length, and force and moment of the cable on it."""
         names = (clip.name for clip in self.pose.clips)
         return dict(zip(names, self.equilibrium.clips, strict=True))
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """Where the cable touches obstacles, from its start to its end, and the forces on them."""
+        """Contacts with obstacles from start to end, with the forces on them."""
         return self.equilibrium.contacts
 
     @property
@@ -318,14 +318,14 @@ class Shape:
 
     @property
     def stable(self) -> bool:
-        """Whether the cable would stay there: the energy has a strict minimum."""
+        """Whether the equilibrium is stable: the energy has a strict minimum."""
         return self.equilibrium.stable
 
     @cached_property
     def band(self) -> FloatArray:
         """Half width (101,) [m] at `s` of the band across the cable with 90 % of new repeats.
 
-        First order in the parameters' errors, the fixtures' scatter and the scatter of repeats.
+        To first order in parameter errors, scatter of fixtures and scatter of repeats.
         """
         cable, s = self.cable, self.s
         known = cable.metadata.uncertainty
@@ -335,21 +335,21 @@ class Shape:
         return np.asarray(EDGE * np.linalg.norm(spread_across(curve, s, moved), axis=1))
 
     def check(self, limits: Asked = None, *, tolerances: Asked = None) -> tuple[LimitCheck, ...]:
-        """Whether a new repeat of the pose keeps limits, by default the session's.
+        """Check whether a new repeat of the pose keeps limits, by default the session's.
 
-        `tolerances` are standard deviations of other fixtures than the session's, by its keys:
-        `end`, `length`, `clip`, `slip` [m], `heading`, `rotation`, `roll` [rad].
+        `tolerances`: standard deviations of fixtures other than the session's, by key: `end`,
+        `length`, `clip`, `slip` [m], `heading`, `rotation`, `roll` [rad].
 
         Raises
         ------
         ConfigError, DloError
-            If there is no limit, or one or a tolerance has no meaning for this cable.
+            If there is no limit, or if a limit or tolerance is meaningless for this cable.
         """
         known, found = self.cable.metadata, self.equilibrium
         return check_limits(self.cable, known, self.pose, found, limits, tolerances)
 
     def plot(self) -> Figure:
-        """The shape with the forces of the cable on what it touches; in a plane with its band."""
+        """Draw the shape with the forces of the cable on its supports; in a plane also its band."""
         other, forces = self.other_side, {"start": self.start_force}
         state = "stable" if self.stable else "NOT stable"
         radius = millimetres(self.min_bend_radius)
@@ -394,7 +394,7 @@ class Shape:
         return html_table(f"{self.cable.name}: predicted shape", self.rows())
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything a program may want to know, as plain data in SI units."""
+        """All results as plain data in SI units."""
         pose = self.pose
         return {
             "cable": self.cable.name,
@@ -427,11 +427,11 @@ class Shape:
         return {**tipping, "greatest_distance": apart, **other.as_dict()}
 
     def _apart(self, other: "Shape") -> float:
-        """Greatest distance [m] of points at equal arc lengths."""
+        """Largest distance [m] of points at equal arc lengths."""
         return float(np.linalg.norm(other.points - self.points, axis=1).max())
 
     @property
     def _side(self) -> str:
-        """What tells the side on which the cable hangs, as in a configuration."""
+        """Entry of a configuration that selects the side on which the cable hangs."""
         branch, turns = self.pose.branch, self.pose.turns
         return f"branch: {branch}" if branch else f"turns: {turns:g}"

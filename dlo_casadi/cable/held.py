@@ -1,4 +1,4 @@
-"""How the ends of a fitted cable are held, from what a caller gives and what a session shares."""
+"""End conditions of a fitted cable, from what a caller gives and what a session shares."""
 
 import csv
 import math
@@ -23,7 +23,7 @@ from dlo_casadi.model.contact import Contact, outwards
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.show.text import millimetres, vector
 
-# Distances [m] between a fixture and the cable that a table shows.
+# Smallest distance [m] between a fixture and the cable that a table reports.
 _SHOWN = 5e-6
 
 
@@ -35,7 +35,7 @@ def fixture_texts(
     force: FloatArray,
     moment: FloatArray,
 ) -> list[tuple[str, str]]:
-    """How an end is held at a place, where the cable is, and its reactions, as text."""
+    """How an end is held, the cable's true end, and its reactions, as text."""
     if at is None:
         return [(side, "free")]
     rows = [(side, vector(at, "g", "m"))]
@@ -62,7 +62,7 @@ def side_texts(
 
 
 def check_mesh(n: object, element: object) -> None:
-    """Raise DloError if there is no mesh of `n` elements of that kind; None is the fit's."""
+    """Raise DloError if a mesh of `n` such elements is impossible; None is the fit's mesh."""
     if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
         raise DloError(f"n: a whole number, {MESH}, found {n!r}")
     if element not in (None, *ELEMENTS):
@@ -70,7 +70,7 @@ def check_mesh(n: object, element: object) -> None:
 
 
 def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:
-    """Clips, and the forces and moments of the cable on them, as text."""
+    """Clips with the forces and moments of the cable on them, as text."""
     rows = []
     for clip, load in zip(clips, loads, strict=True):
         at = f"{clip.kind} at {load.at:.4g} m of the cable, {vector(clip.place, 'g', 'm')}"
@@ -83,7 +83,7 @@ def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tup
 
 
 def contact_texts(contacts: Sequence[Contact]) -> list[tuple[str, str]]:
-    """Where a cable touches obstacles, and its forces on them, as text."""
+    """Contacts of a cable with obstacles and its forces on them, as text."""
     rows = []
     for one in contacts:
         where = f"at {one.start:.4g}"
@@ -97,7 +97,7 @@ def contact_texts(contacts: Sequence[Contact]) -> list[tuple[str, str]]:
 def reaction_texts(
     model: CableModel, pose: HeldPose, found: Equilibrium, points: FloatArray
 ) -> list[tuple[str, str]]:
-    """All that holds a cable whose points (K, d) [m] begin and end so, and its reactions."""
+    """All supports of a cable whose points (K, d) [m] start and end there, and its reactions."""
     rows = []
     ends = (("start", pose.start, points[0]), ("end", pose.end, points[-1]))
     forces = (found.start_force, found.end_force)
@@ -108,7 +108,7 @@ def reaction_texts(
 
 
 class _Obstacles(ConfigSection):
-    """Obstacles of a call, so that messages name them by their places in the list."""
+    """Obstacles of a call, so that messages name them by their index in the list."""
 
     obstacles: tuple[Obstacle, ...]
 
@@ -119,10 +119,10 @@ def among(
     obstacles: Sequence[Obstacle | Mapping[str, Any]],
     over: Sides = None,
 ) -> dict[str, Any]:
-    """Model and parameters `p` of a cable among obstacles, checked as those of a session.
+    """Model and parameters `p` of a cable among obstacles, checked like those of a session.
 
-    They are where they are declared: an `obstacle_offset` is of the session's own. `over` as of
-    `HeldPose`. Raises DloError if one cannot be so.
+    Obstacles are exactly where they are declared: an `obstacle_offset` belongs to the session only.
+    `over`: as in `HeldPose`. Raises DloError if an obstacle is impossible.
     """
     given: dict[str, Any] = {"obstacles": obstacles}
     listed = _Obstacles(**given).obstacles
@@ -135,19 +135,19 @@ def among(
 
 
 def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, Any]) -> HeldPose:
-    """End conditions, checked as those of a session and against the boundary.
+    """End conditions, checked like those of a session and against the boundary.
 
     Parameters
     ----------
     shared : dict
-        What all poses of the session had in common, for what is not asked for.
+        End conditions that all poses of the session share; defaults for `asked`.
     asked : dict
-        The arguments of `FittedCable.solve` by their names.
+        Arguments of `FittedCable.solve`, by name.
 
     Raises
     ------
     DloError
-        If the ends are not held as the cable's boundary asks, or are no finite numbers.
+        If the ends are not held as the cable's boundary requires, or are not finite numbers.
     """
     name, branch = repr(model.cable.name), asked["branch"]
     own, other = AXES[model.node.dimension], AXES[5 - model.node.dimension]
@@ -195,8 +195,8 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
 
     Columns are end_x_m, end_y_m and, where they differ from pose to pose, start_x_m, start_y_m,
     start_heading_rad, end_heading_rad; in space also end_z_m, start_z_m, start_qx to start_qw,
-    end_qx to end_qw and turns; and name, the line's number when absent. Raises DloError if there is
-    no such file, or it has other columns or cells that are no numbers.
+    end_qx to end_qw and turns; and name, by default the line's number. Raises DloError if the file
+    is missing, has other columns, or has cells that are not numbers.
     """
     node, sides = model.node, ("start", "end")
     keys = {side: [f"{side}_{axis}_m" for axis in node.axes] for side in sides}

@@ -1,4 +1,4 @@
-"""Checks of a shape against limits: value, probability, where it is tight, and what decides."""
+"""Check a shape against limits: value, probability, tightest place, main cause of uncertainty."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,16 +27,16 @@ from dlo_casadi.thresholds import SAFE
 
 Kind = TypeVar("Kind", bound=ConfigSection)
 Verdict = Literal["pass", "risk", "fail"]
-# Smallest probability that is written as a number.
+# Smallest probability that is printed as a number.
 SHOWN = 1e-3
 UNITS = {"bend_radius": "m", "force": "N", "moment": "N m", "twist": "1/m", "clearance": "m"}
-# Quantities of which a limit is the least value.
+# Quantities with a lower limit.
 LEAST = ("bend_radius", "clearance")
 
 
 @dataclass(frozen=True, eq=False)
 class LimitUse:
-    """How much of a limit the predicted shape of one pose uses.
+    """Use of a limit by the predicted shape of one pose.
 
     Parameters
     ----------
@@ -46,10 +46,10 @@ class LimitUse:
     at : float [m]
         Arc length from the start where the shape is tightest.
     holder : str
-        The fixture there, of a force or a moment, the nearest obstacle of a clearance; else empty.
+        The fixture (force or moment) or nearest obstacle (clearance) there; otherwise empty.
     s, used : (K,)
-        Arc lengths [m], and the share of the limit that is used there: 1 at the limit, of a
-        clearance 2 where the cable touches.
+        Arc lengths [m], and the used share of the limit at each: 1 at the limit; for a clearance 2
+        where the cable touches.
     """
 
     pose: str
@@ -63,12 +63,12 @@ class LimitUse:
 
     @property
     def margin(self) -> float:
-        """Share of the limit that is left where the shape is tightest; negative beyond it."""
+        """Remaining share of the limit where the shape is tightest; negative beyond it."""
         return float(1 - self.used.max())
 
     @property
     def where(self) -> str:
-        """The fixture, or the arc length, and the obstacle there."""
+        """The fixture, or the arc length and the obstacle there."""
         if self.quantity in ("force", "moment"):
             return self.holder
         return f"s = {self.at:.3f} m{self.holder and f', {self.holder}'}"
@@ -83,12 +83,12 @@ class LimitUse:
 
     @property
     def label(self) -> str:
-        """What is limited, in words."""
+        """Description of the limited quantity."""
         return self.quantity.replace("_", " ")
 
     @property
     def bound(self) -> str:
-        """The limit as text, with its side."""
+        """The limit as text, with its direction."""
         return f"{'≥' if self.quantity in LEAST else '≤'} {self.text(self.limit)}"
 
     def __str__(self) -> str:
@@ -99,27 +99,27 @@ class LimitUse:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LimitCheck(LimitUse, Exceedance):
-    """One quantity of one pose beside its limit, and how likely a new repeat violates it.
+    """One quantity of one pose with its limit, and the probability that a new repeat violates it.
 
     Parameters
     ----------
     std : float
         Standard deviation of `value`, in its unit, to first order.
     probability, error : float
-        That a new repeat of the pose violates the limit; and the standard error of a counted one.
+        Probability that a new repeat of the pose violates the limit; standard error if counted.
     draws, lost : int
         As of `Exceedance`.
     shares : mapping of str to float
-        Parts of the variance by their causes, the largest first; empty where nothing is uncertain.
+        Parts of the variance by cause, the largest first; empty if nothing is uncertain.
     decided_by : str
-        The largest cause in words, with its size.
+        The largest cause with its size, as text.
     """
 
     decided_by: str
 
     @property
     def verdict(self) -> Verdict:
-        """Fail where the value itself violates the limit, pass below a probability of 1 %."""
+        """Fail if the value itself violates the limit; pass below a probability of 1 %."""
         if self.used.max() > 1:
             return "fail"
         return "pass" if self.probability < SAFE else "risk"
@@ -160,7 +160,7 @@ class LimitCheck(LimitUse, Exceedance):
         }
 
 
-# What a caller may give for a section of a session: itself, its keys and values, or nothing.
+# Forms of a session's section that a caller may give: itself, its keys and values, or nothing.
 Asked = ConfigSection | Mapping[str, Any] | None
 # Largest tolerance of a place or of the length, in lengths of the cable.
 _LOOSE = 0.1
@@ -168,9 +168,9 @@ _TRY = "{'bend_radius': 0.05, 'force': 8.0}, of the commands --limits bend_radiu
 
 
 def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Limits:
-    """Limits that a caller gives, or the session's.
+    """Limits given by the caller, or else the session's.
 
-    Raises DloError if there is none, or one has no meaning for this cable.
+    Raises DloError if there are none, or if one is meaningless for this cable.
     """
     asked = _given(Limits, limits, _TRY) or known.limits
     if not asked.given:
@@ -190,7 +190,7 @@ def check_limits(
     limits: Asked = None,
     tolerances: Asked = None,
 ) -> tuple[LimitCheck, ...]:
-    """Checks of a fitted cable's shape, see `Shape.check`."""
+    """Check a fitted cable's shape, see `Shape.check`."""
     asked = asked_limits(cable.model, known, limits)
     beside = _given(DeclaredTolerances, tolerances, "tolerances={'end': 2e-3} [m]")
     stds = {} if beside is None else beside.model_dump(exclude_unset=True)
@@ -209,7 +209,7 @@ def check_limits(
 
 
 def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
-    """A section from what a caller gives."""
+    """Convert what a caller gives to a section."""
     if given is None or isinstance(given, kind):
         return given
     if not isinstance(given, Mapping):
@@ -218,9 +218,9 @@ def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
 
 
 def bounds_of(limits: Limits) -> dict[str, float]:
-    """Upper bounds of the sizes of `sizes_of`, by their names.
+    """Upper bounds of the sizes from `sizes_of`, by name.
 
-    Of a bend radius it is the curvature's; the size of a clearance is its negative.
+    For a bend radius it bounds the curvature; the size of a clearance is its negative.
     """
     sizes = {"bend_radius": lambda y: 1 / y, "clearance": lambda y: -y}
     return {_size(x): sizes.get(x, float)(y) for x, y in limits.given.items()}
@@ -232,10 +232,10 @@ def _size(quantity: str) -> str:
 
 @dataclass(frozen=True)
 class Resolved:
-    """A shape on meshes of which the last one resolves its sharpest bend.
+    """A shape on several meshes, the last of which resolves its sharpest bend.
 
-    Where a state has changed the rest curvature, it is known on the fit's elements alone, and these
-    are used.
+    If a state has changed the rest curvature, that is known only on the fit's elements, and only
+    these are used.
     """
 
     cable: CasadiCable
@@ -252,7 +252,7 @@ class Resolved:
         found: Equilibrium,
         limits: Limits,
     ) -> Self:
-        """On the meshes that the limits ask for."""
+        """Solve on the meshes that the limits need."""
         meshes = [(cable.model, found)]
         if limits.bend_radius is not None and not cable.model.has_state:
             meshes = resolved(cable.model, cable.p, coefficients, pose, found)
@@ -273,7 +273,7 @@ class Resolved:
         return sizes_of(mesh, shape.shapes, given, _size(quantity))[0]
 
     def uses(self, limits: Limits) -> tuple[LimitUse, ...]:
-        """How much of each limit the shape uses, in their order."""
+        """Use of each limit by the shape, in their order."""
         out, bounds = [], bounds_of(limits)
         for quantity, limit in limits.given.items():
             mesh, shape = self.on(quantity)
@@ -298,19 +298,19 @@ def limit_checks(
     uncertainty: Uncertainty,
     limits: Limits,
 ) -> tuple[LimitCheck, ...]:
-    """Checks of one predicted shape, one for each limit, in their order.
+    """Check one predicted shape, one limit after the other.
 
     A bend is measured on a mesh that resolves it, see `resolved`. Draws are solved there, too: how
     places compete for the sharpest bend depends on the mesh. `coefficients` (n_coefficients,)
-    [1/m]: of the rest curvature. `limits`: with a meaning for this cable, see `Limits.problems`.
+    [1/m]: of the rest curvature. `limits`: meaningful for this cable, see `Limits.problems`.
     """
     shape, bounds = Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
     drawn, near = shape.meshes[-1]
-    # What a size is on the mesh of the draws, over what it is.
+    # Ratio of a size on the mesh of the draws to its resolved value.
     ratio = {
         _size(x): shape.sizes(drawn, near, x).max() / shape.sizes(*shape.on(x), x).max()
         for x in limits.given
-        if x != "clearance"  # which hardly depends on the mesh, and may be zero
+        if x != "clearance"  # a clearance hardly depends on the mesh, and may be zero
     } | {"clearance": 1.0}
     own = uncertainty.pose_scatter
     with_own = own.within(drawn), own.values(cable.p, drawn)
@@ -332,7 +332,7 @@ def limit_checks(
 
 
 def _said(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:
-    """The largest cause of an uncertain value in words: "2 mm at the end (81 %)"."""
+    """The largest cause of uncertainty as text: "2 mm at the end (81 %)"."""
     if not chance.std > 0:
         return "nothing is uncertain"
     cause, share = next(iter(chance.shares.items()))

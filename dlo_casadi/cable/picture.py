@@ -1,4 +1,4 @@
-"""The picture of one shape: the cable, what it does to its fixtures, and obstacles as lines."""
+"""Draw one shape: the cable, its forces on fixtures, and obstacles as lines."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,8 +10,8 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.rod.obstacles import Obstacle, Plane
 from dlo_casadi.show import style
 
-# Shares of a shape's extent: the longest arrow, how far a number stands from its arrow's tip, and
-# the half width of a band that can be seen beside the line.
+# Shares of a shape's extent: longest arrow, distance of a number from its arrow's tip, and the
+# smallest half width of a band that is visible beside the line.
 _LONGEST, _NUMBER, _VISIBLE = 0.25, 0.1, 0.008
 
 
@@ -30,10 +30,10 @@ def draw_shape(
 ) -> Figure:
     """Draw a shape (K, d) [m] with the forces (d,) [N] on its ends "start" and "end".
 
-    `clips` are the places (d,) [m] of clips and the forces on them, by their names.
-    `band` (K,) [m] are half widths about a shape in a plane, `other` (K, d) [m] is the shape on
-    the other side. `obstacles` are lines (n, d) [m] that show them; `touching` are stretches (n, d)
-    [m] of the cable that touch one, n odd, and the forces on it.
+    `clips`: positions (d,) [m] of clips and the forces on them, by name. `band` (K,) [m]: half
+    widths about a shape in a plane. `other` (K, d) [m]: the shape on the other side. `obstacles`:
+    lines (n, d) [m] that show them. `touching`: pieces (n, d) [m] of the cable that touch one, n
+    odd, and the forces on it.
     """
     ends = {"start": (points[0], "s"), "end": (points[-1], "o")}
     drawn: list[tuple[str | None, FloatArray, str, FloatArray]]
@@ -72,7 +72,7 @@ def draw_shape(
             number.set_color(style.VERMILLION)
             axes.plot(
                 *(tip + 2 * along)[:, None], alpha=0
-            )  # a text does not count for the axes' limits
+            )  # a text does not affect the axes' limits
         axes.set_aspect("equal", adjustable="datalim")
         axes.margins(0.12)
         axes.set(**{f"{axis}label": f"{axis} [m]" for axis in "xyz"[: points.shape[1]]})
@@ -85,13 +85,13 @@ def draw_shape(
     return drawing
 
 
-# Points of a circle; strokes of the hatching on the inner side of a planar surface; lines of the
-# net on a surface in space each way.
+# Points per circle; hatching strokes on the inner side of a planar surface; lines of the net on a
+# surface in space, in each direction.
 _CIRCLE, _STROKES, _NET = 33, 24, 7
-# How far surfaces are drawn beyond the cable, and length of a stroke, in lengths of the cable.
+# Distance by which surfaces extend beyond the cable, and length of a stroke, in cable lengths.
 _BEYOND, _STROKE = 0.06, 0.025
 
-# Half the least length of a stretch that touches something, so that a point is seen, too.
+# Half the smallest drawn length of a contact, so that a point is visible.
 _SEEN = 0.006
 
 
@@ -103,9 +103,9 @@ def touching(start: float, end: float, length: float) -> FloatArray:
 
 
 def outlines(obstacle: Obstacle, points: FloatArray, length: float) -> list[FloatArray]:
-    """Lines (K, d) [m] that show an obstacle beside points (n, d) [m] of a cable of a length [m].
+    """Lines (K, d) [m] that show an obstacle near points (n, d) [m] of a cable of a length [m].
 
-    Of a plane, and of a long bar, the part beside the cable.
+    Of a plane, and of a long bar, only the part near the cable is drawn.
     """
     if isinstance(obstacle, Plane):
         return _plane(obstacle, points, length)
@@ -136,7 +136,7 @@ def outlines(obstacle: Obstacle, points: FloatArray, length: float) -> list[Floa
 
 
 def _plane(plane: Plane, points: FloatArray, length: float) -> list[FloatArray]:
-    """The part of a plane beside points: a hatched line, or a net in space."""
+    """The part of a plane near points: a hatched line, or a net in space."""
     normal, foot = np.array(plane.normal), np.array(plane.point)
     if len(normal) == 2:
         along = _turned(normal)
@@ -156,13 +156,13 @@ def _plane(plane: Plane, points: FloatArray, length: float) -> list[FloatArray]:
 
 
 def _extent(points: FloatArray, axis: FloatArray, length: float) -> tuple[float, float]:
-    """From where to where [m] along an axis points (n, d) reach, and a little more."""
+    """Range [m] along an axis of points (n, d), with a margin."""
     along, more = points @ axis, _BEYOND * length
     return float(along.min()) - more, float(along.max()) + more
 
 
 def _turned(x: FloatArray) -> FloatArray:
-    """A vector (2,) turned by a quarter."""
+    """Rotate a vector (2,) by a quarter turn."""
     return np.array([-x[1], x[0]])
 
 

@@ -1,12 +1,12 @@
-"""Where to put clips: arc lengths and places that keep limits over several poses of the ends.
+"""Place clips: find arc lengths and positions that keep limits over several poses of the ends.
 
-A minimax problem: z are the arc lengths and places of the clips, u_r(z) the share of its limit
-that is used at one arc length of one pose,
+A minimax problem: z are the arc lengths and places of the clips, u_r(z) the used share of its limit
+at one arc length of one pose,
 
     min_z max_r u_r(z)    s.t.   low <= place <= high,   |chord of a span| <= ROOM x its cable
 
-or the greatest force is made least with all u_r(z) <= 1. Each step solves the linear program of the
-first-order model within a trust region, and is taken if the shapes solved anew confirm it.
+or the largest force is minimized subject to u_r(z) <= 1. Each step solves the linear program of the
+first-order model within a trust region, and is accepted if the newly solved shapes confirm it.
 
 References
 ----------
@@ -43,37 +43,37 @@ from dlo_casadi.show.text import vector
 
 Aim = Literal["margin", "force"]
 Sizes = Mapping[str, FloatArray]
-# Largest chord of a span over its cable: beyond it 1 mm changes the pull of a span of 0.25 m by a
-# sixth and more. First guesses have more room, if there is any.
+# Largest chord of a span relative to its cable: beyond it 1 mm changes the pull of a span of 0.25 m
+# by a sixth or more. First guesses use a smaller ratio if possible.
 ROOM, ROOMY = 0.95, (0.8, 0.9, 0.95)
 # First, largest and last radius of the trust region, in lengths of the cable.
 FIRST, LARGEST, LAST = 0.05, 0.2, 1e-4
-# Numbers of first guesses and of steps from each; of the best that go on, and their largest number
-# of steps; largest number of rounds, after which bends are resolved.
+# Number of first guesses and of steps from each; number of the best that continue, and their
+# maximum number of steps; maximum number of rounds, after each of which bends are resolved.
 GUESSES, TRIED, STARTS, STEPS, ROUNDS = 16, 6, 3, 60, 4
 # Scatter of first guesses [lengths].
 SCATTER = 0.05
-# Weight of a share beyond a limit against the force that is made least.
+# Weight of a share beyond a limit relative to the minimized force.
 PENALTY = 10.0
-# Relative change of what resolved bends use that ends the rounds.
+# Rounds end when the resolved use of bends changes by less than this relative amount.
 SETTLED = 5e-3
 _TRY = "within=((0.1, 0.0), (0.3, 0.2)) [m]: the lowest and the highest coordinates of the clips"
 
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Pinned clips, and what the cable uses of its limits between them.
+    """Pinned clips, and the use of limits by the cable between them.
 
     Parameters
     ----------
     clips : tuple of Clip
-        As `FittedCable.solve` takes them.
+        In the form that `FittedCable.solve` takes.
     uses : tuple of LimitUse
-        Of each limit in each pose; empty without limits.
+        For each limit in each pose; empty without limits.
     force : float [N]
-        Greatest force of the cable on any of its fixtures and clips, in all poses.
+        Largest force of the cable on any of its fixtures and clips, over all poses.
     at : str
-        Where: the fixture and the pose.
+        Fixture and pose of that force.
     """
 
     clips: tuple[Clip, ...]
@@ -83,12 +83,12 @@ class Placing:
 
     @property
     def binding(self) -> LimitUse | None:
-        """The limit of which most is used, its pose and place; None without limits."""
+        """The most used limit, with its pose and place; None without limits."""
         return min(self.uses, key=lambda use: use.margin, default=None)
 
     @property
     def margin(self) -> float:
-        """Share of its limit that is left where most is used: 1 = nothing used, < 0 = violated."""
+        """Remaining share of the most used limit: 1 = nothing used, < 0 = violated."""
         return 1.0 if self.binding is None else self.binding.margin
 
     def __str__(self) -> str:
@@ -144,7 +144,7 @@ def placed(
 class _Hung:
     """The lowest shapes of all poses with the clips at z.
 
-    `sizes` of each pose by their names; `aims` (R,) are made least, `others` (S,) kept below 1.
+    `sizes`: of each pose by name; `aims` (R,) are minimized, `others` (S,) kept below 1.
     """
 
     z: FloatArray
@@ -155,15 +155,15 @@ class _Hung:
 
     @property
     def merit(self) -> float:
-        """What is made least."""
+        """The objective."""
         return float(self.aims.max() + PENALTY * max(self.others.max(initial=0.0) - 1, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Search for z (count (1 + d),) in lengths of the cable: arc length and place of each clip.
+    """Search for z (count (1 + d),) in cable lengths: arc length and place of each clip.
 
-    `poses` are without clips, `region` (2, d) in lengths.
+    `poses`: without clips; `region` (2, d): in cable lengths.
     """
 
     cable: CasadiCable
@@ -185,7 +185,7 @@ class _Search:
 
     @cached_property
     def slipping(self) -> CasadiCable:
-        """The cable with a slip of each clip as a parameter: its derivatives are those by `at`."""
+        """The cable with each clip's slip as a parameter: derivatives by it are those by `at`."""
         model, p = self.cable.model, self.cable.p
         for k in range(self.count):
             if (slip := ALONG_CABLE(clip=k)).label not in [
@@ -196,7 +196,7 @@ class _Search:
 
     @cached_property
     def ways(self) -> Uncertainty:
-        """Slips and moves of clips by 1 m, as what varies."""
+        """Slips and moves of clips by 1 m, as uncertain quantities."""
         slips = tuple(f"{ALONG_CABLE(clip=k).label}.ds" for k in range(self.count))
         moves = [
             f"clip_{k}_{axis}" for k in range(self.count) for axis in self.cable.model.node.axes
@@ -205,19 +205,19 @@ class _Search:
 
     @cached_property
     def columns(self) -> list[int]:
-        """Columns of the derivatives by `ways` in the order of z."""
+        """Columns of the derivatives by `ways`, in the order of z."""
         causes = self.ways.causes_in(self.slipping.model)
         moves = [np.flatnonzero([x == f"clip_{k}" for x in causes]) for k in range(self.count)]
         return [int(column) for k, own in enumerate(moves) for column in (k, *own)]
 
     @cached_property
     def bounds(self) -> FloatArray:
-        """Least and greatest z (2, count (1 + d))."""
+        """Lower and upper bounds of z (2, count (1 + d))."""
         least, (low, high) = 1 / self.cable.model.n, self.region
         return np.tile([[least, *low], [1 - least, *high]], self.count)
 
     def held(self, z: FloatArray) -> list[HeldPose]:
-        """The poses, held by the clips, too."""
+        """The poses with the clips added."""
         rows = self.length * z.reshape((self.count, -1))
         clips = tuple(
             HeldClip("pinned", tuple(row[1:].tolist()), float(row[0]), name=f"clip_{k}")
@@ -226,7 +226,7 @@ class _Search:
         return [replace(pose, clips=clips) for pose in self.poses]
 
     def spare(self, z: FloatArray, room: float = ROOM) -> tuple[FloatArray, FloatArray]:
-        """Cable (poses spans,) of spans beyond their chords, in lengths; derivatives by z."""
+        """Cable beyond the chords of spans (poses spans,), in cable lengths; derivatives by z."""
         d, count = self.region.shape[1], self.count
         rows, found = z.reshape((count, 1 + d)), []
         for pose in self.poses:
@@ -242,7 +242,7 @@ class _Search:
         return spare, slopes
 
     def hung(self, z: FloatArray, scales: FloatArray) -> _Hung:
-        """The lowest shapes at z; an EquilibriumError where there is none."""
+        """The lowest shapes at z; raises EquilibriumError if there are none."""
         known, poses = self.slipping, self.held(z)
         shapes, sizes = [], []
         for eq in solve_equilibria(known.model, known.p, known.rest, poses):
@@ -261,9 +261,9 @@ class _Search:
         return bounds_of(self.limits)
 
     def _split(self, sizes: Sequence[Sizes], scales: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is made least and what is kept, of sizes, or of their derivatives, in each pose.
+        """Minimized and bounded quantities, from sizes or from their derivatives, in each pose.
 
-        `scales` (poses, limits): resolved sizes over those on the mesh of the fit.
+        `scales` (poses, limits): resolved sizes relative to those on the fit's mesh.
         """
         shares = [
             one[name] * scale / bound
@@ -288,7 +288,7 @@ class _Search:
         return self._split(sizes, scales)
 
     def best(self) -> Placing:
-        """The best of all first guesses; an error where none keeps the limits."""
+        """The best result of all first guesses; raises an error if none keeps the limits."""
         scales, lost = np.ones((len(self.poses), len(self.bounded))), EquilibriumError("")
         hung: list[_Hung] = []
         for z in self._guesses():
@@ -312,7 +312,7 @@ class _Search:
         return best
 
     def _guesses(self) -> list[FloatArray]:
-        """First guesses: where the cable hangs without clips, moved until each span has room."""
+        """First guesses: points of the cable without clips, moved until each span has room."""
         known, curves = self.cable.with_clips(()), []
         for pose in self.poses:
             eq = solve_equilibrium(known.model, known.p, known.rest, pose)
@@ -342,9 +342,9 @@ class _Search:
         return guesses
 
     def _with_room(self, first: FloatArray, room: float) -> FloatArray:
-        """The z nearest to a first one at which no span is longer than this share of its cable.
+        """The z nearest to a first guess at which no span is longer than `room` times its cable.
 
-        That set is convex.
+        The set of such z is convex.
         """
         spans = {
             "type": "ineq",
@@ -383,12 +383,12 @@ class _Search:
         return min(found, key=self._order)
 
     def _order(self, one: Placing) -> tuple[float, float]:
-        """Sorts placings, the best first."""
+        """Sorting key of placings, the best first."""
         over = 0.0 if self.aim == "force" else np.inf
         return -min(one.margin, over), one.force
 
     def _descended(self, now: _Hung, scales: FloatArray, steps: int) -> _Hung:
-        """After so many steps, or where the trust region shrinks to nothing."""
+        """State after `steps` steps, or when the trust region has shrunk to nothing."""
         radius, slopes = FIRST, self.slopes(now, scales)
         for _ in range(steps):
             step, foreseen = self._step(now, slopes, radius)
@@ -412,7 +412,7 @@ class _Search:
     def _step(
         self, now: _Hung, slopes: tuple[FloatArray, FloatArray], radius: float
     ) -> tuple[FloatArray, float]:
-        """Best step of the first-order model within a radius, and the merit it foresees.
+        """Best step of the first-order model within a radius, and the merit that it predicts.
 
         Variables: the step, the greatest aim, and the greatest violation.
         """
@@ -433,7 +433,7 @@ class _Search:
         return found.x[:size], float(found.fun)
 
     def _told(self, now: _Hung, uses: Sequence[LimitUse]) -> Placing:
-        """A placing in words of the configuration."""
+        """Convert a result to a placing in a configuration's terms."""
         poses = self.held(now.z)
         model, worst = self.slipping.model, []
         for pose, eq, sizes in zip(poses, now.shapes, now.sizes, strict=True):

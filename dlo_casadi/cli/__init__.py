@@ -17,7 +17,7 @@ from types import FrameType
 
 from dlo_casadi.errors import DloError
 
-# Subcommand -> its module, which is imported only when it is called, and what it does.
+# Subcommand -> its module, imported only when the command is called, and its summary.
 COMMANDS = {
     "new": ("new", "write a commented configuration to start from"),
     "import": ("recordings", "make a session of motion capture, ROS bags or point clouds"),
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv : sequence of str, optional
-        What follows `dlo`; the command line by default.
+        Arguments after `dlo`; by default those of the command line.
 
     Returns
     -------
@@ -108,12 +108,12 @@ def _overview() -> str:
 OK, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
-# Errors of writing to the output stream; errors of files have become an OutputError before.
+# Errors of the output stream; errors of files have already become an OutputError.
 _LOST = (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class _Signals:
-    """Record of received signals: a library may swallow the exceptions that they raise."""
+    """Record received signals: a library may swallow the exceptions that they raise."""
 
     def __init__(self) -> None:
         self.received = False
@@ -133,7 +133,7 @@ signals = _Signals()
 
 
 def guarded(work: Callable[[], int]) -> int:
-    """Run a command, its imports included, and return its exit code."""
+    """Run a command, including its imports, and return its exit code."""
     # Also for SIGINT: a shell may have started the command with SIGINT ignored.
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     signals.received = False
@@ -141,7 +141,7 @@ def guarded(work: Callable[[], int]) -> int:
         for number in before:
             signal.signal(number, signals.interrupt)
         if isinstance(sys.stdout, io.TextIOWrapper):
-            sys.stdout.reconfigure(errors="backslashreplace")  # as stderr is
+            sys.stdout.reconfigure(errors="backslashreplace")  # same as stderr
         code = work()
         print(end="", flush=True)
         return code
@@ -152,12 +152,12 @@ def guarded(work: Callable[[], int]) -> int:
         print("\n".join([f"{type(error).__name__}: {error}", *notes]), file=sys.stderr)
         return BAD_INPUT
     except Exception as error:
-        if signals.received:  # an import that was interrupted may end as any error
+        if signals.received:  # an interrupted import may end with any error
             return _interrupted()
         if isinstance(error, OSError) and error.errno in _LOST:
-            sys.stdout = None  # its unwritten rest would be tried again at exit
+            sys.stdout = None  # otherwise Python retries the unwritten rest at exit
             if error.errno == errno.EPIPE:
-                return OK  # the reader has gone, as `head` does; nothing is left to be said
+                return OK  # the reader has closed the pipe, as `head` does
             print(f"OutputError: the output cannot be written: {error.strerror}", file=sys.stderr)
             return BAD_INPUT
         traceback.print_exc()

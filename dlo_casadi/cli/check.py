@@ -63,7 +63,7 @@ def check(chosen: argparse.Namespace) -> int:
 
 
 def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
-    """Write the steps' pictures of all poses; return the files."""
+    """Write pictures of all steps in all poses; return the files."""
     if config.experiment.measurement.kind != "images":
         raise DloError("--show draws photographs; this configuration has centre-lines")
     poses = [pose for pose in config.measured_poses if any(path.is_file() for path in pose.paths)]
@@ -73,7 +73,7 @@ def _show(config: Config, folder: Path, watch: Watch) -> list[Path]:
         watch.step("draw the steps", k, len(poses))
         try:
             pictures = measure.draw_steps(config, pose)
-        except MeasurementError:  # no photograph; the table says so
+        except MeasurementError:  # no photograph; the table reports it
             continue
         for name, picture in pictures.items():
             written.append(folder / f"{name}.jpg")

@@ -98,7 +98,7 @@ def export(chosen: argparse.Namespace) -> None:
 
 
 def _held(cable: FittedCable, chosen: argparse.Namespace) -> dict[str, Any]:
-    """How the ends are held: as is said, or as in the session's first pose."""
+    """End conditions: from the options, or those of the session's first pose."""
     from dlo_casadi.session.round_trip import session_of
 
     held = {name: getattr(chosen, name) for name in HELD}

@@ -14,12 +14,12 @@ from dlo_casadi.io.files import make_folder
 from dlo_casadi.runtime.executors import ended_first
 from dlo_casadi.runtime.parallel import begin, open_executor
 
-# Of report.json, what a diagnosis prints.
+# Keys of report.json that a diagnosis prints.
 DIAGNOSIS = ("config", "verdict", "effects", "candidates", "unexplained", "next_pose", "warnings")
 
 
-# Processes of a single session by default: two where there are two processors, a third saves
-# little; one where other processes cannot be started.
+# Default number of processes of a single session: two if there are two processors (a third saves
+# little); one if other processes cannot be started.
 PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
 SESSION_JOBS = jobs(1 if multiprocessing.current_process().daemon else min(2, PROCESSORS))
 NO_DIAGNOSIS = option(
@@ -75,13 +75,13 @@ def diagnose(chosen: argparse.Namespace) -> None:
 def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
     """Fit a session here and in `--jobs` - 1 processes; write to the output, if given; print.
 
-    With `keys`, `--json` prints these of report.json alone, and text lists all that was tried.
+    With `keys`, `--json` prints only these of report.json, and text lists all effects tried.
     """
     config, output = chosen.config, chosen.output
     libraries = ("dlo_casadi.session", "dlo_casadi.report.writer")
     with open_executor(chosen.jobs, here=True, libraries=libraries) as executor:
         begin(executor, os.getpid)
-        # These imports take as long as those of the other process, beside which they are made.
+        # These imports take as long as those of the other process, which run in parallel.
         from dlo_casadi.cli.watch import Watch
         from dlo_casadi.report.documents import report_dict
         from dlo_casadi.report.terminal import candidate_table, print_summary

@@ -44,7 +44,7 @@ LIMITS = (
         help="of other fixtures than the session's: end, length [m], heading, rotation, roll [rad]",
     ),
 )
-# Arguments of `FittedCable.solve` among the options.
+# Options that are arguments of `FittedCable.solve`.
 HELD = (
     *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
     *("turns", "branch"),
@@ -113,7 +113,7 @@ def predict(chosen: argparse.Namespace) -> None:
     shape = load(chosen.parameters).solve(**asked, over=_sides(chosen.over))
     if figure is not None:
         save_figure(figure, shape.plot())
-    # What a reader of the prediction should know of the file it came from.
+    # What a reader of the prediction should know about the file it came from.
     notes = []
     if shape.cable.metadata.edited:
         notes.append("note: the model in this file was changed after it had been fitted")
@@ -140,7 +140,7 @@ def predict(chosen: argparse.Namespace) -> None:
 
 
 def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:
-    """Clips or obstacles of the command's file; none without one."""
+    """Clips or obstacles from the command's file; empty without a file."""
     path, kind = getattr(chosen, name), {"clips": "pinned", "obstacles": "plane"}[name]
     found = [] if path is None else read_yaml(path)
     if not isinstance(found, list):
@@ -149,7 +149,7 @@ def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:
 
 
 def _sides(words: list[str] | None) -> bool | dict[str, bool] | None:
-    """Sides of bars, of true or false alone or of NAME=true ..."""
+    """Sides of bars, from true or false alone, or from NAME=true ..."""
     if words is None:
         return None
     said = {"true": True, "false": False}
@@ -168,12 +168,12 @@ def _sides(words: list[str] | None) -> bool | dict[str, bool] | None:
 
 
 def _checked(shape: Shape, chosen: argparse.Namespace) -> tuple[LimitCheck, ...]:
-    """Checks of a shape against the limits of the command, or those of the session."""
+    """Check a shape against the limits of the command, or those of the session."""
     return shape.check(_named("limits", chosen) or None, tolerances=_named("tolerances", chosen))
 
 
 def _named(key: str, chosen: argparse.Namespace) -> dict[str, float]:
-    """Numbers by their names, of NAME=VALUE."""
+    """Numbers by name, from NAME=VALUE."""
     found = {}
     for word in getattr(chosen, key) or ():
         name, _, value = word.partition("=")
@@ -290,7 +290,7 @@ def shape_table(chosen: argparse.Namespace) -> None:
 
 
 def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
-    """The poses; columns that a list lacks are taken from the options or the session."""
+    """The poses; columns missing in a list come from the options or the session."""
     model, shared = cable.model, cable.metadata.fixtures
     x, y = chosen.start or shared.get("start") or (0.0, 0.0)
     fixed = {"start_x": float(x), "start_y": float(y)}

@@ -79,7 +79,7 @@ def new(chosen: argparse.Namespace) -> None:
 
 
 def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list[str]:
-    """Files of a folder in the order of their names, pose_2 before pose_10, relative to `base`."""
+    """Files of a folder sorted by name (pose_2 before pose_10), relative to `base`."""
     try:
         found = [path for path in folder.iterdir() if path.suffix.lower() in endings]
     except OSError as error:

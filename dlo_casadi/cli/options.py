@@ -22,7 +22,7 @@ from dlo_casadi.errors import ConfigError
 
 EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 
-# Adds itself to a parser or a group.
+# Function that adds an option to a parser or a group.
 Option = Callable[[Any], object]
 
 
@@ -32,7 +32,7 @@ def option(*names: str, **settings: Any) -> Option:
 
 
 def one_of(*options: Option, required: bool = False) -> Option:
-    """Options of which at most one may be given."""
+    """Make a group of mutually exclusive options."""
 
     def add(parser: Any) -> None:
         group = parser.add_mutually_exclusive_group(required=required)
@@ -62,19 +62,19 @@ SCHEDULER = option("--scheduler", metavar="ADDRESS", help="of a Dask cluster, in
 def command(
     *options: Option, codes: str = "", json: str | None = "print JSON instead of tables"
 ) -> Callable[[Callable[[argparse.Namespace], int | None]], Callable[[Sequence[str]], int]]:
-    """Make a subcommand of the function of the same name: from arguments to exit code.
+    """Make a subcommand from the function of the same name: from arguments to exit code.
 
-    Its docstring is the help: what it does and, after an empty line, examples, one command a line.
+    Its docstring is the help: a description and, after an empty line, examples, one command a line.
     A `CONFIG` among the options is loaded before the call.
 
     Parameters
     ----------
     options : Option
-        In the order in which the help lists them.
+        In the order of the help.
     codes : str
-        Meaning of the exit codes, if it is more than in every command.
+        Meaning of the exit codes, if they differ from those of every command.
     json : str or None
-        Help of `--json`, which comes with `--quiet`; without both if None.
+        Help of `--json`, which is added with `--quiet`; neither is added if None.
     """
     if json is not None:
         quiet = option("--quiet", action="store_true", help="print nothing but errors")
@@ -112,7 +112,7 @@ def plain_numbers(argv: Sequence[str]) -> list[str]:
 
 
 def configuration(path: Path) -> Config:
-    """Load a configuration; of a folder, say which configurations it holds."""
+    """Load a configuration; for a folder, list the configurations it holds."""
     if os.path.isdir(path):
         found = [str(file) for file in sorted(path.glob("*.y*ml"))[:5]]
         hint = ", ".join(found) or "a YAML file, such as configs/cable.yaml"
@@ -122,7 +122,7 @@ def configuration(path: Path) -> Config:
 
 
 class Page(Console):
-    """Where results go: with `--json` as JSON alone, else as text, unless it is `--quiet`."""
+    """Destination of results: JSON only with `--json`, otherwise text, unless `--quiet`."""
 
     def __init__(self, chosen: argparse.Namespace) -> None:
         width = None if sys.stdout.isatty() else 120  # a file or a pipe has room for a whole table
@@ -131,12 +131,12 @@ class Page(Console):
         self.as_json: bool = chosen.json
 
     def data(self, data: Any) -> None:
-        """Print plain data as JSON, if it is asked for."""
+        """Print plain data as JSON, if requested."""
         if self.as_json:
             print(json.dumps(data, indent=1, allow_nan=False))
 
     def say(self, text: object, mark: str = "") -> None:
-        """Print a line as it is, however long, after a mark with markup."""
+        """Print a line unchanged, however long, after a mark with markup."""
         self.print(f"{mark}{escape(str(text))}", soft_wrap=True)
 
     def warn(self, text: str) -> None:

@@ -34,7 +34,7 @@ _CABLE = {
 
 
 def _vector(name: str, axes: str, text: str) -> Option:
-    """An option of several numbers, as many as its axes."""
+    """An option of several numbers, one per axis."""
     kept = tuple(axes.split())
     many = "+" if kept[-1] == "..." else len(kept)
     shown = kept[0] if many == "+" else kept
@@ -127,10 +127,10 @@ def _write(session: Imported, folder: Path) -> None:
 
 
 def _mistakes(session: Imported, folder: Path) -> list[str]:
-    """What `dlo check` finds in a written session, with stand-ins for values to fill in."""
+    """Mistakes that `dlo check` finds in a written session, with stand-ins for missing values."""
     text = session.text(session.stand_ins)
     if "FILL_IN" in text.split("experiment:")[1]:
-        return []  # without fixtures there is nothing to compare with
+        return []  # without fixtures there is nothing to compare
     stand_in = folder / "check.yaml"
     write_file(stand_in, text)
     try:

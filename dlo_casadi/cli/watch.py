@@ -1,4 +1,4 @@
-"""Progress of a run: live on a terminal, line by line elsewhere."""
+"""Show the progress of a run: live on a terminal, otherwise line by line."""
 
 import time
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from dlo_casadi.cli import signals
 from dlo_casadi.errors import counted
 from dlo_casadi.runtime.parallel import Tally
 
-# Shortest time between two lines about the same part, without a terminal [s].
+# Shortest interval between two lines about the same part, without a terminal [s].
 PATIENCE = 10.0
 
 
@@ -29,7 +29,7 @@ PATIENCE = 10.0
 class Shown:
     """Shows progress, unless it is `quiet`, on another console than the results.
 
-    The results can thus be redirected alone.
+    Results can therefore be redirected alone.
     """
 
     console: Console = field(default_factory=lambda: Console(stderr=True))
@@ -54,14 +54,14 @@ class Shown:
             self.bars.stop()
 
     def message(self, text: str) -> None:
-        """Something worth a line."""
+        """Show a message on its own line."""
         if not self.quiet:
             self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def update(
         self, part: str, done: int, total: int | None, line: str, description: str, detail: str = ""
     ) -> None:
-        """Move the bar of a part, or print a line at its end and from time to time before."""
+        """Move the bar of a part, or print a line at its end and occasionally before."""
         if self.bars is not None:
             if part not in self._tasks:
                 self._tasks[part] = self.bars.add_task(part, detail="")
@@ -75,10 +75,10 @@ class Shown:
 
 @dataclass
 class Watch(Shown):
-    """Shows the progress of a run, and the longest time that its present part will take.
+    """Shows the progress of a run, and the longest time that its current part will take.
 
-    The remaining time is that of the named part, extrapolated from its progress; a part in one
-    piece has none.
+    The remaining time is extrapolated from the progress of the named part; a part that reports no
+    progress has none.
     """
 
     _begun: dict[str, float] = field(default_factory=dict)
@@ -91,7 +91,7 @@ class Watch(Shown):
         return ended, "{task.description}", BarColumn(24), detail, TimeElapsedColumn(), *left
 
     def step(self, name: str, done: int, total: int) -> None:
-        """`done` of `total` parts of the named work are finished."""
+        """Report that `done` of `total` parts of the named work are finished."""
         signals.check()
         name, detail = ("read the poses", name[5:]) if name.startswith("read ") else (name, "")
         now = time.perf_counter()
@@ -111,7 +111,7 @@ class Watch(Shown):
 
 @dataclass
 class Counter(Shown):
-    """Shows the progress of many equal tasks, and an interval of the time left.
+    """Shows the progress of many equal tasks, and an interval of the remaining time.
 
     Parameters
     ----------

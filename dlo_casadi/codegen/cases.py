@@ -37,10 +37,10 @@ def case_of(
 
 @dataclass(frozen=True)
 class Case:
-    """Contents of the templates: the cable's numbers, and the parts of its kind.
+    """Contents of the templates: the cable's numbers, and the text parts of its kind.
 
-    `obstacles`: on how many it may lie. `name` begins the names of its templates; `try_steps`:
-    Newton steps for a part of a path, `iterations`: of a descent.
+    `obstacles`: their maximum number. `name`: prefix of its templates. `try_steps`: Newton steps
+    for a part of a path; `iterations`: of a descent.
     """
 
     model: CableModel
@@ -58,7 +58,7 @@ class Case:
         return {"kernel": self.kernels(self.model, self.rest, self.model.clamped_between)}
 
     def kernels(self, model: CableModel, rest: FloatArray, moved: bool) -> Kernels:
-        """Kernels of a mesh, without what holds the cable between its ends.
+        """Kernels of a mesh without the supports between the ends.
 
         `moved`: whether nodes move along the cable.
         """
@@ -66,7 +66,7 @@ class Case:
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
         if self.obstacles and bare.end == "free":
-            bare = replace(bare, end="pinned")  # the force on an obstacle is one at an end
+            bare = replace(bare, end="pinned")  # forces on obstacles are those at an end
         if not self.holds:
             return kernels_of(bare, p, rest, self.inline)
         if not bare.chain.kind.smooth:
@@ -74,7 +74,7 @@ class Case:
                 "no solver can be generated for a cable of links with a tether\n"
                 "  Try: another element, --element quadratic"
             )
-        # Before a clip there is a force also in a cable whose end is free.
+        # Before a clip the cable carries a force even if its end is free.
         bare = replace(bare, end="pinned") if bare.end == "free" else bare
         slides = bool(self.model.sliding)
         return kernels_of(bare, p, rest, self.inline, Held(moved, slides))
@@ -86,7 +86,7 @@ class Case:
 
     @property
     def eyelet_rows(self) -> list[int]:
-        """Of each holder the row of its arc length in the border; 0 of those that do not slide."""
+        """Row of each holder's arc length in the border; 0 for holders that do not slide."""
         first, rows = self.model.node.dimension * (1 + self.holds), [0] * self.holds
         for k, clip in enumerate(self.model.sliding):
             rows[clip] = first + k
@@ -99,7 +99,7 @@ class Case:
 
     @property
     def holding(self) -> list[float]:
-        """Declared length [m]; of each clip what is true minus declared, and each tether."""
+        """Declared length [m]; per clip the true minus the declared values; and each tether."""
         length = self.model.cable.length
         places, at = (
             np.array(x)
@@ -113,7 +113,7 @@ class Case:
 
     @property
     def example_clips(self) -> str:
-        """Clips of the pose of example.c, evenly along its chord."""
+        """Clips for the pose in example.c, evenly spaced along its chord."""
         model, shares = self.model, np.linspace(0.0, 1.0, len(self.model.clips) + 2)[1:-1]
         rows = [
             [s, *(s * np.array([0.6, 0.1, 0.1]))[: model.node.dimension]]
@@ -130,7 +130,7 @@ class Case:
 
     @property
     def compliances(self) -> list[float]:
-        """Turn of the start and end clamp per moment on it [rad/(N m)]."""
+        """Rotation of the start and end clamp per moment on it [rad/(N m)]."""
         turns = np.array(self.lagrangian.compliances(self.p)).ravel()
         found = zip(self.lagrangian.compliant, turns, strict=True)
         named = {self.model.condition_names[k]: float(c) for k, c in found}
@@ -139,14 +139,14 @@ class Case:
 
     @property
     def stiffnesses(self) -> list[float]:
-        """Of the start and end clamp [N m/rad], 0 of rigid ones."""
+        """Stiffness of the start and end clamp [N m/rad], 0 for rigid ones."""
         return [1 / c if c > 0 else 0.0 for c in self.compliances]
 
     @cached_property
     def tethers(self) -> list[FloatArray]:
-        """Of each tether arc length over length, anchor [m] and inverse stiffness [m/N] (d + 2,).
+        """Per tether: arc length over length, anchor [m] and inverse stiffness [m/N], (d + 2,).
 
-        V = k |r|^2 / 2 - f . r + constant, with the anchor f / k. One of no stiffness is one of a
+        V = k |r|^2 / 2 - f . r + constant, with the anchor f / k. A tether without stiffness gets a
         billionth of the cable's.
         """
         terms, length = self.lagrangian, self.model.cable.length
@@ -160,12 +160,12 @@ class Case:
 
     @property
     def numbers(self) -> list[float]:
-        """Numbers that are in no kernel, in the order of the template's macros."""
+        """Numbers outside the kernels, in the order of the template's macros."""
         raise NotImplementedError
 
     @property
     def values(self) -> dict[str, int | str]:
-        """Values of the templates' marks."""
+        """Values that replace the templates' marks."""
         raise NotImplementedError
 
     @property
@@ -176,7 +176,7 @@ class Case:
 
     @property
     def words(self) -> dict[str, str]:
-        """Parts of the templates by their marks."""
+        """Text parts of the templates, by mark."""
         text = template(f"{self.name}_words.in")
         _, *parts = re.split(r"^@([A-Z_]+)@\n", text, flags=re.MULTILINE)
         return {mark: part[:-1] for mark, part in zip(parts[::2], parts[1::2], strict=True)}
@@ -198,7 +198,7 @@ class Case:
 
 
 def _initializer(frame: Sequence[float]) -> str:
-    """C text behind the place of a clip: its direction, of those that have one."""
+    """C text after the place of a clip: its direction, if it has one."""
     if not len(frame):
         return ""
     return f", {frame[0]:g}" if len(frame) == 1 else f", {{{', '.join(f'{x:g}' for x in frame)}}}"
@@ -234,7 +234,7 @@ class _PlaneCase(Case):
     def values(self) -> dict[str, int | str]:
         model, chain, kernels = self.model, self.model.chain, self.meshes["kernel"]
         count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
-        # From each first guess there is one free descent, and one guided by springs in 15 stages; a
+        # Each first guess starts one free descent, and one guided by springs in 15 stages; a
         # descent takes 100 steps, and 6 more off saddles; each may land on obstacles, in 100. The
         # template checks the number.
         guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
@@ -265,17 +265,17 @@ class _SpaceCase(Case):
     """A cable in space."""
 
     name, try_steps, iterations = "space", 12, 80
-    # Doubles of a workspace per node, and beside those eight coarse shapes; as in the template.
+    # Doubles of a workspace per node, and those of eight coarse shapes; as in the template.
     doubles = 4 + 4 + 4 + 3 + 6 + 9 + 58
     # Doubles of a workspace for each segment with a clip or tether inside.
     held_doubles = 58 + 3 + 9 + 9 + 9 + 6 + 14
-    # Fewest arcs of the coarse mesh, and number of fine elements in each. Of 3,000 random clamped
-    # problems with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first
-    # guesses on the fine mesh.
+    # Fewest arcs of the coarse mesh, and fine elements per arc. Of 3,000 random clamped problems
+    # with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first guesses on
+    # the fine mesh.
     least_coarse, coarsening = 6, 2.0
-    # Arcs of a span between clips there. Beside a clamp an eyelet ends no span; each adds as many
-    # arcs to all of them: without these, of 2,400 random cables in a saddle and an eyelet 80 lead
-    # to a higher and 9 to a lower equilibrium.
+    # Arcs of the coarse mesh in a span between clips. An eyelet beside a clamp ends no span; each
+    # adds as many arcs to all spans. Without these arcs, of 2,400 random cables in a saddle and an
+    # eyelet, 80 lead to a higher and 9 to a lower equilibrium.
     coarse_span = 3
 
     @property
@@ -304,7 +304,7 @@ class _SpaceCase(Case):
 
     @property
     def clamps(self) -> FloatArray:
-        """End's offset ahead (3,), and frames (8,) of the true clamps in the declared ones."""
+        """Forward offset of the end (3,), and frames (8,) of true clamps in the declared ones."""
 
         def held(frames: FloatArray) -> FloatArray:
             ends = np.concatenate([np.zeros(6), frames.ravel()])
@@ -335,9 +335,9 @@ class _SpaceCase(Case):
     @property
     def values(self) -> dict[str, int | str]:
         n, coarse = self.model.n, self.coarse_elements
-        # From each first guess there is a descent on the coarse mesh, from its minimum one on the
-        # fine mesh, and if all fail, one on the fine mesh from the first guess; a descent takes 80
-        # steps. The template checks the number.
+        # Each first guess starts a descent on the coarse mesh, whose minimum starts one on the fine
+        # mesh; if all fail, the first guess starts one on the fine mesh. A descent takes 80 steps.
+        # The template checks the number.
         hangs = self.model.end == "free" and not self.model.clips
         guesses = 3 if hangs else 8 + 2 * bool(self.model.sliding)
         held = self.held_doubles * self.holds + (11 + 58) * n if self.holds else 0

@@ -34,10 +34,10 @@ from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.obstacles import Obstacle, Plane
 
-# Poses, or rows of numbers laid out as dlo_pose in the C header.
+# Poses, or rows of numbers in the layout of dlo_pose in the C header.
 Poses = Sequence[AnyPose] | FloatArray
 
-# Types of the arguments of functions in the header: a pointer, an int, a count (size_t).
+# Argument types of the header's functions: a pointer, an int, a count (size_t).
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "n": ctypes.c_size_t}
 _ARGUMENTS = {
     "dlo_solve": "pipppn",
@@ -48,12 +48,12 @@ _ARGUMENTS = {
     "dlo_batch": "pnipppn",
     "dlo_path": "pnipppppn",
 }
-# Before which of them obstacles belong, if the solver knows any.
+# Index of the argument before which obstacles are inserted, if the solver supports any.
 _AMONG = {"dlo_solve": 1, "dlo_step": 1, "dlo_sensitivity": 1, "dlo_batch": 2, "dlo_path": 2}
 
 
 def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",)) -> Path:
-    """Compile a solver into a shared library in a folder, with these and the required flags.
+    """Compile a solver into a shared library in a folder, with the required flags and these.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",
 class CompiledSolver:
     """Equilibria in the plane and in space by compiled C: thousands of poses a second.
 
-    All methods that find shapes take `obstacles`; without them they are those of the model.
+    Methods that find shapes take `obstacles`; without them the model's own apply.
 
     Parameters
     ----------
@@ -93,9 +93,9 @@ class CompiledSolver:
     rest : (n_rests,) [1/m]
         Rest strains of the cells: `model.rest_basis @ coefficients`.
     flags : sequence of str
-        Of the compiler.
+        For the compiler.
     obstacles : int
-        Maximum number of obstacles on which the cable may lie; at least those of the model.
+        Maximum number of obstacles that the cable may touch; at least those of the model.
 
     Raises
     ------
@@ -151,9 +151,9 @@ class CompiledSolver:
         ----------
         pose : Pose
             Its branch selects which way a cable in a plane turns; without one the result is the
-            stable equilibrium of lowest energy. If none turns so, the status is "other_branch".
+            stable equilibrium of lowest energy. If none turns that way: status "other_branch".
         warm : CompiledShape, optional
-            Where to start from.
+            Start of the iteration.
         throw : bool
             Whether to raise if there is no equilibrium; otherwise see the shape's `status`.
 
@@ -162,7 +162,7 @@ class CompiledSolver:
         EquilibriumError
             If there is no stable equilibrium and `throw` is true.
         DloError
-            If pose or warm start do not fit the cable.
+            If pose or warm start do not fit this cable.
         """
         table, branch = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.shape)
@@ -183,12 +183,12 @@ class CompiledSolver:
         steps: int = 4,
         obstacles: Sequence[Obstacle] | None = None,
     ) -> CompiledShape:
-        """Shape in a nearby pose after at most `steps` Newton steps; see its `status`.
+        """Shape in a nearby pose after at most `steps` Newton steps; check its `status`.
 
         Raises
         ------
         DloError
-            If pose or shape do not fit the cable, or `steps` is no whole number.
+            If pose or shape do not fit this cable, or `steps` is not a whole number.
         """
         if not isinstance(steps, int | np.integer):
             raise DloError(f"steps: a whole number of Newton steps belongs here, found {steps!r}")
@@ -213,7 +213,7 @@ class CompiledSolver:
             Rows are laid out as dlo_pose in the C header: in a plane start x, y, end x, y [m],
             start heading, end heading [rad]; in space start, end [m], their quaternions, turns.
         branch : "ccw" or "cw", optional
-            Of an array's rows.
+            For the rows of an array.
 
         Returns
         -------
@@ -238,12 +238,12 @@ class CompiledSolver:
         warm: CompiledShape | None = None,
         obstacles: Sequence[Obstacle] | None = None,
     ) -> ShapePath:
-        """Shapes along a path, each followed continuously from the one before.
+        """Shapes along a path, each one continued from the one before.
 
         Parameters
         ----------
         poses, branch : as in `solve_many`
-            The branch is that of the first pose.
+            Only the first pose's branch counts.
         warm : CompiledShape, optional
             For the first pose.
 
@@ -272,7 +272,7 @@ class CompiledSolver:
         Raises
         ------
         EquilibriumError
-            If the shape is no stable equilibrium of this pose.
+            If the shape is not a stable equilibrium of this pose.
         """
         table, _ = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.slope)
@@ -288,13 +288,13 @@ class CompiledSolver:
     def clearance(
         self, shape: CompiledShape, obstacles: Sequence[Obstacle], slope: Slope | None = None
     ) -> Gap:
-        """The nearest place of the cable to obstacles, and its distance from them.
+        """The place of the cable nearest to obstacles, and its distance from them.
 
         Parameters
         ----------
         obstacles : sequence of Obstacle, at least one
         slope : Slope, optional
-            For the gradient.
+            Needed for the gradient.
 
         Raises
         ------
@@ -318,22 +318,22 @@ class CompiledSolver:
         obstacles: Sequence[Obstacle] = (),
         slope: Slope | None = None,
     ) -> dict[str, Usage]:
-        """How much of its limits a shape uses, by the names in QUANTITIES, the tightest one first.
+        """Use of each limit by a shape, keyed by QUANTITIES, the tightest one first.
 
-        All values are those of the solver's own mesh; `Shape.check` measures bends on a finer one.
+        Values refer to the solver's own mesh; `Shape.check` measures bends on a finer one.
 
         Parameters
         ----------
         limits : mapping of str to float
-            Of quantities in QUANTITIES; all are told, also those without a limit.
+            For names in QUANTITIES; all are reported, also those without a limit.
         slope : Slope, optional
-            For the gradients.
+            Needed for the gradients.
 
         Raises
         ------
         DloError
-            If a limit has an unknown name or is not positive, the shape is none, or a number is not
-            finite.
+            If a limit has an unknown name or is not positive, the shape is empty, or a number is
+            not finite.
         """
         if unknown := [name for name in limits if name not in QUANTITIES]:
             text = f"a shape has no limit {unknown[0]!r}"
@@ -354,7 +354,7 @@ class CompiledSolver:
         return {first: found[first]} | found
 
     def _table_of(self, obstacles: Sequence[Obstacle]) -> NDArray[Any]:
-        """Obstacles as dlo_obstacle."""
+        """Obstacles in the layout of dlo_obstacle."""
         given = np.zeros(len(obstacles), self._records.obstacle)
         for row, obstacle in zip(given, obstacles, strict=True):
             if not isinstance(obstacle, Obstacle):
@@ -382,7 +382,7 @@ class CompiledSolver:
         return _filled(self._records.shape, shape)
 
     def _call(self, name: str, *arguments: Any, obstacles: Sequence[Obstacle] | None = None) -> int:
-        """Status of a call into the library; those that solve take a workspace."""
+        """Call the library and return its status; functions that solve get a workspace."""
         work, among = np.empty(self.workspace), self.obstacles if obstacles is None else obstacles
         given = [*arguments, work, work.size][: len(_ARGUMENTS[name])]
         if len(among) > self.most_obstacles:
@@ -402,7 +402,7 @@ def _shape(record: Any, status: int) -> CompiledShape:
 
 
 def _values(record: Any) -> dict[str, Any]:
-    """Numbers and arrays of a record of the library by their names."""
+    """Fields of a record of the library, by name."""
     values = {name: record[name] for name in record.dtype.names}
     return {name: v.copy() if v.ndim else v.item() for name, v in values.items()}
 

@@ -1,4 +1,4 @@
-"""Write the C solver of a model: fill the templates."""
+"""Write the C solver of a model by filling templates."""
 
 import hashlib
 import json
@@ -22,9 +22,9 @@ from dlo_casadi.model.clips import CLAMPS
 
 # Maximum number of steps between two poses of a path, as in the templates.
 FINEST = 4096
-# What a clamp between the ends lets the cable do, as in the templates.
+# Freedoms that a support between the ends leaves to the cable, as in the templates.
 _CLAMP_KINDS = {"clamped": 1, "swivel": 2}
-# Text by which a generated file is recognised, in all templates.
+# Text in all templates that identifies a generated file.
 MARK = "written by dlo-casadi"
 # Keywords of C99, C11 and C++, and names that every program defines.
 _KEYWORDS = """
@@ -47,11 +47,11 @@ class Solver:
     prefix : str
         Prefix of all public names and of the files.
     hash : str
-        SHA-256 of all that determines the solver's numbers: see `solver_hash`.
+        SHA-256 of everything that determines the solver's numbers: see `solver_hash`.
     files : dict
         File name -> text.
     workspace : int
-        Number of doubles of a workspace.
+        Size of a workspace in doubles.
     """
 
     prefix: str
@@ -62,13 +62,13 @@ class Solver:
     def write(self, folder: Path | str) -> list[Path]:
         """Write all files into the folder, or none; the folder is made if it does not exist.
 
-        Files of these names are replaced if they contain the mark of generated ones; other files in
+        Existing files of these names are replaced if they are marked as generated; other files in
         the folder stay.
 
         Raises
         ------
         OutputError
-            If the folder cannot be written, or holds files of these names from elsewhere.
+            If the folder cannot be written, or holds files of these names from another source.
         """
         folder = Path(folder)
         refuse_foreign(folder, [name for name in self.files if not is_marked(folder / name, MARK)])
@@ -80,10 +80,10 @@ class Solver:
 
 
 def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
-    """SHA-256 of all that determines the solver's numbers: DLO_MODEL_HASH in its header.
+    """SHA-256 of everything that determines the solver's numbers: DLO_MODEL_HASH in its header.
 
-    Effects of the camera and of the history do not enter a solver and are left out. The hash in a
-    parameters.yaml is a different one, of the whole fitted model.
+    Effects of the camera and of the history are not part of a solver and are left out. The hash in
+    parameters.yaml differs: it covers the whole fitted model.
     """
     left_out = [e for e in model.effects if isinstance(e, MeasurementEffect | StateEffect)]
     prefixes = tuple(f"{effect.label}." for effect in left_out)
@@ -169,12 +169,12 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
 
 
 def table_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
-    """The table of another cable of the kind of a solver generated with `inline=False`."""
+    """The table for another cable, for a solver of this kind generated with `inline=False`."""
     return case_of(model, p, rest, inline=False).table
 
 
 def check_prefix(prefix: str) -> None:
-    """Raise DloError unless the prefix can begin the names of a C library."""
+    """Raise DloError unless the prefix is a valid beginning of C names."""
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix, flags=re.ASCII):
         raise DloError(
             f"the prefix {prefix!r} is not a C identifier: use letters, digits and underscores, "
@@ -187,18 +187,18 @@ def check_prefix(prefix: str) -> None:
 
 
 def comment(text: str) -> str:
-    """Any text as a part of a comment in C: one line of ASCII that cannot end the comment.
+    """Turn any text into a part of a C comment: one line of ASCII that cannot end the comment.
 
-    Characters that are not printable ASCII become escapes, a backslash two. A space separates the
-    characters that begin or end a comment, and those that begin a trigraph: `??/` is a backslash,
-    which at the end of a line continues it. More must follow on the same line.
+    Characters other than printable ASCII become escapes, a backslash becomes two. Spaces separate
+    the characters that begin or end a comment or a trigraph: `??/` is a backslash, which at the end
+    of a line continues it. More text must follow on the same line.
     """
     line = text.encode("unicode_escape").decode()
     return re.sub(r"(?<=/)(?=\*)|(?<=\*)(?=/)|(?<=\?)(?=\?)", " ", line)
 
 
 def marked(text: str, values: dict[str, str]) -> str:
-    """Replace those @MARKS@ that have a value; CMake's own stay."""
+    """Replace the @MARKS@ that have a value; CMake's own marks stay."""
     return re.sub(r"@([A-Z_]+)@", lambda match: values.get(match.group(1), match.group(0)), text)
 
 
@@ -223,19 +223,19 @@ def generate(
     Parameters
     ----------
     model : CableModel
-        Effects of the camera do not enter: the solver gives the true shape.
+        Effects of the camera are left out: the solver gives the true shape.
     p : (n_parameters,)
         In the order of `model.names`, SI units.
     rest : (n_rests,) [1/m]
-        Rest curvature of the bending cells; of a drifting cable the latest.
+        Rest curvature of the bending cells; for a drifting cable the latest one.
     prefix : str
         Prefix of all public names: `<prefix>_solve`.
     inline : bool
-        Whether numbers that all elements share are written into the code; otherwise all numbers
-        are in one table, and cables of one kind differ in it alone.
+        Whether numbers shared by all elements are written into the code; otherwise all numbers are
+        in one table, the only difference between cables of one kind.
     obstacles : int
-        Maximum number of obstacles on which the cable may lie, which each call tells; at least
-        those of the model.
+        Maximum number of obstacles that the cable may touch, given with each call; at least those
+        of the model.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""C text of the model's segments, printed by CasADi from the functions used everywhere else."""
+"""C text of the model's segments, printed by CasADi from the same functions as used elsewhere."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -19,9 +19,9 @@ from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentDerivatives
 
-# Largest difference of two numbers that count as equal: rounding of the mesh.
+# Largest difference at which two numbers count as equal: rounding of the mesh.
 _ROUNDING = 1e-14
-# Functions that CasADi calls by names of its own; the others are those of libm.
+# Functions that CasADi renames; the others have libm's names.
 _CALLS = {"casadi_sq": "square", "casadi_sign": "sign_of", "casadi_real": "double"}
 _HELPERS = {
     "square": "static double square(double a) { return a * a; }\n",
@@ -46,10 +46,10 @@ def table_to_c(numbers: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class Kernel:
-    """Segments first <= j < last of one kind, which differ only by a row of numbers each.
+    """Segments first <= j < last of one kind, which differ only in a row of numbers each.
 
-    `members` are (first, last), `rows` (last - first, k) the numbers of each segment; `derive`
-    makes the function. Where nodes move along the cable a pose has the rows, see `row_of` in C.
+    `members`: (first, last); `rows` (last - first, k): the numbers of each segment; `derive`: makes
+    the function. Where nodes move along the cable the pose has the rows, see `row_of` in C.
     """
 
     members: tuple[int, int]
@@ -63,7 +63,7 @@ class Kernel:
         return self.derive()
 
     def loop(self, name: str, table_at: int) -> str:
-        """Statement that calls it for all its segments, whose rows begin at `table_at`."""
+        """C statement that calls it for all its segments; their rows begin at `table_at`."""
         (first, last), width = self.members, self.rows.shape[1]
         row = f"table + {table_at} + (j - {first}) * {width}" if width else "table"
         row = "row_of(w, j)" if self.moved else row
@@ -74,7 +74,7 @@ class Kernel:
         {" " * len(name)} segment + SEGMENT * j);"""
 
     def at_holder(self, name: str) -> str:
-        """Statement that calls it for segment j, in which something holds the cable."""
+        """C statement that calls it for segment j, inside which something holds the cable."""
         return f"    {name}(x + {self.function.numel_in(0) // 2} * j, lam, row, table, out);"
 
     def text(self, name: str) -> str:
@@ -97,10 +97,10 @@ class Kernel:
 class Kernels:
     """The mechanics of a model in the generated solver.
 
-    `segments` are in the order of the cable; `ends` is the energy of the holders, if any, as a
-    function of the first and last node; `shared` (n_parameters,) or (0,) are the parameters in the
-    table, before the segments' rows. `holder` is any segment inside of which a clip or a tether
-    holds the cable, at a share of it that follows its row.
+    `segments` are in the order of the cable. `ends` is the energy of the holders, if any, as a
+    function of the first and last node. `shared` (n_parameters,) or (0,) are the parameters in the
+    table, before the segments' rows. `holder` is a segment with a clip or a tether inside, at a
+    share of its length that follows its row.
     """
 
     segments: tuple[Kernel, ...]
@@ -134,9 +134,9 @@ class Kernels:
 class KernelText:
     """C text of the kernels of all meshes.
 
-    `functions`, `loops` that call them for the segments, `holders` for one that holds the cable;
-    `even`: where in their table the rows of the latter begin, `size`: its length. With two meshes
-    the second one is called if `w->coarse` is set.
+    `functions`; `loops` call them for the segments, `holders` for one that holds the cable; the
+    rows of the latter begin at `even` in their table, of length `size`. With two meshes the second
+    one is called if `w->coarse` is set.
     """
 
     functions: str
@@ -174,7 +174,7 @@ class KernelText:
 
 
 def _by_mesh(statements: list[str]) -> str:
-    """Statements for the mesh in use, of those for the fine and, if there is one, the coarse."""
+    """Choose the statements of the mesh in use: the fine one, or the coarse one if there is one."""
     text, *coarse = statements or [""]
     for inside in coarse:
         inside = re.sub("^", "    ", inside, flags=re.MULTILINE)
@@ -183,16 +183,16 @@ def _by_mesh(statements: list[str]) -> str:
 
 
 def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
-    """Approximate size of a compiled solver in bytes: its code, its kernels and its table.
+    """Approximate size of a compiled solver in bytes: code, kernels and table.
 
-    Within 8 % for 13 solvers in the plane and in space, with gcc 12 -O2 on x86-64.
+    Accurate to 8 % for 13 solvers in the plane and in space, with gcc 12 -O2 on x86-64.
     """
     return 25_000 + sum(kernels.code_size for kernels in meshes) + 8 * len(numbers)
 
 
 @dataclass(frozen=True)
 class Held:
-    """How something holds a cable inside of a segment.
+    """How something holds a cable inside a segment.
 
     `moved`: whether nodes move along the cable; `slides`: whether the cable may slide through.
     """
@@ -228,7 +228,7 @@ def kernels_of(
             (Kernel(whole, own[:, :0], plain, moved),), _ends(bare, parameters), shared, holder
         )
     kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
-    # A point force acts on all of a segment, on none of it, or at a place in it.
+    # A point force acts on a whole segment, on none of it, or from a place inside it.
     shares = np.array([np.array(lagrangian_of(bare).shares(p, place)).ravel() for place in places])
     within = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * within
@@ -299,7 +299,7 @@ def _kernel(
     for i, k in enumerate(np.flatnonzero(~alike)):
         values[k] = row[i]
     start = values[0]
-    # The cell's start is relative to the segment's: otherwise segments of one kind would differ.
+    # The cell's start counts from the segment's start: otherwise segments would not be of one kind.
     place = ca.vertcat(start, first[1], start + (first[2] - first[0]), *first[3:])
     numbers = SegmentNumbers(
         p,
@@ -322,16 +322,16 @@ def _plain(model: CableModel, numbers: SegmentNumbers, row: ca.SX) -> ca.Functio
 def _derivatives(
     model: CableModel, x: ca.SX, lam: ca.SX, numbers: SegmentNumbers
 ) -> SegmentDerivatives:
-    """Derivatives of a segment's Lagrangian, in space by increments about the world's axes.
+    """Derivatives of a segment's Lagrangian; in space by rotations about the world's axes.
 
-    x are the states of both nodes, lam the force on the end's holder, also with a free end, then
-    that of a clip [N].
+    x: states of both nodes. lam [N]: force on the holder of the end, also for a free end, then that
+    of a clip.
     """
     if model.node.increment > 1:
         forces = ca.reshape(lam, 3, lam.numel() // 3)
         found = lagrangian_of(model).in_frame(x, forces, numbers).derivatives()
         return found.about(found.turn, found.turn)
-    # At a free end lam is zero, but the derivative by it is still the advance.
+    # At a free end lam is zero, but the derivative with respect to it is still the advance.
     free = model.end == "free"
     multipliers = ca.SX.zeros(model.n_lam)
     for rows, own in zip((model.end_pull, *model.pulls), ca.vertsplit(lam, 2), strict=True):
@@ -362,7 +362,7 @@ def _in_order(found: SegmentDerivatives) -> list[ca.SX]:
 
     Value; by lam: advance [m]; in space the rotation vector from node to node [rad]; gradient by
     the first, last node; Hessian by first-first, first-last, last-last, first-lam, last-lam,
-    lam-lam: row by row, of symmetric blocks the upper triangle column by column.
+    lam-lam: row by row; of symmetric blocks only the upper triangle, column by column.
     """
     (first, between, last), mixed = found.bends, found.mixed
     bends = [_triangle(first), _rows(between), _triangle(last)]
@@ -408,8 +408,8 @@ _OUTPUT = re.compile(r"if \(res\[0\]!=0\) res\[0\]\[(\d+)\]=(.*?);")
 def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[str]) -> str:
     """C statements that CasADi prints for a function, with our names of inputs and outputs.
 
-    `inputs` are the C arrays of its inputs, `targets` the left side and the operator of each
-    assignment to a number of its output.
+    `inputs`: C arrays of its inputs; `targets`: left side and operator of the assignment to each
+    number of its output.
     """
     generator = ca.CodeGenerator("kernel")
     generator.add(function)

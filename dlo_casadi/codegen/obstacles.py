@@ -1,4 +1,4 @@
-"""What the generated solver knows of obstacles: how many there may be, and those of the model."""
+"""Obstacles in the generated solver: their maximum number, and those of the model."""
 
 from dataclasses import dataclass
 
@@ -15,19 +15,19 @@ from dlo_casadi.rod.obstacles import Plane
 
 @dataclass(frozen=True)
 class Obstacles:
-    """Obstacles of a solver: `most` of a call, and those of the model where a fit has them."""
+    """Obstacles of a solver: at most `most` per call, and those of the model if a fit has them."""
 
     most: int
     declared: tuple[rod.Obstacle, ...]
 
     @classmethod
     def of(cls, model: CableModel, p: FloatArray, most: int) -> "Obstacles":
-        """At least those of the model.
+        """Make room for at least the model's own obstacles.
 
         Raises
         ------
         DloError
-            If it is no number of obstacles, or the cable is one of links.
+            If `most` is not a valid number, or the cable is one of links.
         """
         if not isinstance(most, int | np.integer) or not 0 <= most <= 1000:
             raise DloError(f"obstacles: a whole number, 0 to 1000, found {most!r}")
@@ -40,12 +40,12 @@ class Obstacles:
         return cls(max(int(most), len(declared)), declared)
 
     def values(self, model: CableModel) -> dict[str, int | str]:
-        """Values of the templates' marks."""
+        """Values that replace the templates' marks."""
         d, n, nodes = model.node.dimension, model.n, model.chain.n_nodes
         holds = len(model.clips) + model.n_springs
         border, slots = d * (1 + holds) + len(model.sliding), 4 * self.most * n
         rows, columns = model.node.increment * nodes + border, (1 + d) * n
-        # Both points of a plane, columns with their block, sums and forces; as in the template.
+        # Two points per plane, columns with their block, sums and forces; as in the template.
         size = (2 if d == 2 else 1) * ((3 + d) * slots + d * (3 * n + 2))
         size += columns * (4 * d + 5 + 2 * rows) + columns * (columns + 1) + columns
         size += d * (d + 1) // 2 * n + d * n + (7 + 3 * d) * slots
@@ -58,7 +58,7 @@ class Obstacles:
 
     @property
     def words(self) -> dict[str, str]:
-        """Parts of the templates by their marks."""
+        """Text parts of the templates, by mark."""
         if not self.most:
             return dict.fromkeys(_MARKS, "")
         among = "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     "
@@ -81,7 +81,7 @@ _MARKS = (
     "HPP_GIVEN",
     "DECLARED_OBSTACLES",
 )
-# What the header says of them.
+# Text about obstacles in the header.
 _SAID = """\
  *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie. Where
  *                   the status is DLO_OK the whole cable, its radius and its fixtures are outside

@@ -15,7 +15,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import EndConditions
 
-# As in the header.
+# Same values as in the header.
 STATUSES = (
     "ok",
     "unreachable",
@@ -43,7 +43,7 @@ _HINTS = {
 }
 
 
-# A pose of a session, or its ends alone.
+# A pose of a session, or only its ends.
 AnyPose = Pose | HeldPose
 
 
@@ -59,10 +59,10 @@ class CompiledShape:
     start_force, end_force : (dimension,) [N]
         Of the cable on whatever holds its start and its end.
     moments : (2, increment) [N m]
-        Of the cable on its clamps (start, end), in space about the world's axes.
+        Of the cable on its clamps (start, end); in space about the world's axes.
     energy : float [J]
     min_bend_radius, min_bend_at : float [m]
-        And the arc length there, along the declared length.
+        Smallest bend radius, and its arc length along the declared length.
     max_twist, max_twist_at : float [1/m, m]
         Largest twist of an element, with its sign, and its middle; 0 in a plane.
     end_error : float [m]
@@ -75,16 +75,16 @@ class CompiledShape:
     clip_forces : (n_clips + n_tethers, dimension) [N]
         Of the cable on each clip, then on each tether.
     clip_grip : (n_clips + n_tethers,) [N]
-        Their parts along the cable, forward: what a clip holds against slipping.
+        Components along the cable, forward: what a clip must hold against slipping.
     clip_at : (n_clips + n_tethers,) [m]
         Arc lengths at which they hold the cable.
     clip_moments : (n_clips + n_tethers, increment) [N m]
-        With clamped clips, of the cable on them, in space about the world's axes.
+        With clamped clips: of the cable on them; in space about the world's axes.
     places : (n + 1,)
-        With clamped clips, arc lengths over length of points and nodes: one is moved to each.
+        With clamped clips: arc lengths over length of points and nodes; one is moved to each clip.
     contact_forces : (obstacles, 4 n) [N]
-        Sizes of the forces on each obstacle, across its surface, at places of the cable; 0 where it
-        does not touch.
+        Magnitudes of the forces on each obstacle, normal to its surface, at places of the cable; 0
+        without contact.
     contact_places : (obstacles, 4 n)
         These places: arc lengths over length.
     obstacle_forces : (obstacles, dimension) [N]
@@ -130,13 +130,13 @@ class ShapePath:
 
 @dataclass(frozen=True)
 class Slope:
-    """Derivatives of a shape by k numbers of its pose, which are the last index.
+    """Derivatives of a shape by the k numbers of its pose, which are the last index.
 
-    In a plane by end x, y [m], start heading, end heading [rad], k = 4. In space by start x, y, z
-    [m], the rotation of the start about the world's axes x, y, z [rad], and the same of the end,
-    k = 12. Then of each clip by its arc length and its place [m] and, if any is clamped, its
-    heading, or rotation about the world's axes [rad]. In a plane with obstacles the start x, y [m]
-    come last.
+    In a plane: end x, y [m], start heading, end heading [rad]; k = 4. In space: start x, y, z [m],
+    rotation of the start about the world's axes x, y, z [rad], and the same for the end; k = 12.
+    Then for each clip: its arc length, its place [m] and, if any clip is clamped, its heading, or
+    its rotation about the world's axes [rad]. In a plane with obstacles the start x, y [m] come
+    last.
 
     Parameters
     ----------
@@ -152,8 +152,8 @@ class Slope:
         Derivatives of the energy by the clips' arc lengths.
     obstacle_forces : (obstacles, dimension, k)
     degenerate : int
-        Number of contacts that begin or end with the least change of the pose: then the derivatives
-        are those to one side.
+        Number of contacts that begin or end at the smallest change of the pose: the derivatives
+        are then one-sided.
     """
 
     points: FloatArray
@@ -173,7 +173,7 @@ class Slope:
 
 @dataclass(frozen=True)
 class Gap:
-    """Where the cable comes nearest to obstacles.
+    """Place of the cable that is nearest to obstacles.
 
     Parameters
     ----------
@@ -182,9 +182,9 @@ class Gap:
     place : float
         Arc length over length.
     point, normal : (dimension,)
-        Of the cable's axis there [m], and away from the obstacle.
+        Point on the cable's axis [m], and direction away from the obstacle.
     gradient : (4,) or (12,)
-        Of the distance by the columns of the slope; NaN without one.
+        Of the distance, by the slope's columns; NaN without a slope.
     obstacle : int
         Index of the nearest obstacle.
     """
@@ -197,29 +197,29 @@ class Gap:
     obstacle: int
 
 
-# What a shape must keep, in the order of dlo_quantity.
+# Quantities that limits apply to, in the order of dlo_quantity.
 QUANTITIES = ("bend_radius", "force", "moment", "twist", "clearance")
 
 
 @dataclass(frozen=True)
 class Usage:
-    """How much of a limit a shape uses.
+    """Use of a limit by a shape.
 
     Parameters
     ----------
     value : float
-        Least bend radius [m], greatest force [N] and moment [N m] on a fixture, greatest twist
-        [1/m], least distance from obstacles [m]; 1e300 where nothing bends, without obstacles.
+        Smallest bend radius [m], largest force [N] and moment [N m] on a fixture, largest twist
+        [1/m], smallest distance from obstacles [m]; 1e300 if nothing bends, or without obstacles.
     margin : float
-        Share of the limit that is left, negative where it is violated: 1 - value / limit; of a
-        bend radius 1 - limit / value; of a clearance value / limit - 1. 1 without a limit.
+        Remaining share of the limit, negative where it is violated: 1 - value / limit; for a bend
+        radius 1 - limit / value; for a clearance value / limit - 1. 1 without a limit.
     at : float [m]
-        Arc length of the tightest place from the start.
+        Arc length of the tightest place.
     gradient : (k,)
-        Of the value by the columns of the slope; NaN without one.
+        Of the value, by the slope's columns; NaN without a slope.
     which : int
-        Of forces and moments the fixture: 0 the start, 1 the end, 2 the first clip. Of a clearance
-        the obstacle.
+        For forces and moments the fixture: 0 the start, 1 the end, 2 the first clip. For a
+        clearance the obstacle.
     """
 
     value: float
@@ -232,8 +232,8 @@ class Usage:
 class Records(NamedTuple):
     """Layouts of dlo_shape, dlo_slope, dlo_obstacle, dlo_gap and dlo_usage of a solver's C.
 
-    `columns` are the numbers of a pose by which dlo_slope has derivatives; in a plane not those of
-    the start's place.
+    `columns`: numbers of a pose by which dlo_slope has derivatives; in a plane without the place of
+    the start.
     """
 
     shape: np.dtype[Any]
@@ -245,7 +245,7 @@ class Records(NamedTuple):
 
 
 def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
-    """Layouts of the structures of a model's solver that knows so many obstacles."""
+    """Layouts of the structures of a model's solver with room for `n_obstacles` obstacles."""
     node, n, nodes = model.node, model.n + 1, model.chain.n_nodes
     d, turn = node.dimension, node.increment
     clips, holds = len(model.clips), len(model.clips) + model.n_springs
@@ -297,10 +297,10 @@ def _record(*fields: list[Any]) -> np.dtype[Any]:
 def pose_table(
     model: CableModel, poses: Sequence[AnyPose] | FloatArray, branch: object = None
 ) -> tuple[FloatArray, int]:
-    """Poses (m, k) laid out as dlo_pose, and the C solver's number of their branch.
+    """Poses (m, k) in the layout of dlo_pose, and the C solver's number of their branch.
 
-    `branch` ("ccw", "cw" or None) is that of rows of numbers; a Pose has its own. Raises DloError
-    if they are no poses of this cable, of several branches, or of an unknown one.
+    `branch` ("ccw", "cw" or None) applies to rows of numbers; a Pose has its own. Raises DloError
+    if they are not poses of this cable, or are of several branches or an unknown one.
     """
     if isinstance(poses, np.ndarray):
         size = pose_size(model)
@@ -359,7 +359,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
 
 
 def _frame(clip: HeldClip, model: CableModel) -> FloatArray:
-    """Frame (coordinates,) of a clip as dlo_clip has it; any where the cable may turn."""
+    """Frame (coordinates,) of a clip in the layout of dlo_clip; arbitrary if the cable may turn."""
     return np.array(model.node.identity) if clip.frame is None else clip.frame
 
 

@@ -1,7 +1,7 @@
-"""YAML text <-> checked objects: the configuration of a fit, and plain YAML for results.
+"""Convert YAML text <-> checked objects: the configuration of a fit, and plain YAML for results.
 
-The only package that imports yaml and pydantic. All units are SI. Every problem of a file is
-reported at once, each with its line.
+No other package imports yaml and pydantic. All units are SI. All problems of a file are reported
+together, each with its line.
 """
 
 from dlo_casadi.config.document import dump_yaml, read_yaml

@@ -1,4 +1,4 @@
-"""YAML text <-> plain data. The only module that imports yaml."""
+"""Convert YAML text <-> plain data. No other module imports yaml."""
 
 import re
 from collections.abc import Mapping
@@ -11,31 +11,31 @@ import yaml
 from dlo_casadi.config.problems import Place, Source, did_you_mean, show
 from dlo_casadi.errors import ConfigError
 
-# Largest file [bytes]; PyYAML reads it in five seconds. A session of a thousand poses has 80,000.
+# Largest file [bytes]: PyYAML reads it in five seconds. A session of a thousand poses has 80,000.
 _LARGEST = 500_000
-# Largest number of values with aliases written out: as many as the largest file can hold itself.
+# Largest number of values after expanding aliases: as many as the largest file can hold.
 _MOST_VALUES = _LARGEST // 2
-# Levels of lists and mappings; a configuration has seven.
+# Maximum nesting of lists and mappings; a configuration has seven levels.
 _DEEPEST = 30
-# Characters that are refused: control characters other than tab and line breaks, which a terminal
-# would obey; and lone surrogates, except those that stand for bytes of file names (PEP 383).
+# Refused characters: control characters other than tab and line breaks, which a terminal would
+# obey; and lone surrogates, except those that stand for bytes of file names (PEP 383).
 _NO_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udc7f\udd00-\udfff]")
 
 
 def read_yaml(path: str | Path) -> Any:
     """Read a YAML file as plain dicts, lists, text and numbers.
 
-    Numbers such as 1e-3 are numbers here, as in YAML 1.2; a key that occurs twice is an error.
+    1e-3 is a number here, as in YAML 1.2; a key that occurs twice is an error.
     Raises ConfigError if the file cannot be read, is empty, or is not YAML.
     """
     return Document.read(Path(path)).data
 
 
 def dump_yaml(data: object) -> str:
-    """Write plain data as YAML: every digit of a float, keys in their order, no aliases.
+    """Write plain data as YAML: all digits of floats, keys in their order, no aliases.
 
-    Of mappings, sequences, arrays, numbers, text, paths, None, nested as you like; `read_yaml`
-    turns the text into the same data.
+    Data: mappings, sequences, arrays, numbers, text, paths and None, in any nesting; `read_yaml`
+    turns the text back into the same data.
     """
     return yaml.dump(
         _plain(data),
@@ -48,7 +48,7 @@ def dump_yaml(data: object) -> str:
 
 
 def _plain(data: object) -> object:
-    """Arrays, tuples and subclasses of the basic types as what YAML knows."""
+    """Convert arrays, tuples and subclasses of the basic types to types that YAML knows."""
     if hasattr(data, "tolist"):
         data = data.tolist()
     if data is None or isinstance(data, bool):
@@ -77,7 +77,7 @@ _TAG = "tag:yaml.org,2002:"
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with the numbers of YAML 1.2: 1e-3 is one, 012 twelve, 1:30, 2024-01-01 text."""
+    """SafeLoader with YAML 1.2 numbers: 1e-3 is one, 012 is 12; 1:30 and 2024-01-01 are text."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
         try:
@@ -114,7 +114,7 @@ _Loader.add_constructor(f"{_TAG}float", _float)
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that repeats instead of referring, and quotes what any YAML takes for a number."""
+    """SafeDumper without aliases; it quotes text that any YAML version reads as a number."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
@@ -125,7 +125,7 @@ _Dumper.add_implicit_resolver(f"{_TAG}float", _FLOAT, list("-+.0123456789"))
 
 @dataclass(frozen=True)
 class Document(Source):
-    """A YAML file: its data, and the node tree that knows the lines."""
+    """A YAML file: its data, and the node tree with the lines."""
 
     source: Path
     root: yaml.Node
@@ -162,7 +162,7 @@ class Document(Source):
             raise ConfigError(f"not a YAML text file: {reason}", file=source) from None
 
     def line(self, place: Place) -> int:
-        """Line of a place; of the nearest enclosing one if it is not in the file."""
+        """Line of a place, or of the nearest enclosing one if the place is not in the file."""
         node = self.root
         line = int(node.start_mark.line) + 1
         for part in place:
@@ -182,12 +182,12 @@ class Document(Source):
         return line
 
     def located(self, message: str, line: int | None = None) -> ConfigError:
-        """The error, with the file and the line."""
+        """Add the file and the line to an error."""
         return ConfigError(message, self.source, line)
 
 
 def _read_bytes(source: Path) -> bytes:
-    """Contents of a file that is not larger than it may be."""
+    """Contents of a file, unless it is too large."""
     try:
         with source.open("rb") as file:
             text = file.read(_LARGEST + 1)
@@ -211,7 +211,7 @@ def _too_deep() -> str:
 
 
 def _inspect(root: yaml.Node, source: Path) -> None:
-    """Refuse what is valid YAML but no plain data: each node once, aliases counted in full."""
+    """Refuse valid YAML that is not plain data; nodes are visited once, aliases counted in full."""
     measured: dict[int, tuple[int, int]] = {}
     above: set[int] = set()
 
@@ -219,7 +219,7 @@ def _inspect(root: yaml.Node, source: Path) -> None:
         return ConfigError(message, file=source, line=node.start_mark.line + 1)
 
     def inspect(node: yaml.Node) -> tuple[int, int]:
-        """Values and levels of a node, its aliases written out."""
+        """Number of values and levels of a node with its aliases expanded."""
         if id(node) in above:
             raise refuse("an anchor (&) around its own alias (*): it contains itself", node)
         if id(node) in measured:

@@ -1,4 +1,4 @@
-"""A cable of which everything is known: the part of a configuration that is left without poses."""
+"""A cable whose data are all known: the parts of a configuration other than its poses."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,9 +16,9 @@ from dlo_casadi.rod.chain import RestCurvature
 
 
 def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config, FloatArray]:
-    """A configuration without poses, and rest coefficients [1/m], of arguments of `known_cable`.
+    """Make a configuration without poses, and rest coefficients [1/m], for `known_cable`.
 
-    Raises ConfigError if something is missing or cannot be; the message lists every problem with
+    Raises ConfigError if an argument is missing or impossible; the message lists every problem with
     its argument.
     """
     given = plain(given)
@@ -64,7 +64,7 @@ def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config,
 
 
 def _without_values(config: Config) -> Iterator[ConfigProblem]:
-    """Find effects that need more than their declaration says."""
+    """Find effects whose declaration leaves values undetermined."""
     setup = declared_setup(config)
     for item in config.model.effects:
         effect = EFFECTS[item.name].made_for(setup)
@@ -79,7 +79,7 @@ def _without_values(config: Config) -> Iterator[ConfigProblem]:
 
 
 def _curvatures(given: Any, axes: int) -> FloatArray | None:
-    """A rest curvature as rows (axes, K) [1/m]; None if it cannot be one."""
+    """A rest curvature as rows (axes, K) [1/m]; None if it is not one."""
     try:
         values = np.atleast_1d(np.array(given, dtype=float))
     except (TypeError, ValueError):

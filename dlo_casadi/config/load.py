@@ -1,4 +1,4 @@
-"""A YAML file -> a checked configuration; checks that concern several sections."""
+"""Load a YAML file into a checked configuration; checks across several sections."""
 
 import difflib
 import math
@@ -39,14 +39,14 @@ def load_config(path: str | Path) -> Config:
     Returns
     -------
     Config
-        Frozen, with the files of the poses as absolute paths.
+        Frozen; the files of the poses are absolute paths.
 
     Raises
     ------
     ConfigError
         If the file cannot be used; the message lists every problem with its line. A pose that
-        cannot be reached or has no file is left out and noted in `Config.skipped`; that is an
-        error only if no pose to fit remains.
+        cannot be reached or has no file is left out and noted in `Config.skipped`; it is an error
+        only if no pose to fit remains.
     """
     return load_as(Config, path)
 
@@ -72,7 +72,7 @@ def load_as(kind: type[Kind], path: str | Path) -> Kind:
 
 
 def checked_config(source: Source, kind: type[Kind]) -> Kind:
-    """A configuration from a file or from arguments; raises ConfigError as `load_config`."""
+    """Check a configuration from a file or from arguments; raises ConfigError as `load_config`."""
     config = source.checked(kind)
     if problems := [
         *_contradictions(config.experiment),
@@ -120,30 +120,30 @@ _RELATIVE = "files are found relative to the YAML, from Python relative to the w
 
 
 def any_photographs(poses: object) -> bool:
-    """Whether a file of the poses has the name of a picture."""
+    """Whether any file of the poses has a picture's name."""
     listed = poses if isinstance(poses, list | tuple) else ()
     paths = [path for pose in listed if isinstance(pose, Pose) for path in pose.paths]
     return any(path.suffix.lower() in _IMAGE_ENDINGS for path in paths)
 
 
-# Results are named after a pose, with up to forty characters more; file systems take 255 bytes.
+# Names of results add up to forty characters to a pose's name; file systems allow 255 bytes.
 _LONGEST_NAME = 200
 
-# A fifth of the wavelength of green light, beyond any camera. Upwards: the cable's length.
+# Lower limit: a fifth of green light's wavelength, beyond any camera. Upper: the cable's length.
 _FINEST_STD = 1.0e-7
-# A nanometre over a metre is what interferometers resolve.
+# Interferometers resolve a nanometre over a metre.
 _FINEST_TOLERANCE = 1.0e-9
 
-# The mesh that is chosen from the data has 20 elements at least, which error and time suggest. By
-# the order with which elements converge.
+# Order of convergence -> number of elements below which a declared mesh is coarse. A mesh chosen
+# from the data has at least 20 elements, a compromise of error and time.
 _COARSE = {4: 10, 2: 20}
-# And it has 160 at most.
+# Largest number of elements of a mesh chosen from the data.
 _FINE = 160
-# Seconds of COBYLA for one pose: measured 1 for 10 links, 4 for 20; it grows with the square.
+# Time of COBYLA for one pose: 1 s measured for 10 links, 4 s for 20; it grows with the square.
 _COBYLA_LINKS = 20
 
-# A start needs no more than a full turn [rad]; an end is continuous along a cable that may turn
-# round several times.
+# A start heading needs at most one full turn [rad]; an end heading is continuous along the cable,
+# which may turn several times.
 _LARGEST_HEADINGS = {"start": 6.3, "end": 25.0}
 
 
@@ -152,7 +152,7 @@ def _called(index: int, pose: Pose) -> str:
 
 
 def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
-    """Find poses that do not fit the boundary, the kind of measurement, or each other."""
+    """Find poses that contradict the boundary, the kind of measurement, or each other."""
     measurement, held, poses = experiment.measurement, experiment.boundary, experiment.poses
     if experiment.in_space and measurement.kind == "images" and measurement.board is None:
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
@@ -175,7 +175,7 @@ def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
 
 
 def _wrong_clips(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
-    """Find clips that cannot be so on a cable of that length [m]."""
+    """Find clips that are impossible on a cable of that length [m]."""
     if wrong := clips_differ(experiment.poses):
         yield ConfigProblem(("experiment", "poses"), wrong)
     for i, pose in enumerate(experiment.poses):
@@ -185,11 +185,11 @@ def _wrong_clips(experiment: Experiment, length: float) -> Iterator[ConfigProble
 
 
 def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
-    """What is wrong with the files of a pose, and the key."""
+    """Problems with the files of a pose, each with its key."""
     if len(pose.name.encode()) > _LONGEST_NAME:
         yield f"results are named after the file, at most {_LONGEST_NAME} bytes long", None
     endings = {path.suffix.lower() for path in pose.paths}
-    # In space photographs, lines and markers may stand in one session.
+    # In space one session may mix photographs, lines and markers.
     mixed = experiment.in_space and pose.file is not None
     if experiment.measurement.kind == "images" and ".csv" in endings and not mixed:
         yield "a CSV is not a photograph; measurement kind: centerlines?", None
@@ -206,7 +206,7 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
 
 
 def _weightless(config: Config) -> Iterator[ConfigProblem]:
-    """Why a mass that is not declared cannot be found."""
+    """Reasons why an undeclared mass cannot be found."""
     experiment, at = config.experiment, ("cable", "mass")
     if config.cable.mass is not None:
         return
@@ -222,7 +222,7 @@ def _weightless(config: Config) -> Iterator[ConfigProblem]:
 
 
 def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
-    """What is wrong with the ends of a pose, in the plane or in space, and the key."""
+    """Problems with the ends of a pose, in the plane or in space, each with its key."""
     held, space, d = experiment.boundary, experiment.in_space, len(experiment.gravity)
     own, other = AXES[d], AXES[5 - d]
     numbers = f"{own.gravity} of gravity: the cable is in {own.where}"
@@ -261,7 +261,7 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
 def _unreachable(
     poses: Iterable[Pose], cable: Cable, tolerances: DeclaredTolerances
 ) -> dict[str, str]:
-    """Find poses whose ends are farther apart than the cable is long, beyond three tolerances."""
+    """Find poses whose ends are farther apart than the cable's length plus three tolerances."""
     slack = 3.0 * math.hypot(tolerances.length, tolerances.end)
     reasons: dict[str, str] = {}
     for pose in poses:
@@ -280,7 +280,7 @@ def _unreachable(
 
 
 def _absent(file: Path) -> str:
-    """Why there is no such file to be read, and what may be meant; empty if there is."""
+    """Why a file cannot be read, and what may have been meant; empty if it exists."""
     try:
         if stat.S_ISREG(file.stat().st_mode):
             return ""
@@ -295,7 +295,7 @@ def _absent(file: Path) -> str:
 
 
 def _oddities(config: Config) -> Iterator[str]:
-    """Find what can be computed with but is probably not meant."""
+    """Find values that are computable but probably unintended."""
     cable, experiment, estimation = config.cable, config.experiment, config.estimation
     young, std = cable.youngs_modulus, experiment.measurement.std
     n, element = config.model.n, config.model.element
@@ -339,7 +339,7 @@ def _oddities(config: Config) -> Iterator[str]:
 
 
 def _impossible_values(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
-    """Find noise, tolerances, arc lengths that are impossible for a cable of that length [m]."""
+    """Find noise, tolerances and arc lengths that are impossible for a cable of that length [m]."""
     std = experiment.measurement.std
     if std is not None and std not in (possible := Range(_FINEST_STD, length, "m")):
         text = f"std: {possible.complaint(std)}; without it, it is estimated from the data"
@@ -351,7 +351,7 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Config
                 f"{length:g} m: arc length from the start, in metres?"
             )
             yield ConfigProblem(("experiment", "poses", i, "at"), text)
-    # A tolerance must leave what it allows within its bounds, or these, and not it, decide.
+    # A tolerance must fit within its bounds; otherwise the bounds decide instead.
     torsional_stiffness = 1.0 if experiment.in_space else None
     cable = CableData(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
     declared = experiment.tolerances.model_dump()
@@ -371,7 +371,7 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Config
 
 
 def declared_setup(config: Config) -> Setup:
-    """How the cable is held and measured, as far as a configuration tells."""
+    """How the cable is held and measured, as far as a configuration says."""
     cable, experiment = config.cable, config.experiment
     measurement = experiment.measurement
     d = len(experiment.gravity)
@@ -401,7 +401,7 @@ def declared_setup(config: Config) -> Setup:
 
 
 def wrong_effects(config: Config) -> list[ConfigProblem]:
-    """Find effects, and parameters of theirs, that do not exist or cannot be as declared."""
+    """Find effects, and parameters of effects, that do not exist or are impossible as declared."""
     setup = declared_setup(config)
     found: list[ConfigProblem] = []
     for i, item in enumerate(config.model.effects):

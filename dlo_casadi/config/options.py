@@ -105,10 +105,10 @@ class DiagnosisOptions(ConfigSection):
     """Largest number of effects that are added."""
 
 
-# Largest bend radius and clearance of a limit, in lengths of the cable. At a radius of three the
-# whole cable turns by 20 degrees; a limit in millimetres would be hundreds of lengths.
+# Largest bend radius and clearance of a limit, in lengths of the cable. At three lengths the whole
+# cable turns by 20 degrees; a limit mistakenly given in millimetres would be hundreds of lengths.
 _LARGEST = 3.0
-# A full turn in a tenth of a millimetre.
+# A full turn within a tenth of a millimetre.
 _TWIST = Range(0.0, 1.0e5, "1/m")
 
 
@@ -128,17 +128,17 @@ class Limits(ConfigSection):
 
     @property
     def given(self) -> dict[str, float]:
-        """The limits that there are, by their names."""
+        """The declared limits, by name."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         return {name: value for name, value in values.items() if value is not None}
 
     def problems(
         self, held: Sequence[str], twists: bool, length: float, avoided: bool
     ) -> Iterator[ConfigProblem]:
-        """Find limits that have no meaning for a cable.
+        """Find limits that are meaningless for a cable.
 
-        `held` are the kinds of its ends and clips, `length` [m] is the cable's; `twists`: whether
-        it can, in space; `avoided`: whether there are obstacles that it is not meant to touch.
+        `held`: kinds of its ends and clips; `length` [m]: of the cable; `twists`: whether it can
+        twist, in space; `avoided`: whether there are obstacles that it must not touch.
         """
         for name in ("bend_radius", "clearance"):
             value = self.given.get(name, 0.0)
@@ -162,14 +162,14 @@ class Limits(ConfigSection):
 # ---- measuring -----------------------------------------------------------------------------------
 
 _STANDARD = Tolerances()
-# A nanonewton is what atomic force microscopes resolve.
+# Atomic force microscopes resolve a nanonewton.
 FORCE_STD, MOMENT_STD = FORCE._replace(least=1.0e-9), MOMENT._replace(least=1.0e-9)
 # A camera's picture is less than 1e5 pixels wide, its focal length less than ten times that.
 PIXELS = Range(-1.0e6, 1.0e6, "px")
 FOCAL_LENGTH = Range(1.0, 1.0e6, "px")
-# Terms of a wide lens that cancel one another reach hundreds; a million is a slip.
+# Terms of a wide lens that cancel each other reach hundreds; a million is a typing error.
 DISTORTION = Range(-1.0e6, 1.0e6, "")
-# A marker of a tenth of a millimetre has no pixels; ten metres are the side of a house.
+# A marker of a tenth of a millimetre covers no pixel; ten metres are the side of a house.
 MARKER = Range(1.0e-4, 10.0, "m")
 
 
@@ -199,7 +199,7 @@ class DeclaredCamera(ConfigSection):
     """OpenCV's 4, 5, 8, 12 or 14 coefficients k1, k2, p1, p2, k3, k4, ...; [] for none."""
 
 
-# OpenCV's dictionaries of markers, and how many each has.
+# OpenCV's marker dictionaries and the number of markers in each.
 _DICTIONARIES = {
     **{f"DICT_{k}X{k}_{n}": n for k in (4, 5, 6, 7) for n in (50, 100, 250, 1000)},
     "DICT_ARUCO_ORIGINAL": 1024,

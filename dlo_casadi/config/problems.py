@@ -1,4 +1,4 @@
-"""What is wrong with a file, or with arguments, and how to say it: place, reason, what to try."""
+"""Report what is wrong with a file or with arguments: place, reason, what to try."""
 
 import difflib
 import re
@@ -20,14 +20,14 @@ PLACEHOLDER = "FILL_IN"
 
 
 class ConfigProblem(NamedTuple):
-    """Something wrong, and where in the file."""
+    """A problem and its place in the file."""
 
     place: Place
     message: str
 
 
 class Contradiction(ValueError):  # noqa: N818  (a ValueError is what pydantic collects)
-    """What is wrong inside one section: problems by the key they belong to."""
+    """A contradiction inside one section: problems by the key they belong to."""
 
     def __init__(self, *problems: ConfigProblem) -> None:
         super().__init__("; ".join(problem.message for problem in problems))
@@ -35,7 +35,7 @@ class Contradiction(ValueError):  # noqa: N818  (a ValueError is what pydantic c
 
 
 def show(value: object) -> str:
-    """Show a value as it stands in the file."""
+    """Show a value as it is written in the file."""
     if value is None:
         return "nothing"
     text = repr(value) if not isinstance(value, bool) else str(value).lower()
@@ -43,13 +43,13 @@ def show(value: object) -> str:
 
 
 def kind_of(value: object) -> str:
-    """Say what a value is: a mapping, a list, text, nothing, or the value itself."""
+    """Describe a value: a mapping, a list, text, nothing, or the value itself."""
     kinds: dict[type, str] = {dict: "a mapping", list: "a list", str: "text"}
     return kinds.get(type(value), show(value))
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Name the nearest known word if it is near, all of them otherwise."""
+    """Name the nearest known word if one is similar, otherwise all of them."""
     words = sorted(set(known))
     if near := difflib.get_close_matches(word, words, 1, cutoff=0.6):
         return f"; did you mean {near[0]!r}?"
@@ -59,8 +59,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 # ---- what pydantic finds ---------------------------------------------------------------------
 
 
-# Sections of a file by the keys, and kinds that a file chooses, which lead to them: their classes,
-# and their names in messages.
+# Maps the path of keys in a file, with the kinds chosen in it, to the class of the section there
+# and its name in messages.
 _Sections = dict[Place, tuple[type[BaseModel], str]]
 
 
@@ -70,7 +70,7 @@ def _sections(model: type[BaseModel], at: Place = (), name: str = "") -> _Sectio
         for inner in _models(field.annotation):
             kind = inner.model_fields.get("kind")
             kinds = () if kind is None else get_args(kind.annotation)
-            # A class of several kinds is chosen by its key alone.
+            # The key alone selects a class that covers several kinds.
             kinds = kinds if len(kinds) == 1 else ()
             named = f"{name}.{key}".lstrip(".") + "".join(f" (kind: {kind})" for kind in kinds)
             found |= _sections(inner, (*at, key, *kinds), named)
@@ -85,7 +85,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _section_at(place: Place, sections: _Sections) -> type[BaseModel]:
-    """The section at a place; what is no key of one, such as an index, is passed over."""
+    """The section at a place; parts that are no keys of a section, such as indices, are skipped."""
 
     def leads(at: Place) -> bool:
         left = iter(place)
@@ -95,7 +95,7 @@ def _section_at(place: Place, sections: _Sections) -> type[BaseModel]:
 
 
 class Source:
-    """Data to be checked, and how to say where something in them is wrong."""
+    """Data to check, and how to describe a place in them."""
 
     data: Any
     folder: Path
@@ -107,7 +107,7 @@ class Source:
     top = "the top of the file"
 
     def checked(self, model: type[Model], heading: str = "", remedy: str = "") -> Model:
-        """The data as an object of a model, or a ConfigError of all problems; see `error`."""
+        """Check the data against a model; raises one ConfigError with all problems, see `error`."""
         try:
             return model.model_validate(self.data, context={"folder": self.folder})
         except ValidationError as error:
@@ -116,7 +116,7 @@ class Source:
     def error(
         self, problems: Iterable[ConfigProblem], heading: str = "", remedy: str = ""
     ) -> ConfigError:
-        """All problems as one error, in the order of their lines, under what they say together."""
+        """Combine all problems into one error, in the order of their lines, below a heading."""
         most = 12
         lines = sorted({(self.line(problem.place), problem.message) for problem in problems})
         if len(lines) == 1:
@@ -134,11 +134,11 @@ class Source:
         return 0
 
     def located(self, message: str, line: int | None = None) -> ConfigError:
-        """The error, with the file and the line where there are any."""
+        """Add the file and the line, where known, to an error."""
         return ConfigError(message)
 
     def inside(self, key: str, section: str) -> str:
-        """Say that a key stands in a section; empty where that cannot be given."""
+        """Say that a key belongs in a section; empty if there is no section."""
         return section
 
     def label(self, place: Place) -> str:
@@ -160,7 +160,7 @@ class Source:
 
 
 class Arguments(Source):
-    """Arguments of a call: a place is named by its argument alone."""
+    """Arguments of a call: places are named by their arguments only."""
 
     hidden = ("experiment", "measurement")
     top = "the arguments"
@@ -169,21 +169,21 @@ class Arguments(Source):
         self.data, self.folder, self.names = data, Path(), names
 
     def inside(self, key: str, section: str) -> str:
-        """Say that a key stands in a mapping that is an argument."""
+        """Say that a key belongs in a mapping passed as an argument."""
         own = re.sub(r"^experiment\.(measurement [^.]*\.)?", "", section)
         known = not self.names or own.partition(".")[0] in self.names
         return f'{own}={{"{key}": ...}}' if known else ""
 
 
 def _help(section: type[BaseModel], key: object) -> str:
-    """Help on a key, where the section knows it."""
+    """Help on a key, if the section has any."""
     field = section.model_fields.get(str(key))
     description = " ".join((field.description or "").split()) if field else ""
     return f": {description.rstrip('.')}" if description else ""
 
 
 def _about_number(value: object) -> str:
-    """Guess why text stands where a number belongs."""
+    """Guess why a number was written as text."""
     text = str(value).strip()
     if isinstance(value, str) and re.fullmatch(_NUMBER, text):
         return "; write it without quotes"
@@ -195,7 +195,7 @@ def _about_number(value: object) -> str:
 
 
 def _allowed(section: type[BaseModel], key: object) -> str:
-    """The range of a number, where it has two ends."""
+    """The range of a number with two limits."""
     field = section.model_json_schema()["properties"].get(str(key), {})
     ends: dict[str, float] = {}
     for part in (field, *field.get("anyOf", ())):
@@ -230,7 +230,7 @@ _MESSAGES: dict[str, str] = {
 def explain(
     model: type[BaseModel], errors: Sequence[ErrorDetails], source: Source
 ) -> Iterator[ConfigProblem]:
-    """Say what pydantic found in a source of that model in the words of the source."""
+    """Rewrite what pydantic found in the words of the source."""
     sections = _sections(model)
     suggested: set[Place] = set()
     for error in errors:

@@ -1,6 +1,6 @@
 """The checked objects: one class for each section of a configuration. All units are SI.
 
-How was measured is in `measuring`.
+Sections on how it was measured are in `measuring`.
 """
 
 import dataclasses
@@ -48,8 +48,8 @@ from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.ends import REACTIONS, clip_force
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 
-# Of copper in plastic [kg/m^3]: two sessions of tests have 2200. `mass_error` finds a fifth of it,
-# a foam, to five times, which no metal of cables reaches.
+# Density of copper in plastic [kg/m^3]: two test sessions have 2200. `mass_error` can find a fifth
+# of it (foam) up to five times it, more than any metal in cables.
 DENSITY = 2200.0
 
 
@@ -76,7 +76,7 @@ class Cable(ConfigSection):
 
     @property
     def prior_bending_stiffness(self) -> float:
-        """First guess of EI [N m^2]: as declared, or E pi d^4 / 64."""
+        """First guess of EI [N m^2]: the declared value, or E pi d^4 / 64."""
         if self.bending_stiffness is not None:
             return self.bending_stiffness
         assert self.youngs_modulus is not None  # checked when the object was made
@@ -85,14 +85,14 @@ class Cable(ConfigSection):
 
     @property
     def prior_mass(self) -> float:
-        """Mass [kg] as declared, or that of a solid round rod of DENSITY."""
+        """Mass [kg]: the declared value, or that of a solid round rod of DENSITY."""
         if self.mass is not None:
             return self.mass
         return DENSITY * math.pi / 4.0 * self.diameter * self.diameter * self.length
 
     @property
     def prior_torsional_stiffness(self) -> float:
-        """First guess of GJ [N m^2]: as declared, or EI / 1.3, of a round rod of nu = 0.3."""
+        """First guess of GJ [N m^2]: the declared value, or EI / 1.3 (round rod, nu = 0.3)."""
         return self.torsional_stiffness or self.prior_bending_stiffness / 1.3
 
     @model_validator(mode="after")
@@ -122,7 +122,7 @@ class Boundary(ConfigSection):
 
 
 def _no_file_name(name: str) -> str:
-    """Why results cannot be named so; empty if they can."""
+    """Why results cannot carry this name; empty if they can."""
     if name in (".", "..") or set(name) & set('/\\:*?"<>|\0') or name != name.strip():
         return (
             f"results are named after it: a file name without ending belongs here, found {name!r}"
@@ -141,7 +141,7 @@ def _both_ends(value: object) -> object:
 _as_boundary = BeforeValidator(_both_ends, json_schema_input_type=Boundary | tuple[str, str])
 
 
-# pose_01_a -> pose_01: a digit, and letters after it.
+# pose_01_a -> pose_01: a digit followed by letters.
 _TOLD_APART = re.compile(r"(.*[0-9])[-_. ]?[A-Za-z]+")
 
 
@@ -208,12 +208,12 @@ class Pose(ConfigSection):
 
     @property
     def shown_by(self) -> str:
-        """Names of its files, or its own, for messages."""
+        """Names of its files, or its own name, for messages."""
         return ", ".join(path.name for path in self.paths) or self.name
 
     @property
     def photographs(self) -> dict[str, Path]:
-        """Its files by their names without folder and ending."""
+        """Its files by their names without folder and extension."""
         return {well_formed(path.stem): path for path in self.paths}
 
     @property
@@ -255,9 +255,9 @@ class Pose(ConfigSection):
     @field_validator("name", mode="after")
     @classmethod
     def _named(cls, value: str, info: ValidationInfo) -> str:
-        """Of photographs in `files` the first one's name, without what tells them apart.
+        """For photographs in `files`: the name of the first without the letters after its number.
 
-        That is letters after a number: pose_01 of pose_01_a.jpg and pose_01_b.jpg.
+        For example pose_01 from pose_01_a.jpg and pose_01_b.jpg.
         """
         files = info.data.get("files") or ()
         paths = files or [file for file in [info.data.get("file")] if file is not None]
@@ -312,7 +312,7 @@ class Experiment(ConfigSection):
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:
-        """The obstacles for the statics."""
+        """Obstacles in the form that the statics use."""
         return tuple(item.surface(k) for k, item in enumerate(self.obstacles, start=1))
 
     @property
@@ -330,7 +330,7 @@ class Experiment(ConfigSection):
     @field_validator("poses")
     @classmethod
     def _shown(cls, poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
-        """Refuse a pose that nothing shows; name those without a file by their number."""
+        """Refuse a pose without any measurement; name poses without a file by their number."""
         text = (
             "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs; or "
             "points: [[x, y], ...]"
@@ -376,21 +376,21 @@ class Config(ConfigSection):
 
     @property
     def path(self) -> Path | None:
-        """The YAML file, absolute; None of a session from Python."""
+        """The YAML file, absolute; None for a session made in Python."""
         return self._path
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What looks odd but does not stop the fit."""
+        """What looks unintended but does not stop the fit."""
         return self._warnings
 
     @property
     def skipped(self) -> tuple[SkippedPose, ...]:
         """Poses that cannot be used.
 
-        Those without an equilibrium (farther apart than the cable is long) are not in
-        `experiment.poses`; those whose file is missing stay there, because their end conditions
-        are part of the cable's history, but not in `measured_poses`.
+        Poses farther apart than the cable is long have no equilibrium and are not in
+        `experiment.poses`. Poses whose file is missing stay there, because their end conditions are
+        part of the cable's history, but they are not in `measured_poses`.
         """
         return self._skipped
 
@@ -401,7 +401,7 @@ class Config(ConfigSection):
     __str__ = __repr__
 
     def noted(self, **notes: Any) -> Self:
-        """The same with other `path`, `warnings` or `skipped`."""
+        """The same configuration with other `path`, `warnings` or `skipped`."""
         noted = self.model_copy()
         for name, value in notes.items():
             setattr(noted, f"_{name}", value)
@@ -409,7 +409,7 @@ class Config(ConfigSection):
 
     @property
     def name(self) -> str:
-        """Name of the session: its file without folder and ending, or that of the cable."""
+        """Name of the session: its file without folder and extension, or the cable's name."""
         return well_formed(self.cable.name if self.path is None else self.path.stem)
 
     @property
@@ -427,7 +427,7 @@ class Config(ConfigSection):
 
     @property
     def limit_problems(self) -> list[ConfigProblem]:
-        """Limits that have no meaning for this cable."""
+        """Find limits that are meaningless for this cable."""
         given, ends = self.experiment, self.experiment.boundary
         held = {ends.start, ends.end, *(clip.kind for x in given.poses for clip in x.clips)}
         avoided = any(one.touch == "avoided" for one in given.obstacles)
@@ -436,6 +436,6 @@ class Config(ConfigSection):
 
     @property
     def measured_poses(self) -> tuple[Pose, ...]:
-        """Poses with something to read, in the order in which they were taken."""
+        """Poses with a measurement, in the order in which they were taken."""
         skipped = {pose.name for pose in self.skipped}
         return tuple(pose for pose in self.experiment.poses if pose.name not in skipped)

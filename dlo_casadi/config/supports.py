@@ -1,4 +1,4 @@
-"""What is between the ends: clips that hold the cable, obstacles; and what is wrong with them."""
+"""Supports between the ends: clips that hold the cable, and obstacles; with checks of both."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ KINDS = ("pinned", "clamped", "eyelet")
 
 
 def undetermined(start: str, end: str, in_space: bool) -> Iterator[ConfigProblem]:
-    """Why ends that are held so leave a cable in more than one place."""
+    """Why ends held in this way leave the cable's position undetermined."""
     if in_space and start == "pinned" and end == "free":
         text = (
             "on a ball joint and with a free end a cable in space may be turned about gravity, "
@@ -58,7 +58,7 @@ class Clip(ConfigSection):
     """Force [N] that the cable exerts on the clip, where it was measured, as start_force."""
 
     def held(self, number: int) -> HeldClip:
-        """The same for the statics; `number` names it where it has no name."""
+        """The clip in the form that the statics use; `number` names it if it has no name."""
         return HeldClip(
             kind="swivel" if self.kind == "clamped" and self.roll == "free" else self.kind,
             place=self.place,
@@ -83,7 +83,7 @@ class _Clipped(Protocol):
 
 
 def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[str, int]]:
-    """What is wrong with the clips of a pose on a cable of that length [m], and which clip.
+    """Problems with the clips of a pose on a cable of that length [m], each with the clip's index.
 
     `axes`: 2 in a plane, 3 in space.
     """
@@ -114,7 +114,7 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
 
 
 def too_short(pose: _Clipped, length: float, slack: float) -> str:
-    """Why a pose cannot be: a span is longer than its cable, by more than a slack [m]; or empty."""
+    """Why a pose is impossible: a span exceeds its cable by more than a slack [m]; empty if not."""
     names = ["the start", *(clip.name for clip in pose.held.clips), "the end"]
     places = [pose.start, *(clip.place for clip in pose.clips), pose.end]
     at = [0.0, *(clip.at for clip in pose.clips), length]
@@ -138,7 +138,7 @@ def too_short(pose: _Clipped, length: float, slack: float) -> str:
 
 
 def clips_differ(poses: Sequence[_Clipped]) -> str:
-    """Why poses are not of one session: their clips are of other kinds or numbers; or empty."""
+    """Why poses cannot share a session: kinds or numbers of clips differ; empty if they agree."""
     kinds = [[clip.kind for clip in pose.held.clips] for pose in poses]
     for i, own in enumerate(kinds):
         if own != kinds[0]:
@@ -150,7 +150,7 @@ def clips_differ(poses: Sequence[_Clipped]) -> str:
     return ""
 
 
-# Kind -> its keys.
+# Kind of an obstacle -> its keys.
 _KEYS = {
     "plane": ("point", "normal"),
     "sphere": ("center", "radius"),
@@ -183,7 +183,7 @@ class Obstacle(ConfigSection):
     same either way."""
 
     def surface(self, number: int) -> Surface:
-        """The same for the statics; `number` names it where it has no name."""
+        """The obstacle in the form that the statics use; `number` names it if it has no name."""
         name = self.name or f"obstacle_{number}"
         if self.kind == "plane":
             normal, point = self.normal or (), self.point or ()
@@ -193,14 +193,14 @@ class Obstacle(ConfigSection):
         return Capsule(a or (), b or (), self.radius or 0.0, name, self.touch == "allowed")
 
 
-# What a pose says of the sides of bars: over all (true) or under them, or some by their names.
+# Side of bars in a pose: over all (true) or under all (false), or by the names of some bars.
 Sides = bool | Mapping[str, bool] | None
 
 
 def obstacle_problems(
     obstacles: Sequence[Obstacle], gravity: Sequence[float], sides: Sequence[Sides]
 ) -> Iterator[ConfigProblem]:
-    """What is wrong with obstacles, and with the sides of bars that poses name."""
+    """Problems with obstacles, and with the sides of bars that poses declare."""
     names = [item.name or f"obstacle_{k}" for k, item in enumerate(obstacles, start=1)]
     usable = True
     for k, (item, name) in enumerate(zip(obstacles, names, strict=True)):

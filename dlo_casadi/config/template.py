@@ -1,4 +1,4 @@
-"""What helps to write a configuration: a commented one to start from, a schema for editors."""
+"""Help to write a configuration: a commented template, and a schema for editors."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -26,33 +26,33 @@ def template(
     clips: Sequence[str] = (),
     remarks: Sequence[str] = (),
 ) -> str:
-    """Text of a configuration with placeholders for values that only the user knows.
+    """Text of a configuration with placeholders for what only the user knows.
 
     Parameters
     ----------
     name : str
-        What to call the cable.
+        Name of the cable.
     files : sequence of str
         One pose each, relative to the configuration; one placeholder if there are none.
     kind : "images" or "centerlines"
-        What the files are, in a plane; in space centre-lines.
+        What the files are in a plane; in space they are always centre-lines.
     in_space : bool
         Whether the cable may leave the plane.
     cable : mapping of str to str
-        What is known of the cable, by its keys.
+        Known values of the cable, by key.
     poses : sequence of mapping of str to str
-        In space, for each file: what is known of its pose by its keys, and a `remark`.
+        In space, one per file: known values of its pose, by key, and a `remark`.
     end : str
         How the end is held in space.
     clips : sequence of str
         Kinds of the clips of every pose.
     remarks : sequence of str
-        Lines of comment that begin the configuration.
+        Comment lines at the top of the configuration.
 
     Returns
     -------
     str
-        Valid YAML. `load_config` names each placeholder that is left.
+        Valid YAML. `load_config` reports each remaining placeholder.
     """
     text = (folder_of("dlo_casadi.config") / "templates" / "session.yaml.in").read_text("utf-8")
     filled = Template(text, trim_blocks=True, keep_trailing_newline=True)
@@ -77,15 +77,14 @@ def _clip(kind: str, in_space: bool) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Text as YAML writes it inside a list: in quotes where it needs them."""
+    """Quote text for use inside a YAML list where it needs quotes."""
     return dump_yaml([text]).strip()[1:-1]
 
 
 def config_schema() -> dict[str, Any]:
-    """JSON schema of what may stand in a configuration, made from the checked sections.
+    """JSON schema of a configuration, made from the checked sections.
 
-    It knows keys, types, ranges and help; what concerns several values together only
-    `load_config` checks.
+    It covers keys, types, ranges and help; only `load_config` checks several values together.
     """
     schema: dict[str, Any] = _plain(Config.model_json_schema())
     return {"$schema": DIALECT, **schema, "title": "Configuration of dlo_casadi"}
@@ -97,7 +96,7 @@ def schema_text() -> str:
 
 
 def _plain(schema: Any) -> Any:
-    """Write tuples of equal items as arrays of a fixed length, which older editors know."""
+    """Write tuples of equal items as fixed-length arrays, which older editors understand."""
     if isinstance(schema, list):
         return [_plain(item) for item in schema]
     if not isinstance(schema, dict):

@@ -1,7 +1,7 @@
-"""What may stand behind a key of a file: numbers, places, orientations; how was measured.
+"""Types of the values in a file: numbers, places, orientations; how they were measured.
 
-What lies beyond a range is a slip (a unit, an exponent) and cannot be computed with: it is refused
-with the range that is allowed. What can be computed but is hardly meant is a warning of
+A value beyond its range is a typing error (a unit, an exponent) that cannot be computed with: it is
+refused, and the message gives the range. A computable but unlikely value is a warning of
 `load_config`.
 """
 
@@ -33,7 +33,7 @@ from dlo_casadi.errors import ConfigError, DloError, counted
 
 
 class Range(NamedTuple):
-    """From where to where a value can lie."""
+    """Limits between which a value can lie."""
 
     least: float
     most: float
@@ -46,45 +46,45 @@ class Range(NamedTuple):
         return f"{self.least:g} to {self.most:g}{self.unit and ' '}{self.unit} is possible"
 
     def complaint(self, value: float) -> str:
-        """What is wrong with a value that lies outside; empty if it does not."""
+        """Describe why a value is out of range; empty if it is inside."""
         return "" if value in self else f"{value:g}{self.unit and ' '}{self.unit}: {self}"
 
 
-# Nothing shorter than a millimetre is held in two fixtures; 100 m hang between two masts.
+# Nothing shorter than a millimetre is held by two fixtures; a cable between two masts has 100 m.
 LENGTH = Range(1.0e-3, 100.0, "m")
-# Largest change of a quaternion's length by rounding to three digits.
+# Largest deviation of a quaternion's length from one: rounding to three digits.
 _UNIT = 2.0e-3
-# Carbon fibres have 5e-6 m; the upper limit is the length itself.
+# Carbon fibres have 5e-6 m; the upper limit is the cable's length.
 _THINNEST = 1.0e-6
 # A millimetre of the thinnest wire on sale (copper, 10 um): 9e3 pi (5e-6)^2 1e-3 = 7e-10 kg.
 _LIGHTEST = 1.0e-10
 # A metre of a submarine power cable has 100 kg.
 _HEAVIEST, _HEAVIEST_PER_METRE = 1000.0, 100.0
-# From polystyrene foam to osmium, the densest metal.
+# Polystyrene foam to osmium, the densest metal.
 _DENSITIES = Range(15.0, 2.26e4, "kg/m^3")
-# A strip whose thickness is declared as its diameter seems denser (0.9 mm, 0.25 m and 17 g: 1.1e5),
-# a tube lighter; but 200 kg/m^3, less than any rope, are 2e5 in grams, and what is lighter than air
-# does not hang.
+# A strip declared with its thickness as diameter seems denser (0.9 mm, 0.25 m and 17 g: 1.1e5), a
+# tube lighter. The upper limit still catches grams: 200 kg/m^3, less than any rope, become 2e5. The
+# lower limit is air: a lighter cable does not hang.
 _POSSIBLE_DENSITIES = Range(1.2, 2.0e5, "kg/m^3")
-# A carbon fibre has E pi d^4 / 64 = 2.3e11 pi (5e-6)^4 / 64 = 7e-12 N m^2, a steel bar of 0.5 m
-# 6e8 N m^2: the bounds of the fit itself.
+# Bounds of the fit itself: a carbon fibre has E pi d^4 / 64 = 2.3e11 pi (5e-6)^4 / 64 =
+# 7e-12 N m^2, a steel bar of 0.5 m 6e8 N m^2.
 STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
-# The largest centrifuge for models of soil reaches some 1e3 times the Earth's 9.81 m/s^2.
+# The largest centrifuges for soil models reach about 1e3 times the Earth's 9.81 m/s^2.
 GRAVITY = Range(0.0, 1.0e4, "m/s^2")
-# Only frames of maps have an origin farther away; at 1e3 m doubles resolve 1e-13 m.
+# Only map frames have an origin farther away; at 1e3 m doubles resolve 1e-13 m.
 COORDINATE = Range(-1.0e3, 1.0e3, "m")
-# The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; taut it pulls more. A moment: a metre's arm.
+# The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; tension adds to it. Moments: at a metre's arm.
 FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
-# Two elements have a joint between them; of a metre, 2000 are half a millimetre each, less than a
+# A joint needs two elements; 2000 elements on a metre have half a millimetre each, less than a
 # cable is thick.
 MESH = Range(2, 2000, "elements")
-# Cubic splines need four coefficients. A line of 240 points has four between two knots of 64; the
-# covariance that a result holds grows with their square.
+# Cubic splines need four coefficients. With 64, a line of 240 points has four between two knots;
+# the covariance in a result grows with the square of their number.
 REST_COEFFICIENTS = Range(0, 64, "coefficients")
 
 
 def implausible_sizes(length: float, mass: float, diameter: float) -> list[ConfigProblem]:
-    """Find sizes [m], [kg] of a cable that no cable has: one by one, then all together."""
+    """Find impossible sizes [m] and masses [kg] of a cable: each alone, then their combination."""
 
     def density(diameter: float) -> float:
         """Mass over volume [kg/m^3] of a round cable: m / (pi d^2 / 4 L)."""
@@ -94,7 +94,7 @@ def implausible_sizes(length: float, mass: float, diameter: float) -> list[Confi
         return f"did you mean {value:g}? " if possible else ""
 
     def in_metres() -> str:
-        """Question after a diameter of millimetres or centimetres that would be sound."""
+        """Ask whether the diameter is in millimetres or centimetres, if that would be plausible."""
         sound = [d for d in (diameter / 1e3, diameter / 1e2) if density(d) in _DENSITIES]
         return f", did you mean {sound[0]:g}?" if sound else ""
 
@@ -109,13 +109,13 @@ def implausible_sizes(length: float, mass: float, diameter: float) -> list[Confi
         wrong.append(("diameter", thin))
     heaviest = min(_HEAVIEST, _HEAVIEST_PER_METRE * length)
     if mass > heaviest:
-        hint = meant(mass / 1e3, mass / 1e3 <= heaviest)  # of grams
+        hint = meant(mass / 1e3, mass / 1e3 <= heaviest)  # given in grams
         text = f"units are SI, {hint}at most {heaviest:g} kg is possible"
         wrong.append(("mass", f"{mass:g} kg for {length:g} m: {text}"))
     elif mass < _LIGHTEST:
         text = f"no cable is lighter than {_LIGHTEST:g} kg; to leave its weight out, write "
         wrong.append(("mass", f"{mass:g} kg: {text}gravity: [0, 0]"))
-    apparent = math.nan if wrong else density(diameter)  # of possible sizes alone
+    apparent = math.nan if wrong else density(diameter)  # for possible sizes only
     if apparent > _POSSIBLE_DENSITIES.most:
         hint = meant(mass / 1e3, apparent / 1e3 in _DENSITIES)
         text = f"{mass:g} kg make it {apparent / 1e3:.3g} times as dense as water (osmium, the "
@@ -128,7 +128,7 @@ def implausible_sizes(length: float, mass: float, diameter: float) -> list[Confi
 
 
 def implausible_quaternion(values: Sequence[float]) -> str:
-    """What is wrong with an orientation (x, y, z, w); empty if its length is one."""
+    """Problem with an orientation (x, y, z, w); empty if its length is one."""
     belongs = "a unit quaternion [qx, qy, qz, qw] belongs here"
     if len(values) != 4:
         return f"{belongs}, not {counted(len(values), 'number')}"
@@ -137,7 +137,7 @@ def implausible_quaternion(values: Sequence[float]) -> str:
 
 
 class Axes(NamedTuple):
-    """What a session says of a cable in a plane or in space: `direction` is that of a clamp."""
+    """Words for a session in a plane or in space; `direction` is that of a clamp."""
 
     where: str
     gravity: str
@@ -147,7 +147,7 @@ class Axes(NamedTuple):
     unit: str
 
 
-# By the numbers of gravity.
+# Keyed by the number of gravity's components.
 _TURNED, _FRAME = "[rad], continuous along the cable", "[qx, qy, qz, qw]"
 AXES = {
     2: Axes("a plane", "two numbers", "[x, y]", "[fx, fy]", "heading", _TURNED),
@@ -158,13 +158,13 @@ AXES = {
 # ---- types -------------------------------------------------------------------------------------
 
 
-# Longest list that the text of a section shows in full.
+# Longest list that is shown in full when a section is printed.
 _SHOWN = 6
 
 
 def plain(value: Any) -> Any:
-    """Arrays, matrices of CasADi and NumPy's numbers as those of Python that stand in a file."""
-    if hasattr(value, "full"):  # a matrix of CasADi
+    """Convert arrays, CasADi matrices and NumPy numbers to Python numbers as in a file."""
+    if hasattr(value, "full"):  # a CasADi matrix
         value = value.full()
     if hasattr(value, "tolist"):
         return value.tolist()
@@ -176,7 +176,7 @@ def plain(value: Any) -> Any:
 
 
 class _Long(int):
-    """A long list, shown by the number of its items alone."""
+    """A long list, printed as its number of items."""
 
     def __repr__(self) -> str:
         return f"<{counted(int(self), 'item')}>"
@@ -217,14 +217,14 @@ class ConfigSection(BaseModel):
         super().__setattr__(name, value)
 
     def changed(self, **values: Any) -> Self:
-        """The same with other values, unchecked; of a section inside, mappings of its own."""
+        """Copy with other values, unchecked; values of a nested section are given as a mapping."""
         inner = {name: getattr(self, name) for name, x in values.items() if isinstance(x, dict)}
         changed = {name: section.changed(**values[name]) for name, section in inner.items()}
         return self.model_copy(update=values | changed)
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
-        """Tell the keys in `help`, beside the docstring that stands in the schema."""
+        """Put the keys' help in `help`, and in the docstring but not the schema."""
         own = inspect.cleandoc(cls.__doc__ or "")
         cls.model_config["json_schema_extra"] = {"description": own}
         if "Parameters\n" not in own:
@@ -235,31 +235,31 @@ class ConfigSection(BaseModel):
             cls.__doc__ = "\n".join([own, "", "Parameters", "----------", *rows])
 
     def __repr_args__(self) -> Iterator[tuple[str, Any]]:
-        """What was given, long lists by their length."""
+        """What was given; long lists are shown by their length."""
         for name in (x for x in type(self).model_fields if x in self.model_fields_set):
             value = getattr(self, name)
             long = isinstance(value, tuple) and len(value) > _SHOWN
             yield name, _Long(len(value)) if long else value
 
-    # Sections inside of others are made by pydantic, which collects all problems of the whole.
+    # Pydantic constructs nested sections and collects all problems of the whole.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
 
 class OpenSection(ConfigSection):
-    """A section in which other keys may stand beside those that are read."""
+    """A section that may have other keys than those that are read."""
 
     model_config = ConfigDict(extra="ignore")
 
 
 def optional(section: type[ConfigSection]) -> BeforeValidator:
-    """Let a section be empty: `model:` with nothing behind it."""
+    """Let a section be empty, such as `model:` without a value."""
     return BeforeValidator(
         lambda value: {} if value is None else value, json_schema_input_type=section | None
     )
 
 
 def checked(complaint: Callable[[Any], str | list[ConfigProblem]]) -> AfterValidator:
-    """Refuse a value with what is wrong with it, or with its keys, if anything is."""
+    """Refuse a value if the check finds something wrong with it or its keys."""
 
     def check(value: Any) -> Any:
         if wrong := complaint(value):
@@ -270,7 +270,7 @@ def checked(complaint: Callable[[Any], str | list[ConfigProblem]]) -> AfterValid
 
 
 def within(allowed: Range) -> AfterValidator:
-    """Refuse a number, or the numbers of a list, that lie outside of a range."""
+    """Refuse a number, or the numbers of a list, outside a range."""
 
     def complaint(value: Any) -> str:
         numbers = value if isinstance(value, tuple) else (value,)
@@ -280,7 +280,7 @@ def within(allowed: Range) -> AfterValidator:
 
 
 def stacked(names: Sequence[str]) -> BeforeValidator:
-    """Numbers of several components by their names: one list, the components one after another."""
+    """Combine several components by name into one list, one component after another."""
 
     def check(value: Any) -> Any:
         if not isinstance(value, Mapping):
@@ -293,7 +293,7 @@ def stacked(names: Sequence[str]) -> BeforeValidator:
 
 
 def _listed(belongs: str, schema: Any, *counts: int) -> BeforeValidator:
-    """A list with one of these numbers of items; `schema` is what editors are told of it."""
+    """A list with one of these numbers of items; editors get `schema`."""
 
     def check(value: object) -> object:
         if not isinstance(value, list | tuple) or len(value) not in counts:
@@ -304,7 +304,7 @@ def _listed(belongs: str, schema: Any, *counts: int) -> BeforeValidator:
 
 
 def _table(words: str, *columns: int) -> BeforeValidator:
-    """Numbers in rows of one of these lengths, of none in one row; a tuple, frozen."""
+    """Numbers in rows of one of these lengths (or one plain row), as a frozen tuple."""
 
     def check(value: object) -> object:
         belongs = f"{words} belong here"

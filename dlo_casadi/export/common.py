@@ -1,4 +1,4 @@
-"""What all simulators share: numbers in the text of their files, and how a cable comes to rest."""
+"""Common code of all simulators: numbers as text in their files, and how a cable comes to rest."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -8,9 +8,9 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EquilibriumError
 
-# At rest: no node moves faster than this [m/s], on average over two intervals [s] in a row.
+# Largest mean speed [m/s] of a node at rest, in each of two successive intervals [s].
 REST_SPEED, INTERVAL = 2e-5, 0.02
-# Simulated time [s] after which it has failed.
+# Simulated time [s] after which relaxation has failed.
 PATIENCE = 60.0
 
 
@@ -20,7 +20,7 @@ def rounded(values: FloatArray) -> list:
 
 
 def array(values: FloatArray) -> str:
-    """An array in Python, one row a line."""
+    """Format an array in Python, one row a line."""
     rows = ",\n    ".join(map(str, rounded(values)))
     return f"np.array([\n    {rows},\n])"
 
@@ -28,7 +28,7 @@ def array(values: FloatArray) -> str:
 def head_of_python(
     head: Sequence[str], imports: Sequence[str], numbers: Sequence[tuple[str, str, str]]
 ) -> str:
-    """Comments, imports, and numbers: name, value, meaning."""
+    """Format comments, imports, and numbers: name, value, meaning."""
     lines = [f"# {line}".rstrip() for line in head]
     lines += ["", *(f"import {name}" for name in imports), ""]
     for name, value, meaning in numbers:
@@ -43,7 +43,7 @@ class Relaxed:
     Parameters
     ----------
     nodes : (n + 1, 3) [m]
-        Where the nodes of the `Rod` have come to rest.
+        Positions of the `Rod`'s nodes at rest.
     end_force : (3,) [N]
         Force of the cable on its end fixture, world axes; zero at a free end.
     seconds : float
@@ -63,27 +63,27 @@ def relax(
     name: str,
     speed: float = REST_SPEED,
 ) -> tuple[FloatArray, float]:
-    """Nodes (n + 1, 3) [m] at rest, and the simulated time [s].
+    """Relax a cable; return its nodes (n + 1, 3) [m] at rest, and the simulated time [s].
 
-    Kinetic damping: whenever the kinetic energy has passed a maximum all velocities are set to zero
-    (Barnes, Comput. Struct. 19 (1984)). Damping and inertia do not change where it comes to rest.
+    Kinetic damping: whenever the kinetic energy has passed a maximum, all velocities are set to
+    zero (Barnes, Comput. Struct. 19 (1984)). Damping and inertia do not change the shape at rest.
 
     Parameters
     ----------
     advance : callable
-        Makes so many steps, and returns the nodes.
+        Makes the given number of steps and returns the nodes.
     energy : callable
-        The kinetic energy, in any unit.
+        Returns the kinetic energy, in any unit.
     halt : callable
         Sets all velocities to zero.
     step : float [s]
     speed : float [m/s]
-        Below it a node is at rest; larger for a simulator of single precision.
+        Speed below which a node is at rest; larger for a single-precision simulator.
 
     Raises
     ------
     EquilibriumError
-        If it does not come to rest, or its numbers become infinite.
+        If it does not come to rest, or if its numbers become infinite.
     """
     many = max(1, round(INTERVAL / step))
     nodes, still, time, last = advance(0), 0, 0.0, 0.0

@@ -1,8 +1,8 @@
-"""MuJoCo: bodies in a chain, each joined to the one before by three hinges with springs.
+"""Export to MuJoCo: a chain of bodies, each joined to the one before by three sprung hinges.
 
-No plugin: `mujoco.elasticity.cable` knows one stiffness for a whole cable, takes the initial shape
-(or, `flat`, a straight one) for that without load, and is gone in MuJoCo 4. Springs of hinges are
-read by MuJoCo 3 and 4 and by MJX.
+No plugin is used: `mujoco.elasticity.cable` has one stiffness for the whole cable, takes the
+initial shape (or, with `flat`, a straight one) as the shape without load, and no longer exists in
+MuJoCo 4. Hinges with springs work in MuJoCo 3 and 4 and in MJX.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,11 +15,11 @@ from dlo_casadi.export.common import Relaxed, relax
 from dlo_casadi.export.rod import Fixture, Rod
 from dlo_casadi.rod.node import Frame, Heading
 
-# Time step [s]; damping of a joint over its stiffness [s], not measured.
+# Time step [s]; ratio of a joint's damping to its stiffness [s], not measured.
 STEP, DAMPING = 0.002, 0.03
-# Moduli [Pa] in bending and twist of the cable that comes with MuJoCo 3 (model/plugin/elasticity).
+# Moduli [Pa] in bending and twist of MuJoCo 3's own cable example (model/plugin/elasticity).
 DEFAULT = (4e6, 1e7)
-# By the axes about which the cable turns: the joint of a pin, and its position in a frame.
+# Joint of a pin and its position in a frame, by the axes about which the cable turns.
 _PINS: dict[tuple[str, ...], tuple[str, Callable[[Rotation], FloatArray]]] = {
     Heading.about: ('type="hinge" axis="0 0 1"', lambda frame: frame.as_rotvec()[2:]),
     Frame.about: ('type="ball"', lambda frame: np.roll(frame.as_quat(), 1)),
@@ -64,11 +64,11 @@ def _escaped(text: str) -> str:
 
 
 def _turned(frame: Rotation) -> str:
-    return _row(np.roll(frame.as_quat(), 1))  # MuJoCo has w ahead
+    return _row(np.roll(frame.as_quat(), 1))  # MuJoCo puts w first
 
 
 def _gripper(side: str, fixture: Fixture) -> str:
-    """The body that holds an end, and, for the end, the site in it that the cable is held at."""
+    """The body that holds an end; for the end, also the site at which it holds the cable."""
     place, frame = fixture.offset
     site = f'<site name="{side}" pos="{_row(place)}" quat="{_turned(frame)}"/>'
     return (
@@ -108,10 +108,10 @@ def _bodies(rod: Rod) -> list[str]:
 
 
 def principal(rod: Rod) -> tuple[FloatArray, Rotation]:
-    """Stiffnesses (n - 1, 3) [N m^2] about the principal axes of each joint, and those axes.
+    """Principal stiffnesses (n - 1, 3) [N m^2] of each joint, and the axes.
 
-    First GJ about x, then the two of bending. The axes (n - 1,) are in the material frame; of
-    an isotropic section they are that frame.
+    First GJ about x, then the two of bending. The axes (n - 1,) are given in the material frame;
+    for an isotropic section they equal that frame.
     """
     values, vectors = np.linalg.eigh(rod.bending)
     round_ = np.ptp(values, axis=1) < 1e-9 * values[:, 1]
@@ -121,16 +121,16 @@ def principal(rod: Rod) -> tuple[FloatArray, Rotation]:
 
 
 def _pin(rod: Rod) -> str:
-    """A pin at the start: damped as a joint is, so that nothing spins for ever."""
+    """A pin at the start, damped like a joint so that nothing spins forever."""
     damping = DAMPING * float(np.linalg.eigvalsh(rod.bending[0])[0]) / rod.h
     return f'<joint name="start_pin" {_PINS[rod.node.about][0]} damping="{damping:.9g}"/>'
 
 
 def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: FloatArray) -> str:
-    """Hinges about the principal axes; of a cable in a plane the one across it.
+    """Hinges about the principal axes; for a cable in a plane only the one normal to it.
 
-    Their armature keeps each from oscillating by more than a radian in a step: MuJoCo integrates
-    springs explicitly, and a link of a few millimetres has next to no inertia about its axis.
+    Their armature keeps each from oscillating by more than a radian per step: MuJoCo integrates
+    springs explicitly, and a link of a few millimetres has almost no inertia about its axis.
     """
     about = dict(zip("xyz", axes.as_matrix().T, strict=True))
     text = ""
@@ -145,16 +145,16 @@ def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: Float
 
 
 def _order(k: int) -> str:
-    """Order of the hinges of joint k, 1 being the first.
+    """Order of the hinges of joint k, where 1 is the first.
 
-    Three turns b, c, ... one after the other also make one of b c / 2 about the third axis: the
-    opposite order in the next joint undoes it, which leaves an error of second order in h.
+    Successive rotations b, c, ... also cause one of b c / 2 about the third axis. The opposite
+    order in the next joint cancels it, which leaves an error of second order in h.
     """
     return "xyz" if k % 2 else "zyx"
 
 
 def _in_axes(turns: Rotation, axes: Rotation) -> FloatArray:
-    """Angles (n - 1, 3) [rad] of the hinges of each joint, in their order, for these turns."""
+    """Angles (n - 1, 3) [rad] of each joint's hinges, in their order, for these rotations."""
     local = axes.inv() * turns * axes
     odd = np.arange(len(local)) % 2 == 0
     return np.where(odd[:, None], local.as_euler("XYZ"), local.as_euler("ZYX"))

@@ -1,4 +1,4 @@
-"""Newton: a Python file that adds a rod of capsules and holds its ends; for its solver VBD."""
+"""Export to Newton: a Python file that adds a rod of capsules and holds its ends (solver VBD)."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,17 +12,17 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.export.common import Relaxed, array, head_of_python, relax
 from dlo_casadi.export.rod import Rod
 
-# Moduli [Pa] of the softest cable in Newton's example cable_twist: 100 N m/rad each 0.1 m, r 20 mm.
+# Moduli [Pa] of the softest cable in Newton's example cable_twist: 100 N m/rad per 0.1 m, r 20 mm.
 DEFAULT = (8e7, 4e7)
-# Rows are y, z, x of a link: Newton has the tangent last.
+# Rows are y, z, x of a link: in Newton the tangent is last.
 AXES = Rotation.from_matrix([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-# EA and GA over weight and buckling load, where no stretch was found: a strain of 1 % at that load.
-# With more, cables come to rest elsewhere, probably for the rounding of single precision.
+# EA and GA over weight and buckling load, if no stretch was found: a strain of 1 % at that load.
+# With stiffer values cables come to rest elsewhere, probably due to single-precision rounding.
 STIFF = 100.0
-# Time step over the largest one of an explicit solver, and iterations in a step. They also change
+# Time step relative to the largest of an explicit solver, and iterations per step. They also change
 # the shape at rest: a part of each step's free fall remains uncorrected.
 _COURANT, ITERATIONS = 2.0, 40
-# At rest [m/s]: in single precision nodes keep creeping at some 1e-4.
+# At rest [m/s]: in single precision nodes keep creeping at about 1e-4.
 _REST_SPEED = 5e-4
 _BODY = '''
 
@@ -120,7 +120,7 @@ def settle(text: str, rod: Rod) -> Relaxed:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Without messages of compilation, and of pins beside the free joint of a rod."""
+    """Suppress messages of compilation, and of pins beside the free joint of a rod."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
@@ -130,7 +130,7 @@ def quietly() -> Iterator[None]:
 
 
 def settled(model: Any, rod: Rod, name: str) -> Relaxed:
-    """A model of Newton at rest, whose first bodies and last joints are the links of a rod."""
+    """Relax a Newton model whose first bodies and last joints are the links of a rod."""
     import newton
     import warp as wp
 

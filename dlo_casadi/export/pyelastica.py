@@ -1,4 +1,4 @@
-"""PyElastica: a Python file that makes a CosseratRod and holds its ends."""
+"""Export to PyElastica: a Python file that makes a CosseratRod and holds its ends."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,9 +11,9 @@ from dlo_casadi.export.rod import Fixture, Rod
 
 # Young's modulus and shear modulus [Pa] of PyElastica's first examples (Timoshenko beam).
 DEFAULT = (1e6, 1e4)
-# EA and GA over the cable's weight and buckling load, where no stretch was found: a strain of 2e-4.
+# EA and GA over the cable's weight and buckling load, if no stretch was found: a strain of 2e-4.
 _STIFF = 5e3
-# Time step over the largest stable one.
+# Time step relative to the largest stable one.
 _COURANT = 0.4
 _BODY = '''
 
@@ -101,7 +101,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
 
 
 def _held(fixture: Fixture, first: int, second: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Nodes and elements that a fixture holds."""
+    """Nodes and elements held by a fixture."""
     kinds: dict[str, Any] = {"clamped": ((first, second), (first,)), "pinned": ((first,), ())}
     return kinds.get(fixture.kind, ((), ()))
 
@@ -114,7 +114,7 @@ def settle(text: str, rod: Rod) -> Relaxed:
     exec(compile(text, "export", "exec"), made)
 
     class Simulator(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping):
-        """PyElastica mixes its features in by inheritance."""
+        """PyElastica adds its features by inheritance."""
 
     simulator, cable = Simulator(), made["make_rod"]()
     made["hold"](simulator, cable)

@@ -1,9 +1,9 @@
-"""A fitted cable in one pose as a chain of rigid segments: all that a simulator needs to know.
+"""A fitted cable in one pose as a chain of rigid segments: all data that a simulator needs.
 
-Segments of equal length h are joined at the nodes between them. A joint stands for the cable within
+Segments of equal length h are joined at the nodes between them. A joint represents the cable within
 h / 2 of it: its stiffness is EI / h and GJ / h, its rest rotation exp(h kappa_0). A clamp holds a
-segment whose middle is the cable's end: half of it is inside the clamp. Shapes are then of second
-order in h.
+segment centred at the cable's end, so that half of it is inside the clamp. Shapes then converge
+with second order in h.
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.node import Node
 
-# What a target may be able to carry, beyond a straight uniform round cable with its weight.
+# Features beyond a straight uniform round cable with its weight; targets support some of them.
 Feature = Literal[
     "rest shape",
     "anisotropy",
@@ -50,22 +50,22 @@ Feature = Literal[
     "clips",
     "obstacles",
 ]
-# GJ / EI of a cable whose session lay in a plane: that of a solid round rod.
+# GJ / EI of a cable that was measured in a plane: that of a solid round rod.
 ROUND = 1 / 1.3
-# Largest turn of a joint in the pose [rad], and numbers of segments, of a mesh that is not given.
+# Default mesh: largest turn of a joint in the pose [rad], and limits of the number of segments.
 TURN, SEGMENTS = 0.1, (40, 200)
-# Steps in which the segments are turned until they reach the end.
+# Maximum number of steps in which the segments are turned until they reach the end.
 _CLOSING = 200
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A cable in an equilibrium of one pose: what a `Rod` is cut from.
+    """A cable in an equilibrium of one pose, from which a `Rod` is cut.
 
     Parameters
     ----------
     model : CableModel
-        Without the effects of the camera.
+        Without effects of the camera.
     p : (n_parameters,)
     rest : (n_rests,) [1/m]
     curve : NodeCurve
@@ -83,7 +83,7 @@ class Held:
 
     @classmethod
     def solved(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> "Held":
-        """The cable where it is predicted to be."""
+        """The cable in its predicted shape."""
         eq = solve_equilibrium(model, p, rest, pose)
         rows = assembly_of(model).curve(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
         return cls(model, p, rest, pose, NodeCurve.of(model.cable.length, rows), eq.x)
@@ -91,9 +91,9 @@ class Held:
 
 @dataclass(frozen=True)
 class Fixture:
-    """What holds an end: as declared, and the end of the cable itself, world axes.
+    """The support of an end: as declared, and the true end of the cable, world axes.
 
-    `kind` is "pinned", "clamped" or "free"; places (3,) [m]; frames with x along the cable.
+    `kind`: "pinned", "clamped" or "free"; places (3,) [m]; frames with x along the cable.
     """
 
     kind: str
@@ -104,27 +104,27 @@ class Fixture:
 
     @property
     def offset(self) -> tuple[FloatArray, Rotation]:
-        """Place and frame of the cable's end in the fixture's."""
+        """Place and frame of the cable's end in the fixture's frame."""
         back = self.frame.inv()
         return back.apply(self.cable_place - self.place), back * self.cable_frame
 
 
 @dataclass(frozen=True, eq=False)
 class Rod:
-    """A cable in a pose as n segments of the length `h` [m].
+    """A cable in a pose as n segments of length `h` [m].
 
     Parameters
     ----------
     node : type[Node]
-        The kind of the model's nodes; of headings the cable stayed in the plane z = 0, and nothing
-        is known of the rest.
+        Kind of the model's nodes. With headings the cable stayed in the plane z = 0, and nothing is
+        known out of the plane.
     s : (n + 1,) [m]
-        Arc lengths of the nodes; those inside clamps lie beyond [0, L].
+        Arc lengths of the nodes; nodes inside clamps lie outside [0, L].
     nodes : (n + 1, 3) [m]
     frames : (n,) rotations
         Material frames of the segments: x along the cable, y and z the section's axes.
     bending : (n - 1, 2, 2) [N m^2]
-        Of each joint, about the material axes y and z.
+        Bending stiffness of each joint, about the material axes y and z.
     torsion : (n - 1,) [N m^2]
     rest : (n - 1, 3) [1/m]
         Twist and curvatures about y and z of each joint without load.
@@ -132,12 +132,12 @@ class Rod:
     lumps : (m, 2)
         Mass [kg] and arc length [m] of compact masses.
     axial : float [N]
-        EA; infinite where no stretch was found.
+        EA; infinite if no stretch was found.
     radius : float [m]
     gravity : (3,) [m/s^2]
     start, end : Fixture
     features : dict
-        What it has beyond a straight uniform round cable: feature -> labels of the effects.
+        Features beyond a straight uniform round cable: feature -> labels of the effects.
     """
 
     name: str
@@ -203,7 +203,7 @@ class Rod:
         )
 
     def with_stiffness(self, bending: float, torsion: float) -> Self:
-        """A straight cable of uniform stiffness [N m^2] in its place, as if unmeasured."""
+        """A straight cable of uniform stiffness [N m^2] in the same pose, as if unmeasured."""
         count = len(self.torsion)
         return replace(
             self,
@@ -214,7 +214,7 @@ class Rod:
 
     @property
     def mean_bending(self) -> FloatArray:
-        """EI (n - 1,) [N m^2] of the joints: the mean about all axes of a section."""
+        """EI (n - 1,) [N m^2] of the joints: the mean over all bending axes of a section."""
         return np.trace(self.bending, axis1=1, axis2=2) / 2
 
     def inextensible(self, factor: float) -> float:
@@ -224,11 +224,11 @@ class Rod:
         return float(factor * (weight + buckling))
 
     def explicit(self, masses: FloatArray, stiff: float, courant: float) -> tuple[float, float]:
-        """Time step [s] for a stiffness EA [N] along it, and the inertia [kg m^2] of a link.
+        """Time step [s] for an axial stiffness EA [N], and the inertia [kg m^2] of a link.
 
-        The step is `courant` times the largest that an explicit solver can take with the inner ones
+        The step is `courant` times the largest stable step of an explicit solver with inner nodes
         of these masses [kg]. The inertia is that of a link about its end, or larger, so that the
-        step serves in bending, twist and shear, too.
+        step is also stable in bending, twist and shear.
         """
         largest = float(np.sqrt(masses[1:-1].min() * self.h / stiff))
         fastest = stiff * self.h
@@ -237,7 +237,7 @@ class Rod:
         return courant * largest, inertia
 
     def lumps_at(self, s: FloatArray) -> FloatArray:
-        """Compact masses [kg] carried by points at arc lengths s, each by its two neighbours."""
+        """Compact masses [kg] carried by points at arc lengths s: each by its two neighbours."""
         out = np.zeros(len(s))
         for mass, place in self.lumps:
             k = int(np.clip(np.searchsorted(s, place) - 1, 0, len(s) - 2))
@@ -247,7 +247,7 @@ class Rod:
 
     @property
     def link_masses(self) -> FloatArray:
-        """Masses (n,) [kg] of the links with the compact ones."""
+        """Masses (n,) [kg] of the links, including compact masses."""
         return self.masses + self.lumps_at((self.s[1:] + self.s[:-1]) / 2)
 
     @property
@@ -262,7 +262,7 @@ class Rod:
 
     @property
     def unloaded(self) -> tuple[FloatArray, Rotation]:
-        """Nodes (n + 1, 3) [m] and frames (n,) without load, with the first link in its place."""
+        """Nodes (n + 1, 3) [m] and frames (n,) without load, with the first link in its pose."""
         frames = [self.frames[0]]
         for turn in self.rest_turns:
             frames.append(frames[-1] * turn)
@@ -284,7 +284,7 @@ def features_of(model: CableModel, p: FloatArray, pose: HeldPose) -> dict[Featur
 def _features(
     effect: Effect, terms: Lagrangian, local: dict[str, ca.SX], p: FloatArray, pose: HeldPose
 ) -> list[Feature]:
-    """Features that an effect needs; all targets carry places of the ends, and weights."""
+    """Features that an effect needs; every target supports places of the ends, and weights."""
     cable, found = terms.model.cable, list[Feature]()
     if isinstance(effect, SectionLaw):
         cell, square = Cell(ca.SX.sym("s"), ca.SX(1e-3), 1e-3), ca.SX.sym("square")
@@ -325,14 +325,14 @@ def _held(terms: Lagrangian) -> tuple[ca.SX, ca.SX]:
 def _numbers(
     terms: Lagrangian, p: FloatArray, pose: HeldPose, *expressions: ca.SX
 ) -> list[FloatArray]:
-    """Values of expressions of the parameters, the pose and no deviation."""
+    """Evaluate expressions at the parameters and the pose, with all deviations zero."""
     of = ca.Function("numbers", [terms.p, terms.pose, terms.deviation], [*expressions])
     found = of.call([p, pose.vector, np.zeros(terms.deviation.numel())])
     return [np.array(value).squeeze() for value in found]
 
 
 def _spatial(vector: FloatArray) -> FloatArray:
-    """Vectors (..., 2 or 3) as ones in space: a plane is z = 0."""
+    """Embed vectors (..., 2 or 3) in space: a plane is z = 0."""
     out = np.zeros((*vector.shape[:-1], 3))
     out[..., : vector.shape[-1]] = vector
     return out
@@ -341,7 +341,7 @@ def _spatial(vector: FloatArray) -> FloatArray:
 def _fixtures(
     model: CableModel, pose: HeldPose, true: FloatArray, curve: NodeCurve
 ) -> tuple[Fixture, Fixture]:
-    """Both fixtures; of what is not clamped the frame is the world's."""
+    """Both fixtures; if an end is not clamped, its frame is the world's."""
     d, c = model.node.dimension, model.node.coordinates
     edges = np.cumsum([d, d, c])
     parts = [np.split(ends, edges) for ends in (pose.ends, true)]
@@ -394,7 +394,7 @@ def _segments(
 
 
 def _weights(terms: Lagrangian, p: FloatArray, pose: HeldPose) -> tuple[float, FloatArray]:
-    """Mass per length [kg/m] that all loads along gravity make, and gravity (3,) with its tilt."""
+    """Mass per length [kg/m] equal to all loads along gravity, and gravity (3,) with its tilt."""
     cable = terms.model.cable
     total, gravity = _numbers(terms, p, pose, terms.resultant(0.0), terms.felt_gravity)
     square = float(gravity @ gravity)
@@ -429,7 +429,7 @@ def _stiffness(
 
 
 def _rest(model: CableModel, rest: FloatArray, s: FloatArray, h: float) -> FloatArray:
-    """Rest strains (n - 1, 3) [1/m] of joints at s: means over the cable within h / 2 of them."""
+    """Rest strains (n - 1, 3) [1/m] of joints at s: means over the cable within h / 2 of each."""
     chain, out = model.chain, np.zeros((len(s), 3))
     edges = np.append(chain.cells[:, 0], chain.cells[-1, 1])
     low, high = (np.clip(s + side * h / 2, *edges[[0, -1]]) for side in (-1, 1))

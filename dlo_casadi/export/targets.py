@@ -1,4 +1,4 @@
-"""Simulators that a fitted cable can be written for, what they cannot carry, and their files."""
+"""Simulators that a fitted cable can be written for, their limits, and their files."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from dlo_casadi.export.common import Relaxed
 from dlo_casadi.export.rod import Feature, Held, Rod
 from dlo_casadi.io.files import is_marked, write_file
 
-# Text by which a written file is recognised.
+# Text that identifies a written file.
 MARK = "written by dlo-casadi for"
 CHAIN: frozenset[Feature] = frozenset(
     {"rest shape", "anisotropy", "stiffness along the cable", "lumped mass"}
@@ -29,17 +29,17 @@ class Target:
     Parameters
     ----------
     suffix : str
-        End of the names of its files, where none is given.
+        End of the names of its files, unless a name is given.
     packages : tuple of str
-        Modules that have to be installed to relax a cable in it, and the `extra` that has them.
+        Modules needed to relax a cable in it; `extra` installs them.
     write : callable
-        The text of a file: of a rod, and the lines of its head.
+        Makes the text of a file from a rod and the lines of its head.
     settle : callable
         Relaxes a written file in the simulator.
     default : (float, float) [Pa]
-        Moduli in bending and twist that its own example of a cable has, and `default_of` it.
+        Moduli in bending and twist of the simulator's own cable example; `default_of` names it.
     places : tuple of str
-        Where our numbers stand in the file.
+        Where the file contains our numbers.
     """
 
     title: str
@@ -55,16 +55,16 @@ class Target:
 
     @property
     def installed(self) -> bool:
-        """Whether a cable can be relaxed in it here."""
+        """Whether a cable can be relaxed in it on this computer."""
         return all(find_spec(name) is not None for name in self.packages)
 
     def default_stiffness(self, radius: float) -> tuple[float, float]:
-        """EI and GJ [N m^2] of its own example's moduli with a round section."""
+        """EI and GJ [N m^2] from its own example's moduli for a round section."""
         second = np.pi * radius**4 / 4
         return self.default[0] * second, self.default[1] * 2 * second
 
     def dropped(self, rod: Rod) -> list[Feature]:
-        """Features of a rod that it cannot carry."""
+        """Features of a rod that it does not support."""
         return [feature for feature in rod.features if feature not in self.carries]
 
 
@@ -147,7 +147,7 @@ TARGETS = {
         ),
     ),
 }
-# Simulators that cannot take a cable -> why, and what to use.
+# Simulators that cannot represent a cable -> why, and what to use.
 REFUSED = {
     "mjx": "MJX ignores bend and twist of MuJoCo's cable plugin: every cable is limp in it.\n"
     "  Try: --to mujoco: hinges with springs and no plugin. MJX loads it; shapes there were not "
@@ -156,10 +156,10 @@ REFUSED = {
 
 
 def target_of(name: str) -> Target:
-    """The target of a name.
+    """Find a target by name.
 
-    Raises DloError if there is none, with the nearest name, or it cannot take a cable, with the
-    reason.
+    Raises DloError with the nearest name if there is none, or with the reason if it cannot
+    represent a cable.
     """
     if name in REFUSED:
         raise DloError(REFUSED[name])
@@ -171,7 +171,7 @@ def target_of(name: str) -> Target:
 
 
 def require(target: Target) -> None:
-    """Raise DloError if cables cannot be relaxed in a target here."""
+    """Raise DloError if cables cannot be relaxed in a target on this computer."""
     if not target.installed:
         raise DloError(
             f"{' and '.join(target.packages)} is not installed.\n"
@@ -180,9 +180,9 @@ def require(target: Target) -> None:
 
 
 def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence[str]) -> list[str]:
-    """Lines that a file begins with: which number went where, and what is lost.
+    """First lines of a file: which number went where, and what is lost.
 
-    `lost`: feature that is not carried -> what that costs. `origin`: what the cable is.
+    `lost`: unsupported feature -> its effect on the shape. `origin`: description of the cable.
     """
     bends, masses = rod.bending[:, [0, 1], [0, 1]], rod.masses.sum() + rod.lumps[:, 0].sum()
     known = [
@@ -218,7 +218,7 @@ def _range(values: np.ndarray) -> str:
     return f"{low:.4g}" if high - low <= 1e-6 * abs(high) else f"{low:.4g} to {high:.4g}"
 
 
-# Draws per sample before it is said that the fit leaves none that is physical.
+# Draws per sample after which the fit counts as leaving no physical samples.
 _DRAWS = 200
 
 
@@ -232,8 +232,8 @@ def write_rods(
 ) -> list[Path]:
     """Write cables, the first to `path` and the others to <path>_001, ...; return the files.
 
-    `origin`: where the first comes from; the others are samples of it, drawn with the seed. Raises
-    OutputError if a file cannot be written, or is there and no export.
+    `origin`: source of the first cable; the others are samples of it, drawn with the seed. Raises
+    OutputError if a file cannot be written, or if it exists and is not an export.
     """
     count = len(cables) - 1
     names = [path, *(path.with_stem(f"{path.stem}_{k:03d}") for k in range(1, count + 1))]
@@ -247,7 +247,7 @@ def write_rods(
     texts = []
     for k, cable in enumerate(cables):
         rod = Rod.of(cable, segments)
-        segments = len(rod.masses)  # samples are cut as the cable is
+        segments = len(rod.masses)  # samples get the same segments as the cable
         said = [origin, *[f"sample {k} of {count}, seed {seed}"] * (k > 0)]
         texts.append(target.write(rod, head(target, rod, losses(cable, target, rod), said)))
     for name, text in zip(names, texts, strict=True):
@@ -256,7 +256,7 @@ def write_rods(
 
 
 def losses(cable: Held, target: Target, rod: Rod) -> dict[Feature, str]:
-    """Features that a target cannot carry: which effects, and how far the shape moves without."""
+    """Features that a target does not support: their effects, and the shape's change without."""
     return {item: _cost(cable, rod, item) for item in target.dropped(rod)}
 
 
@@ -266,7 +266,7 @@ def _cost(cable: Held, rod: Rod, feature: Feature) -> str:
     length, known = model.cable.length, dict(zip(model.names, cable.p, strict=True))
     if feature == "clips":
         model, pose = replace(model, clips=()), replace(pose, clips=())
-    if feature in ("anisotropy", "stiffness along the cable"):  # what is left is the mean
+    if feature in ("anisotropy", "stiffness along the cable"):  # the mean remains
         known["bending_stiffness"] = float(rod.mean_bending.mean())
         known["torsional_stiffness"] = float(rod.torsion.mean())
     if feature == "obstacles":
@@ -294,10 +294,10 @@ def samples_of(
     count: int,
     seed: int,
 ) -> list[Held]:
-    """Cables in the same pose, drawn from a covariance: positive and within all physical bounds.
+    """Draw cables in the same pose from a covariance: positive and within all physical bounds.
 
-    What is estimated as a logarithm is drawn as one; what lies outside its bounds is drawn again,
-    and so is a cable without an equilibrium in the pose.
+    A value estimated as a logarithm is drawn as one. Values outside their bounds, and cables
+    without an equilibrium in the pose, are drawn again.
 
     Parameters
     ----------
@@ -309,8 +309,8 @@ def samples_of(
     Raises
     ------
     DloError
-        If nothing is uncertain, the fit leaves hardly anything within the bounds, or the rest shape
-        changed from pose to pose, which is not known together with the parameters.
+        If nothing is uncertain, if the fit leaves almost nothing within the bounds, or if the rest
+        shape changed from pose to pose: its covariance with the parameters is then unknown.
     """
     model = cable.model
     if count and not names:
@@ -328,7 +328,7 @@ def samples_of(
     mean = np.array([values[name] for name in fitted])
     logarithms = {q.name for q in model.parameters if q.log}
     log = np.array([name in logarithms for name in fitted], dtype=bool)
-    # The covariance of log(v) is that of v over v.
+    # The covariance of log(v) is the covariance of v divided by v.
     scale = np.where(log, mean, 1.0)
     root = root_of(covariance[np.ix_(kept, kept)] / np.outer(scale, scale))
     generator, out = np.random.default_rng(seed), list[Held]()
@@ -350,7 +350,7 @@ def samples_of(
 
 
 def _cable(cable: Held, values: Mapping[str, float], count: int) -> Held | None:
-    """The cable with other values; None if they are outside their bounds, or it has no shape."""
+    """The cable with other values; None if they are outside their bounds, or if it has no shape."""
     model = cable.model
     if not all(q.lower <= values[q.name] <= q.upper for q in model.parameters):
         return None

@@ -1,7 +1,7 @@
-"""USD: a linear curve with the deformable physics that the AOUSD working group proposes.
+"""Export to USD: a linear curve with the deformable physics proposed by the AOUSD working group.
 
-The proposal is in no release of USD yet: its schemas and attributes are authored by name, and
-programs that do not know them see a curve.
+No release of USD has this proposal yet: its schemas and attributes are authored by name, and
+programs that do not know them see only a curve.
 """
 
 from collections.abc import Sequence
@@ -13,20 +13,20 @@ from dlo_casadi.export import newton
 from dlo_casadi.export.common import Relaxed, rounded
 from dlo_casadi.export.rod import Fixture, Rod
 
-# Moduli [Pa] that the proposal assumes of a material without values: E 1 MPa, Poisson's ratio 0.3.
+# Moduli [Pa] that the proposal assumes for a material without values: E 1 MPa, Poisson's ratio 0.3.
 DEFAULT = (1e6, 1e6 / 2.6)
-# Distance [link lengths] of the points by which a clamp holds its link, against its roll.
+# Distance [link lengths] between the points at which a clamp holds its link, to prevent roll.
 _LEVER = 5.0
 
 
 def write(rod: Rod, head: Sequence[str]) -> str:
-    """The rod as USDA: a curve, its material, two grippers and what attaches the curve to them."""
+    """The rod as USDA: a curve, its material, two grippers, and the curve's attachments to them."""
     doc = "\n".join(head).replace('"', "'")
     rest_nodes, rest_frames = rod.unloaded
     count, stiff = len(rod.nodes), rod.inextensible(newton.STIFF)
     gravity = float(np.linalg.norm(rod.gravity))
     down = rod.gravity / gravity if gravity else np.array([0.0, 0.0, -1.0])
-    # Of each link the normal is its axis z; the last point begins no link.
+    # A link's normal is its axis z; the last point starts no link.
     normals, rest_normals = (
         np.vstack([z, z[-1:]])
         for z in (f.apply([0.0, 0.0, 1.0]) for f in (rod.frames, rest_frames))
@@ -89,7 +89,7 @@ def _gripper(side: str, fixture: Fixture, link: int, rod: Rod) -> str:
     """A fixture, and the attachment of the cable to it."""
     if fixture.kind == "free":
         return ""
-    if fixture.kind == "clamped":  # in segment coordinates: share of the start, normal, binormal
+    if fixture.kind == "clamped":  # segment coordinates: share from the start, normal, binormal
         lever = _LEVER * rod.h
         kind, index = "segment", [link] * 3
         on_link = np.array([[0.5, 0.0, 0.0], [0.5 - _LEVER, 0.0, 0.0], [0.5, lever, 0.0]])
@@ -135,7 +135,7 @@ def _extent(rod: Rod) -> FloatArray:
 
 
 def settle(text: str, rod: Rod) -> Relaxed:
-    """Relax a written curve where it can be simulated today: in Newton, by its own importer."""
+    """Relax a written curve in Newton by its own importer, where it can be simulated today."""
     with newton.quietly():
         import newton as simulator
         from pxr import Sdf, Usd

@@ -1,4 +1,4 @@
-"""Many sessions or poses: tables that survive interruptions, and an overview page of sessions."""
+"""Process many sessions or poses: tables that survive interruptions, and an overview page."""
 
 from typing import Any
 
@@ -6,5 +6,5 @@ from dlo_casadi.errors import library
 
 
 def parquet_library() -> tuple[Any, ...]:
-    """The library that writes Parquet, and its module for that; DloError without it."""
+    """The Parquet library and its Parquet module; raises DloError without it."""
     return tuple(library(name, "table", "tables") for name in ("pyarrow", "pyarrow.parquet"))

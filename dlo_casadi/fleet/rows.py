@@ -1,4 +1,4 @@
-"""The table of many sessions: its columns and rows, and the page that lists the odd ones first."""
+"""The table of many sessions: its columns and rows, and a page that lists unusual ones first."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ Row = dict[str, Any]
 STAGES = get_args(StageName)
 TIMES = (*TIMED, "total")
 _INTERVAL = ("_low_95", "_high_95")
-# Errors of a stage, with their units.
+# Errors of a stage and their units.
 _ERRORS = {"rmse_fit": "m", "rmse_held_out": "m", "chi2_per_dof": ""}
 
-# Column -> type and unit; null where a session has no such value. Names of columns that differ from
-# run to run begin with `time_`.
+# Column -> type and unit; null where a session has no value. Columns that differ from run to run
+# have names that begin with `time_`.
 COLUMNS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("session", "status", "message", "cable", "verdict"), ("text", "")),
     "effects": ("effects", ""),
@@ -82,7 +82,7 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
     found = report["stages"][-1]["parameters"]
     stiffness, torsion = found["bending_stiffness"], found.get("torsional_stiffness", {})
     interval = stiffness["interval_95"] or (None, None)
-    # In a plane, or in space about the material axis y, and then about z.
+    # In a plane; in space about the material axis y, then about z.
     rest = found["rest_curvature"]
     about = {"": rest} if "value" in rest else {"": rest["k_y"], "_z": rest["k_z"]}
     measurement, mesh = report["measurement"], report["discretization"]
@@ -131,7 +131,7 @@ def _parameters(items: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def last_error(row: Row) -> float | None:
-    """Error of the last stage [m]: of held-out poses where there are any."""
+    """Error of the last stage [m]: of held-out poses if there are any."""
     errors = ("rmse_held_out", "rmse_fit")
     names = [f"{stage}_{what}" for stage in ("closed", "batch") for what in errors]
     return next((row[name] for name in names if row[name] is not None), None)
@@ -142,12 +142,12 @@ def _row_file(output: Path, key: str) -> Path:
 
 
 def write_row(output: Path, row: Row) -> None:
-    """Write a session's row; it is durable when this returns. A second one replaces the first."""
+    """Write a session's row durably; it replaces an earlier one."""
     write_file(_row_file(output, row["session"]), json.dumps(row, allow_nan=False))
 
 
 def read_row(output: Path, key: str, digest: str) -> Row | None:
-    """Read the row of a session if it belongs to the session's present digest."""
+    """Read the row of a session if it belongs to the session's current digest."""
     try:
         row: Row = json.loads(_row_file(output, key).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -157,7 +157,7 @@ def read_row(output: Path, key: str, digest: str) -> Row | None:
 
 
 def write_table(output: Path, rows: Iterable[Row]) -> None:
-    """Write all rows, in the order of their keys, into one table: equal rows, equal bytes."""
+    """Write all rows into one table, sorted by key; equal rows give equal bytes."""
     pyarrow, parquet = parquet_library()
     ordered = sorted(rows, key=lambda row: str(row["session"]))
     table = pyarrow.Table.from_pylist(ordered, schema=arrow_schema())
@@ -202,9 +202,9 @@ if TYPE_CHECKING:
 
 # Modified z-score beyond which a value is an outlier (Iglewicz and Hoaglin, 1993).
 OUTLYING = 3.5
-# Fewest sessions among which there may be outliers.
+# Fewest sessions for a search for outliers.
 FEWEST = 5
-# Largest z-score, also of a value where all others are equal to the last digit.
+# Largest z-score, used also if all other values are equal to the last digit.
 LARGEST = 99.0
 
 
@@ -238,7 +238,7 @@ class Judged:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Reasons to look at it first; empty if it is not unusual."""
+        """Reasons to look at this session first; empty if it is not unusual."""
         if self.row["status"] != "done":
             return (self.verdict,)
         stiffness, error = self.stiffness_z or 0.0, self.error_z or 0.0
@@ -264,7 +264,7 @@ class Judged:
 
 
 def judge(rows: Sequence[Row]) -> list[Judged]:
-    """All rows, the most unusual first: failed, unexplained, outlying, then the others by score."""
+    """All rows, the most unusual first: failed, unexplained, outlying; the rest by score."""
     measures = [row["bending_stiffness"] for row in rows], [last_error(row) for row in rows]
     scores = [
         robust_z([None if x is None or x <= 0 else float(np.log(x)) for x in values])
@@ -276,7 +276,7 @@ def judge(rows: Sequence[Row]) -> list[Judged]:
 def robust_z(values: Sequence[float | None]) -> list[float | None]:
     """Modified z-scores: z = 0.6745 (x - median) / median |x - median|.
 
-    None where there is no value, and everywhere if there are fewer than five values.
+    None for missing values, and for all if there are fewer than five.
 
     References
     ----------
@@ -295,7 +295,7 @@ def robust_z(values: Sequence[float | None]) -> list[float | None]:
 def overview_html(rows: Sequence[Row], output: Path) -> str:
     """The page of a fleet as text: one row per session; self-contained, without a script.
 
-    `output`: folder in which the page will lie; sessions with results in it are linked.
+    `output`: folder of the page; sessions with results in it are linked.
     """
     judged = judge(rows)
     verdicts = Counter(item.verdict for item in judged)
@@ -312,7 +312,7 @@ def overview_html(rows: Sequence[Row], output: Path) -> str:
 
 @cache
 def _template() -> Template:
-    # Imported here, since workers import this module but write no page.
+    # Imported late: workers import this module but write no page.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(

@@ -1,4 +1,4 @@
-"""The sessions of a folder: those not fitted yet are fitted, a table and a page show all."""
+"""Fit the sessions of a folder that are not fitted yet, and show all in a table and a page."""
 
 import glob
 import hashlib
@@ -32,7 +32,7 @@ from dlo_casadi.runtime.parallel import Tally, map_as_completed
 from dlo_casadi.session import run_session
 
 ENDINGS = (".yaml", ".yml")
-# A line that makes a YAML file a configuration, even one with mistakes.
+# A line that marks a YAML file as a configuration, even one with mistakes.
 _SECTION = re.compile(rb"^(cable|experiment)\s*:", re.MULTILINE)
 
 
@@ -43,7 +43,7 @@ class SessionFile:
     Parameters
     ----------
     key : str
-        Its path below the common folder of all, with `/`: unique.
+        Its path below the common folder, with `/`; unique.
     path : Path
         The YAML file, absolute.
     """
@@ -53,11 +53,11 @@ class SessionFile:
 
 
 def find_sessions(where: str | Path) -> tuple[Path, tuple[SessionFile, ...]]:
-    """Find all configurations in a folder and below, or of a pattern.
+    """Find all configurations in and below a folder, or those that match a pattern.
 
-    In a folder a YAML file counts if it has a `cable:` or an `experiment:` and is no result of a
-    fit; hidden folders are left out. All files that match a pattern count; `**` stands for any
-    folders.
+    In a folder a YAML file counts if it has a `cable:` or an `experiment:` and is not a fit's
+    result; hidden folders are skipped. Every file that matches a pattern counts; `**` stands for
+    any folders.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[SessionFile, ...]]:
     Raises
     ------
     DloError
-        If there is none.
+        If there are none.
     """
     text = str(where)
     folder = Path(text)
@@ -93,19 +93,19 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[SessionFile, ...]]:
 
 
 def _is_session(path: Path) -> bool:
-    """Whether a YAML file is intended as a configuration."""
+    """Whether a YAML file is meant as a configuration."""
     try:
         content = path.read_bytes()
     except OSError:
-        return True  # its row will say why
+        return True  # its row will give the reason
     return bool(_SECTION.search(content)) and not re.search(rb"^schema\s*:", content, re.MULTILINE)
 
 
 def digest_of(session: SessionFile, options: tuple[Any, ...]) -> str:
-    """SHA-256 of all that determines a session's results.
+    """SHA-256 of everything that determines a session's results.
 
-    The package's version, the options of the run, the configuration's bytes, and the name and
-    bytes of each file that its poses name; an unreadable file enters as such.
+    It covers the package's version, the options of the run, the configuration's bytes, and name and
+    bytes of each file that its poses name; an unreadable file is included as such.
     """
     digest = hashlib.sha256()
 
@@ -119,7 +119,7 @@ def digest_of(session: SessionFile, options: tuple[Any, ...]) -> str:
         named = [name for pose in poses for name in (pose.get("file"), *(pose.get("files") or ()))]
         names = [str(name) for name in named if name is not None]
     except (DloError, KeyError, TypeError, AttributeError):
-        names = []  # a configuration that cannot be read
+        names = []  # an unreadable configuration
     add(_content(session.path))
     for name in names:
         add(well_formed(name).encode())
@@ -132,12 +132,12 @@ def _content(path: Path) -> bytes:
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").digest()
-    except (OSError, ValueError):  # a name that no file can have is a ValueError
+    except (OSError, ValueError):  # ValueError: a name that no file can have
         return b""
 
 
 PAGE = "index.html"
-# Shortest time between two updates of the table [s], and largest share of the time spent on them.
+# Shortest interval between updates of the table [s], and their largest share of the time.
 FOLD_AFTER = 10.0
 FOLD_SHARE = 0.02
 
@@ -149,9 +149,9 @@ class Options:
     Parameters
     ----------
     diagnosis : bool
-        Whether missing effects are searched for, where the configuration does not forbid it.
+        Whether to search for missing effects, unless the configuration forbids it.
     reports : bool
-        Whether each session gets its folder of results.
+        Whether to write a folder of results for each session.
     """
 
     diagnosis: bool = True
@@ -186,22 +186,21 @@ def fit_fleet(
     begin: Callable[[int, int], None] = lambda taken_over, left: None,
     progress: Callable[[Tally], None] | None = None,
 ) -> FleetResult:
-    """Fit many sessions; what an earlier run has finished is taken over.
+    """Fit many sessions; finished ones of an earlier run are reused.
 
     Writes `table.parquet`, `index.html`, `rows/` (one durable file per session, as it finishes),
-    `sessions/` (the results of each) and, with an executor that logs, `logs/`. A session counts
-    as finished if neither its configuration nor its data, the options or the package's version
-    have changed.
+    `sessions/` (the results of each) and, with an executor that logs, `logs/`. A finished session
+    is reused if its configuration, its data, the options and the package's version are unchanged.
 
     Parameters
     ----------
     output : Path
-        On a file system that all workers see.
+        On a file system visible to all workers.
     retry_failed : bool
-        Whether failed sessions are tried again. Lost ones always are: with a killed worker, or
-        because their results could not be written.
+        Whether to retry failed sessions. Lost ones are always retried: those with a killed worker,
+        or whose results could not be written.
     begin : callable
-        Called with the numbers of rows taken over and of sessions left.
+        Called with the number of reused rows and of sessions left.
     progress : callable, optional
         Called with the progress after each session.
 
@@ -254,16 +253,16 @@ def fit_fleet(
 
 @dataclass(frozen=True)
 class Job:
-    """One session to fit, complete for a worker."""
+    """One session to fit, with everything that a worker needs."""
 
     session: SessionFile
-    digest: str  # of what decides the results
+    digest: str  # of everything that determines the results
     output: Path  # folder of all results, absolute
     options: Options
 
     @property
     def folder(self) -> Path:
-        """Folder of the session's results: named after its file, and so unique."""
+        """Folder of the session's results, named after its file and therefore unique."""
         return self.output / "sessions" / self.session.key
 
     def __repr__(self) -> str:
@@ -271,10 +270,9 @@ class Job:
 
 
 def fit_one(job: Job) -> Row:
-    """Fit a session, write its results and then its row; a failure is a row with a message.
+    """Fit a session, write its results and then its row; a failure becomes a row with a message.
 
-    Raises OutputError if the results or the row cannot be written: that is no property of the
-    session.
+    Raises OutputError if the results or the row cannot be written: that is not the session's fault.
     """
     begin, key = time.perf_counter(), job.session.key
     try:
@@ -296,7 +294,7 @@ def _fitted(job: Job, begin: float) -> Row:
     if not job.options.diagnosis:
         config = config.changed(diagnosis={"enabled": False})
     if job.options.reports:
-        # It imports the drawing libraries; without figures a worker starts in half the time.
+        # It imports drawing libraries; without figures a worker starts in half the time.
         from dlo_casadi.report.writer import ResultsFolder
 
         with ResultsFolder(job.folder, config) as folder:

@@ -1,4 +1,4 @@
-"""Shapes of a fitted cable in very many poses: a grid or a list, solved in chunks into one file."""
+"""Solve a fitted cable in very many poses (a grid or a list), in chunks, into one file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from dlo_casadi.runtime.parallel import Tally, map_as_completed
 
 # Columns of a pose, as the compiled solver takes them [m, m, m, m, rad, rad].
 COLUMNS = ("start_x", "start_y", "end_x", "end_y", "start_heading", "end_heading")
-# The same in the header of a list.
+# Names of the same columns in the header of a list.
 HEADER = tuple(f"{name}_rad" if name.endswith("heading") else f"{name}_m" for name in COLUMNS)
 
 
@@ -40,7 +40,7 @@ class Grid:
     Parameters
     ----------
     x, y : (float, float, float) [m, m, -]
-        First and last place, and the number of places.
+        First place, last place, number of places.
     fixed : dict
         Start [m] and headings [rad] of all poses, by COLUMNS.
     """
@@ -68,7 +68,7 @@ class Grid:
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """Plain data that determine the poses."""
+        """Plain data that identify the poses."""
         x, y = self._axes
         return {"grid_x": x, "grid_y": y, "fixed": dict(self.fixed)}
 
@@ -93,9 +93,9 @@ class PoseList:
         With the columns end_x_m, end_y_m and, where they differ from pose to pose, start_x_m,
         start_y_m, start_heading_rad, end_heading_rad.
     needed : tuple of str
-        Columns that must be there.
+        Required columns.
     fixed : dict
-        Start [m] and headings [rad] of all poses, by COLUMNS; columns of the file go first.
+        Start [m] and headings [rad] of all poses, by COLUMNS; columns of the file take precedence.
 
     Raises
     ------
@@ -129,7 +129,7 @@ class PoseList:
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        """Plain data that determine the poses."""
+        """Plain data that identify the poses."""
         with self.path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         return {"list_sha256": digest, "fixed": dict(self.fixed)}
@@ -172,16 +172,16 @@ if TYPE_CHECKING:
 
 
 SCHEMA = "dlo-shapes/1"
-# Size of a chunk's shapes [bytes]; a process holds one chunk at a time.
+# Size of a chunk's shapes [bytes]; each process holds one chunk at a time.
 CHUNK_BYTES = 12_000_000
-# Part of a column's name -> its unit; [m] otherwise.
+# Part of a column's name -> its unit; otherwise [m].
 _UNITS = {"force": "N", "moment": "N m", "energy": "J", "heading": "rad"}
 _ORDER = "x and y of the nodes in turn, from start to end"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Inputs of the computation for each pose.
+    """Inputs of the computation that all poses share.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ class Plan:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all that determines the shapes, as in the C header."""
+        """SHA-256 of everything that determines the shapes, as in the C header."""
         return solver_hash(self.model, self.p, self.rest)
 
     @property
@@ -237,15 +237,15 @@ def shape_table(
 ) -> dict[str, int]:
     """Solve all poses and write them to a Parquet file, in their order: equal input, equal bytes.
 
-    Finished chunks lie in `plan.parts` until the file is complete, so that an interrupted run
-    goes on. No process holds more than one chunk of shapes (`CHUNK_BYTES`) and some copies of it.
+    Finished chunks stay in `plan.parts` until the file is complete, so that an interrupted run can
+    continue. No process holds more than one chunk of shapes (`CHUNK_BYTES`) and a few copies.
 
     Parameters
     ----------
     output : Path
         The file.
     metadata : dict, optional
-        More to be written into the file, as plain data.
+        Additional plain data for the file.
     restart : bool
         Discard existing output and parts.
     progress : callable, optional
@@ -254,12 +254,12 @@ def shape_table(
     Returns
     -------
     dict
-        Number of poses by status; empty if the file was complete already.
+        Number of poses by status; empty if the file was already complete.
 
     Raises
     ------
     DloError
-        If the file or the parts belong to something else, or cannot be written.
+        If the file or the parts are of another table, or cannot be written.
     """
     _, pq = parquet_library()
     identity = json.dumps(
@@ -298,7 +298,7 @@ def shape_table(
                 stream,
                 schema,
                 use_dictionary=["status"],
-                # Without it the digits of neighbouring points would not compress.
+                # Otherwise the digits of neighbouring points would not compress.
                 use_byte_stream_split=["points.list.element"],
                 compression="zstd",
                 compression_level=1,
@@ -339,7 +339,7 @@ def _parts_in_order(
     for index in range(total):
         while index not in there:
             done = next(tasks)
-            _ = done.value  # a chunk that fails ends the run; finished ones are kept
+            _ = done.value  # a failed chunk ends the run; finished ones are kept
             there.add(done.item.index)
         yield plan.part(index)
 
@@ -358,7 +358,7 @@ _solvers: dict[str, CompiledSolver] = {}
 
 
 def solve_chunk(plan: Plan, chunk: Chunk) -> None:
-    """Solve a chunk and keep it durably, on a worker, which compiles the solver once."""
+    """Solve a chunk on a worker and store it durably; each worker compiles the solver once."""
     import pyarrow as pa
 
     digest = plan.digest
@@ -378,9 +378,9 @@ def solve_chunk(plan: Plan, chunk: Chunk) -> None:
 def table_of(
     model: CableModel, poses: FloatArray, records: NDArray[np.void], statuses: NDArray[np.intc]
 ) -> pyarrow.Table:
-    """Poses with their shapes, which are null where there is none.
+    """Table of poses and shapes; shapes are null where there is none.
 
-    Points are in single precision: 0.1 um and better below a metre.
+    Points are in single precision: 0.1 um or better below a metre.
     """
     import pyarrow as pa
 

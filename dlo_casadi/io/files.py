@@ -1,7 +1,7 @@
 """Atomic writing of files and folders: complete or unchanged, even after a power cut.
 
-The whole package writes through here, and so fails in one way: the earlier file is unchanged, no
-draft is left, and the error names the place, the system's reason and a remedy.
+The whole package writes through this module, so that every failure is the same: the earlier file is
+unchanged, no draft is left, and the error names the place, the system's reason and a remedy.
 """
 
 import os
@@ -30,12 +30,12 @@ def write_file(
     Parameters
     ----------
     path : Path
-        The file; for a link, the file that it leads to.
+        The target; a link is followed.
     content : str, bytes or callable
         Text is written as UTF-8, `well_formed`; a callable fills the open draft.
     draft : Path, optional
-        Another place of the draft, on the same file system: the next process then overwrites one
-        that a killed process has left.
+        Another place for the draft, on the same file system; a draft left by a killed process is
+        then overwritten by the next one.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def write_file(
             os.replace(draft, target)
         finally:
             draft.unlink(missing_ok=True)
-    if _DRAFT not in str(target.parent):  # a draft's folders are made durable all at once
+    if _DRAFT not in str(target.parent):  # folders of drafts are made durable together at the end
         _sync_folder(target.parent)
 
 
@@ -69,9 +69,9 @@ class FolderDraft:
             write_file(draft.folder / "a.txt", "...")
             draft.put_in_place()
 
-    The folder and its parents are made if they do not exist; `folder` is the one to be filled.
-    Until `put_in_place` nothing changes, and if that fails, earlier entries are restored. Entries
-    of other names are never touched.
+    The folder and its parents are created if needed; `folder` is the hidden one to fill. Until
+    `put_in_place` nothing changes, and if that fails, earlier entries are restored. Entries with
+    other names are never touched.
 
     Raises
     ------
@@ -81,7 +81,7 @@ class FolderDraft:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(os.path.realpath(path))
-        # On the file system of the folder, so that moving is renaming.
+        # On the folder's file system, so that moving is renaming.
         beside = self.path if os.path.isdir(self.path) else self.path.parent
         self._hidden = _draft_in(beside)
         self.folder, self._previous = self._hidden / "complete", self._hidden / "previous"
@@ -109,7 +109,7 @@ class FolderDraft:
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self._remove()
-        if isinstance(error, OutputError):  # the user knows nothing of drafts
+        if isinstance(error, OutputError):  # the user does not know about drafts
             error.retold(str(self.folder), str(self.path))
         if error is not None and self._previous.exists():
             error.add_note(f"What was in {self.path} before is in part in {self._previous}.")
@@ -117,11 +117,11 @@ class FolderDraft:
     def put_in_place(self, obsolete: Iterable[str] = ()) -> None:
         """Move the draft's entries into the folder; on any failure restore the earlier ones.
 
-        Entries named in `obsolete` are removed even if the draft has none of that name.
+        Entries named in `obsolete` are removed even if the draft does not replace them.
         """
         for folder, _, files in os.walk(self.folder):
             for name in files:
-                if name.startswith(_DRAFT):  # of a process that was killed
+                if name.startswith(_DRAFT):  # left by a killed process
                     Path(folder, name).unlink()
             _sync_folder(Path(folder))
         with _explained(self.path):
@@ -153,13 +153,13 @@ class FolderDraft:
         shutil.rmtree(self._previous, ignore_errors=True)
 
     def _remove(self) -> None:
-        """Remove the draft, and parents that were made for it alone.
+        """Remove the draft, and parents that were created only for it.
 
         Earlier entries that could not be restored stay in the draft.
         """
         shutil.rmtree(self.folder, ignore_errors=True)
         for folder in (self._previous, self._hidden, *self._made):
-            with suppress(OSError):  # not there, or not empty
+            with suppress(OSError):  # missing, or not empty
                 folder.rmdir()
 
 
@@ -172,7 +172,7 @@ def is_marked(path: Path, mark: str) -> bool:
 
 
 def refuse_foreign(folder: Path, taken: Sequence[str]) -> None:
-    """Raise OutputError if `taken` names entries of a folder: they are not ours to replace."""
+    """Raise OutputError if a folder has entries named in `taken`: they are not ours to replace."""
     if taken:
         raise OutputError(
             f"{folder} holds {', '.join(taken)} from elsewhere, which would be replaced.\n"
@@ -206,7 +206,7 @@ def only_run(folder: Path) -> Iterator[None]:
 
 
 def _draft_in(folder: Path) -> Path:
-    """Place of a draft; not named after the file, whose name may have the greatest length."""
+    """Place of a draft; its name is independent of the file's, which may have maximal length."""
     return folder / f"{_DRAFT}{secrets.token_hex(8)}"
 
 
@@ -224,7 +224,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make renamings durable where the file system can; the files themselves are written."""
+    """Make renamings durable if the file system can; the files' contents already are."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

@@ -41,7 +41,7 @@ class MeasuredPoints:
     s : (K,) [m], optional
         Arc lengths of markers.
     count : (K,) or one for all
-        Number of measured points of which each point is the mean.
+        Number of measured points averaged into each point.
     """
 
     points: FloatArray
@@ -58,8 +58,8 @@ class MeasuredPoints:
     ) -> "MeasuredPoints":
         """The points from start to end, as `read_points` returns them.
 
-        Raises MeasurementError if they are no measurement of a cable of that length; the message
-        begins with the `name` of a file and calls the arc lengths `place`.
+        Raises MeasurementError if they cannot be a measurement of a cable of that length; the
+        message begins with the file's `name` and calls the arc lengths `place`.
         """
         points, s = self.points, self.s
         if s is not None:
@@ -94,12 +94,12 @@ class MeasuredPoints:
     def means(self, most: int) -> "MeasuredPoints":
         """Means of the points in at most `most` intervals of equal length.
 
-        White errors average out; an interval without points has no mean. The mean over an arc of
-        length h and curvature k lies k h^2 / 24 beside it: 5 um for a circle of 1 m in 240 parts.
+        White noise averages out; an interval without points has no mean. The mean over an arc of
+        length h and curvature k is off by k h^2 / 24: 5 um for a circle of 1 m in 240 parts.
         """
         along, every = self.s, np.arange(len(self.points))
         if along is None:
-            # Chords are longer than the noise, so that their lengths do not depend on it.
+            # Chords are longer than the noise, which then hardly changes their lengths.
             ends = np.linspace(0, every[-1], min(most, len(every))).astype(int)
             along = np.interp(every, ends, chord_lengths(self.points[ends]))
         share = (along - along[0]) / (along[-1] - along[0])
@@ -121,27 +121,27 @@ def read_points(
     Parameters
     ----------
     path : str or Path
-        CSV file, one point a line [m]. With the header `x_m,y_m` (in space `x_m,y_m,z_m`) a line,
-        in order along the cable; with `s_m,x_m,y_m` (`s_m,x_m,y_m,z_m`) markers at the arc length
+        CSV file, one point a line [m]. The header `x_m,y_m` (in space `x_m,y_m,z_m`) means a line
+        in order along the cable; `s_m,x_m,y_m` (`s_m,x_m,y_m,z_m`) means markers at the arc lengths
         s_m from the start.
     start : (d,) [m]
-        Where the start of the cable is held, d = 2 or 3.
+        Fixture of the cable's start, d = 2 or 3.
     end : (d,) [m], optional
-        Where its end is held.
+        Fixture of its end.
     length : float [m]
         Of the cable: no marker lies beyond it.
 
     Returns
     -------
     MeasuredPoints
-        From start to end, K >= 2, without repeated points. A line that runs from end to start is
-        put right: the first point is the one nearer to `start` (with `end` given, the order with
-        the smaller sum of both distances, which also tells the order of a part of a loop).
+        From start to end, K >= 2, without repeated points. A line from end to start is reversed:
+        the first point is the one nearer to `start`; with `end` given, the order has the smaller
+        sum of both distances, which also works for part of a loop.
 
     Raises
     ------
     MeasurementError
-        If the file cannot be read so; the message names the file and the line.
+        If the file is not such a measurement; the message names the file and the line.
     """
     source = Path(path)
     header, table = _parse(source, len(start))

@@ -1,4 +1,4 @@
-"""Recordings of laboratories to sessions: motion capture, ROS bags, point clouds."""
+"""Turn recordings of laboratories into sessions: motion capture, ROS bags, point clouds."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,9 +11,9 @@ from dlo_casadi.recordings.mocap import read_c3d, read_mocap_csv
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream, together
 from dlo_casadi.recordings.session import FREE, Imported, Wishes, make_session
 
-WHOLE = CloudView()  # all points of clouds in metres
+WHOLE = CloudView()  # all points of clouds, in metres
 
-# Ending of a name -> reader of a file.
+# File extension -> reader.
 FORMATS: dict[str, Callable[[Path], Recording]] = {
     ".csv": read_mocap_csv,
     ".c3d": read_c3d,
@@ -35,9 +35,9 @@ def read_recording(
     Parameters
     ----------
     paths : sequence of Path
-        Files of the `FORMATS`; each has a clock of its own.
+        Files of the `FORMATS`; each has its own clock.
     up : "x", "y", "z" or None
-        The axis that points up; as usual in each format when absent.
+        The axis that points up; by default the usual one of each format.
     view : CloudView
         How clouds were seen, in the axes of their files.
 

@@ -13,7 +13,7 @@ from dlo_casadi.errors import MeasurementError, library
 from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream
 
 _NANO = 1e-9
-# Types of a message's numpy fields by their numbers in sensor_msgs/PointField.
+# NumPy types of a message's fields, by their numbers in sensor_msgs/PointField.
 _FIELDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _WANTED = (
     "marker arrays (visualization_msgs/MarkerArray, geometry_msgs/PoseArray, or any message with "
@@ -27,8 +27,8 @@ def read_bag(path: Path) -> Recording:
     """Read a bag: markers, poses and TF of grippers, wrenches, and clouds of points.
 
     Times are those of the messages' headers. Markers and clouds share one clock, grippers and force
-    sensors another. A body is called as its topic or, in TF, as its frame, and given in the root of
-    its tree; clouds are turned there, too, where TF tells where the camera stands. Raises
+    sensors another. A body is named after its topic or, in TF, its frame, and given in the root of
+    its tree. Clouds are also transformed to the root where TF contains the camera's pose. Raises
     MeasurementError if the bag is damaged, or holds none of these.
     """
     anyreader = library("rosbags.highlevel", "recordings", "reading this file")
@@ -66,7 +66,7 @@ def read_bag(path: Path) -> Recording:
                         rows["marker", marker].append((t, place))
     except MeasurementError:
         raise
-    except Exception as error:  # its storages raise what they like: sqlite3, struct, YAML, zstd
+    except Exception as error:  # storages raise various errors: sqlite3, struct, YAML, zstd
         raise MeasurementError(
             f"cannot be read: {str(error) or type(error).__name__}.\n  Try: `ros2 bag info`, "
             "`ros2 bag reindex`, or a bag that was closed.",
@@ -103,7 +103,7 @@ def _pose(place: Any, turn: Any) -> list[float]:
     return [*_vector(place), turn.x, turn.y, turn.z, turn.w]
 
 
-# Type of a message -> kind of its stream, and its row.
+# Type of a message -> kind of its stream, and function that reads its row.
 _BODIES: dict[str, tuple[Kind, Callable[[Any], list[float]]]] = {
     "PoseStamped": ("body", lambda m: _pose(m.pose.position, m.pose.orientation)),
     "PoseWithCovarianceStamped": (
@@ -118,7 +118,7 @@ _HANDLED = {"TFMessage", "PointCloud2", "PoseArray", *_BODIES}
 
 
 def _markers(message: Any, kind: str) -> Iterator[tuple[str, float, list[float]]]:
-    """Name, time and place of the markers in a message."""
+    """Name, time and position of each marker in a message."""
     if kind == "PoseArray":
         for k, pose in enumerate(message.poses):
             yield f"{k:02d}", _time(message), _vector(pose.position)
@@ -150,7 +150,7 @@ def _to_root(child: str, links: Links) -> Rows:
 
 
 def _at(items: Rows, t: FloatArray) -> tuple[FloatArray, Rotation]:
-    """Places (n, 3) and rotations of a link at other times, interpolated; the first for ever."""
+    """Interpolated places (n, 3) and rotations of a link at other times; static ones stay."""
     times, first = np.unique([time for time, _ in items], return_index=True)
     poses = np.array([items[k][1] for k in first])
     if len(times) == 1:
@@ -163,7 +163,7 @@ def _at(items: Rows, t: FloatArray) -> tuple[FloatArray, Rotation]:
 
 
 def _cloud(item: tuple[str, float, Any], links: Links, clock: str) -> Cloud:
-    """A sensor_msgs/PointCloud2 in the root of its frame's tree."""
+    """Read a sensor_msgs/PointCloud2 into the root of its frame's tree."""
     name, t, message = item
     layout = {
         "names": [f.name for f in message.fields],

@@ -1,4 +1,4 @@
-"""Files of point clouds: PLY, PCD and NPY."""
+"""Read files of point clouds: PLY, PCD and NPY."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ _PLY |= {"uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float6
 
 @dataclass(frozen=True)
 class CloudView:
-    """How clouds were seen, and which of their points are the cable."""
+    """How clouds were seen, and which of their points belong to the cable."""
 
     camera: Sequence[float] = ()
     """Place of the camera [m], in the frame of the file."""
@@ -32,9 +32,9 @@ class CloudView:
     """Unit of the files, which do not contain it."""
 
     def of(self, cloud: Cloud) -> Cloud:
-        """The cloud without what is not the cable.
+        """Keep only the points of the cable.
 
-        Raises MeasurementError if no points are left, or they have no colour.
+        Raises MeasurementError if no points are left, or if they have no colour.
         """
         points = cloud.points * METRES[self.units]
         kept = np.isfinite(points).all(axis=1)
@@ -58,7 +58,7 @@ class CloudView:
 
 
 def read_cloud(path: Path) -> Recording:
-    """Read a cloud: PLY or PCD, text or binary, or an array (K, 3) or (K, 6) with colours as NPY.
+    """Read a cloud: PLY or PCD (text or binary), or NPY, an array (K, 3), or (K, 6) with colours.
 
     Raises MeasurementError if the file is damaged.
     """
@@ -121,7 +121,7 @@ def _pcd(path: Path) -> Cloud:
 
 
 def _cloud(path: Path, fields: list[tuple[str, str]], body: bytes, count: int, style: str) -> Cloud:
-    """Points and colours of a table, as text or binary."""
+    """Points and colours of a table, stored as text or binary."""
     names = [name for name, _ in fields]
     if style == "ascii":
         lines = [line.split()[: len(names)] for line in body.decode().splitlines()[:count]]
@@ -144,7 +144,7 @@ def _cloud(path: Path, fields: list[tuple[str, str]], body: bytes, count: int, s
 
 
 def _colors(table: dict[str, Any]) -> FloatArray | None:
-    """Red, green, blue from columns of their own, or from PCL's packed `rgb`."""
+    """Red, green and blue from separate columns, or from PCL's packed `rgb`."""
     if {"red", "green", "blue"} <= table.keys():
         return np.column_stack([table[name].astype(float) for name in ("red", "green", "blue")])
     if "rgb" not in table:

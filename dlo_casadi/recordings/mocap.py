@@ -13,9 +13,9 @@ from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError, counted, library
 from dlo_casadi.recordings.recording import Kind, Recording, Stream, factor
 
-# Sections of a Vicon file that hold places; others (devices, model outputs) are passed over.
+# Sections of a Vicon file that hold positions; others (devices, model outputs) are skipped.
 _SECTIONS: dict[str, Kind] = {"Trajectories": "marker", "Objects": "body", "Segments": "body"}
-_KINDS: dict[str, Kind] = {"Marker": "marker", "Rigid Body": "body"}  # Types of Motive
+_KINDS: dict[str, Kind] = {"Marker": "marker", "Rigid Body": "body"}  # Types in Motive files
 _RADIANS = {"deg": np.pi / 180.0, "rad": 1.0}
 _AGAIN = "Try: export it again, whole, as Motive (Tracking Data) or Vicon (ASCII) writes it."
 Rows = list[list[str]]
@@ -27,14 +27,14 @@ def read_mocap_csv(path: Path) -> Recording:
     Returns
     -------
     Recording
-        Markers, and rigid bodies with their rotations; those of Motive have to be quaternions,
-        those of Vicon may be rotation vectors, too. Unlabelled markers are left out. The standards
-        for the way up are y in Motive, z in Vicon.
+        Markers, and rigid bodies with their rotations: quaternions in Motive files, also rotation
+        vectors in Vicon files. Unlabelled markers are left out. By default y points up in Motive
+        and z in Vicon.
 
     Raises
     ------
     MeasurementError
-        If the file is neither, damaged, or has other units.
+        If the file is neither, is damaged, or has other units.
 
     References
     ----------
@@ -143,7 +143,7 @@ def _vicon(rows: Rows, path: Path) -> Iterator[Stream]:
 
 
 def _quaternions(turns: FloatArray, unit: str) -> FloatArray:
-    """Quaternions (n, 4) of quaternions, or of rotation vectors (n, 3) in a unit of angle."""
+    """Quaternions (n, 4) from quaternions, or from rotation vectors (n, 3) in a unit of angle."""
     if turns.shape[1] == 4:
         return turns
     found = np.full((len(turns), 4), np.nan)
@@ -180,7 +180,7 @@ _WHOLE = "Try: export the file again, whole."
 def read_c3d(path: Path) -> Recording:
     """Read the labelled points of a C3D file as markers; a gripper is three of them.
 
-    POINT:Y_SCREEN tells the way up; without it that is z.
+    POINT:Y_SCREEN names the axis that points up; without it that is z.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def read_c3d(path: Path) -> Recording:
     group = content["parameters"]["POINT"].items()
     point = {key: item["value"] for key, item in group if key != "__METADATA__"}
     places = content["data"]["points"][:3]
-    first, last = unpack_from("<HH", path.read_bytes(), 6)  # ezc3d corrects what it gives
+    first, last = unpack_from("<HH", path.read_bytes(), 6)  # ezc3d alters its numbers
     declared = last - first + 1 if last < 65535 else 0
     if places.shape[2] < declared:
         raise MeasurementError(

@@ -1,4 +1,4 @@
-"""What laboratories record, in one form: streams in SI units, z up, each with its own clock."""
+"""One form for everything that laboratories record: streams in SI units, z up, with own clocks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,20 +12,20 @@ from dlo_casadi.errors import MeasurementError
 
 Kind = Literal["marker", "body", "wrench"]
 
-# The way up in a file -> rotation into axes of which z is up, with x or y kept.
+# Axis that points up in a file -> rotation to z up that keeps x or y.
 _UP = {
     "x": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "z": np.eye(3),
 }
-_LARGEST = 100.0  # m, distance from the origin from which on coordinates are not in metres
+_LARGEST = 100.0  # m, distance from the origin beyond which coordinates cannot be in metres
 METRES = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "centimeters": 0.01}
 METRES |= {"mm": 1e-3, "millimeters": 1e-3, "millimetres": 1e-3}
 
 
 @dataclass(frozen=True)
 class Stream:
-    """What was recorded of one marker, rigid body or force sensor."""
+    """The record of one marker, rigid body or force sensor."""
 
     name: str
     kind: Kind
@@ -42,7 +42,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points that a depth camera has seen at once."""
+    """Points that a depth camera has seen at one time."""
 
     name: str
     points: FloatArray
@@ -58,7 +58,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Recording:
-    """Everything that was recorded, and what had to be assumed to read it."""
+    """Everything that was recorded, and the assumptions made to read it."""
 
     streams: tuple[Stream, ...] = ()
     clouds: tuple[Cloud, ...] = ()
@@ -69,11 +69,11 @@ class Recording:
     """Why it is taken for the one."""
 
     def of(self, kind: Kind) -> dict[str, Stream]:
-        """Streams of a kind by their names."""
+        """Streams of one kind, by name."""
         return {stream.name: stream for stream in self.streams if stream.kind == kind}
 
     def with_z_up(self, up: str | None) -> "Recording":
-        """The same in axes of which z is up, from axes of which `up` is, or as it was read."""
+        """The recording rotated to z up, from axes in which `up` points up, or as it was read."""
         turn = _UP[up or self.up]
         assumed = () if up else (f"{self.up} is up, {self.up_by}; or --up",)
 
@@ -82,7 +82,7 @@ class Recording:
             if stream.kind != "wrench":
                 values[:, :3] = values[:, :3] @ turn.T
             if stream.kind == "body":
-                seen = np.linalg.norm(values[:, 3:], axis=1) > 0.5  # zero where it was lost
+                seen = np.linalg.norm(values[:, 3:], axis=1) > 0.5  # zero where tracking was lost
                 values[~seen] = np.nan
                 turns = Rotation.from_matrix(turn) * Rotation.from_quat(values[seen, 3:])
                 values[seen, 3:] = turns.as_quat()
@@ -103,10 +103,9 @@ class Recording:
 
 
 def together(recordings: Sequence[Recording]) -> Recording:
-    """Several files as one recording.
+    """Combine several files into one recording.
 
-    Raises MeasurementError if they hold two streams of one name, or coordinates that are not in
-    metres.
+    Raises MeasurementError if two streams have the same name, or if coordinates are not in metres.
     """
     streams = [stream for item in recordings for stream in item.streams]
     names = [(stream.kind, stream.name) for stream in streams]
@@ -131,7 +130,7 @@ def together(recordings: Sequence[Recording]) -> Recording:
 
 
 def factor(unit: str, name: str) -> float:
-    """Metres in a unit of length that a file names."""
+    """Convert a unit of length named in a file to metres."""
     if unit.strip().lower() not in METRES:
         known = ", ".join(METRES)
         raise MeasurementError(f"the unit of length {unit!r} is none of {known}", pose=name)

@@ -1,4 +1,4 @@
-"""From a recording to the files of a session: poses, grippers' frames, markers along the cable."""
+"""Turn a recording into a session's files: poses, gripper frames, markers along the cable."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,17 +25,17 @@ from dlo_casadi.recordings.stills import (
 )
 
 FREE = "free"
-_COLUMNS = 98  # of a comment
-_SAMPLES = 50  # points of a spline between two markers, for its length: exact to 1e-5
-_LONGER = 0.03  # relative difference of a declared and a measured length: a mistake
-_DENSITY = 2200.0  # kg/m^3, of a cable whose mass is not known, for `Imported.stand_ins`
+_COLUMNS = 98  # width of a comment
+_SAMPLES = 50  # points of a spline between two markers, to compute its length: exact to 1e-5
+_LONGER = 0.03  # relative difference of declared and measured length beyond which one is a mistake
+_DENSITY = 2200.0  # kg/m^3, assumed for a cable of unknown mass, for `Imported.stand_ins`
 
 Points = tuple[FloatArray, FloatArray | None]  # (K, 3) [m], and arc lengths (K,) [m] of markers
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What a recording does not tell, and its user may."""
+    """What the recording does not contain, and the user may add."""
 
     start: str = "start"
     """Name of the body that holds the start, or of three markers `o,x,y`: its place, a point along
@@ -59,7 +59,7 @@ class Wishes:
 
 @dataclass(frozen=True)
 class Imported:
-    """Files of a session that are not written yet."""
+    """Files of a session that are not yet written."""
 
     name: str
     points: dict[str, Points]
@@ -73,7 +73,7 @@ class Imported:
     remarks: tuple[str, ...]
 
     def text(self, cable: Mapping[str, str] | None = None) -> str:
-        """The configuration; with other values of the cable, if given."""
+        """Text of the configuration; with other values of the cable, if given."""
         return template(
             self.name,
             list(self.points),
@@ -89,7 +89,7 @@ class Imported:
     def stand_ins(self) -> dict[str, str]:
         """Values of the cable with which the geometry can be checked before all are known.
 
-        Shapes tell stiffness over weight alone: any mass serves, and a fit finds its stiffness.
+        Shapes determine only stiffness over weight: any mass will do, the fit finds its stiffness.
         """
         length = self.length
         diameter = float(self.cable.get("diameter", 0.01 * length))
@@ -100,10 +100,10 @@ class Imported:
 
 
 def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
-    """Make a session of a recording: align clocks, find poses, name markers, turn grippers.
+    """Make a session from a recording: align clocks, find poses, name markers, orient grippers.
 
-    `name`: what to call the cable. Raises MeasurementError if the recording does not hold what a
-    session takes; the message says what to try.
+    `name`: of the cable. Raises MeasurementError if the recording lacks something that a session
+    needs; the message says what to try.
     """
     recording, offsets = align_clocks(recording)
     stills = find_stills(recording, wishes.hold)
@@ -165,12 +165,12 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
 
 
 def _guess(mass: float, length: float) -> float:
-    """Stiffness [N m^2] of a cable that bends visibly under its weight, right to decades."""
+    """Rough stiffness [N m^2], within decades, of a cable that bends visibly under its weight."""
     return mass * 9.81 * length**2 / 30.0
 
 
 def _declared(k: int, start: Gripper | None, end: Gripper | None, wishes: Wishes) -> dict[str, str]:
-    """What a configuration says of pose `k`."""
+    """Entries of pose `k` in a configuration."""
     left_out = wishes.held_out and not (k + 1) % wishes.held_out
     found = {"role": "held_out" if left_out else "fit"}
     for side, gripper in (("start", start), ("end", end)):
@@ -191,7 +191,7 @@ def _row(values: FloatArray) -> str:
 def _readings(
     recording: Recording, stills: Sequence[Still], wishes: Wishes, remarks: list[str]
 ) -> list[dict[str, str]]:
-    """Forces and moments of each pose in the world's axes, by their keys in a configuration."""
+    """Forces and moments of each pose in the world's axes, by their configuration keys."""
     found: list[dict[str, str]] = [{} for _ in stills]
     for name, stream in recording.of("wrench").items():
         named = (stream.frame, name)
@@ -228,7 +228,7 @@ def _cloud_lines(
     wishes: Wishes,
     remarks: list[str],
 ) -> tuple[list[FloatArray], list[str]]:
-    """Line of the cable (K, 3) [m] in each pose, from all its clouds, and what to say of it."""
+    """Line of the cable (K, 3) [m] in each pose, from all its clouds, and remarks on it."""
     clouds = recording.clouds
     missing = [key for key in ("length", "diameter") if key not in wishes.known]
     if missing or start is None:
@@ -273,9 +273,9 @@ def _cloud_lines(
 def _cable_markers(
     recording: Recording, stills: Sequence[Still], wishes: Wishes
 ) -> dict[str, FloatArray]:
-    """Places (P, 3) [m] of each of the cable's markers; nan in poses where it is not seen."""
+    """Positions (P, 3) [m] of each of the cable's markers; nan in poses where it is not seen."""
     of_grippers = {part.strip() for name in (wishes.start, wishes.end) for part in name.split(",")}
-    on_bodies = tuple(f"{body}:" for body in recording.of("body"))  # as Motive and Vicon call them
+    on_bodies = tuple(f"{body}:" for body in recording.of("body"))  # naming of Motive and Vicon
     names = [
         name
         for name in recording.of("marker")
@@ -297,10 +297,10 @@ def _cable_markers(
 
 
 def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> list[int]:
-    """Markers from the start to the end of the cable.
+    """Order of the markers from the start to the end of the cable.
 
-    The greatest distance of two markers over all poses is close to their distance along the cable,
-    in which the shortest tree that joins all of them is the cable itself.
+    The largest distance of two markers over all poses approximates their distance along the cable.
+    With these distances the shortest tree that joins all markers is the cable itself.
     """
     places = np.array([*markers.values()])
 
@@ -331,7 +331,7 @@ def _along(
     wishes: Wishes,
     remarks: list[str],
 ) -> tuple[FloatArray, float]:
-    """Arc lengths (M,) [m] of the markers and of the cable, measured or as wished."""
+    """Arc lengths (M,) [m] of the markers, and the cable's length, measured or as wished."""
     s, length, scatter = _arc_lengths(start, places, end)
     fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
     declared = wishes.known.get("length")
@@ -364,10 +364,10 @@ def _along(
 def _arc_lengths(
     start: Gripper | None, places: FloatArray, end: Gripper | None
 ) -> tuple[FloatArray, float, float]:
-    """Arc lengths (M,) [m] of markers from the start, and the cable's length [m] and its scatter.
+    """Arc lengths (M,) [m] of markers from the start; length of the cable and its scatter [m].
 
-    Means over all poses of the lengths of a cubic spline through fixtures and markers, clamped in
-    the grippers' directions.
+    They are means over all poses of lengths along a cubic spline through fixtures and markers,
+    clamped in the grippers' directions.
     """
     knots = places
     if start is not None:
@@ -385,7 +385,7 @@ def _arc_lengths(
             for gripper in (start, end)
         )
         lengths = np.linalg.norm(np.diff(x, axis=0), axis=1)
-        for _ in range(3):  # the parameter tends to the arc length
+        for _ in range(3):  # the parameter converges to the arc length
             t = np.concatenate([[0.0], np.cumsum(lengths)])
             curve = CubicSpline(t, x, bc_type=ends)
             fine = np.linspace(t[:-1], t[1:], _SAMPLES + 1, axis=1)

@@ -1,4 +1,4 @@
-"""Clocks aligned by motion, stretches in which nothing moves, and the grippers in them."""
+"""Align clocks by motion, find intervals in which nothing moves, and the grippers in them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,26 +13,26 @@ from dlo_casadi.arrays import BoolArray, FloatArray, unit
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings.recording import Recording, Stream
 
-_LEVER = 0.1  # m, from a body to the points that show its rotation
-_SMOOTH = 0.05  # s, over which speeds are smoothed before clocks are compared
-# Correlation of speeds from which two clocks are aligned. Of a gripper and the markers of its cable
-# it is above 0.9; of two unrelated recordings of ten moves below 0.4 (simulated).
+_LEVER = 0.1  # m, distance from a body of the points that show its rotation
+_SMOOTH = 0.05  # s, window in which speeds are smoothed before clocks are compared
+# Smallest correlation of speeds at which two clocks are aligned. For a gripper and the markers of
+# its cable it is above 0.9; for two unrelated recordings of ten moves below 0.4 (simulated).
 _ALIKE = 0.6
-_WINDOW = 0.4  # s, in which scatter is compared with the noise
-_QUIET = 0.1  # share of the time that the cable is still, at least
-# Scatter over the noise from which something moves: RMS over all streams, which noise alone
-# changes by a few per cent.
+_WINDOW = 0.4  # s, window in which scatter is compared with the noise
+_QUIET = 0.1  # smallest share of the time in which the cable is still
+# Ratio of scatter to noise beyond which something moves: RMS over all streams; noise alone changes
+# it by a few per cent.
 _MOVES = 2.0
-_FLOOR = 1.0e-5  # m, a noise below the resolution of files
-# Largest ratio of the scatter of a still stretch to the noise from frame to frame: filters of the
-# export make it about 10, slow motion hundreds.
+_FLOOR = 1.0e-5  # m, smallest noise, below the resolution of files
+# Largest ratio of a still interval's scatter to the noise from frame to frame: filters of the
+# export raise it to about 10, slow motion to hundreds.
 _NEVER = 50.0
-_OUTLIER = 5.0  # median absolute deviations from which a frame is left out of a mean
+_OUTLIER = 5.0  # median absolute deviations beyond which a frame is left out of a mean
 
 
 @dataclass(frozen=True)
 class Offset:
-    """How much a clock is ahead of another."""
+    """Time by which a clock is ahead of another one."""
 
     clock: str
     other: str
@@ -43,8 +43,8 @@ class Offset:
 
     @property
     def told(self) -> str:
-        """Sentence on it, and on whether it matters."""
-        if abs(self.seconds) > 1e6:  # one counts from 1970
+        """One sentence on the offset and on whether it matters."""
+        if abs(self.seconds) > 1e6:  # one clock counts from 1970
             return f"{self.clock} and {self.other}: different origins of time, aligned by motion"
         moved = 1e3 * abs(self.seconds) * self.speed
         matters = (
@@ -61,18 +61,18 @@ class Offset:
 
 @dataclass(frozen=True)
 class Still:
-    """A stretch of time in which nothing moves, and the means in it."""
+    """An interval in which nothing moves, and the means in it."""
 
     begin: float  # [s]
     end: float  # [s]
     values: dict[str, FloatArray]
     """Mean of each stream that was seen, by kind and name: `marker m1`."""
     scatter: float  # [m], standard deviation of a coordinate of a marker or body
-    drift: float  # [m], largest distance of the means of its two halves
+    drift: float  # [m], largest distance between the means of its two halves
 
     @property
     def told(self) -> str:
-        """How still it was, in words."""
+        """Describe how still it was."""
         return (
             f"still from {self.begin:.2f} to {self.end:.2f} s: scatter {1e3 * self.scatter:.2f} "
             f"mm, drift {1e3 * self.drift:.2f} mm"
@@ -83,9 +83,9 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
     """Shift all clocks to that of the first marker or body, which then begins at zero.
 
     The offset of two clocks is the lag at which the mean speeds of their markers and bodies
-    correlate best, to a fraction of a frame by a parabola through the maximum. A clock whose
-    streams do not move, as that of a force sensor, keeps its times. Raises MeasurementError if two
-    recordings do not move alike.
+    correlate best, to a fraction of a frame by a parabola through the maximum. A clock without
+    moving streams, such as that of a force sensor, keeps its times. Raises MeasurementError if the
+    motions in two recordings do not match.
     """
     clocks = tuple(dict.fromkeys(s.clock for s in recording.streams if s.kind != "wrench"))
     if not clocks:
@@ -116,12 +116,12 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
 
 
 def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
-    """Stretches of at least `hold` [s] in which no marker and no body moves.
+    """Intervals of at least `hold` [s] in which no marker and no body moves.
 
-    The noise of each stream is its scatter in the quietest tenth of the time, in windows of 0.4 s;
-    the recording is still where the root mean square over all streams of scatter over noise is
-    below 2. A steady drift of 6 noises a second is just seen. Raises MeasurementError if nothing
-    was seen, or it never stands still.
+    The noise of each stream is its scatter in the quietest tenth of the time, in windows of 0.4 s.
+    The recording is still where the RMS over all streams of scatter over noise is below 2. The
+    slowest steady drift that this detects is 6 noises a second. Raises MeasurementError if nothing
+    was seen, or if the recording never stands still.
     """
     shown = [stream for stream in recording.streams if stream.kind != "wrench"]
     tracks = [track for stream in shown for track in _tracks(stream)]
@@ -156,7 +156,7 @@ def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
         if inside[-1] - inside[0] >= hold:
             found.append(_still(recording.streams, float(inside[0]), float(inside[-1])))
     merged: list[Still] = []
-    for still in found:  # a glitch of a second does not make two poses of one
+    for still in found:  # a glitch of a second must not split one pose in two
         last = merged[-1] if merged else None
         if last and still.begin - last.end < _WINDOW + hold and _same(last, still):
             merged[-1] = _still(recording.streams, last.begin, still.end)
@@ -171,7 +171,7 @@ def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
 
 
 def _still(streams: Sequence[Stream], begin: float, end: float) -> Still:
-    """Robust means between two times, and how much they scatter and drift."""
+    """Robust means between two times, with their scatter and drift."""
     values, scatters, drifts = {}, [], [0.0]
     for stream in streams:
         seen = (stream.t >= begin) & (stream.t <= end) & np.isfinite(stream.values).all(axis=1)
@@ -193,7 +193,7 @@ def _still(streams: Sequence[Stream], begin: float, end: float) -> Still:
 
 
 def _same(one: Still, other: Still) -> bool:
-    """Whether two stretches show the same pose, to the noise of a single frame."""
+    """Whether two intervals show the same pose, to the noise of a single frame."""
     away = [
         float(np.linalg.norm(one.values[key][:3] - other.values[key][:3]))
         for key in one.values.keys() & other.values.keys()
@@ -203,7 +203,7 @@ def _same(one: Still, other: Still) -> bool:
 
 
 def _tracks(stream: Stream) -> list[tuple[FloatArray, FloatArray]]:
-    """Times and places (n, 3) of points that show the motion of a stream, where it is seen."""
+    """Times and positions (n, 3) of points that show a stream's motion, while it is seen."""
     seen = np.isfinite(stream.values).all(axis=1)
     t, x = stream.t[seen], stream.values[seen, :3]
     if stream.kind != "body" or not len(t):
@@ -221,7 +221,7 @@ def _period(streams: Sequence[Stream]) -> float:
 
 
 def _speed(streams: Sequence[Stream], dt: float) -> tuple[float, FloatArray]:
-    """First time [s], and RMS speed [m/s] every `dt` of all that moves with one clock."""
+    """First time [s], and RMS speed [m/s] every `dt` of all moving streams on one clock."""
     tracks = [track for stream in streams for track in _tracks(stream) if len(track[0]) > 3]
     if not tracks:
         raise MeasurementError(
@@ -241,7 +241,7 @@ def _speed(streams: Sequence[Stream], dt: float) -> tuple[float, FloatArray]:
 def _scatter(
     t: FloatArray, x: FloatArray, grid: FloatArray, width: int
 ) -> tuple[FloatArray, BoolArray]:
-    """Standard deviation of a coordinate in windows about each time, and where it is known."""
+    """Standard deviation of a coordinate in windows about each time, and whether it is known."""
     path = np.column_stack([np.interp(grid, t, column) for column in x.T]) - x.mean(axis=0)
     mean = uniform_filter1d(path, width, axis=0, mode="nearest")
     square = uniform_filter1d(path**2, width, axis=0, mode="nearest") - mean**2
@@ -252,7 +252,7 @@ def _scatter(
 
 
 def _jitter(x: FloatArray) -> float:
-    """Noise [m] of a coordinate from frame to frame, which smooth motion hardly changes.
+    """Noise [m] of a coordinate from frame to frame; smooth motion hardly affects it.
 
     The median absolute second difference of white noise is 0.6745 sqrt(6) times its std.
     """
@@ -262,25 +262,25 @@ def _jitter(x: FloatArray) -> float:
 
 # ---- grippers ------------------------------------------------------------------------------------
 
-_STRAY = 0.5  # direction cosine of a gripper's axis and the cable from which they may be the same
+_STRAY = 0.5  # smallest cosine at which a gripper's axis may be the cable's
 
 
 @dataclass(frozen=True)
 class Gripper:
-    """A fixture in all poses: places (P, 3) [m], and frames (P, 3, 3) with x along the cable."""
+    """A fixture in all poses: positions (P, 3) [m], and frames (P, 3, 3) with x along the cable."""
 
     places: FloatArray
     frames: FloatArray
 
     def turned(self, axes: FloatArray) -> "Gripper":
-        """With other axes, given as columns in its own."""
+        """Return the gripper with other axes, given as columns in its own frame."""
         return Gripper(self.places, self.frames @ axes)
 
 
 def find_gripper(
     name: str, offset: Sequence[float], side: str, stills: Sequence[Still], recording: Recording
 ) -> Gripper | None:
-    """The body, or the three markers, that hold an end; None where the recording has no body."""
+    """The body, or the three markers, holding an end; None if the recording has no body."""
     if name.count(",") == 2:
         o, x, y = (_means(stills, f"marker {part.strip()}", recording) for part in name.split(","))
         first = unit(x - o)
@@ -321,9 +321,9 @@ def along_cable(
 ) -> tuple[Gripper | None, Gripper | None]:
     """Grippers with x along the cable from start to end, and the least roll between them.
 
-    Of the six axes of a body the one that points most along the way to the nearest marker; of the
-    four ways to roll the end about it the one with the smallest twist of the cable over all poses.
-    What is left of it is a nuisance of the fit, `end_roll`.
+    Of a body's six axes, x is the one closest to the direction of the nearest marker. Of the four
+    ways to roll the end about it, the one with the smallest twist of the cable over all poses is
+    chosen. The remaining roll is a nuisance of the fit, `end_roll`.
     """
     if start is not None:
         ways = np.array([line[0] for line in lines]) - start.places
@@ -343,7 +343,7 @@ def along_cable(
 
 
 def _aimed(gripper: Gripper, ways: FloatArray, side: str, remarks: list[str]) -> Gripper:
-    """The gripper with that of its axes as x that points most along the ways (P, 3)."""
+    """The gripper with x along the axis that is closest to the directions `ways` (P, 3)."""
     ways = unit(ways)
     cosines = np.mean(np.einsum("pij,pi->pj", gripper.frames, ways), axis=0)
     k = int(np.argmax(np.abs(cosines)))

@@ -1,1 +1,1 @@
-"""Results to files, tables and figures. Reads results, computes none."""
+"""Write results to files, tables and figures; nothing is computed here."""

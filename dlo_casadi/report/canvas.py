@@ -1,4 +1,4 @@
-"""Figures without a screen: what all share, and how one becomes a file or a part of a page."""
+"""Draw figures without a screen: common parts, and how one becomes a file or part of a page."""
 
 import io
 import re
@@ -29,12 +29,12 @@ from dlo_casadi.show.style import (
     styled,
 )
 
-# Stages that are compared, in every figure.
+# Stages that every figure compares.
 STAGE_LINES: dict[str, dict[str, Any]] = {
     "before": {"color": ORANGE, "ls": "--"},
     "after": {"color": BLUE, "ls": "-"},
 }
-# What stands in a scene, by the kinds of its marks.
+# Style of each kind of mark in a scene.
 STYLES: dict[str, dict[str, Any]] = {
     "grid": {"color": "#E3E3E3", "lw": 0.6},
     "shadow": {"color": "#9AA5B1", "lw": 1.0},
@@ -60,23 +60,23 @@ STYLES: dict[str, dict[str, Any]] = {
     "fixture clip": {"color": BLACK, "marker": "D", "mfc": "white", "ms": 5, "markevery": [0]},
 }
 
-# Width [inch] of a chart: on a telephone its letters are still as large as that of a footnote.
+# Width [inch] of a chart: its text is as large as a footnote even on a phone.
 WIDTH = 4.8
 _SVG = "http://www.w3.org/2000/svg"
 
 
 def inline_svg(drawing: Figure, name: str) -> str:
-    """A figure as a part of a page, where several stand side by side.
+    """Return a figure as a part of a page on which several figures stand.
 
-    Of an artist with a gid, the gid becomes the id of its group, and its label is what the browser
-    tells at the pointer. All other ids are made of the `name` of the chart.
+    An artist's gid becomes the id of its group, and its label the browser's tooltip. All other ids
+    start with the `name` of the chart.
     """
     text = io.StringIO()
     with mpl.rc_context(STYLE | {"svg.fonttype": "none", "svg.hashsalt": name}):
         lay_out(drawing, 72)
         drawing.savefig(text, format="svg", metadata={"Date": None})
     root = ET.fromstring(text.getvalue())
-    for unwanted in root[:2]:  # metadata, and a style that would be one of the whole page
+    for unwanted in root[:2]:  # metadata, and a style sheet that would change the whole page
         root.remove(unwanted)
     root.attrib = {"viewBox": root.attrib["viewBox"]}
     told = {item.get_gid(): str(item.get_label()) for item in drawing.findobj() if item.get_gid()}
@@ -96,7 +96,7 @@ def inline_svg(drawing: Figure, name: str) -> str:
 
 
 def headline(drawing: Figure, text: str) -> None:
-    """Write what a figure shows above it, in lines that are no wider than it."""
+    """Write above a figure what it shows, in lines no wider than the figure."""
     letters = int(12 * drawing.get_figwidth())
     drawing.suptitle(textwrap.fill(text, letters, break_on_hyphens=False), fontsize=11)
 
@@ -105,25 +105,25 @@ def headline(drawing: Figure, text: str) -> None:
 def chart(
     outcome: Outcome, said: str, height: float, panels: int = 1, width: float = WIDTH
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Open a figure of a run with panels below one another; its headline tells what it shows."""
+    """Open a figure of a run with panels below one another and a headline."""
     with styled((width, height)) as drawing:
         yield drawing, list(drawing.subplots(panels, 1, squeeze=False, sharex=True)[:, 0])
         headline(drawing, f"{outcome.config.cable.name}: {said}")
 
 
 def line_of(label: str, **style: Any) -> Line2D:
-    """A line in a legend."""
+    """Make a line for a legend."""
     return Line2D([], [], label=label, **style)
 
 
 def dot(label: str, marker: str, color: str, fill: str = "") -> Line2D:
-    """A marker in a legend."""
+    """Make a marker for a legend."""
     fill = fill or ("white" if marker == "D" else color)
     return line_of(label, ls="none", ms=7, marker=marker, color=color, mfc=fill)
 
 
 def draw_marks(axes: Axes, marks: Iterable[Mark]) -> None:
-    """Draw what stands in a room, seen from a corner, or lies on a board."""
+    """Draw the marks of a room seen from a corner, or of a board."""
     for mark in marks:
         points = seen(mark.points)
         if mark.label:
@@ -141,7 +141,7 @@ def draw_marks(axes: Axes, marks: Iterable[Mark]) -> None:
 
 
 def frame(axes: Axes, scene: Scene) -> None:
-    """Show all of a room, without ticks: the floor's squares tell its size; or of a board."""
+    """Show the whole room without ticks (the floor's squares give the scale), or the board."""
     if not isinstance(scene, Room):
         axes.set_aspect("equal", adjustable="datalim")
         axes.set(xlabel="x [m]", ylabel="y [m]")

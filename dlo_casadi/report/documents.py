@@ -1,7 +1,7 @@
-"""What a run or a check has found, for other programs.
+"""Write what a run or a check has found for other programs.
 
-report.json (schema "dlo-report/1"), and parameters.yaml: a fitted cable, complete enough to compute
-with.
+The files are report.json (schema "dlo-report/1") and parameters.yaml, a fitted cable that is
+complete enough to compute with.
 """
 
 import hashlib
@@ -37,14 +37,14 @@ from dlo_casadi.session.outcome import (
     StageName,
 )
 
-# What report.json has of a parameter of an added effect.
+# Fields in report.json for a parameter of an added effect.
 _OF_EFFECT = ("value", "std", "unit")
 
 
 def report_dict(outcome: Outcome) -> dict[str, Any]:
-    """Everything that a program may want to know of a run, as plain data.
+    """All results of a run that a program may need, as plain data.
 
-    Every key of the schema is present; what is not known is None, never NaN.
+    Every key of the schema is present; unknown values are None, never NaN.
     """
     m, load, proposal = outcome.measurement, outcome.unexplained, outcome.next_pose
     names: list[StageName] = [*ALWAYS]
@@ -106,7 +106,7 @@ def report_text(outcome: Outcome) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Copy with plain numbers for NumPy's, None for what is not finite, and `well_formed` text."""
+    """Copy with Python numbers, None for values that are not finite, and `well_formed` text."""
     if isinstance(value, dict):
         return {finite(str(key)): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -121,12 +121,12 @@ def finite(value: Any) -> Any:
 
 
 def fields_of(item: object, *names: str) -> dict[str, Any]:
-    """Fields of an object that have the same names in a file."""
+    """Fields of an object that have the same names in the file."""
     return {name: getattr(item, name) for name in names}
 
 
 def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
-    """One stage; with None for all numbers if it did not run."""
+    """One stage; all numbers are None if it did not run."""
     stage, held_out = outcome.stage(name), None
     if stage is None or not stage.parameters:
         nothing = RestCurvatureEstimate(*np.zeros((3, 0)))
@@ -136,7 +136,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
         held_out = asdict(outcome.held_out(stage))
     rest = stage.rest_curvature
     curvature: dict[str, Any] = {"s": rest.s, "value": rest.value, "std": rest.std}
-    if rest.value.ndim > 1:  # in space about each material axis
+    if rest.value.ndim > 1:  # in space one row per material axis
         about = zip(("k_y", "k_z"), rest.value, rest.std, strict=True)
         own = {axis: {"value": value, "std": std} for axis, value, std in about}
         curvature = {"s": rest.s, **own}
@@ -182,7 +182,7 @@ def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
 def check_dict(
     config: Config, inputs: Sequence[PoseInput], found: Sequence[Suspicion]
 ) -> dict[str, Any]:
-    """What `dlo check` has found, in SI units: ok, mistakes, warnings, and a row for each pose."""
+    """Results of `dlo check` in SI units: ok, mistakes, warnings, and a row for each pose."""
     unread = [f"{item.name}: {item.problem}" for item in inputs if item.problem]
     known = {item.name for item in inputs}
     left_out = [f"{item.name}: {item.reason}" for item in config.skipped if item.name not in known]
@@ -199,7 +199,7 @@ def check_dict(
 
 
 def _checked(config: Config, item: PoseInput) -> dict[str, Any]:
-    """What was found in one pose; None for what was not."""
+    """Results of one pose; None for what was not found."""
     declared = {pose.name: pose for pose in config.experiment.poses}[item.name]
     length, away = None, []
     if len(item.points):
@@ -223,7 +223,7 @@ def _checked(config: Config, item: PoseInput) -> dict[str, Any]:
 
 
 def parameters_text(outcome: Outcome) -> str:
-    """The text of parameters.yaml: equal results, equal bytes."""
+    """The text of parameters.yaml; equal results give equal bytes."""
     head = (
         f"# {outcome.config.cable.name}: parameters fitted by dlo_casadi. SI units: m, kg, s, N, "
         "rad.\n# null: a bound or an end of an interval that does not exist. fitted: false: as "
@@ -233,14 +233,14 @@ def parameters_text(outcome: Outcome) -> str:
 
 
 def fitted_cable(outcome: Outcome) -> FittedCable:
-    """The fitted cable of a run, as `load` would read it from the run's file."""
+    """The fitted cable of a run, the same that `load` reads from the run's file."""
     fit, metadata = outcome.fit, metadata_of(parameters_dict(outcome), outcome.config.path)
-    # What held it in the session is no part of a cable.
+    # The supports of the session are no part of a cable.
     return FittedCable(replace(fit.model, clips=(), obstacles=()), fit.p, fit.rest_now, metadata)
 
 
 def cable_of_known(known: Declared, coefficients: FloatArray, limits: Limits) -> FittedCable:
-    """A cable of which nothing is uncertain, of rest coefficients [1/m], as a fit would give it."""
+    """A cable without uncertainty, with rest coefficients [1/m], in the form of a fitted one."""
     model, p, rest = known.model, known.start, known.model.rest_basis @ coefficients
     nothing = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter())
     document = _cable_dict(model, p, coefficients, rest, nothing)
@@ -273,7 +273,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
 
 
 def _scatter(fit: Fit) -> dict[str, Any] | None:
-    """What differs from pose to pose, and what cannot be distinguished from it."""
+    """What differs from pose to pose, and which sources cannot be distinguished from it."""
     found = fit.problem.priors.pose_scatter
     if not found.std:
         return None
@@ -282,7 +282,7 @@ def _scatter(fit: Fit) -> dict[str, Any] | None:
 
 
 def fit_dict(fit: Fit) -> dict[str, Any]:
-    """What a fit alone tells: the model, its parameters, covariance and state."""
+    """Results of the fit alone: model, parameters, covariance and state."""
     return _cable_dict(fit.model, fit.p, fit.coefficients, fit.rest_now, uncertainty_of(fit))
 
 
@@ -293,7 +293,7 @@ def _cable_dict(
     rest: FloatArray,
     uncertainty: Uncertainty,
 ) -> dict[str, Any]:
-    """The model of a cable, its values, and how uncertain they are."""
+    """The model of a cable, its values and their uncertainty."""
     names, covariance = uncertainty.names, uncertainty.covariance
     stds = Covariance(names, covariance).std
     document: dict[str, Any] = {
@@ -315,7 +315,7 @@ def _cable_dict(
                 "std": stds.get(q.name, 0.0),
                 **fields_of(q, "unit", "lower", "upper"),
                 "fitted": q.name in names,
-                # Standard deviation of the prior of what is known within a tolerance.
+                # Prior standard deviation of a nuisance parameter, from its tolerance.
                 "tolerance": model.priors.get(q.name),
             }
             for q, value in zip(model.parameters, p, strict=True)
@@ -343,14 +343,14 @@ def _cable_dict(
 
 
 def _by_name(values: FloatArray, names: Sequence[str]) -> Any:
-    """Curvatures as they are in a plane; in space components of the strain by their names."""
+    """Curvatures: in the plane as they are, in space by the names of the strain components."""
     if len(names) == 1:
         return values
     return dict(zip(names, values.reshape(len(names), -1), strict=True))
 
 
 def _effect_row(effect: Effect) -> dict[str, Any]:
-    """Name and label of an effect, and what else it was made with."""
+    """Name and label of an effect, and its other arguments."""
     if known_effect(effect.name) is not type(effect):
         raise DloError(f"the effect {effect.name!r} cannot be written to parameters.yaml")
     options = (item.name for item in fields(effect) if item.name != "label")
@@ -358,7 +358,7 @@ def _effect_row(effect: Effect) -> dict[str, Any]:
 
 
 def shared_fixtures(config: Config) -> dict[str, Any]:
-    """What all poses share of their start and of the directions of clamps."""
+    """Start and clamp directions that all poses share."""
     shared: dict[str, Any] = {}
     direction = AXES[len(config.experiment.gravity)].direction
     for key in ("start", f"start_{direction}", f"end_{direction}"):
@@ -368,7 +368,7 @@ def shared_fixtures(config: Config) -> dict[str, Any]:
 
 
 def _hash(config: Config) -> str | None:
-    """SHA-256 of the configuration; None where its file cannot be read any more."""
+    """SHA-256 of the configuration; None if its file is no longer readable."""
     try:
         known = config.text.encode() if config.path is None else config.path.read_bytes()
     except OSError:

@@ -1,6 +1,6 @@
 """Figures of a run: errors, residuals, rest curvature, candidates, the board.
 
-Those of a run are drawn once: the page has them as they are, and each is a file of its own.
+The figures of a run are drawn once: the page embeds them, and each is also written to a file.
 """
 
 import textwrap
@@ -25,21 +25,21 @@ from dlo_casadi.show import style
 from dlo_casadi.show.text import millimetres
 from dlo_casadi.thresholds import NORMAL_95
 
-# A candidate that was not refitted.
+# Colour of a candidate that was not refitted.
 _UNTRIED = "#C8C8C8"
-# Where noise lies 95 % of the time.
+# Colour of the band that contains 95 % of the noise.
 _BAND = "#E8EEF3"
-# Behind a number that may lie on a line.
+# Background of a number that may lie on a line.
 _PAPER = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
-# Errors beyond these are drawn at the edge of an axis [mm].
+# Errors beyond these limits are drawn at the edge of an axis [mm].
 _LEAST_MM, _MOST_MM = 1e-9, 1e9
-# A line of more points looks the same.
+# Number of points beyond which a line looks the same.
 _POINTS = 600
 _DPI = 200
 
 
 def figures_of(outcome: Outcome) -> dict[str, Figure]:
-    """Errors, residuals, parameters and findings, as far as there are any, by their names."""
+    """Figures of errors, residuals, parameters and findings by name; empty ones are left out."""
     last, end = outcome.stages[-1], outcome.config.experiment.boundary.end
     with_shapes = any(stage.shapes for stage in outcome.stages)
     wanted: list[tuple[str, object, Callable[[Outcome], Figure | None]]] = [
@@ -75,7 +75,7 @@ _KINDS = {
 
 
 def errors_figure(outcome: Outcome) -> Figure:
-    """Errors of all stages as points on a logarithmic axis, with that of noise alone."""
+    """Errors of all stages as points on a logarithmic axis, with the error due to noise alone."""
     validated = words.cross_validated(outcome)
     floor = outcome.measurement.noise_distance
     shown = ["fit", *["cross-validated"] * bool(validated)]
@@ -98,7 +98,7 @@ def errors_figure(outcome: Outcome) -> Figure:
             at = float(np.clip(1e3 * value, left, right))
             fill = "white" if kind == "cross-validated" else color
             axes.plot(at, y, marker, color=color, mfc=fill, ms=7)
-            # The number stands right of the noise line, which would cross it.
+            # The number goes to the right of the noise line, which would cross it otherwise.
             beside = max(at, 1e3 * floor) if at > 500 * floor else at
             axes.annotate(
                 millimetres(value),
@@ -121,7 +121,7 @@ def errors_figure(outcome: Outcome) -> Figure:
 
 
 def pose_errors_figure(outcome: Outcome) -> Figure:
-    """Error of every pose, before and after; a row of it can be chosen on the page."""
+    """Error of every pose, before and after; the page can highlight one row."""
     floor = outcome.measurement.noise_distance
     looks = {"before": ("^", style.ORANGE), "after": ("o", style.BLUE)}
     stages = [(stage, label, *looks[kind]) for kind, label, stage in compared(outcome)]
@@ -157,7 +157,7 @@ def pose_errors_figure(outcome: Outcome) -> Figure:
 def _error_axis(
     axes: Axes, values: Iterable[float | None], floor: float, beyond: float
 ) -> tuple[float, float]:
-    """Make x logarithmic for errors [m]; its range [mm] is finite, and `beyond` the largest."""
+    """Make x logarithmic for errors [m]; its range [mm] is finite and ends at `beyond` at most."""
     known = [
         min(max(1e3 * x, _LEAST_MM), _MOST_MM) for x in (*values, floor) if x and 0 < x < np.inf
     ]
@@ -187,7 +187,7 @@ def _name(pose: PoseInput) -> str:
 
 
 def residuals_figure(outcome: Outcome) -> Figure:
-    """Residual along the arc in noise units, before and after, a line for each pose."""
+    """Residual along the arc in noise units, before and after, one line per pose."""
     ways = list(enumerate(directions(outcome)))
     found = compared(outcome)
     panels = [(*item, *way) for item in found for way in ways]
@@ -218,7 +218,7 @@ def residuals_figure(outcome: Outcome) -> Figure:
                     gid=f"residual-{kind}-{k}{direction and f'-{direction}'}",
                     label=_name(pose) + error,
                 )
-            # Not the stage's chi-square, which goes by its own noise.
+            # Not the stage's own chi-square, which uses its own noise.
             size = float(np.sqrt(np.mean(np.concatenate(fitted) ** 2))) if fitted else np.nan
             quality = f", RMS\u00a0{size:.2g}" if np.isfinite(size) else ""
             title = f"{kind}: {label}{direction and f', along {direction}'}"
@@ -233,10 +233,10 @@ def residuals_figure(outcome: Outcome) -> Figure:
 
 
 def _residual_range(stage: Stage, noise: float) -> tuple[float, float]:
-    """From where to where residuals are drawn, in standard deviations `noise` [m] of them.
+    """Range of the residuals drawn, in standard deviations `noise` [m].
 
-    Beyond 95 % of the noise, and all residuals; of poses that were measured in another equilibrium
-    than the predicted one, which are off by a hundred times as much, only where all are.
+    It contains 95 % of the noise and all residuals, except those of poses measured in another
+    equilibrium than the predicted one, a hundred times larger, unless all poses are such.
     """
     shown = [shape for shape in stage.shapes.values() if len(shape.residual)]
     near = [shape for shape in shown if shape.measured_branch is None]
@@ -246,7 +246,7 @@ def _residual_range(stage: Stage, noise: float) -> tuple[float, float]:
 
 
 def _legend_of_poses(drawing: Figure, poses: Iterable[PoseInput], **drawn: Any) -> None:
-    """Tell fit poses, held-out poses if there are any, and the band of noise apart."""
+    """Explain in a legend fit poses, held-out poses if there are any, and the band of noise."""
     handles = [canvas.line_of("fit pose", color=style.BLUE, **drawn)]
     if any(pose.role == "held_out" for pose in poses):
         handles.append(
@@ -288,7 +288,7 @@ def readings_figure(outcome: Outcome) -> Figure:
 
 
 def rest_curvature_figure(outcome: Outcome) -> Figure:
-    """Rest curvature of the last stage with its band, and of the fit that it improves on."""
+    """Rest curvature of the last stage with its band, and that of the fit before it."""
     ways = directions(outcome)
     straight = outcome.config.cable.rest_shape == "straight"
     said = (
@@ -315,12 +315,12 @@ def rest_curvature_figure(outcome: Outcome) -> Figure:
 
 
 def moment_figure(outcome: Outcome) -> Figure | None:
-    """Bending moment against curvature of a cable with a free end, measured and fitted."""
+    """Bending moment over curvature of a cable with a free end, measured and fitted."""
     cable, gravity = outcome.config.cable, outcome.config.experiment.gravity
     weight = outcome.fit.mass / cable.length * float(np.linalg.norm(gravity))
     shown = [p for p in outcome.poses if p.role == "fit" and len(p.points) >= LEAST_POINTS]
     if not weight or not shown or cable.rest_shape != "straight":
-        return None  # the moment needs the weight, and the bend the shape without load
+        return None  # the moment needs the weight, the bending needs the shape without load
     with canvas.chart(outcome, "moment against curvature", 3.8) as (drawing, (axes,)):
         most = 0.0
         for pose in shown:
@@ -381,7 +381,7 @@ def candidates_figure(outcome: Outcome) -> Figure:
 
 
 def unexplained_figure(outcome: Outcome) -> Figure:
-    """Where the cable is pulled, and how, in each fit pose."""
+    """Place and direction of the unexplained pull on the cable in each fit pose."""
     load = outcome.unexplained
     assert load is not None
     low, high = load.interval
@@ -396,7 +396,7 @@ def unexplained_figure(outcome: Outcome) -> Figure:
 
 
 def next_pose_figure(outcome: Outcome) -> Figure:
-    """Where to hold the end in the next pose, among those that were taken."""
+    """The end position proposed for the next pose, among those of poses already taken."""
     handles = [
         canvas.line_of("measured", **canvas.STYLES["taken"]),
         canvas.dot("next end", "P", style.VERMILLION),

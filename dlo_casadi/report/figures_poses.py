@@ -1,4 +1,4 @@
-"""Figures pose by pose: measured points on predicted shapes, how much of each limit is used."""
+"""Figures pose by pose: measured points on predicted shapes, and the use of each limit."""
 
 import math
 from collections.abc import Sequence
@@ -26,14 +26,14 @@ from dlo_casadi.show.style import band_outline
 from dlo_casadi.show.text import millimetres
 
 _POSES_A_PAGE = 20
-# Points of a measured line that are drawn, about: on a page of poses, with all poses in one frame.
+# Approximate number of points drawn per measured line: on a page of poses, and in one frame.
 _POINTS, _POINTS_IN_ONE = 60, 40
-# A typical deviation is drawn about this share of the cable's length wide.
+# Width at which a typical deviation is drawn, as a share of the cable's length.
 _VISIBLE = 0.02
 _FACTORS = (1, 5, 10, 20, 50, 100)
-# Sizes [inch] of a page: least width, width of a panel with what is beside it, tallest single row.
+# Sizes [inch] of a page: smallest width, width of a panel with its margin, tallest single row.
 _NARROWEST, _PANEL, _TALLEST = 7.5, 3.1, 8.0
-# Height [inch] of what is above a panel, and above and below all of them.
+# Height [inch] of the space above each panel, and of that above and below all panels.
 _ABOVE, _AROUND = 0.15, 1.4
 # Width [inch] of an entry of the legend.
 _ENTRY = 1.9
@@ -43,7 +43,7 @@ _ENTRY = 1.9
 
 
 def draw_poses(folder: Path, outcome: Outcome) -> None:
-    """Every pose: measured points and predictions, before and after, on pages of one scale."""
+    """Draw every pose on pages of one scale: measured points and predictions, before and after."""
     poses = outcome.poses
     pages = math.ceil(len(poses) / _POSES_A_PAGE)
     for page in range(pages):
@@ -146,7 +146,7 @@ def _draw_pose(
 
     last = stages[-1].stage.shapes.get(pose.name) if stages else None
     elsewhere = last is not None and last.measured_branch is not None
-    factor = 1 if elsewhere else factor  # so far off, larger deviations would leave the picture
+    factor = 1 if elsewhere else factor  # enlarged, such large deviations would leave the picture
     for kind, _, stage in stages:
         shape = stage.shapes.get(pose.name)
         if shape is not None:
@@ -182,7 +182,7 @@ def _draw_pose(
 
 
 def _magnification(stages: Sequence[ComparedStage], size: float) -> int:
-    """Factor on deviations that makes those of the stage before visible in a figure."""
+    """Factor that makes the deviations of the stage "before" visible in a figure."""
     shapes = stages[0].stage.shapes.values() if stages else ()
     errors = [shape.rmse for shape in shapes if shape.rmse]
     if not errors:
@@ -192,17 +192,17 @@ def _magnification(stages: Sequence[ComparedStage], size: float) -> int:
 
 
 def _window(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Middle and size [m] of a window that holds all lines (K, 2)."""
+    """Middle and size [m] of a window that contains all lines (K, 2)."""
     corners = np.concatenate(lines) if lines else np.zeros((1, 2))
     low, high = corners.min(axis=0), corners.max(axis=0)
     span = 1.08 * (high - low) + 0.02 * max(float((high - low).max()), 1e-3)
-    # A slender window would leave no room for the axis: at least a third of the other side.
+    # A slender window would leave no room for the axis: its short side is at least a third.
     span = np.maximum(span, span.max() / 3)
     return (low + high) / 2, span
 
 
 def _page_size(rows: int, columns: int, slope: float) -> tuple[float, float]:
-    """Size [inch] of a page of panels about `slope` times as high as wide."""
+    """Size [inch] of a page of panels that are about `slope` times as high as wide."""
     width = max(_PANEL * columns, _NARROWEST)
     tall = slope * width / columns
     if rows == 1 and tall > _TALLEST:
@@ -211,7 +211,7 @@ def _page_size(rows: int, columns: int, slope: float) -> tuple[float, float]:
 
 
 def _arranged(count: int) -> tuple[int, int]:
-    """Rows and columns of a grid with few empty places, about as many of one as of the other."""
+    """Rows and columns of a nearly square grid with few empty places."""
     if count <= 4:
         return 1, count
 
@@ -253,7 +253,7 @@ def outcome_figure(outcome: Outcome) -> Figure:
     return drawing
 
 
-# Share of a limit -> colour: pale while there is room, dark red at and beyond the limit.
+# Share of a limit -> colour: pale while far from it, dark red at and beyond the limit.
 _USED = LinearSegmentedColormap.from_list(
     "used", [(0.0, "#E8EEF3"), (0.5, "#F2D9A0"), (0.8, "#E08A2B"), (1.0, style.VERMILLION)]
 )
@@ -261,7 +261,7 @@ _COLORS = {"pass": style.GREEN, "risk": style.ORANGE, "fail": style.VERMILLION}
 
 
 def limits_figure(outcome: Outcome) -> Figure:
-    """A row for each limit of each pose: the cable from start to end, coloured by use."""
+    """One row per limit and pose: the cable from start to end, coloured by its use of the limit."""
     checks = sorted(outcome.limits, key=lambda item: item.quantity)
     names = list(dict.fromkeys(item.quantity for item in checks))
     gaps = {item: k + names.index(item.quantity) for k, item in enumerate(checks)}
@@ -285,7 +285,7 @@ def limits_figure(outcome: Outcome) -> Figure:
 
 
 def _draw_row(axes: Axes, item: LimitCheck, y: float, length: float) -> None:
-    """The cable of one pose as a bar, or its fixtures as dots; at the right the probability."""
+    """Draw the cable of a pose as a bar, or its fixtures as dots; at the right the probability."""
     used = np.clip(item.used, 0.0, 1.0)
     if item.quantity in ("force", "moment"):
         axes.plot([0.0, length], [y, y], color="#E3E3E3", lw=1, zorder=1)

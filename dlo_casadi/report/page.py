@@ -1,4 +1,4 @@
-"""report.html and failed.html: one page for the person at the bench, alone in one file."""
+"""Write report.html and failed.html: one self-contained page for the person at the bench."""
 
 import base64
 import hashlib
@@ -30,9 +30,9 @@ from dlo_casadi.show import text
 from dlo_casadi.show.text import millimetres
 from dlo_casadi.thresholds import NORMAL_95
 
-# By which a page is known as written by this package.
+# Text that marks a page as written by this package.
 GENERATOR = '<meta name="generator" content="dlo_casadi">'
-# Where a number does not exist.
+# Text for a missing number.
 NOTHING = "–"
 VERDICT_WORDS = {
     None: "Not diagnosed",
@@ -49,8 +49,8 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
     """The text of report.html.
 
     All text of the session is escaped. The page's own policy forbids it to load anything, and to
-    run any script but those that are written into it, known by their hashes. `drawn`: the
-    `figures_of` the outcome, if they have been drawn already.
+    run any script other than its own, which are known by their hashes. `drawn`: the `figures_of`
+    the outcome, if they have been drawn already.
     """
     shown = pictures(outcome)
     charts = figures_of(outcome) if drawn is None else drawn
@@ -71,7 +71,7 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
 
 
 def page_data(outcome: Outcome) -> dict[str, Any]:
-    """What the template of a run writes, beside pictures, charts and the outcome itself."""
+    """Data for the template of a run, besides pictures, charts and the outcome itself."""
     first, *details = (line.strip() for line in words.verdict_lines(outcome))
     labels = {item.kind: item.label for item in compared(outcome)}
     return {
@@ -88,7 +88,7 @@ def page_data(outcome: Outcome) -> dict[str, Any]:
 
 
 def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
-    """The numbers that most readers come for: name, value, remark."""
+    """The numbers that most readers look for: name, value, remark."""
     rows, m, shown = [], outcome.measurement, compared(outcome)
     if shown:
         after = shown[-1].stage
@@ -111,7 +111,7 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
 
 
 def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
-    """Candidates for a missing effect, as ranked, with what could not be told apart."""
+    """Candidates for a missing effect, as ranked, with those that could not be told apart."""
     largest = max([row.score for row in outcome.candidates], default=0.0)
     rows = []
     for row in outcome.candidates:
@@ -132,13 +132,13 @@ def candidate_rows(outcome: Outcome) -> list[dict[str, Any]]:
 
 
 def meaning(name: str) -> str:
-    """What an effect is, in a line."""
+    """Explain an effect in one line."""
     text = inspect.getdoc(EFFECTS[name]) or "" if name in EFFECTS else ""
     return text.partition("\n")[0].replace("`", "")
 
 
 def parameter_rows(outcome: Outcome) -> list[dict[str, str]]:
-    """Fitted parameters of the last stage with 95 % intervals, and what the data cannot tell."""
+    """Fitted parameters of the last stage with 95 % intervals, also undetermined ones."""
     keys = ("name", "value", "interval", "remark", "doubt")
     rows = []
     for name, value, interval, remark in tables.fitted_rows(outcome):
@@ -152,7 +152,7 @@ def parameter_rows(outcome: Outcome) -> list[dict[str, str]]:
 
 
 def symmetric_interval(estimate: Estimate) -> str:
-    """A 95 % interval from the standard deviation, where no profile was computed."""
+    """A 95 % interval from the standard deviation, for parameters without a profile."""
     if estimate.identifiable is False or not estimate.std > 0:
         return ""
     low, high = (estimate.value + sign * NORMAL_95 * estimate.std for sign in (-1, 1))
@@ -163,7 +163,7 @@ def symmetric_interval(estimate: Estimate) -> str:
 
 
 def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = ()) -> str:
-    """The text of failed.html: what was run, how it ended, the poses as they were read, if any."""
+    """The text of failed.html: configuration, error, and the poses that were read."""
     known = {pose.name: pose for pose in poses}
     nothing = np.zeros((0, len(config.experiment.gravity)))
     shown = [
@@ -187,7 +187,7 @@ def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = (
 
 
 def hints(messages: Sequence[str]) -> list[str]:
-    """The advice in messages (their "Try: ..."), without repetitions."""
+    """The advice in messages (their "Try: ..."), without duplicates."""
     found = [hint for text in messages for hint in re.findall(r"Try: (.+)", text)]
     return list(dict.fromkeys(hint[:1].upper() + hint[1:] for hint in found))
 
@@ -199,7 +199,7 @@ def _render(template: str, config: Config, **data: Any) -> str:
     """Fill a file of `templates/` with data."""
     page = _environment().get_template(template)
     in_space = config.experiment.in_space
-    names = ["page", *["room"] * in_space]  # pictures in space are rooms that can be turned
+    names = ["page", *["room"] * in_space]  # pictures in space are rooms that can be rotated
     scripts = [_text(f"{name}.js") for name in names]
     hashes = [base64.b64encode(hashlib.sha256(x.encode()).digest()).decode() for x in scripts]
     return page.render(
@@ -217,7 +217,7 @@ def _render(template: str, config: Config, **data: Any) -> str:
 
 
 def sentence(line: str) -> str:
-    """A line of the terminal as a sentence of its own."""
+    """Turn a line of the terminal into a full sentence."""
     text = line.removeprefix("Verdict: ")
     for word in ("unexplained. ", "complete. ", "the fit has failed. "):
         text = text.removeprefix(word)
@@ -225,7 +225,7 @@ def sentence(line: str) -> str:
 
 
 def configuration_text(config: Config) -> str:
-    """The configuration as it stands in its file, or as a file would have it."""
+    """Text of the configuration's file; without a file the text that it would have."""
     try:
         return config.text
     except OSError as error:
@@ -233,7 +233,7 @@ def configuration_text(config: Config) -> str:
 
 
 def units(text: str) -> str:
-    """Units as they are printed: N m^2 becomes N m², and is not broken."""
+    """Typeset units: N m^2 becomes N m² and is not broken across lines."""
     text = text.replace(">=", "≥").replace("<=", "≤")
     return text.replace(" N m^2", "\u00a0N\u00a0m^2").replace("^2", "²").replace("^3", "³")
 

@@ -1,9 +1,9 @@
-"""Pictures of the page: every pose with its measured line and the predictions, as drawings.
+"""Pictures of the page: every pose with its measured line and the predictions.
 
-A picture is a photograph made smaller, or the board of a centre-line, under lines whose
-coordinates are those of the photograph [px] or of the board [mm, y down]. The lines stay sharp
-at any size and can be hidden one by one. A cable in space stands in a room: its lines also carry
-their places there, and the page draws them anew as the room is turned.
+A picture is a reduced photograph, or the board of a centre-line, under lines whose coordinates
+are those of the photograph [px] or of the board [mm, y down]. The lines stay sharp at any size
+and can be hidden one by one. A cable in space stands in a room: its lines also carry their
+coordinates in the room, and the page redraws them when the room is rotated.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,10 +37,10 @@ from dlo_casadi.vision import nearest_in_order
 
 Box = tuple[float, float, float, float]  # left, top, width, height
 
-# Of a part of a photograph about the cable: its sides over those of the cable.
+# Sides of the cut-out of a photograph, relative to those of the cable's bounding box.
 _ROOM = 1.3
 _GRID = 100.0  # mm
-_PER_POINT = 4  # of a predicted curve in a photograph, between two of its points
+_PER_POINT = 4  # points of a predicted curve drawn for each point of the photograph
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Background:
-    """What lies under the lines: a photograph [px], the board or a room [mm, y down]."""
+    """What lies below the lines: a photograph [px], the board or a room [mm, y down]."""
 
     whole: Box
     """All there is."""
@@ -96,23 +96,23 @@ class Background:
         )
 
     def points(self, points: FloatArray) -> FloatArray:
-        """Points (K, d) [m] of the world in the picture; none where it was not located."""
+        """Convert points (K, d) [m] of the world to the picture; none if it was not located."""
         if self.place is None or not len(points):
             return np.zeros((0, 2))
         return np.asarray(self.place(points if self.scene is None else self.scene.points(points)))
 
     def solid(self, points: FloatArray, decimals: int) -> str:
-        """Points (K, 3) [m] of the world as they stand in a room, if it is one."""
+        """Coordinates of points (K, 3) [m] of the world in a room, if it is one."""
         return "" if self.room is None else _text(self.room.points(points), decimals)
 
     def drawn(self, mark: Mark) -> Line:
-        """A mark of the scene as the page has it."""
+        """Convert a mark of the scene to the page's form."""
         at = np.zeros((0, 2)) if self.place is None else self.place(mark.points)
         solid = "" if self.room is None else _text(mark.points, 1)
         return Line(mark.kind, svg(at, 1), solid=solid, label=mark.label)
 
     def about(self, lines: Sequence[FloatArray]) -> Box:
-        """The part of a photograph about all lines, sides in the same ratio; all of a board."""
+        """Part of a photograph around all lines, with its aspect ratio; the whole of a board."""
         if not self.photograph:
             return self.whole
         left, top, width, height = self.whole
@@ -164,9 +164,9 @@ def pose_pictures(
     stages: Sequence[ComparedStage] = (),
     measurement: MeasurementSummary | None = None,
 ) -> list[Picture]:
-    """A picture of every pose; of a run that has failed with what was measured until then.
+    """Make a picture of every pose; for a failed run with the measurements made until then.
 
-    `stages`: whose predictions are drawn.
+    `stages`: those whose predictions are drawn.
     """
     scenes, marks = scenes_of(config, poses, [item.stage for item in stages])
     declared = {pose.name: pose for pose in config.experiment.poses}
@@ -188,7 +188,7 @@ def pose_pictures(
 
 
 def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
-    """Pictures of all poses in one room: "pull", "next"; none in a plane."""
+    """Pictures of all poses in one room: "pull", "next"; none for a cable in a plane."""
     said = {
         "pull": ("with the pull as an arrow in each pose", outcome.unexplained, pull_marks),
         "next": ("with the proposed end", outcome.next_pose, next_marks),
@@ -214,9 +214,9 @@ def scene_pictures(outcome: Outcome) -> dict[str, Picture]:
 def view_pictures(
     poses: Sequence[PoseInput], stages: Sequence[ComparedStage] = ()
 ) -> list[Picture]:
-    """A picture of every usable photograph of poses in space, those of a pose side by side.
+    """Make a picture of every usable photograph of poses in space, grouped by pose.
 
-    `stages`: whose predictions are projected into it.
+    `stages`: those whose predictions are projected into it.
     """
     shown = [(pose, view) for pose in poses for view in pose.views]
     return [_view_picture(pose, view, stages, PHOTOGRAPHS // len(shown)) for pose, view in shown]
@@ -226,7 +226,7 @@ def view_pictures(
 
 
 def _in_room(room: Room) -> Background:
-    """A room as it is seen at first."""
+    """A room in its first view."""
     low, size = -room.window / 2, room.window
     whole = (float(low[0]), float(low[1]), float(size[0]), float(size[1]))
     return Background(whole, room, lambda points: seen(points) * [1.0, -1.0])
@@ -237,7 +237,7 @@ def _to_millimetres(points: FloatArray) -> FloatArray:
 
 
 def _board(config: Config, scene: Scene, lines: Sequence[FloatArray]) -> Background:
-    """The part of the board that holds all lines (K, 2) [m] and all fixtures."""
+    """The part of the board that contains all lines (K, 2) [m] and all fixtures."""
     held = [held_places(pose) for pose in config.experiment.poses]
     drawn = _to_millimetres(np.concatenate([*held, *lines]))
     low, high = drawn.min(axis=0), drawn.max(axis=0)
@@ -338,7 +338,7 @@ def _picture(
 
 
 def _readings(measurement: MeasurementSummary, shape: PoseShape) -> list[tuple[str, str]]:
-    """Each reading by its name: how far from the predicted one, in units and in its noise."""
+    """Each reading by name: difference from the predicted one, in units and relative to noise."""
     facts = []
     for name, (known, model) in shape.readings.items():
         std, unit = measurement.std_of(name.split("_")[-1])
@@ -385,7 +385,7 @@ def _view_picture(
 
 
 def _nearest(pixels: FloatArray, curve: FloatArray) -> IntArray:
-    """Points (K,) of a projected curve (M, 2) [px] beside the pixels (K, 2), in order."""
+    """Points (K,) of a projected curve (M, 2) [px] nearest to the pixels (K, 2), in order."""
     away = np.linalg.norm(pixels[:, None] - curve[None], axis=2)
     nearest = away.min(axis=1)
     found = nearest_in_order(away / (1.0 + np.median(nearest)))
@@ -397,12 +397,12 @@ def _text(points: FloatArray, decimals: int) -> str:
 
 
 def svg(points: FloatArray, decimals: int) -> str:
-    """Points as SVG has them; nothing where the camera cannot see a point of it."""
+    """Points in SVG syntax; empty if the camera cannot see one of them."""
     return _text(points, decimals) if np.isfinite(points).all() else ""
 
 
 def _point(points: FloatArray) -> tuple[float, float] | None:
-    """The one point of an array (1, 2), if it is there."""
+    """The point of an array (1, 2), if there is one."""
     if not len(points) or not np.isfinite(points).all():
         return None
     return round(float(points[0, 0]), 1), round(float(points[0, 1]), 1)

@@ -1,4 +1,4 @@
-"""Photographs in the report: made smaller for the page, and with all lines drawn over them."""
+"""Photographs in the report: reduced ones for the page, and ones with all lines drawn over them."""
 
 import base64
 import io
@@ -20,12 +20,12 @@ from dlo_casadi.show.style import styled
 from dlo_casadi.show.text import millimetres
 from dlo_casadi.vision import read_image
 
-# All photographs of a page together [bytes], before they become text, which takes a third more.
+# Size [bytes] of all photographs of a page; as base64 text they take a third more.
 PHOTOGRAPHS = 3_000_000
 _WIDEST = 1280  # px
 _NARROWEST = 320  # px
 _QUALITIES = (82, 70, 55)
-# Of a drawn photograph [px]: the largest, the narrowest with its legend, the strip of the legend.
+# Sizes [px] of a drawn photograph: the largest, the narrowest with its legend, the legend's height.
 _LARGEST, _LEGEND, _STRIP = (1200, 900), 640, 56
 _DPI = 100
 
@@ -36,9 +36,9 @@ def photograph_of(path: Path, budget: int) -> tuple[str, int, int] | None:
     Parameters
     ----------
     budget : int
-        Largest size [bytes] of the JPEG; quality goes first, then width.
+        Largest size [bytes] of the JPEG; quality is reduced first, then width.
 
-    None where the file cannot be read (any more).
+    None where the file cannot be read.
     """
     try:
         pixels = read_image(path)[..., ::-1]
@@ -65,14 +65,14 @@ def photograph_of(path: Path, budget: int) -> tuple[str, int, int] | None:
 
 
 def write_overlays(folder: Path, outcome: Outcome) -> None:
-    """Draw one JPEG for each pose with a photograph, if there is any, into a new folder."""
+    """Draw a JPEG for each pose with a photograph into a new folder, if there is any."""
     if any(pose.image is not None for pose in outcome.poses):
         make_folder(folder)
     for pose in outcome.poses:
         if pose.image is not None and pose.to_pixels is not None:
             try:
                 image = read_image(pose.image)[..., ::-1]
-            except MeasurementError:  # gone since it was measured
+            except MeasurementError:  # deleted since it was measured
                 continue
             _draw_overlay(folder / f"{pose.name}.jpg", image, pose, outcome)
 
@@ -113,7 +113,7 @@ def _draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome
         canvas = FigureCanvasAgg(drawing)
         canvas.draw()
         over = Image.fromarray(np.asarray(canvas.buffer_rgba()))
-    # Matplotlib draws a photograph more slowly than all the lines over it.
+    # Matplotlib takes longer for a photograph than for all the lines over it.
     page = Image.new("RGB", over.size, "white")
     page.paste(part, ((whole - width) // 2, 0))
     page.paste(over, mask=over)
@@ -123,7 +123,7 @@ def _draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome
 def _window(
     image: NDArray[np.uint8], lines: Sequence[FloatArray]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Corners (left, top), (right, bottom) [px] of a window about all lines, with a margin."""
+    """Corners (left, top), (right, bottom) [px] of a window around all lines, with a margin."""
     size = np.array([image.shape[1], image.shape[0]])
     drawn = np.concatenate(lines)
     drawn = np.clip(drawn[np.isfinite(drawn).all(axis=1)], 0, size - 1)

@@ -1,4 +1,4 @@
-"""How an exported cable came to rest in its simulator: table, data and picture."""
+"""Report how an exported cable came to rest in its simulator: table, data and picture."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -15,7 +15,7 @@ from dlo_casadi.report.terminal import plain_table
 from dlo_casadi.session.round_trip import CASES, Distance, Relaxation
 from dlo_casadi.show import style
 
-# Poses that are drawn.
+# Number of poses that are drawn.
 _DRAWN = 4
 _COLORS = {"default": style.GREY, "first guess": style.ORANGE, "identified": style.BLUE}
 
@@ -23,8 +23,8 @@ _COLORS = {"default": style.GREY, "first guess": style.ORANGE, "identified": sty
 def summary(rows: Sequence[Relaxation]) -> dict[str, Any]:
     """Root mean square and largest errors of each case over all poses, as plain data.
 
-    Shapes as shares of the length, forces [N]; None where a pose did not come to rest. Forces are
-    compared with what was measured in the poses that have a reading.
+    Shapes relative to the length, forces [N]; None where a pose did not come to rest. Forces are
+    compared with measured ones in poses that have a reading.
     """
     out: dict[str, Any] = {}
     for case in CASES:
@@ -65,7 +65,7 @@ def round_trip_dict(rows: Sequence[Relaxation]) -> dict[str, Any]:
 
 
 def round_trip_table(target: Target, rows: Sequence[Relaxation]) -> Table:
-    """One line for each case: how far shapes and end forces are from ours and from the measured."""
+    """One line per case: differences of shapes and end forces from prediction and measurement."""
     numbers = ["from ours", "largest", "from measured", "largest", "force from ours", "measured"]
     poses = counted(len({row.pose for row in rows}), "pose")
     table = plain_table(
@@ -85,7 +85,7 @@ def round_trip_table(target: Target, rows: Sequence[Relaxation]) -> Table:
 
 
 def draw_round_trip(title: str, target: Target, rows: Sequence[Relaxation]) -> Figure:
-    """Measured points, our prediction and the shapes at rest of some poses."""
+    """Draw measured points, our prediction and the shapes at rest of some poses."""
     names = list(dict.fromkeys(row.pose for row in rows))[:_DRAWN]
     spatial = rows[0].predicted.shape[1] == 3
     with style.styled((4.8 * len(names), 5.2)) as drawing:

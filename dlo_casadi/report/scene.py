@@ -1,8 +1,8 @@
-"""Where a cable is drawn: on its board, or in a room; and what stands around it there.
+"""Map a cable and its surroundings to a drawing: on its board, or in a room.
 
-A scene maps places of the world [m] to its own coordinates, in which the page and the figures draw
-the same marks. A board has metres in its plane. A room has millimetres about the middle of a pose,
-the third one up, against gravity.
+A scene maps points of the world [m] to its own coordinates, in which the page and the figures draw
+the same marks. A board uses metres in its plane. A room uses millimetres from the middle of a pose;
+its third axis points up, against gravity.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,7 +21,7 @@ from dlo_casadi.session.outcome import Outcome, PoseInput, Stage
 from dlo_casadi.session.pose_shape import PoseShape
 from dlo_casadi.show.style import arrow
 
-# From where a room is seen: name, azimuth and elevation [degrees]. The first one is shown at first.
+# Views of a room: name, azimuth and elevation [degrees]; the first is the default.
 VIEWS = (
     ("a corner", -60.0, 24.0),
     ("the front", -90.0, 0.0),
@@ -29,11 +29,11 @@ VIEWS = (
     ("above", -90.0, 90.0),
 )
 _MM = 1e3
-# The longest arrow as a share of the cable's length: in a room, at an end and along a planar cable.
+# Longest arrow relative to the cable's length: in a room, at an end and along a planar cable.
 _IN_ROOM, _AT_END, _PULLING = 0.15, 1 / 5, 0.25
-# Other shares of it: an axis of a frame, the air above the floor, half of a cross.
+# More shares of the length: an axis of a frame, the height above the floor, half of a cross.
 _AXIS, _AIR, _CROSS = 0.09, 0.06, 0.05
-# Points of a measured line that are drawn beside others, about.
+# Approximate number of points of a measured line that are drawn in addition to others.
 _POINTS = 60
 
 
@@ -42,7 +42,7 @@ _POINTS = 60
 
 @dataclass(frozen=True)
 class Mark:
-    """A line (K, d) in a scene, or a word at a place in it."""
+    """A line (K, d) in a scene, or a word at a point of it."""
 
     kind: str
     """How it is drawn."""
@@ -52,7 +52,7 @@ class Mark:
 
 
 def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray:
-    """Points (K, d) [m] of the prediction beside the measured ones, distances multiplied."""
+    """Points (K, d) [m] of the prediction beside the measured ones, deviations times `factor`."""
     return np.asarray(pose.points - factor * shape.gap)
 
 
@@ -71,7 +71,7 @@ class Plane:
     """Outlines (K, 5, 2) [m] of the squares printed on it."""
 
     def points(self, points: FloatArray) -> FloatArray:
-        """Points (K, 2) [m], or one of them, as they are."""
+        """Points (K, 2) [m], or a single one, unchanged."""
         return points.reshape(-1, 2)
 
     def force(self, at: FloatArray, force: FloatArray, kind: str = "force") -> Mark:
@@ -85,7 +85,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Room:
-    """Space about one pose."""
+    """The surroundings of one pose in space."""
 
     upright: FloatArray
     """Rows (3, 3): two level directions of the world, and the one up."""
@@ -109,7 +109,7 @@ class Room:
 
     @property
     def window(self) -> FloatArray:
-        """Width and height [mm] of a picture; only arrows that stand upright may leave it."""
+        """Width and height [mm] of a picture; only vertical arrows may leave it."""
         return np.array([2.0, 1.7]) * self.radius
 
     def points(self, points: FloatArray) -> FloatArray:
@@ -122,7 +122,7 @@ class Room:
 
     def ground(self) -> list[Mark]:
         """The floor with its squares, the world's axes and gravity."""
-        # From no side do its corners, with the letters there, leave the window: sqrt(2) 0.68 < 1.
+        # The floor's corners, with their letters, stay in every view's window: sqrt(2) 0.68 < 1.
         reach = self.square * np.floor(0.68 * self.radius / self.square)
         across = np.arange(-reach, reach + 0.5 * self.square, self.square)
         lines = np.array(
@@ -143,7 +143,7 @@ class Room:
         return marks
 
     def shadow(self, points: FloatArray) -> list[Mark]:
-        """What a line (K, 3) [mm] throws on the floor, and plumb lines from its ends."""
+        """Shadow of a line (K, 3) [mm] on the floor, and vertical lines from its ends."""
         below = np.column_stack([points[:, :2], np.full(len(points), self.floor)])
         plumb = [Mark("plumb", np.stack([points[k], below[k]])) for k in (0, -1)]
         return [Mark("shadow", below), *plumb]
@@ -161,7 +161,7 @@ Scene = Plane | Room
 
 
 def seen(points: FloatArray, view: tuple[str, float, float] = VIEWS[0]) -> FloatArray:
-    """Points (..., 3) of a room as they are seen from afar: (..., 2) to the right and up.
+    """Project points (..., 3) of a room from far away: (..., 2) to the right and up.
 
     right = (-sin a, cos a, 0), up = (-sin e cos a, -sin e sin a, cos e)
     with azimuth a and elevation e of the eye. Points (..., 2) of a board are seen as they are.
@@ -174,7 +174,7 @@ def seen(points: FloatArray, view: tuple[str, float, float] = VIEWS[0]) -> Float
 
 
 def upright(gravity: Sequence[float]) -> FloatArray:
-    """Rows (3, 3): two level directions, the first along the world's x if it can be, and up."""
+    """Rows (3, 3): two horizontal directions, the first along the world's x if possible, and up."""
     g = np.asarray(gravity, dtype=float)
     size = float(np.linalg.norm(g))
     up = -g / size if size > 0 else np.array([0.0, 0.0, 1.0])
@@ -187,9 +187,9 @@ def upright(gravity: Sequence[float]) -> FloatArray:
 def scenes_of(
     config: Config, poses: Sequence[PoseInput], stages: Sequence[Stage]
 ) -> tuple[Sequence[Scene], list[tuple[list[Mark], list[Mark]]]]:
-    """A scene for each pose, all on one scale, and the marks `around` its cable.
+    """Make a scene for each pose, all on one scale, and the marks `around` its cable.
 
-    The last stage's forces are drawn.
+    Forces are those of the last stage.
     """
     last, length = stages[-1].shapes if stages else {}, config.cable.length
     declared = {pose.name: pose for pose in config.experiment.poses}
@@ -219,12 +219,12 @@ def scenes_of(
 
 
 def held_places(pose: Pose) -> FloatArray:
-    """Where the ends of a pose are held (1 or 2, d) [m]."""
+    """Points (1 or 2, d) [m] at which the ends of a pose are held."""
     return np.array([place for place in (pose.start, pose.end) if place is not None])
 
 
 def _all_forces(shape: PoseShape) -> list[FloatArray]:
-    """Forces (d,) [N] of the cable on all that it touches."""
+    """Forces (d,) [N] of the cable on everything it touches."""
     touched = (*shape.clips, *shape.contacts)
     return [*shape.forces, *(np.array(one["force"]) for one in touched)]
 
@@ -232,7 +232,7 @@ def _all_forces(shape: PoseShape) -> list[FloatArray]:
 def _rooms(
     config: Config, drawn: Sequence[Sequence[FloatArray]], forces: Iterable[FloatArray]
 ) -> list[Room]:
-    """Rooms of one size about lines (K, 3) [m], for forces (3,) [N]."""
+    """Rooms of one size around lines (K, 3) [m], with space for forces (3,) [N]."""
     length = _MM * config.cable.length
     directions = upright(config.experiment.gravity)
     standing = [_MM * np.concatenate(lines) @ directions.T for lines in drawn]
@@ -251,7 +251,7 @@ def _rooms(
 
 
 def _scale(longest: float, forces: Iterable[FloatArray]) -> float:
-    """Length of a newton with which the largest of all forces is drawn with the `longest` arrow."""
+    """Length per newton that gives the largest of all forces the `longest` arrow."""
     largest = max((float(np.linalg.norm(force)) for force in forces), default=0.0)
     return longest / largest if largest > 0 else 0.0
 
@@ -260,13 +260,13 @@ def _scale(longest: float, forces: Iterable[FloatArray]) -> float:
 
 
 def _forces_read(shape: PoseShape) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Forces that were read and the predicted ones by their holders: start, end, clip_1, ..."""
+    """Measured and predicted forces by what measured them: start, end, clip_1, ..."""
     forces = (name for name in shape.readings if name.endswith("_force"))
     return {name.removesuffix("_force"): shape.readings[name] for name in forces}
 
 
 def _spot(scene: Scene, at: FloatArray, what: str) -> list[Mark]:
-    """Where a cable is held; a line of no length at all would not be drawn."""
+    """Mark where a cable is held; a line of zero length would not be drawn."""
     spot = np.stack([at, at + 1e-4 * scene.length])
     return [Mark(f"{kind} {what}", spot) for kind in ("fixture-casing", "fixture")]
 
@@ -274,10 +274,10 @@ def _spot(scene: Scene, at: FloatArray, what: str) -> list[Mark]:
 def around(
     scene: Scene, declared: Pose, measured: FloatArray, shape: PoseShape | None
 ) -> tuple[list[Mark], list[Mark]]:
-    """What stands behind a cable, and in front of it: ground and shadow; clamps, clips and forces.
+    """Marks behind and in front of a cable: ground and shadow; clamps, clips and forces.
 
-    On a board clips, and forces that were read, each after what a sensor would show of the
-    predicted one.
+    On a board: clips, and measured forces, each followed by the predicted one as a sensor would
+    show it.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def around(
         How the ends are held, and where clips are.
     measured : (K, d) [m]
     shape : PoseShape or None
-        Predicted; without it the measured points throw the shadow.
+        The prediction; without it the measured points cast the shadow.
     """
     read = {} if shape is None else _forces_read(shape)
     line = scene.points(measured if shape is None else shape.curve)
@@ -329,13 +329,13 @@ def around(
 def obstacle_marks(
     scene: Scene, surfaces: Iterable[Obstacle], points: FloatArray, length: float
 ) -> list[Mark]:
-    """Obstacles beside points (K, d) [m] of a cable of a length [m]."""
+    """Obstacles near points (K, d) [m] of a cable of the given length [m]."""
     lines = (line for one in surfaces for line in outlines(one, points, length))
     return [Mark("obstacle", scene.points(line)) for line in lines]
 
 
 def contact_marks(scene: Scene, shape: PoseShape, length: float) -> list[Mark]:
-    """The stretches of a predicted cable that touch something, each with its force."""
+    """The parts of a predicted cable that touch something, each with its force."""
     places = np.linspace(0.0, length, len(shape.curve))
     marks = []
     for one in shape.contacts:
@@ -372,7 +372,7 @@ def scene_of(outcome: Outcome) -> tuple[Scene, list[Mark]]:
 
 
 def pull_marks(outcome: Outcome, scene: Scene) -> list[Mark]:
-    """Where the cable is pulled (95 %), and the force in each fit pose."""
+    """Where the unexplained force acts on the cable (95 %), and the force in each fit pose."""
     load = outcome.unexplained
     assert load is not None
     pulled = np.array([*np.linspace(*load.interval, 9), load.position])
@@ -393,7 +393,7 @@ def pull_marks(outcome: Outcome, scene: Scene) -> list[Mark]:
 
 
 def next_marks(outcome: Outcome, scene: Scene) -> list[Mark]:
-    """The ends of the poses that were taken, and the end to hold next."""
+    """The ends of the poses that were taken, and the proposed end of the next one."""
     assert outcome.next_pose is not None
     marks = []
     for pose in outcome.config.experiment.poses:

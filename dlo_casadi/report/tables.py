@@ -1,4 +1,4 @@
-"""Rows of the tables of a report: parameters, errors, time, one predicted pose; notebooks."""
+"""Rows of the report's tables: parameters, errors, time, one predicted pose; notebook output."""
 
 import math
 from dataclasses import replace
@@ -13,7 +13,7 @@ from dlo_casadi.session.outcome import MASS, Outcome
 from dlo_casadi.show import text
 from dlo_casadi.show.text import html_table
 
-# Correlations that a summary names.
+# Correlations beyond which a summary names the pair.
 _STRONG = 0.9
 # A row of the tables of parameters: name, value, 95 % interval, remark.
 Row = tuple[str, str, str, str]
@@ -23,9 +23,9 @@ NO_FIT = "of a model that does not fit"
 
 
 def describe(estimate: Estimate, explains: bool | None = None) -> tuple[str, str, str]:
-    """Value, interval and remark: no number where the data do not tell one.
+    """Value, interval and remark; no number where the data do not determine one.
 
-    `explains`: of the stage; without a model that fits there is neither std nor interval.
+    `explains`: of the stage; a model that does not fit gets neither std nor interval.
     """
     if explains is False:
         return (f"{estimate.value:.4g}{_after(estimate.unit)}", "", NO_FIT)
@@ -57,7 +57,7 @@ def fitted_rows(outcome: Outcome) -> list[Row]:
 
 
 def rest_rows(outcome: Outcome) -> list[Row]:
-    """The rest curvature of the last stage in a line, in space about each material axis."""
+    """The rest curvature of the last stage in one line, in space for each material axis."""
     if outcome.config.cable.rest_shape == "straight":
         return [("rest curvature", "0 1/m", "", "fixed: declared straight")]
     rest = outcome.stages[-1].rest_curvature
@@ -77,7 +77,7 @@ def rest_rows(outcome: Outcome) -> list[Row]:
 
 
 def nuisance_rows(outcome: Outcome) -> list[Row]:
-    """What is known within a tolerance and was adjusted there."""
+    """Values known within a tolerance that the fit adjusted."""
     fit = outcome.fit
     reported = set(outcome.stages[-1].parameters)
     hidden = tuple(f"{effect.label}." for effect in fit.model.effects if not effect.shown)
@@ -94,7 +94,7 @@ def nuisance_rows(outcome: Outcome) -> list[Row]:
 
 
 def fixed_rows(outcome: Outcome) -> list[Row]:
-    """What was declared and kept."""
+    """Declared values that the fit kept."""
     cable, fit = outcome.config.cable, outcome.fit
     kept = {"length": f"{cable.length:g} m"}
     if MASS not in outcome.stages[-1].parameters:
@@ -107,7 +107,7 @@ def fixed_rows(outcome: Outcome) -> list[Row]:
 
 
 def footnotes(outcome: Outcome) -> list[str]:
-    """What the table of parameters needs to be read rightly."""
+    """Remarks needed to read the table of parameters correctly."""
     lines, found = [], outcome.stages[-1].parameters
     stiffness, twisting = found.get("bending_stiffness"), found.get("torsional_stiffness")
     gravity = outcome.config.experiment.gravity
@@ -146,7 +146,7 @@ def footnotes(outcome: Outcome) -> list[str]:
 
 
 def _best_reading(outcome: Outcome) -> list[str]:
-    """In which pose a reading of a force tells mass and stiffnesses best: all grow alike."""
+    """Pose in which a force reading determines mass and stiffnesses best (all scale together)."""
     experiment = outcome.config.experiment
     ends = ("start", "end") if experiment.boundary.end != "free" else ("start",)
     forces = {
@@ -168,10 +168,10 @@ def _after(unit: str) -> str:
 
 
 def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
-    """Errors of the stages in words: fit, cross-validated, held out, chi-square.
+    """Errors of the stages as text: fit, cross-validated, held out, chi-square.
 
-    A stage of which poses were measured in another equilibrium has a second row. `nothing`: what
-    stands where there is no number.
+    A stage with poses measured in another equilibrium has a second row. `nothing`: text for a
+    missing number.
     """
 
     def row(label: str, note: str, fit: float | None, held_out: float | None) -> dict[str, str]:
@@ -198,7 +198,7 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
 
 
 def error_rows(outcome: Outcome) -> list[tuple[str, str]]:
-    """RMS distance of the measured points from the last stage's shapes, and by noise alone."""
+    """RMS distance of the measured points from the last stage's shapes, and that of noise."""
     stage, m = outcome.stages[-1], outcome.measurement
     rows = [("error of the fit", text.millimetres(stage.rmse_fit))]
     if stage.rmse_held_out is not None:
@@ -249,7 +249,7 @@ def outcome_text(outcome: Outcome) -> str:
 
 
 def estimates_of(outcome: Outcome) -> dict[str, Estimate]:
-    """All parameters of the last stage; what is known within tolerances comes last."""
+    """All parameters of the last stage; those known within tolerances come last."""
     stage, fit = outcome.stages[-1], outcome.fit
     known, free = dict(stage.parameters), fit.problem.unknowns.names
     for q in fit.model.parameters:

@@ -1,4 +1,4 @@
-"""Tables for the terminal: what was found, how well, what is not known, and how long it took."""
+"""Tables for the terminal: findings, their accuracy, what remains unknown, and run time."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -16,7 +16,7 @@ from dlo_casadi.report import tables, words
 from dlo_casadi.session.outcome import Outcome, ReadingErrors
 from dlo_casadi.show.text import millimetres
 
-# Of the table of a check: the key of a pose's row, how its number is written, and times what.
+# Columns of a check's table: key of a pose's row, format of its number, factor of its unit.
 _CHECKED: dict[str, tuple[str, str, float]] = {
     "length": ("length", "{:.3f} m", 1.0),
     "of declared": ("length_over_declared", "{:.0f} %", 100.0),
@@ -25,7 +25,7 @@ _CHECKED: dict[str, tuple[str, str, float]] = {
     "confidence": ("confidence", "{:.0f} %", 100.0),
     "pixel": ("pixel", "{:.2f} mm", 1e3),
 }
-# Columns that are left out where no pose has anything for them.
+# Columns left out if no pose has a value for them.
 _OPTIONAL = ("seen", "confidence", "pixel", "markers")
 
 
@@ -43,7 +43,7 @@ def plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -
 
 
 def print_summary(console: Console, outcome: Outcome) -> None:
-    """Print all that a user should see at the end of a run."""
+    """Print everything that a user should see at the end of a run."""
     warnings = [
         Text.assemble(("warning: ", "bold yellow"), text) for text in words.all_warnings(outcome)
     ]
@@ -82,7 +82,7 @@ def _heading(outcome: Outcome) -> Text:
 
 
 def _parameter_table(outcome: Outcome) -> Table:
-    """Fitted parameters of the last stage with their units, and what was kept fixed."""
+    """Fitted parameters of the last stage with their units, and those that were kept fixed."""
     table = plain_table(f"Parameters ({words.label_of(outcome.stages[-1], outcome)})", [])
     for column in ("parameter", "value", "95 % interval", ""):
         table.add_column(column, no_wrap=bool(column))
@@ -118,7 +118,7 @@ def _error_table(outcome: Outcome) -> Table:
 
 
 def _newtons(errors: ReadingErrors) -> str:
-    """Errors of forces and moments, as far as there are any."""
+    """Errors of forces and moments that were measured."""
     found = ((errors.force, "N"), (errors.moment, "N m"))
     return ", ".join(f"{value:.2g} {unit}" for value, unit in found if value is not None) or "-"
 
@@ -166,7 +166,7 @@ def prediction_table(shape: Shape, notes: Iterable[str] = ()) -> RenderableType:
 
 
 def limits_table(name: str, checks: Sequence[LimitCheck]) -> Table:
-    """A row for each limit of each pose, and what decides."""
+    """One row for each limit of each pose, with the place that decides."""
     numbers = ("value", "limit", "violated")
     table = plain_table(f"{name}: limits", ["pose", "quantity"], numbers)
     for column in ("counted by", "tightest at", "verdict", "most of the variance"):
@@ -185,7 +185,7 @@ def limits_table(name: str, checks: Sequence[LimitCheck]) -> Table:
 
 
 def check_table(config: Config, rows: Sequence[Mapping[str, Any]]) -> Table:
-    """One line for each pose of `check_dict`; columns without anything in them are left out."""
+    """One line for each pose of `check_dict`; empty columns are left out."""
     keys = {name: key for name, (key, *_) in _CHECKED.items()} | {"markers": "markers"}
     known = {name for name, key in keys.items() if any(row[key] is not None for row in rows)}
     shown = [name for name in keys if name in known or name not in _OPTIONAL]

@@ -1,4 +1,4 @@
-"""The report in words: numbers, what stages are called, and all sentences."""
+"""The report in words: numbers, names of stages, and all sentences."""
 
 import math
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from dlo_casadi.session.pose_shape import EitherSide
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import APART, NOTABLE
 
-# Name, in tables and charts, of the RMS distance caused by the noise of points alone.
+# Name of the RMS distance caused by the noise of points alone, in tables and charts.
 NOISE_ALONE = "noise alone"
-# The errors of a stage, of which some poses were measured in another equilibrium.
+# Name of a stage's errors when some poses were measured in another equilibrium.
 ON_BRANCH = "on the measured branch"
-# How candidates are ordered; the score alone does not tell how well a refit does.
+# Order of candidates; the score alone does not show how good a refit is.
 CANDIDATE_ORDER = "first those that were refitted, by log likelihood, the rest by score"
 # Stages of every report, in this order; `closed` only where an effect was added.
 ALWAYS: tuple[StageName, ...] = ("initial", "stiffness_only", "algorithm1", "batch")
@@ -43,12 +43,12 @@ MOST_REPEATS = 20
 
 
 def score_text(score: float) -> str:
-    """A candidate's score with two digits, or all before the point."""
+    """A candidate's score with two significant digits, or as an integer."""
     return f"{score:,.0f}" if score >= 100 else f"{score:.2g}"
 
 
 def missing(pose: PoseInput) -> str:
-    """Why a pose has no predicted shape that can be compared."""
+    """Why a pose has no predicted shape to compare with."""
     return "no equilibrium" if len(pose.points) else "not read"
 
 
@@ -56,7 +56,7 @@ def missing(pose: PoseInput) -> str:
 
 
 class ComparedStage(NamedTuple):
-    """A stage that is compared: "before" or "after", and what to call it."""
+    """A stage in a comparison: "before" or "after", and its label."""
 
     kind: str
     label: str
@@ -64,10 +64,10 @@ class ComparedStage(NamedTuple):
 
 
 def compared(outcome: Outcome) -> list[ComparedStage]:
-    """The last stage with predictions as "after", and as "before" the one that it improves on.
+    """The last stage with predictions as "after", and the one that it improves on as "before".
 
-    With effects added: the declared model fitted, and the model with the effects. Otherwise: the
-    initial guess, and the declared model fitted.
+    If effects were added: the fitted declared model, and the model with the effects. Otherwise: the
+    initial guess, and the fitted declared model.
     """
     with_shapes = [stage for stage in outcome.stages if stage.shapes]
     if not with_shapes:
@@ -80,14 +80,14 @@ def compared(outcome: Outcome) -> list[ComparedStage]:
 
 
 def label_of(stage: Stage, outcome: Outcome) -> str:
-    """What to call a stage."""
+    """Label of a stage."""
     if stage.name == "closed" and outcome.effects:
         return "with " + " and ".join(effect.name for effect in outcome.effects)
     return STAGE_LABELS[stage.name]
 
 
 def directions(outcome: Outcome) -> tuple[str, ...]:
-    """Names of the directions across a cable: in a plane there is one, which needs none."""
+    """Names of the directions across a cable; in a plane the only one needs no name."""
     return ("y", "z") if outcome.config.experiment.in_space else ("",)
 
 
@@ -103,7 +103,7 @@ def cross_validated(outcome: Outcome) -> dict[StageName, float | None]:
 
 
 def predicted_share(outcome: Outcome, stage: Stage) -> str:
-    """How many of the held-out poses a stage has predicted, where it is not all of them."""
+    """Number of held-out poses that a stage has predicted, if that is not all of them."""
     held_out = outcome.held_out(stage)
     if not held_out.missing or not stage.shapes:
         return ""
@@ -111,15 +111,15 @@ def predicted_share(outcome: Outcome, stage: Stage) -> str:
 
 
 def mesh_text(outcome: Outcome) -> str:
-    """Elements of the model, and the error of this mesh."""
+    """Number of elements of the model, and the error due to this mesh."""
     model, error = outcome.fit.model, millimetres(outcome.mesh_error)
     return f"{counted(model.n, model.element)}, mesh error {error}"
 
 
 def all_warnings(outcome: Outcome) -> list[str]:
-    """Warnings of the run, why a stage lacks a number, and what sits on a bound.
+    """Warnings of the run, reasons for missing numbers of stages, and parameters on a bound.
 
-    Algorithm 1 is a baseline: that it does not apply stands beside it, and is no warning.
+    Algorithm 1 is a baseline: where it does not apply, its row says so and no warning is given.
     """
     lines = list(outcome.warnings)
     held_out = outcome.measurement.poses_held_out > 0
@@ -142,7 +142,7 @@ def all_warnings(outcome: Outcome) -> list[str]:
 
 
 def verdict_lines(outcome: Outcome) -> list[str]:
-    """What the diagnosis has led to, in sentences."""
+    """Result of the diagnosis, in sentences."""
     if outcome.doubts:
         head, *others = (f"{text[:1].upper()}{text[1:]}." for text in outcome.doubts)
         word = "the fit has failed" if outcome.fit.failed else "unexplained"
@@ -196,7 +196,7 @@ def _verdict(outcome: Outcome) -> str:
 
 
 def _either_side(name: str, found: EitherSide) -> str:
-    """A held-out pose on both of its sides, and what chooses each."""
+    """Describe a held-out pose on both of its sides, and what selects each."""
     predicted, other, near = found.predicted, found.other, found.tipping
     text = f"  {name} (held out): "
     if near is not None:
@@ -211,7 +211,7 @@ def _either_side(name: str, found: EitherSide) -> str:
 
 
 def structure_lines(outcome: Outcome) -> list[str]:
-    """What shows that the declared model's residual is not noise."""
+    """Evidence that the declared model's residual is not noise."""
     if outcome.structure is None or outcome.verdict == "complete":
         return []
     before, _ = outcome.structure
@@ -220,7 +220,7 @@ def structure_lines(outcome: Outcome) -> list[str]:
     for key, text in DEPENDENCES.items():
         z = getattr(before, key)
         score = f"z = {z:+.1f}"
-        if abs(z) >= 0.999 * LARGEST_SCORE:  # beyond what its test tells
+        if abs(z) >= 0.999 * LARGEST_SCORE:  # beyond the resolution of its test
             score = "z > 7" if z > 0 else "z < -7"
         if abs(z) > NOTABLE:
             found.append(f"{text.format(plane=plane)} ({score})")
@@ -235,14 +235,14 @@ def _effect_lines(effect: FoundEffect) -> list[str]:
     values = [f"{name} {found}" for name, found in effect.parameters.items()]
     line = f"  {effect.name}: {', '.join(values)}"
     if effect.p_value is not None:
-        # Below the smallest double it is zero.
+        # It underflows: below the smallest double.
         line += f" (p = {effect.p_value:.1g})" if effect.p_value > 0 else " (p < 1e-307)"
     rivals = " or ".join(effect.indistinguishable_from)
     return [line, *([f"    These data cannot tell it from {rivals}."] if rivals else [])]
 
 
 def separation_text(proposal: NextPose) -> str:
-    """How far rivals differ in a proposed pose, and how often it has to be measured."""
+    """Difference of rivals in a proposed pose, and how often it has to be measured."""
     z = proposal.separation
     text = (
         f"they differ there by {millimetres(proposal.difference)} RMS, {z:.2g} "
@@ -257,7 +257,7 @@ def separation_text(proposal: NextPose) -> str:
 
 
 def reading_text(reading: NextReading) -> str:
-    """What a reading of force or moment in the proposed pose would tell of rivals."""
+    """How a reading of force or moment in the proposed pose would separate rivals."""
     unit, times = "N m" if reading.name.endswith("moment") else "N", reading.times
     text = (
         f"A reading of {reading.name} there differs by {reading.difference:.2g} {unit}, "
@@ -285,7 +285,7 @@ def finding_of(outcome: Outcome, row: Ranked) -> tuple[str, str]:
 
 
 def p_value_note(outcome: Outcome) -> str:
-    """What the p-values of candidates and of added effects are."""
+    """Explain the p-values of candidates and of added effects."""
     note = "p-value: score test in the declared model, corrected for the number of effects tried."
     if outcome.effects and outcome.measurement.std_source == "estimated":
         note += (

@@ -1,4 +1,4 @@
-"""The folder of results: complete or untouched."""
+"""The folder of results: either complete or untouched."""
 
 import json
 import os
@@ -21,34 +21,34 @@ from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.session.outcome import Outcome
 
-# What a run writes; nothing else in the folder is ever touched.
+# Files that a run writes; no other file in the folder is ever touched.
 OWNED = ("report.json", "report.html", "parameters.yaml", "centerlines", "figures")
-# What a run that fails writes, and the next one that does not removes.
+# Files that a failed run writes and the next successful one removes.
 FAILURE = "failed.html"
 
 
 class ResultsFolder(FolderDraft):
-    """Where the results go: opened before the work starts, filled at its end.
+    """The folder of the results: opened before the work starts, filled at its end.
 
         with ResultsFolder("results/cable", config) as folder:   # raises if it cannot be written
             outcome = run_session(config)
             folder.write(outcome)
 
-    Everything is written to a hidden draft first and moved into place only when complete, so
-    that a run that fails or is interrupted leaves earlier results as they were. A run that fails
-    with a DloError leaves `failed.html` beside them: what went wrong, pose by pose.
+    Everything is written to a hidden draft first and moved into place when complete, so that a
+    failed or interrupted run leaves earlier results unchanged. A run that fails with a DloError
+    leaves `failed.html` beside them: what went wrong, pose by pose.
 
     Parameters
     ----------
     path : str or Path
-        The folder; made if it does not exist.
+        The folder; created if it does not exist.
     config : Config, optional
-        What is run; without it a failure leaves no page.
+        The configuration of the run; without it a failure leaves no page.
 
     Raises
     ------
     OutputError
-        If the folder cannot be written, or holds files of the same names from elsewhere.
+        If the folder cannot be written, or holds files of the same names from another source.
     """
 
     def __init__(self, path: str | Path, config: Config | None = None) -> None:
@@ -78,15 +78,14 @@ class ResultsFolder(FolderDraft):
                     write_file(draft.folder / FAILURE, page)
                     draft.put_in_place()
             except OutputError:
-                return  # the error itself is what the user must see
+                return  # the user must see the original error
             error.add_note(f"Pose by pose: {self.path / FAILURE}")
 
     def write(self, outcome: Outcome, executor: Executor | None = None) -> Path:
-        """Write all results, then put them in place of the previous ones.
+        """Write all results, then replace the previous ones.
 
-        A page or a figure that cannot be drawn does not lose the numbers: they are put in place
-        before the error goes on. `executor`: where a part is drawn at the same time; in this
-        process by default.
+        If a page or a figure cannot be drawn, the numbers are put in place before the error is
+        raised. `executor`: draws one part in parallel; by default this process does all the work.
         """
         write_numbers(self.folder, outcome)
         failed = None
@@ -104,7 +103,7 @@ class ResultsFolder(FolderDraft):
 
 
 def write_numbers(folder: Path, outcome: Outcome) -> None:
-    """Write all results of a run that are numbers into an empty folder."""
+    """Write all numerical results of a run into an empty folder."""
     write_file(folder / "report.json", report_text(outcome))
     write_file(folder / "parameters.yaml", parameters_text(outcome))
     lines = folder / "centerlines"
@@ -126,20 +125,20 @@ def draw(folder: Path, outcome: Outcome, executor: Executor) -> None:
     for half in (partial(draw_each, figures, outcome), other_half):
         try:
             half()
-        except Exception as error:  # the other half writes to the folder still
+        except Exception as error:  # the other half is still writing to the folder
             failed.append(error)
     if failed:
         raise next((error for error in failed if isinstance(error, OutputError)), failed[0])
 
 
 def draw_each(figures: Path, outcome: Outcome) -> None:
-    """Draw the figures that show pose by pose: half of the work."""
+    """Draw the figures of single poses: half of the work."""
     draw_poses(figures, outcome)
     write_overlays(figures / "overlays", outcome)
 
 
 def draw_summary(folder: Path, outcome: Outcome) -> None:
-    """Write the page, and the other figures: the other half."""
+    """Write the page and the other figures: the other half."""
     drawn = figures_of(outcome)
     write_file(folder / "report.html", report_page(outcome, drawn))
     write_figures(folder / "figures", drawn)

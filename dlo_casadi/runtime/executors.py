@@ -1,7 +1,7 @@
 """Where tasks run: in this process, in a pool of processes, or on a Dask cluster.
 
-Each is a `concurrent.futures.Executor` with attributes for `parallel.py`: the number of `workers`,
-whether this process is one of them (`here`), the errors raised when a worker was killed (`losses`),
+Each is a `concurrent.futures.Executor` with attributes for `parallel.py`: the number of `workers`;
+`here`, whether this process is one of them; `losses`, the errors raised when a worker was killed;
 and the folder of the workers' `logs`.
 """
 
@@ -30,9 +30,9 @@ from threadpoolctl import threadpool_limits
 
 from dlo_casadi.errors import DloError, library
 
-# Longest time until a scheduler answers, and until it has a worker [s].
+# Longest wait for a scheduler's answer, and for its first worker [s].
 PATIENCE = 30.0
-# Longest time in which a terminated process ends [s]: one that is just starting takes 1.
+# Longest time for a terminated process to end [s]: one that is just starting takes 1 s.
 LAST_WORDS = 2.0
 # Environment variables that BLAS, OpenMP and OpenCV read when they are loaded.
 THREADS = dict.fromkeys(
@@ -44,7 +44,7 @@ THREADS = dict.fromkeys(
 )
 # Signals by which a command is interrupted.
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
-# Whether signals can be blocked, also in processes that are started meanwhile: POSIX only.
+# Whether signals can be blocked, also in processes started meanwhile: POSIX only.
 BLOCKABLE = hasattr(signal, "pthread_sigmask")
 
 
@@ -64,7 +64,7 @@ class InProcess(Executor):
 
 
 class Pool(Executor):
-    """Spawned processes, see `open_executor`; a new pool is started when one of them was killed."""
+    """Spawned processes, see `open_executor`; if one is killed, a new pool is started."""
 
     def __init__(
         self, workers: int, logs: Path | None, here: bool, libraries: Sequence[str]
@@ -77,14 +77,14 @@ class Pool(Executor):
     def _start(self) -> ProcessPoolExecutor:
         return ProcessPoolExecutor(
             self.workers - self.here,
-            # A forked copy of a process with threads and solvers in it may hang.
+            # A forked copy of a process with threads and solvers may hang.
             mp_context=multiprocessing.get_context("spawn"),
             initializer=begin_worker,
             initargs=(self.logs, self._libraries),
         )
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Submit to the pool, to a new one if a worker of the last was killed."""
+        """Submit to the pool, or to a new one if a worker of the old pool was killed."""
         try:
             # The pool would pickle later in its own thread, when the arguments may have changed.
             task = pickle.dumps((fn, args, kwargs))
@@ -109,8 +109,8 @@ class Pool(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the workers; with `wait=False` also those in the middle of a task."""
-        # Idle workers are not waited for: they take half a second to end.
+        """End the workers; with `wait=False` even in the middle of a task."""
+        # Idle workers are not awaited: they take half a second to end.
         wait = wait and not all(task.done() for task in self._tasks)
         self._inner.shutdown(wait, cancel_futures=cancel_futures)
         if not wait:
@@ -144,7 +144,7 @@ class Cluster(Executor):
             on_failure.callback(self._client.close)
             self._check_workers(address)
             on_failure.pop_all()
-        # Not pure: equal calls are different tasks, each for its own row or sample.
+        # Not pure: equal calls are separate tasks, each for its own row or sample.
         self._inner = self._client.get_executor(pure=False)
 
     def _check_workers(self, address: str) -> None:
@@ -265,9 +265,9 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Hold BLAS, OpenMP and OpenCV to one thread each: the matrices are small.
+    """Limit BLAS, OpenMP and OpenCV to one thread each: the matrices are small.
 
-    Loaded libraries are told directly, others read it from the environment.
+    Loaded libraries are set directly, others read the environment.
     """
     with ExitStack() as stack:
         stack.enter_context(environment(THREADS))
@@ -303,12 +303,12 @@ def interrupts_held() -> Iterator[None]:
 def starting_processes() -> Iterator[None]:
     """Block interrupts while processes are started, and in them until `begin_worker`.
 
-    Otherwise a process that is interrupted during its start, or its parent, prints its stack.
+    Otherwise an interrupted process, or its parent, prints its stack during the start.
     """
     with interrupts_held(), ExitStack() as stack:
         if BLOCKABLE:
-            resource_tracker.ensure_running()  # it unblocks the signals when it starts
-            # Processes inherit the mask.
+            resource_tracker.ensure_running()  # the tracker unblocks the signals when it starts
+            # New processes inherit the signal mask.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
             stack.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
         yield
@@ -358,7 +358,7 @@ def worker_log(folder: Path | None) -> logging.Logger:
     for old in list(logger.handlers):
         logger.removeHandler(old)
         old.close()
-    # A machine of the cluster may not see the folder: Dask keeps its own log then.
+    # A machine of the cluster may not see the folder: Dask then keeps its own log.
     with suppress(OSError):
         handler = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
         handler.name = str(path)

@@ -34,14 +34,14 @@ __all__ = [
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# Number of repetitions of a task lost with its worker; the last one runs without other tasks.
+# Repetitions of a task lost with its worker; the last one runs without other tasks.
 RETRIES = 2
 # Half width of the 90 % interval of a standard normal distribution.
 NINETY = 1.645
 
 
 class LostTaskError(DloError):
-    """A task whose worker was killed every time."""
+    """A task whose worker was killed in every attempt."""
 
 
 @dataclass(frozen=True)
@@ -107,16 +107,16 @@ def map_as_completed(
 ) -> Generator[Finished[Item, Result]]:
     """Apply a function to all items; yield each as soon as it has ended.
 
-    An exception of the function ends its own item alone. A task lost with a killed worker is
-    repeated on another one, the last time without other tasks; one that is lost every time ends
+    An exception of the function ends only its own item. A task lost with a killed worker is
+    repeated on another one, the last time without other tasks; if it is lost every time, it ends
     with a `LostTaskError`. If this process is one of the executor's workers, it runs tasks between
-    submitting others, and the lost ones. Each task has one thread of BLAS, OpenMP and OpenCV, so
-    that its numbers do not depend on where it runs.
+    submissions, and the lost ones. Each task has one thread of BLAS, OpenMP and OpenCV, so that its
+    numbers do not depend on where it runs.
 
     Parameters
     ----------
     executor : Executor
-        Any; those of `open_executor` keep logs and survive a killed worker.
+        Any executor; those of `open_executor` keep logs and survive a killed worker.
     function : callable
         Of one item. Both, and its result, must be picklable unless all run in this process.
     items : iterable
@@ -142,7 +142,7 @@ def map_as_completed(
     started, taken, failed, durations = time.perf_counter(), 0, 0, list[float]()
 
     def room() -> int:
-        workers = getattr(executor, "workers", 1)  # asked anew: those of a cluster come and go
+        workers = getattr(executor, "workers", 1)  # asked again: workers of a cluster come and go
         most = in_flight or 2 * (workers - here)
         if here and (workers == 1 or total is not None):
             # Towards the end, leave waiting tasks to this process.
@@ -181,7 +181,7 @@ def map_as_completed(
                 if not suspects:
                     return
                 submit(*suspects.pop())
-            # After a task of its own this process goes on without waiting for the others.
+            # After its own task this process continues without waiting for the others.
             for future in wait(under_way, 0.0 if own else None, FIRST_COMPLETED).done:
                 index, item, lost = under_way.pop(future)
                 if future.cancelled():
@@ -227,8 +227,8 @@ def map_in_order(
 def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Callable[[], Result]:
     """Begin one call in the background; the returned function waits for its result.
 
-    It raises what the call raised. The call is made here, on demand, if the executor has no other
-    worker or its worker was killed. As each task of `map_as_completed` it has one thread.
+    It raises what the call raised. If the executor has no other worker, or its worker was killed,
+    the call runs here on demand. Like each task of `map_as_completed` it has one thread.
     """
     task = partial(_run, call, 0, partial(function, *args))
     begun: Future[Finished[Any, Result]] | None = None
@@ -257,7 +257,7 @@ def _run(
     function: Callable[[Item], Result], index: int, item: Item, logs: Path | None
 ) -> Finished[Any, Result]:
     """Run one task, timed and logged; the result holds an exception, but not the item."""
-    # Tasks within a task are not logged.
+    # Nested tasks are not logged.
     log = worker_log(logs) if logs is not None else logging.getLogger("dlo_casadi.unlogged")
     result, failure = None, None
     with _one_at_a_time, one_thread():
@@ -279,9 +279,9 @@ def _run(
 def _remaining(
     durations: Sequence[float], total: int | None, elapsed: float, executor: Executor
 ) -> tuple[float, float] | None:
-    """90 % interval of the time left, from the mean and the deviation of the durations so far.
+    """90 % interval of the remaining time, from mean and deviation of the durations so far.
 
-    (k mean +- 1.645 s sqrt(k + k^2 / m)) / workers  with k left and m done.
+    (k mean +- 1.645 s sqrt(k + k^2 / m)) / workers  with k tasks left and m done.
     """
     m = len(durations)
     if total is None or m < 2:

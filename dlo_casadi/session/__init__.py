@@ -1,4 +1,4 @@
-"""A session: what is declared and measured -> stages and findings -> one outcome."""
+"""One session: its configuration and measurements -> stages and findings -> one outcome."""
 
 from dlo_casadi.session.outcome import Outcome
 from dlo_casadi.session.run import Progress, run_session

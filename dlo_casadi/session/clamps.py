@@ -1,4 +1,4 @@
-"""Mistakes of what holds a cable: directions of its clamps, and the sensors of forces in them."""
+"""Find mistakes about clamps: their declared directions, and readings of their force sensors."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,11 +31,11 @@ from dlo_casadi.thresholds import (
     READ_SCALE,
 )
 
-# A full turn [rad], as somebody may round it; beyond it the line itself must turn so far.
+# A full turn [rad] with room for rounding; a declared heading beyond it needs a line that turns.
 _TURN = 6.3
-# Of the length: pieces of which the direction is taken, and the part at an end that is used.
+# Shares of the length: pieces whose direction is taken, and the part of the line used at an end.
 _STEP, _PART = 0.02, 0.1
-# Largest turn between two pieces of a line [rad]; beyond it the way round is unknown.
+# Largest turn between two pieces of a line [rad]; beyond it the sense of rotation is unknown.
 _TELLING = np.pi / 2
 
 
@@ -43,7 +43,7 @@ def _turned(*vector: float) -> Callable[[Any], FloatArray]:
     return lambda q: (Rotation.from_quat(q) * Rotation.from_rotvec(vector)).as_quat()
 
 
-# What a declared value may have been meant as -> the value that it then is.
+# What the user may have meant -> the value that a declared number then has.
 _MEANT: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
     "heading": {
         "in degrees?": np.radians,
@@ -66,7 +66,7 @@ _RULE = {
     "heading": "headings in radians, counter-clockwise from x, along the cable",
     "orientation": "unit quaternions [qx, qy, qz, qw], x along the cable; start and end exchanged",
 }
-# What sensors may show, over newtons and over newton metres.
+# Possible units of sensor readings, relative to newtons and newton metres.
 _UNITS: Mapping[str, Mapping[str, float]] = {
     "force": {"grams-force": 101.97, "kilograms-force": 0.10197, "millinewtons": 1e3},
     "moment": {"N mm": 1e3, "N cm": 1e2, "kgf cm": 10.197},
@@ -78,9 +78,9 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class _Shown:
-    """A clamp's declared value, and the directions (n, d) that the line beside it may have.
+    """A declared clamp value, and the directions (n, d) that the line beside it allows.
 
-    `turned` [rad] is the heading of the line's last piece with all its turns, where it counts.
+    `turned` [rad]: heading of the line's last piece with all full turns, where turns are counted.
     """
 
     name: str
@@ -95,7 +95,7 @@ class _Shown:
         return self.key.split("_")[1]
 
     def off(self, value: Any) -> float:
-        """Angle [rad] of a value of the key from what the line shows."""
+        """Angle [rad] between a value of the key and the direction of the line."""
         angle = float(np.arccos(np.clip(self.ways @ axes_of(value)[:, 0], -1.0, 1.0)).min())
         return angle if self.turned is None else max(angle, abs(value - self.turned) - np.pi)
 
@@ -117,7 +117,7 @@ class _Shown:
 
 
 def wrong_directions(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Headings and orientations that the lines contradict: of single poses, or of most of them."""
+    """Headings and orientations that the lines contradict, in single poses or in most of them."""
     found: list[Suspicion] = []
     common: list[_Shown] = []
     for side in ("start", "end"):
@@ -134,14 +134,14 @@ def wrong_directions(session: ReadSession) -> tuple[Suspicion, ...]:
             f"{' and '.join(keys)} contradict{'s' * (len(keys) == 1)} {len(wrong)} of "
             f"{counted(len(common), 'line')}. {wrong[0].name}: {wrong[0]}{_try(common)}"
         )
-        # A frame is certainly wrong only where another reading of it explains the lines.
+        # A frame is certainly wrong only where another reading of its value explains the lines.
         certain = wrong[0].kind == "heading" or bool(_meant(common))
         found.insert(0, Suspicion(text, certain))
     return tuple(found)
 
 
 def _meant(shown: Sequence[_Shown]) -> str:
-    """What values may have been meant as, if that explains nearly all of them."""
+    """What the declared values may have meant, if one meaning explains nearly all of them."""
     found = likeliest(
         (Hypothesis(*item) for item in _MEANT[shown[0].kind].items()),
         lambda meant: np.quantile([item.off(meant(item.value)) for item in shown], NEARLY_ALL),
@@ -152,7 +152,7 @@ def _meant(shown: Sequence[_Shown]) -> str:
 
 
 def _try(shown: Sequence[_Shown]) -> str:
-    """What to try, in the first pose that is wrong."""
+    """What to try, taken from the first pose that is wrong."""
     item = next(item for item in shown if item.wrong)
     best = _meant(shown) or _meant([item])
     if not best:
@@ -161,13 +161,13 @@ def _try(shown: Sequence[_Shown]) -> str:
 
 
 def _shown(session: ReadSession, side: str) -> Iterator[_Shown]:
-    """What the lines show at the clamps of one side, where they show it."""
+    """Directions of the lines at the clamps of one side, where the lines determine them."""
     cable, experiment = session.config.cable, session.config.experiment
     if getattr(experiment.boundary, side) != "clamped":
         return
     weight = cable.prior_mass * float(np.linalg.norm(experiment.gravity))
     layer = np.sqrt(cable.prior_bending_stiffness / max(weight, 1e-12))
-    # The weight bends it by 1 / layer beside a clamp: within half of that by a quarter of a radian.
+    # The weight bends the cable by 1 / layer beside a clamp: a quarter radian within half a layer.
     reach = min(layer / 2, _PART * cable.length)
     for item in session.read:
         pose = session.declared[item.name]
@@ -185,9 +185,9 @@ def _ways(
 ) -> Sequence[FloatArray]:
     """Directions (d,) that a line may have at its clamp, from start to end.
 
-    None where it begins too far from the fixture to tell, or its first piece, between points far
-    apart, ends farther than `reach` [m] from it. Markers begin at the fixture, which may be a
-    little elsewhere: the second piece counts, too.
+    None where the line begins too far from the fixture, or where its first piece (between
+    sparse points) ends farther than `reach` [m] from it. Markers begin at the fixture, whose place
+    is inexact, so that the second piece is used as well.
     """
     sign, place = (1 if side == "start" else -1), np.array(getattr(pose, side))
     inward = item.points[::sign]
@@ -199,7 +199,7 @@ def _ways(
         return []
     size = np.linalg.norm(pieces, axis=1)
     s = np.cumsum(size) - size / 2
-    # Of a loop the chord is short: pieces share the cable's length.
+    # The chord of a loop is short: pieces are a share of the cable's length instead.
     if before + size[0] * max(1.0, length / (s[0] + s[-1])) > reach:
         return []
     tangents = sign * pieces / size[:, None]
@@ -210,7 +210,7 @@ def _ways(
 
 
 def _turned_to(pose: Pose, points: FloatArray, length: float) -> float | None:
-    """Heading [rad] at the end of a line, with as many turns as it makes, if its points tell."""
+    """Heading [rad] at the end of a line, full turns included; None if it is unknown."""
     pieces = _pieces(points, _STEP * length)
     heading = np.unwrap(np.arctan2(pieces[:, 1], pieces[:, 0]))
     if np.abs(np.diff(heading)).max(initial=0.0) > _TELLING:
@@ -221,7 +221,7 @@ def _turned_to(pose: Pose, points: FloatArray, length: float) -> float | None:
 
 
 def _pieces(points: FloatArray, step: float) -> FloatArray:
-    """Steps (n, d) between points at least `step` [m] apart: noise turns shorter ones."""
+    """Steps (n, d) between points at least `step` [m] apart: shorter ones show noise."""
     kept = [0]
     for k in range(1, len(points)):
         if np.linalg.norm(points[k] - points[kept[-1]]) >= step:
@@ -241,11 +241,11 @@ class ComparedReading:
     name : str
         As in a configuration, such as end_force.
     measured, model : (m, c) [N] or [N m]
-        What was read, and what the shapes need: known up to the mass.
+        Readings, and the values that the shapes need; known only up to the mass.
     frames : (m, d, d) or None
-        Of the clamp there, columns its axes in the world; None at a pin.
+        Axes of the clamp in the world, as columns; None at a pin.
     forces : (m, d) or None [N]
-        Of a moment: of the model, on the same side.
+        Only for moments: the model's forces on the same side.
     """
 
     name: str
@@ -255,17 +255,17 @@ class ComparedReading:
     forces: FloatArray | None = None
 
     def misfit(self, measured: FloatArray) -> float:
-        """Distance from the nearest multiple of the model, over the size of what was measured."""
+        """Distance from the nearest multiple of the model, relative to the size of the readings."""
         size = float((measured**2).sum() * (self.model**2).sum())
         along = max(float((measured * self.model).sum()), 0.0) / np.sqrt(max(size, 1e-300))
         return float(np.sqrt(max(1 - along**2, 0.0)))
 
 
 def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple[Suspicion, ...]:
-    """What was read otherwise than the configuration says, the likeliest of each reading.
+    """Readings that were taken in another way than declared: the likeliest way for each.
 
-    `sized`: whether the shapes tell stiffness over weight: else only how forces and moments
-    compare.
+    `sized`: whether the shapes determine stiffness over weight; if not, only the ratio of forces to
+    moments is checked.
     """
     found, scales = [], {}
     for one in readings:
@@ -273,7 +273,7 @@ def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple
             continue
         own, rows = one.misfit(one.measured), one.measured
         if own > MISREAD:
-            # A turn of all or an arm fits as well as any reading that it contains.
+            # A general rotation or lever arm fits at least as well as its special cases.
             meant = likeliest(_otherwise(one), one.misfit, MUCH_BETTER * own, READ_OTHERWISE)
             if meant is None:
                 continue
@@ -288,7 +288,7 @@ def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple
 
 
 def _otherwise(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
-    """Other ways to read what was measured, the likely ones first."""
+    """Other interpretations of the readings, the likely ones first."""
     a, (count, size) = one.measured, one.measured.shape
     turned = "with the other sign. Try: what the cable does to the fixture, not the fixture to it."
     yield Hypothesis(turned, -a)
@@ -301,15 +301,15 @@ def _otherwise(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
         yield Hypothesis(
             f"{text}, with the other sign. Try: -R f, with the clamp's frame R.", -world
         )
-    # Forces of few poses are nearly parallel: a turn or an arm that is fitted explains any error.
+    # Forces of few poses are nearly parallel: a fitted rotation or lever arm explains any error.
     if count < FITTED_READINGS:
         return
-    # It halves what an effect does to the readings, too: one that is there leaves nothing odd.
+    # The hypothesis must also halve the misfit caused by effects: a real effect leaves no doubt.
     yield from (way for way in _fitted(one) if one.misfit(way.meant) < MISREAD)
 
 
 def _fitted(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
-    """Ways to read what was measured that are fitted to what the shapes need."""
+    """Interpretations with parameters that are fitted to what the shapes need."""
     a, size = one.measured, one.measured.shape[1]
     if one.forces is not None:
         yield from _about_elsewhere(one, one.forces)
@@ -325,13 +325,13 @@ def _fitted(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
 
 
 def _about_elsewhere(one: ComparedReading, forces: FloatArray) -> Iterator[Hypothesis[FloatArray]]:
-    """Moments about a point that is fixed to the clamp: M + (fixture - point) x F, least squares.
+    """Moments about a point fixed to the clamp, by least squares: M + (fixture - point) x F.
 
-    The point and the scale are found together: both are linear in what was measured.
+    Point and scale are found together: the equations are linear in both.
     """
     m, d = forces.shape
     frames = np.broadcast_to(np.eye(d), (m, d, d)) if one.frames is None else one.frames
-    # Cross products; in a plane the component across it.
+    # Cross products; in a plane only the component normal to it.
     space = [np.pad(x, ((0, 0), (0, 3 - d))) for x in (*np.moveaxis(frames, 2, 0), forces)]
     arms = np.stack([np.cross(axis, space[-1])[:, -one.model.shape[1] :] for axis in space[:d]], 2)
     columns = np.concatenate([one.model[..., None], arms], axis=2).reshape(-1, 1 + d)
@@ -348,7 +348,7 @@ def _about_elsewhere(one: ComparedReading, forces: FloatArray) -> Iterator[Hypot
 
 
 def _other_unit(name: str, scale: float, scales: Mapping[str, float]) -> Iterator[Suspicion]:
-    """A scale that no mass explains; of moments, beside that of forces on the same cable."""
+    """A scale that no mass explains; for moments, compared with that of the same cable's forces."""
     kind = name.split("_")[-1]
     forces = [known for other, known in scales.items() if other.endswith("force")]
     beside = float(np.median(forces)) if forces and kind == "moment" else 1.0

@@ -1,7 +1,7 @@
-"""Mistakes about clips that the measured lines give away: places, kinds, order.
+"""Find mistakes about clips from the measured lines: places, kinds, order.
 
-A line runs straight from point to point between its ends, so that distances from it are known to
-the sag between two points. Arc lengths are chords, scaled to the cable, or those of the markers.
+A measured line is straight between neighbouring points, so distances from it are exact up to
+the sag between two points. Arc lengths are chords scaled to the cable, or those of markers.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from dlo_casadi.thresholds import CONTRADICTS, FITS, HEADING_OFF, NEARLY_ALL
 
 @dataclass(frozen=True)
 class _Passed:
-    """Where a measured line passes the declared place of a clip.
+    """Point of a measured line that is nearest to the declared place of a clip.
 
-    `gap` [m] between them, arc length `at` [m], direction `ahead` (d,) of the line.
+    `gap` [m]: its distance from the place; `at` [m]: its arc length; `ahead` (d,): tangent there.
     """
 
     gap: float
@@ -29,7 +29,7 @@ class _Passed:
 
 
 def wrong_clips(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Clips far off the measured lines, out of order, or of another kind than the lines show."""
+    """Clips that are far from the measured lines, out of order, or not of the declared kind."""
     declared, length = session.declared, session.config.cable.length
     poses = [(declared[item.name], item) for item in session.read]
     found: list[Suspicion] = []
@@ -61,7 +61,7 @@ def _passed(pose: Pose, item: PoseInput, place: tuple[float, ...], length: float
 
 
 def _far_off(session: ReadSession, k: int, gaps: FloatArray) -> list[Suspicion]:
-    """One clip far from the lines, which pass its place at gaps (m,) [m]; empty if it is near."""
+    """Suspicion about one clip at distances `gaps` (m,) [m] from the lines; empty if it is near."""
     length, poses = session.config.cable.length, [session.declared[x.name] for x in session.read]
     clips = [pose.held.clips[k] for pose in poses]
     far = gaps > FITS * length
@@ -81,7 +81,7 @@ def _far_off(session: ReadSession, k: int, gaps: FloatArray) -> list[Suspicion]:
 def _of_other_kind(
     clip: HeldClip, held: list[HeldClip], own: list[_Passed], length: float
 ) -> list[Suspicion]:
-    """A clip that holds the cable elsewhere than declared, or lets it slide."""
+    """A clip that holds the cable at another arc length than declared, or lets it slide."""
     if clip.at is None:
         return []
     slid = np.array([one.at - (h.at or 0.0) for one, h in zip(own, held, strict=True)])

@@ -1,7 +1,7 @@
-"""Mistakes that points and their ends give away: units, frames, files out of step.
+"""Find mistakes from points and their ends: units, frames, files in the wrong order.
 
-A wrong unit shows as a factor of a thousand, an axis that points the other way as ends that fit
-once they are mirrored, a list out of step as ends that fit another pose.
+A wrong unit is a factor of a thousand in the lengths; with a mirrored axis the ends fit once
+they are mirrored back; with files in the wrong order the ends fit another pose.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -38,9 +38,9 @@ from dlo_casadi.thresholds import (
 )
 
 UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
-# Angle [rad] within which a rotation is described as exchanged axes.
+# Angle [rad] within which a rotation is described as an exchange of axes.
 _NAMED = 0.3
-# Fits of a frame, each followed by a new choice of which end of a line is which.
+# Iterations of fitting a frame and then choosing which end of each line is the start.
 _FITS_OF_FRAME = 4
 
 
@@ -77,7 +77,7 @@ def wrong_units(session: ReadSession) -> tuple[Suspicion, ...]:
             meant.append(Hypothesis(ends, spans * size**sign))
 
     def far_from_one(ratio: FloatArray) -> float:
-        """Share of ratios that are not one, up to a quarter."""
+        """Share of ratios that differ from one, up to a quarter."""
         return float(1.0 - ((ratio > 1 / NEAR_UNIT) & (ratio < NEAR_UNIT)).mean())
 
     found = likeliest(meant, far_from_one, 1 - NEARLY_ALL + 1e-9)
@@ -85,7 +85,7 @@ def wrong_units(session: ReadSession) -> tuple[Suspicion, ...]:
 
 
 def counted_from_the_end(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Markers that fit their fixtures once they are counted from the other end."""
+    """Markers that fit their fixtures if they are counted from the other end."""
     lines = session.lines
     if not lines.known.any():
         return ()
@@ -112,7 +112,7 @@ def _by_ends(
     near: float = np.inf,
     certain: bool = True,
 ) -> tuple[Suspicion, ...]:
-    """What explains ends that are `own` lengths of the cable off their fixtures."""
+    """Explanation of ends that are `own` cable lengths away from their fixtures."""
     if own < FITS:
         return ()
     found = likeliest(hypotheses, misfit, min(FITS, MUCH_BETTER * own), near)
@@ -123,10 +123,10 @@ def _by_ends(
 
 
 def wrong_frame(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Ends that fit all fixtures once the points are moved, turned or mirrored as a whole."""
+    """Ends that fit all fixtures once all points are moved, rotated or mirrored together."""
     lines = session.lines
     own = lines.overall(lines.measured)
-    several = len(lines.names) > 2  # to the ends of fewer, some turn and some origin fit
+    several = len(lines.names) > 2  # with fewer lines some rotation and origin always fit
     if own > CONTRADICTS and (
         found := _by_ends(lines, own, _exchanged_axes(lines, several), lines.overall)
     ):
@@ -138,7 +138,7 @@ def wrong_frame(session: ReadSession) -> tuple[Suspicion, ...]:
 
 
 def _exchanged_axes(lines: Lines, several: bool) -> Iterator[Hypothesis[FloatArray]]:
-    """Ends of points from another origin, with other axes, and both."""
+    """Ends of the points from another origin, with other axes, and with both."""
     shift = _shift(lines, lines.measured)
     yield Hypothesis(
         f"all lines lie ({listed(shift, '.4g')}) m away from their start and end. Try: measure "
@@ -165,9 +165,9 @@ def _in_frame(what: str, measured: FloatArray) -> Hypothesis[FloatArray]:
 
 
 def _shift(lines: Lines, measured: FloatArray) -> FloatArray:
-    """The one translation (d,) [m] that fits best, in the middle of both ends.
+    """Best translation (d,) [m], taken at the middle of both ends.
 
-    With a free end: at the start, which the line's first point is then taken for.
+    With a free end it is taken at the start, assumed to be the line's first point.
     """
     away = measured.mean(axis=1) - lines.declared.mean(axis=1)
     away = np.where(np.isfinite(away), away, (measured - lines.declared)[:, 0])
@@ -177,8 +177,8 @@ def _shift(lines: Lines, measured: FloatArray) -> FloatArray:
 def _fitted(lines: Lines, turn: FloatArray) -> Hypothesis[FloatArray]:
     """Ends in the frame that fits best, from a first rotation (d, d).
 
-    Declared = rotation measured + translation, least squares (Kabsch 1976), of the handedness of
-    the first one; the middle of both ends needs no order of a line.
+    Declared = rotation measured + translation, by least squares (Kabsch 1976). Its handedness is
+    that of the first rotation; the middle of both ends does not depend on the line's order.
     """
     d, hand = len(turn), np.sign(np.linalg.det(turn))
     shift = np.median(lines.declared.mean(axis=1) - lines.measured.mean(axis=1) @ turn.T, axis=0)
@@ -198,13 +198,13 @@ def _fitted(lines: Lines, turn: FloatArray) -> Hypothesis[FloatArray]:
 
 
 def _told(turn: FloatArray, shift: FloatArray) -> str:
-    """A frame in words: exchanged axes by their names, else how far it is turned and moved."""
+    """Describe a frame: by its exchanged axes, or by how far it is rotated and moved."""
     d, moved = len(turn), f"moved by ({listed(shift, '.3g')}) m"
     near = min(exchanges(d), key=lambda axes: float(np.linalg.norm(turn - axes)))
     if np.linalg.norm(turn - near) < _NAMED * np.sqrt(2) and not np.allclose(near, np.eye(d)):
         return f"{named(near)} and {moved}"
     hand = np.sign(np.linalg.det(turn))
-    # What is mirrored before it is turned: y in a plane, all axes in space.
+    # A mirrored axis is mirrored before the rotation: y in a plane, all axes in space.
     mirror, whole = np.array([hand**d, hand, hand][:d]), np.eye(3)
     whole[:d, :d] = turn * mirror
     vector = Rotation.from_matrix(whole).as_rotvec()
@@ -216,7 +216,7 @@ def _told(turn: FloatArray, shift: FloatArray) -> str:
 
 
 def out_of_step(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Ends that fit the fixtures of other poses: files and end positions in different orders."""
+    """Ends that fit the fixtures of other poses: files and end positions differ in order."""
     lines = session.lines
     misfit = lines.misfit(lines.measured[:, None], lines.declared[None, :])
     own, order = np.diag(misfit), np.arange(len(misfit))
@@ -241,8 +241,8 @@ def out_of_step(session: ReadSession) -> tuple[Suspicion, ...]:
 def single_poses(session: ReadSession) -> tuple[Suspicion, ...]:
     """Single wrong poses, each with its first reason.
 
-    Points that run to and fro in their order; an end where all others have their start, as if both
-    were exchanged; a line that ends far from the fixtures.
+    Reasons: points in zigzag order; an end where all others have their start, as if both were
+    exchanged; a line that ends far from the fixtures.
     """
     lines = session.lines
     ends, own = lines.declared, lines.misfit(lines.measured, lines.declared)
@@ -302,7 +302,7 @@ def repeated(session: ReadSession) -> tuple[Suspicion, ...]:
 
 
 def stretched(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Markers farther apart than the cable between them."""
+    """Markers that are farther apart than the cable between them is long."""
     texts, marked = {}, 0
     for item in session.read:
         if item.s is None:
@@ -324,6 +324,6 @@ def stretched(session: ReadSession) -> tuple[Suspicion, ...]:
     return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())
 
 
-# Alternatives, of which the first that finds anything is reported; and questions of their own.
+# Alternatives: only the first that finds anything is reported; then independent questions.
 ENDS = (wrong_units, counted_from_the_end, wrong_frame, out_of_step, single_poses)
 POINTS = (repeated, stretched)

@@ -1,4 +1,4 @@
-"""The declared model of a configuration, its fit, and the simpler fits beside it."""
+"""Fit the declared model of a configuration, and simpler models for comparison."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -34,33 +34,33 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import SIMPLER, Stage
 from dlo_casadi.session.stages import algorithm1_stage, initial_stage, stiffness_stage
 
-# Elements of the declared model's mesh; refined from the data.
+# Elements of the declared model's first mesh; the data then decide on its refinement.
 MESH = 40
-# Stiffness and shapes are searched for on this mesh; in space, where an element takes 17
-# times the operations, on half of it.
+# Mesh on which stiffness and shapes are searched for. In space an element takes 17 times the
+# operations, so half as many are used.
 FIRST_MESH = 20
 REST_COEFFICIENTS = 13
-# Markers that are nearer to each other than this share of the cable are at one place.
+# Markers closer than this share of the cable's length count as one place.
 SAME_PLACE = 0.02
-# Share of the objective by which IPOPT's minimum may lie higher and be the same: it stops once the
-# points' places along the cable move by a thousandth of the noise. 1.5e-7 is the most of ten fits.
+# Share of the objective by which IPOPT's minimum may be higher and still count as the same: IPOPT
+# stops once arc lengths move by a thousandth of the noise. Largest of ten fits: 1.5e-7.
 SAME_MINIMUM = 1e-6
-# Huber's constant: points beyond it count with their distance instead of its square.
+# Huber's constant: points with larger errors count linearly instead of quadratically.
 HUBER = 1.5
 
 
 @dataclass(frozen=True)
 class Declared:
-    """The declared model and what of it is estimated.
+    """The declared model and which of its parameters are estimated.
 
     Parameters
     ----------
     model : CableModel
-        Nominal values, priors of the nuisances within their tolerances.
+        With nominal values, and priors of the nuisance parameters within their tolerances.
     start : (n_parameters,)
         Parameters at their declared values.
     free : list of str
-        Parameters that do not keep them.
+        Names of the parameters that are estimated.
     """
 
     model: CableModel
@@ -75,11 +75,10 @@ def nuisances(
     pixel: float | None = None,
     readings: tuple[str, ...] = (),
 ) -> CableModel:
-    """Return the model with what is known of its effects before any shape as nuisances.
+    """Return the model with prior knowledge of its effects added as nuisance parameters.
 
-    What lies within a declared tolerance gets a Gaussian prior with the tolerance as standard
-    deviation; photographs with pixels of the size `pixel` [m] also a bias of edges, `readings` one
-    of their sensors.
+    Each declared tolerance is the standard deviation of a Gaussian prior. Photographs with pixels
+    of size `pixel` [m] add a bias of edges, `readings` add one of their sensors.
     """
     setup = setup_of(model, tolerances=asdict(tolerances), pixel=pixel, readings=readings)
     present = {effect.label for effect in model.effects}
@@ -108,12 +107,12 @@ def declared_model(
     pixel : float, optional [m]
         Size of a pixel on the board, for photographs.
     known : bool
-        Whether all is known to be as declared: without nuisances.
+        Whether everything is exactly as declared: no nuisance parameters.
 
     Raises
     ------
     ConfigError
-        If a configuration that was changed since it was loaded names effects that cannot be.
+        If the configuration was changed after loading and names unknown effects.
     """
     if problems := wrong_effects(config):
         raise ConfigError("; ".join(problem.message for problem in problems), config.path)
@@ -157,9 +156,9 @@ def straight(model: CableModel) -> CableModel:
 def fit_declared(
     config: Config, declared: Declared, measured: Sequence[MeasuredPose], n: int | None = None
 ) -> tuple[Fit, float]:
-    """Fit the declared model on a mesh that is fine enough, and return the mesh's error [m].
+    """Fit the declared model on a mesh that is fine enough; return the fit, mesh error in [m].
 
-    A mesh that is too coarse looks like a missing effect; it is refined first.
+    The mesh is refined first because a coarse mesh looks like a missing effect.
     """
     finest, first = config.model.n or n, first_mesh(declared.model)
     model = declared.model.with_mesh(min(finest or first, first))
@@ -184,36 +183,36 @@ def fit_declared(
 def first_mesh(model: CableModel) -> int:
     """Number of elements on which stiffnesses and shapes are searched for.
 
-    Cables bend sharply at saddles and eyelets: on 10 elements, of a cable in space through one of
-    each, the true parameters leave twice what they leave on 20. A stretch that lies on an obstacle
-    ends at nodes.
+    Cables bend sharply at saddles and eyelets: for a cable in space with one of each, the true
+    parameters leave twice the residual on 10 elements as on 20. Contact with an obstacle starts
+    and ends at nodes.
     """
     more = sum(kind != "pinned" for kind in model.clips) + 2 * bool(model.surfaces)
     return FIRST_MESH // len(model.node.curvatures) * (2 + more) // 2
 
 
 def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) -> int:
-    """Number of coefficients of the rest curvature that the measurements can carry.
+    """Number of coefficients of the rest curvature that the measurements can determine.
 
-    All poses share one rest curvature, so that each place with a marker tells one number across
-    the cable; the heading of a clamp takes one of them, but for the first two: it is known within
-    its tolerance. Lines show all places.
+    All poses share one rest curvature: each place with a marker gives one number per direction
+    across the cable. A clamp's heading, known within its tolerance, uses one of them, except for
+    the first two. Lines show all places.
     """
     fitted = [item for item in measured if item.readable and not item.held_out]
     if not all(sensor.marked for item in fitted for sensor in item.sensors):
         return REST_COEFFICIENTS
     places = np.sort(np.concatenate([item.places(np.inf) for item in fitted]))
     count = 1 + int((np.diff(places) > SAME_PLACE * places[-1]).sum())
-    # Of twenty simulated cables of two to four markers a constant left structure in two, both with
-    # two markers; a straight line did not.
+    # In twenty simulated cables with two to four markers a constant left structure in two, both
+    # with two markers; a linear function left none.
     return max(min(count, 2), count - (model.start, model.end).count("clamped"))
 
 
 class Minimum(NamedTuple):
-    """Minimum of the batch NLP as IPOPT has found it, and its time [s].
+    """Minimum of the batch NLP found by IPOPT, and its time [s].
 
-    None where it fails; it is not `searched` for in space, where third derivatives of all elements
-    would cost IPOPT minutes a run.
+    None where IPOPT fails. In space it is not `searched` for: third derivatives of all elements
+    would take IPOPT minutes per run.
     """
 
     point: Point | None = None
@@ -222,7 +221,7 @@ class Minimum(NamedTuple):
 
 
 def minimum_by_ipopt(fit: Fit) -> Minimum:
-    """Minimum of the batch NLP, from the Gauss-Newton fit's; none in space or held in between."""
+    """IPOPT's minimum, started at the Gauss-Newton fit; none in space or with supports between."""
     if fit.model.in_space or fit.model.clips or fit.model.surfaces:
         return Minimum(searched=False)
     began = time.perf_counter()
@@ -236,9 +235,9 @@ def minimum_by_ipopt(fit: Fit) -> Minimum:
 def confirmed(fit: Fit, found: Minimum) -> Fit:
     """The fit, compared with IPOPT's minimum.
 
-    Where that is lower by more than what a descent stops at, it is the fit's. Where it is the same,
-    the fit has converged; where IPOPT has failed, it has not. In space, with clips, and where IPOPT
-    ends higher, the fit stays as it is.
+    IPOPT's minimum replaces the fit where it is lower by more than the descent's tolerance. Where
+    both agree, the fit counts as converged; where IPOPT fails, it does not. In space, with clips,
+    and where IPOPT ends higher, the fit stays as it is.
     """
     point, own = found.point, fit.point.objective
     if not found.searched:
@@ -252,7 +251,7 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
 
 
 def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:
-    """All poses of a fit, in those fitted outlying points weigh less (Huber's weights)."""
+    """All poses of a fit; outliers in the fitted ones get a smaller weight (Huber's weights)."""
     out = list(fit.problem.history)
     for k, d in zip(fit.problem.fitted, fit.linearization.raw, strict=True):
         item = out[k]
@@ -265,20 +264,20 @@ def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:
 
 @dataclass(frozen=True)
 class SimplerFits:
-    """Simpler fits of the same cable, straight at rest, without its effects.
+    """Simpler fits of the same cable: straight at rest and without effects.
 
     Parameters
     ----------
     model : CableModel
-        On the mesh that the stiffness was searched on.
+        On the mesh on which the stiffness was searched for.
     alone : StiffnessFit
-        The stiffness alone.
+        Fit of the stiffness only.
     loop : Algorithm1Result, optional
-        Of the paper's loop.
+        Result of the paper's loop.
     missing : str
         Why the loop did not run.
     seconds : float [s]
-        That it took.
+        Duration.
     """
 
     model: CableModel
@@ -301,7 +300,7 @@ def simpler_fits(
     options: EstimationOptions, declared: CableModel, measured: Sequence[MeasuredPose], n: int
 ) -> tuple[SimplerFits, list[Stage]]:
     """The simpler fits, and their stages on a mesh of n elements."""
-    # A single number of a simplified model: a coarse mesh suffices.
+    # One number of a simplified model: a coarse mesh suffices.
     model = straight(declared).with_mesh(min(n, first_mesh(declared)))
     alone = fit_stiffness(model, measured)
     missing, loop, seconds = _not_applicable(options, declared, measured), None, 0.0
@@ -322,7 +321,7 @@ def simpler_fits(
 def _not_applicable(
     options: EstimationOptions, model: CableModel, measured: Sequence[MeasuredPose]
 ) -> str:
-    """Why the paper's loop does not run; empty if it does."""
+    """Why the paper's loop cannot run; empty if it can."""
     if not options.algorithm1:
         return "switched off"
     if not applies(model):
@@ -334,10 +333,10 @@ def _not_applicable(
 
 
 def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
-    """A fit, or a better one that starts from a simpler one.
+    """Return the fit, or a better one that starts from a simpler fit.
 
-    A simpler fit is a start where its objective is smaller, where it predicts the fit poses better,
-    or where the fit has not converged. `stages`: the simpler ones, and at last the fit's own.
+    A simpler fit is used as a start where its objective is smaller, where it predicts the fit poses
+    better, or where the fit has not converged. `stages`: simpler ones first, the fit's own last.
     """
     *others, own = stages
     best = fit
@@ -354,12 +353,12 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
 def nearest_to_poses(
     fit: Fit, stages: Sequence[Stage], staged: Callable[[Fit], Stage]
 ) -> tuple[Fit, Stage]:
-    """A fit and its stage; of one that lacks something the nearest to the fit poses, if need be.
+    """Return a fit and its stage; if the model is incomplete, the fit nearest to the fit poses.
 
-    A fit that trusts each point to its noise bends ends and rest shape to whatever the model lacks,
-    and may predict the poses worse than a straight cable. Then it is fitted to its misfit, too,
-    from itself and from each simpler fit: what predicts the poses best is taken. `stages`: as in
-    `not_worse`. `staged`: stage of a fit.
+    A fit that trusts each point to its noise distorts ends and rest shape to make up for a missing
+    effect, and may predict worse than a straight cable. It is then repeated with a noise that
+    includes the misfit, from itself and from each simpler fit; the best prediction wins.
+    `stages`: as in `not_worse`. `staged`: makes the stage of a fit.
     """
     *others, own = stages
     simpler = [stage for stage in others if stage.name in SIMPLER]
@@ -368,7 +367,7 @@ def nearest_to_poses(
     if not misfit and not lacks:
         if not fit.problem.priors.pose_scatter.std:
             return fit, own
-        # By more than chance where all that is left may be what differs from pose to pose.
+        # By more than chance, where the whole residual may be scatter from pose to pose.
         least *= 1 + 1 / np.sqrt(2 * len(fit.problem.used))
     if _off(own) <= least:
         return fit, own
@@ -381,15 +380,15 @@ def nearest_to_poses(
 
 
 def _off(stage: Stage) -> float:
-    """Error [m] of the fit poses, each on the branch where it was measured."""
+    """Error [m] of the fit poses, each compared on the branch on which it was measured."""
     error = stage.rmse_fit_measured_branch
     return np.inf if error is None else error
 
 
 def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> Fit | None:
-    """The fit that begins at a straight cable of a stage's stiffness; None if there is none.
+    """Fit that starts at a straight cable with a stage's stiffness; None if there is none.
 
-    Unless that cable is `better` it has to begin below the fit.
+    Unless that cable is `better`, its objective must be below the fit's.
     """
     problem, model = fit.problem, fit.model
     values = model.nominal.copy()

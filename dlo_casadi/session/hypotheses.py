@@ -1,4 +1,4 @@
-"""What a session may have been meant as: hypotheses, and what they are compared by."""
+"""Hypotheses on what a session may have meant, and the misfits that compare them."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from dlo_casadi.thresholds import (
 
 T = TypeVar("T")
 
-# Usual words for axes in a plane that are exchanged: measured x, y read as.
+# Usual descriptions of exchanged axes in a plane: measured (x, y) is read as the given pair.
 _IN_A_PLANE = {
     "x, -y": "y pointing down instead of up",
     "-x, y": "x pointing left instead of right",
@@ -30,18 +30,18 @@ _IN_A_PLANE = {
     "y, -x": "the picture turned by 90 degrees counter-clockwise",
     "-y, x": "the picture turned by 90 degrees clockwise",
 }
-# Pieces of a dense line, whose points are averaged: second differences of closer ones are noise.
+# Pieces of a dense line whose points are averaged: second differences of single points are noise.
 _PIECES = 16
-# A line of less than this share of the cable's length may show a part of it alone.
+# A line shorter than this share of the cable's length may show only a part of it.
 _PART = 0.9
-# Number of points between which the length of a line is measured: noise lengthens dense lines.
+# Number of points used to measure a line's length: noise lengthens a line of many points.
 _SPARSE = 60
 
 
 class Suspicion(NamedTuple):
-    """What looks like a mistake, and what to do about it.
+    """A likely mistake and what to do about it.
 
-    It is certain where nothing else explains the whole session; of a single pose it tells the name.
+    It is certain where nothing else explains the whole session; for a single pose, `name` is set.
     """
 
     message: str
@@ -56,7 +56,7 @@ class Suspicion(NamedTuple):
 
 @dataclass(frozen=True)
 class ReadSession:
-    """A configuration and the poses of it that were read, each with points."""
+    """A configuration and those of its poses that were read with points."""
 
     config: Config
     read: tuple[PoseInput, ...]
@@ -77,14 +77,14 @@ class ReadSession:
 
 
 class Hypothesis(NamedTuple, Generic[T]):
-    """One thing that a session may have been meant as.
+    """One thing that the user may have meant.
 
     Parameters
     ----------
     said : str
-        What is said of it; `{own}` and `{left}` in it are the misfits without and with it.
+        Its description, in which `{own}` and `{left}` stand for the misfits without and with it.
     meant : T
-        What is compared if it is true.
+        What to compare under this hypothesis.
     """
 
     said: str
@@ -99,7 +99,7 @@ def likeliest(
 ) -> tuple[Hypothesis[T], float] | None:
     """First hypothesis, in the order of likelihood, whose misfit is below `enough`.
 
-    If `near` is given, the first one whose misfit is at most `near` times the least of all.
+    With `near`: the first one whose misfit is at most `near` times the smallest of all.
     """
     tried = ((item, misfit(item.meant)) for item in hypotheses)
     if near == np.inf:
@@ -114,7 +114,7 @@ def likeliest(
 
 
 def exchanges(d: int) -> list[FloatArray]:
-    """All ways to exchange and turn round the axes of d dimensions, none first."""
+    """All signed permutations of d axes, the identity first."""
     return [
         np.diag(signs) @ np.eye(d)[list(order)]
         for order in permutations(range(d))
@@ -123,12 +123,12 @@ def exchanges(d: int) -> list[FloatArray]:
 
 
 def listed(values: Any, form: str = ".3f") -> str:
-    """Numbers (n,), or one, in words."""
+    """Format one number, or numbers (n,), for a message."""
     return ", ".join(format(x, form) for x in np.atleast_1d(values))
 
 
 def named(axes: FloatArray) -> str:
-    """What can have happened to the points where axes are exchanged."""
+    """Describe what may have happened to points whose axes are exchanged."""
     names = "xyz"[: len(axes)]
     signs = ("-" if row.min() < 0 else "" for row in axes)
     read = ", ".join(
@@ -142,7 +142,7 @@ def named(axes: FloatArray) -> str:
 
 
 def axes_of(value: float | Sequence[float]) -> FloatArray:
-    """Axes (d, d) of a clamp in columns, x along the cable; of a heading [rad] or a quaternion."""
+    """Axes (d, d) of a clamp in columns, x along the cable, from a heading [rad] or quaternion."""
     if isinstance(value, float | int):
         c, s = np.cos(value), np.sin(value)
         return np.array([[c, -s], [s, c]])
@@ -160,25 +160,25 @@ def clamp_axes(pose: Pose, side: str) -> FloatArray | None:
 
 @dataclass(frozen=True)
 class Lines:
-    """Measured lines beside what is declared of them.
+    """Measured lines beside their declared ends.
 
     Parameters
     ----------
     names : tuple of str
-        Of the m poses.
+        Of m poses.
     declared : (m, 2, d) [m]
         Start and end fixture of each pose; NaN for a free end.
     measured : (m, 2, d) [m]
         The two ends of each measured line, in any order unless it is known.
     lengths : (m,) [m]
-        Along each measured line, from point to point; of markers so much longer as the cable is.
+        Length of each measured line from point to point; of markers scaled up to the whole cable.
     length : float [m]
-        Of the cable.
+        Length of the cable.
     gaps : (m, 2) [m]
-        Arc lengths between the fixtures and the ends of what was measured, as far as that is to
-        be expected: of markers, and of lines whose points are far apart; else zero.
+        Expected arc lengths between the fixtures and the ends of the measured line: for markers and
+        for lines with sparse points; otherwise zero.
     known : (m,) of bool
-        Of which line it is known where it begins, as of markers.
+        Whether the start of the line is known, as it is for markers.
     """
 
     names: tuple[str, ...]
@@ -190,9 +190,9 @@ class Lines:
     known: BoolArray
 
     def misfit(self, measured: FloatArray, declared: FloatArray) -> FloatArray:
-        """Distance of ends from fixtures over the length: the better order, RMS over both.
+        """RMS distance of both ends from the fixtures over the length, for the better order.
 
-        Less the gaps that are to be expected.
+        The expected gaps are subtracted.
         Shapes (m, ..., 2, 2) and (..., 2, 2) -> (m, ...).
         """
         gaps = self.gaps.reshape((len(self.gaps), *(1,) * (measured.ndim - 3), 2))
@@ -205,7 +205,7 @@ class Lines:
         return np.where(known, given, np.minimum(given, turned)) / self.length
 
     def short(self, i: int) -> str:
-        """What to try where a line could be one of a part of the cable; empty if it could not."""
+        """What to try if the line could show a part of the cable only; empty if it could not."""
         if self.known[i] or self.lengths[i] > _PART * self.length:
             return ""
         return (
@@ -214,12 +214,12 @@ class Lines:
         )
 
     def overall(self, measured: FloatArray) -> float:
-        """`overall` misfit of ends (m, 2, d) [m]."""
+        """Misfit of the ends (m, 2, d) [m] over all poses, see `overall`."""
         return overall(self.misfit(measured, self.declared))
 
 
 def overall(misfit: FloatArray) -> float:
-    """Root mean square over the poses, the worst fifth left out: a pose or two may be wrong."""
+    """Root mean square over the poses without the worst fifth: one or two poses may be wrong."""
     kept = np.sort(misfit)[: max(1, int(np.ceil(NEARLY_ALL * len(misfit))))]
     return float(np.sqrt(np.mean(kept**2)))
 
@@ -227,8 +227,8 @@ def overall(misfit: FloatArray) -> float:
 def lines_of(config: Config, read: Sequence[PoseInput]) -> Lines:
     """Measured lines beside their declared ends.
 
-    A photograph is searched for a line between the declared ends, so that wrong ends may hide the
-    line. Where several do not fit, the lines are searched for once more without their ends.
+    A photograph is searched for a line between its declared ends, and wrong ends may hide the
+    line. Where several poses do not fit, lines are searched for again without their ends.
     """
     points = {item.name: item.points for item in read}
     known = {item.name: item.s for item in read if item.s is not None}
@@ -246,15 +246,15 @@ def lines_of(config: Config, read: Sequence[PoseInput]) -> Lines:
 
 
 def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, FloatArray]) -> Lines:
-    """Ends and lengths of lines (K, d), some of them markers at known arc lengths (K,)."""
+    """Ends and lengths of lines (K, d); some are markers at known arc lengths (K,)."""
     length, d = config.cable.length, len(config.experiment.gravity)
     whole, spans, gaps, lengths = np.array([0.0, length]), [], [], []
     poses = [pose for pose in config.experiment.poses if pose.name in points]
     for pose in poses:
         own, marked = points[pose.name], pose.name in known
         span = known[pose.name][[0, -1]] if marked else whole
-        # A line of points far apart leaves some of the cable to either side of them; where they
-        # are closer it goes on to its fixture, up to what hides it.
+        # Sparse points leave some of the cable unseen at either end. A dense line reaches its
+        # fixture unless something hides it.
         steps = np.linalg.norm(np.diff(own, axis=0), axis=1)
         apart = float(np.median(steps)) if len(steps) else length
         far = apart > FITS * length and not marked
@@ -275,7 +275,7 @@ def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, Float
 
 
 def spread(count: int, most: int) -> IntArray:
-    """Indices of at most `most` of `count` items, evenly spaced, both ends included."""
+    """Indices of at most `most` of `count` items, evenly spaced, first and last included."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(int)
 
 
@@ -283,10 +283,10 @@ def spread(count: int, most: int) -> IntArray:
 
 
 def shown_pull(session: ReadSession) -> FloatArray | None:
-    """Direction (d,) in which the lines seem to be pulled, without any shape solved.
+    """Direction (d,) in which the lines seem to be pulled, without solving for any shape.
 
-    Between pins a cable hangs from its chord; elsewhere its moments tell, `load_over_stiffness`.
-    None where they do not: of a few points.
+    Between pins a cable hangs from its chord; otherwise see `load_over_stiffness`. None where the
+    lines have too few points.
     """
     boundary = session.config.experiment.boundary
     if boundary.start == boundary.end == "pinned":
@@ -299,7 +299,7 @@ def shown_pull(session: ReadSession) -> FloatArray | None:
 
 
 def _off_the_chord(lines: Sequence[FloatArray], chords: Sequence[FloatArray]) -> FloatArray:
-    """Mean of the points (K, d) of all lines from their chords (2, d): what pulls across them."""
+    """Mean offset of the points (K, d) of all lines from their chords (2, d)."""
     across, away = np.zeros((2, 1, 1))
     for points, (start, end) in zip(lines, chords, strict=True):
         along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-300)
@@ -309,14 +309,14 @@ def _off_the_chord(lines: Sequence[FloatArray], chords: Sequence[FloatArray]) ->
 
 
 def load_over_stiffness(lines: Sequence[tuple[FloatArray, FloatArray | None]]) -> FloatArray:
-    """Load per length over bending stiffness (d,) [1/m^3]; zero of a few points.
+    """Load per length over bending stiffness (d,) [1/m^3]; zero if there are too few points.
 
     Kirchhoff's rod under a dead load w per length, in units of its bending stiffness:
 
         M(s) = M_0 + F_0 x (r - r_0) - w x (s r - int r ds),    M across the tangent = t x t'
 
-    is linear in M_0 and F_0, which each pose has of its own, and w, which all share. Second
-    differences of the points give t x t'; rest curvature and noise are the residual.
+    is linear in M_0 and F_0, separate in each pose, and in w, shared by all. Second differences
+    of the points give t x t'; rest curvature and noise are the residual.
 
     Parameters
     ----------
@@ -333,7 +333,7 @@ def load_over_stiffness(lines: Sequence[tuple[FloatArray, FloatArray | None]]) -
 
 
 def _equations(points: FloatArray, s: FloatArray | None) -> list[tuple[FloatArray, FloatArray]]:
-    """Equations (rows, 3) for w and their right-hand side, of one pose; none of a few points."""
+    """Equations (rows, 3) for w and their right-hand side, of one pose; none for a few points."""
     points, s = _sparse(points) if s is None else (points, s)
     if len(points) < 5:
         return []
@@ -347,7 +347,7 @@ def _equations(points: FloatArray, s: FloatArray | None) -> list[tuple[FloatArra
     lever = s[1:-1, None] * r[1:-1] - swept
     own = np.concatenate([across, -across @ _cross(r[1:-1])], axis=2).reshape(-1, 6)
     shared = (across @ _cross(lever)).reshape(-1, 3)
-    # What a pose's own force and moment can explain tells nothing of the load.
+    # The part that a pose's own force and moment can explain says nothing about the load.
     basis = np.linalg.svd(own, full_matrices=False)[0]
     right = bend.reshape(-1)
     return [(shared - basis @ (basis.T @ shared), right - basis @ (basis.T @ right))]
@@ -359,7 +359,7 @@ def _cross(vectors: FloatArray) -> FloatArray:
 
 
 def _sparse(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of the points of pieces of a line, and their places along it."""
+    """Means of the points in each piece of a line, and their places along it."""
     s = chord_lengths(points)
     piece = np.minimum((s / max(s[-1], 1e-300) * _PIECES).astype(int), _PIECES - 1)
     kept = [piece == k for k in np.unique(piece)]

@@ -1,4 +1,4 @@
-"""Read what a configuration names: its camera, photographs or centre-lines, one pose at a time."""
+"""Read what a configuration names, one pose at a time: its camera, photographs or centre-lines."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,10 +16,10 @@ from dlo_casadi.sensing.pixels import ViewInput, pixel_std, pixels_of
 from dlo_casadi.sensing.sensors import line_or_markers
 from dlo_casadi.session.outcome import PoseInput
 
-# Photographs read at a time: two cores take 0.66 of the time of one.
+# Photographs read in parallel: on two cores this takes 0.66 of the serial time.
 READERS = 2
-# Points of one line that a fit compares, and that errors and pictures are made from. Those of a
-# photograph repeat their neighbours' noise if they are more; of others the fit has their means.
+# Points per line used by fits, errors and pictures. More points of a photograph would repeat their
+# neighbours' noise; other lines enter the fit as means of neighbours.
 MOST_POINTS = 240
 
 
@@ -28,19 +28,19 @@ Step = Callable[[str, int, int], None]
 
 
 def nobody(*_: object) -> None:
-    """A `Step` that reports to nobody."""
+    """A `Step` that ignores the progress."""
 
 
 def read_session(config: Config, step: Step = nobody) -> tuple[Config, tuple[PoseInput, ...]]:
-    """The configuration with its camera, and all poses; see `calibrated` and `read_inputs`."""
+    """Return the configuration with its camera, and all poses: `calibrated` and `read_inputs`."""
     config = calibrated(config, step)
     return config, read_inputs(config, step)
 
 
 def read_inputs(config: Config, step: Step = nobody) -> tuple[PoseInput, ...]:
-    """Read all poses; one that cannot be read keeps its name and says why.
+    """Read all poses; a pose that cannot be read keeps its name and the reason.
 
-    Several at a time: OpenCV and NumPy leave the interpreter to others for half of the work.
+    Several are read at a time: OpenCV and NumPy release the interpreter for half of the work.
     """
     poses, inputs = config.experiment.poses, []
     threads = ThreadPoolExecutor(READERS)
@@ -62,15 +62,15 @@ def _read(config: Config, pose: Pose) -> PoseInput:
             raise MeasurementError(skipped[pose.name])
         return _reader(config, pose)(config, pose)
     except MeasurementError as error:
-        said = error.message.removeprefix(f"{pose.name}: ")  # of a photograph named as the pose
+        said = error.message.removeprefix(f"{pose.name}: ")  # a photograph may have the pose's name
         return PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=said)
 
 
 def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[MeasuredPose, ...]:
-    """What was read, with its end conditions, for the fit.
+    """Convert poses that were read to measurements with end conditions, for the fit.
 
-    A pose that cannot be read keeps its end conditions, for the history. Raises MeasurementError if
-    no fit pose could be read; its text lists the reasons.
+    A pose that cannot be read keeps its end conditions, which the load history needs. Raises
+    MeasurementError with all reasons if no fit pose could be read.
     """
     if not any(item.readable and item.role == "fit" for item in inputs):
         reasons = "\n".join(f"  {item.name}: {item.problem}" for item in inputs if item.problem)
@@ -84,7 +84,7 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
 
 
 def _measured(pose: Pose, item: PoseInput, std: float) -> MeasuredPose:
-    """A pose with its sensors; pixels have the standard deviation `std` [m] at weight one."""
+    """Convert a pose with its sensors; pixels of weight one have standard deviation `std` [m]."""
     held = replace(pose.held, camera_center=item.camera_center)
     held_out = pose.role == "held_out"
     if item.views:
@@ -100,9 +100,9 @@ def _measured(pose: Pose, item: PoseInput, std: float) -> MeasuredPose:
 
 
 def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
-    """The line (K, 2) [m] in a photograph as if its end were free; None if there is none.
+    """Line (K, 2) [m] in a photograph, searched for as if its end were free; None if there is none.
 
-    It ends where the cable does, and not where the configuration says.
+    It ends where the visible cable ends, whatever the configuration says.
     """
     if _reader(config, pose) is not _read_image:
         return None
@@ -116,7 +116,7 @@ def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
 
 
 def _reader(config: Config, pose: Pose) -> Callable[[Config, Pose], PoseInput]:
-    """How a pose is read."""
+    """Function that reads a pose."""
     if pose.points is not None:
         return _read_points
     if config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv":
@@ -135,7 +135,7 @@ def _read_points(config: Config, pose: Pose) -> PoseInput:
 
 
 def _thinned(pose: Pose, read: MeasuredPoints) -> PoseInput:
-    """Lines and markers as a fit compares them: means of neighbours where there are many."""
+    """Reduce lines and markers to what a fit compares: means of neighbours where there are many."""
     kept = _kept(read.points)
     s = None if read.s is None else read.s[kept]
     means = read.means(MOST_POINTS) if len(read.points) > MOST_POINTS else None
@@ -143,12 +143,12 @@ def _thinned(pose: Pose, read: MeasuredPoints) -> PoseInput:
 
 
 def _kept(points: np.ndarray) -> slice:
-    """Points evenly picked, `MOST_POINTS` at most."""
+    """Slice that picks at most `MOST_POINTS` points, evenly spaced."""
     return slice(None, None, max(1, -(-len(points) // MOST_POINTS)))
 
 
 def _read_views(config: Config, pose: Pose) -> PoseInput:
-    """Photographs of a cable in space; messages name those that cannot be used."""
+    """Read photographs of a cable in space; messages name those that cannot be used."""
     images, problems = {}, []
     for name, path in pose.photographs.items():
         try:
@@ -208,9 +208,9 @@ def _held(config: Config, pose: Pose) -> vision.KnownCable:
 
 
 def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
-    """Pictures (h, w, 3) of each step of the camera, as far as it comes.
+    """Pictures (h, w, 3) of each step of the camera, up to the step that failed.
 
-    By the photograph's name and that of the step. Raises VisionError if none of its photographs can
+    Keys: name of the photograph and of the step. Raises VisionError if none of its photographs can
     be read.
     """
     reader = _reader(config, pose)
@@ -226,7 +226,7 @@ def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
             unread = error
             continue
         workings = vision.Workings()
-        with suppress(MeasurementError):  # the pictures show how far it came; the table says why
+        with suppress(MeasurementError):  # the pictures show how far it got; the table says why
             if reader is _read_views:
                 viewpoint = vision.locate_camera(image, *_equipment(config))
                 vision.see_cable(image, viewpoint, cable, workings)
@@ -240,9 +240,9 @@ def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
 
 
 def _turned(config: Config, pose: Pose, image: np.ndarray) -> str:
-    """Sentence for a photograph that can be measured once it is turned.
+    """Sentence for a photograph that becomes measurable once it is rotated.
 
-    A board's markers tell the way up; two reference points do not.
+    A board's markers show which way is up; two reference points do not.
     """
     measurement = config.experiment.measurement
     if measurement.kind != "images" or measurement.reference is None:
@@ -262,7 +262,7 @@ def _turned(config: Config, pose: Pose, image: np.ndarray) -> str:
 
 
 def view_of(config: Config, image: np.ndarray) -> vision.View:
-    """Where the photograph's pixels lie on the cable's plane."""
+    """Map from the photograph's pixels to the cable's plane."""
     measurement = config.experiment.measurement
     assert measurement.kind == "images"
     if measurement.reference is None:
@@ -280,7 +280,7 @@ def view_of(config: Config, image: np.ndarray) -> vision.View:
 
 
 def board_of(measurement: Images) -> vision.Board:
-    """The board as the camera step has it."""
+    """The board in the form that the camera step uses."""
     declared = measurement.board
     assert declared is not None
     return vision.Board(
@@ -293,23 +293,23 @@ def _camera(declared: DeclaredCamera) -> vision.Camera:
 
 
 def _equipment(config: Config) -> tuple[vision.Board, vision.Camera]:
-    """Board and camera of photographs of a cable in space; `calibrated` has found the camera."""
+    """Board and camera for photographs of a cable in space; `calibrated` has found the camera."""
     measurement = config.experiment.measurement
     assert measurement.kind == "images"
     assert measurement.camera is not None
     return board_of(measurement), _camera(measurement.camera)
 
 
-# Relative standard deviation of the focal length from which on a session's own photographs tell
-# no camera: a shape in space is off by as much along the view. Of rendered ones three from within
+# Largest relative standard deviation of a focal length found from a session's own photographs:
+# a shape in space is off by as much along the view. Three rendered photographs with views within
 # ten degrees leave 0.7 to 6 %.
 _UNKNOWN = 0.02
 
 
 def needs_camera(config: Config) -> str:
-    """Why photographs cannot be measured without a camera where none is given; empty if they can.
+    """Why photographs cannot be measured without a declared camera; empty if they can.
 
-    In a plane the board's own plane can; a standoff from it cannot.
+    In a plane the board's own plane gives the view; a standoff from it does not.
     """
     measurement = config.experiment.measurement
     if measurement.kind != "images" or measurement.board is None or measurement.camera is not None:
@@ -320,9 +320,9 @@ def needs_camera(config: Config) -> str:
 
 
 def calibrated(config: Config, step: Step = nobody) -> Config:
-    """Return the configuration with the camera that its photographs show, where it needs one.
+    """Return the configuration with a camera calibrated from its photographs, where it needs one.
 
-    Raises MeasurementError if they do not show it.
+    Raises MeasurementError if they do not determine it.
     """
     why = needs_camera(config)
     if not why:
@@ -374,7 +374,7 @@ def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration
 
 
 def summary(found: vision.Calibration) -> str:
-    """One sentence on a calibration."""
+    """Summarise a calibration in one sentence."""
     matrix, std = found.camera.matrix, found.matrix_std
     return (
         f"focal lengths {matrix[0, 0]:.1f} +- {std[0]:.1f} and {matrix[1, 1]:.1f} +- "

@@ -1,4 +1,4 @@
-"""What a session of measurements has led to: plain results, computed elsewhere."""
+"""What a session of measurements has found: plain results, computed elsewhere."""
 
 import math
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ from dlo_casadi.thresholds import DIFFERENT
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
 # Name of the cable's mass among a stage's parameters.
 MASS = "mass"
-# Stages that a batch estimate must not be worse than.
+# Stages that a batch fit must not be worse than.
 SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
 
 
@@ -47,7 +47,7 @@ class RestCurvatureEstimate:
 
 @dataclass(frozen=True)
 class ReadingErrors:
-    """Root mean square distance of readings of one role from predicted ones; None without any.
+    """RMS differences between measured and predicted readings of one role; None without readings.
 
     `force` [N], `moment` [N m].
     """
@@ -72,19 +72,19 @@ class Stage:
     shapes : dict of PoseShape
         By pose name; poses without a prediction are absent.
     note : str
-        Why the stage is empty or ended early, if so.
+        Why the stage is empty or ended early, otherwise empty.
     rmse_fit_measured_branch, rmse_held_out_measured_branch : float or None [m]
-        The same errors with those poses that were measured in another stable equilibrium than
-        the predicted one compared with that one.
+        The same errors, except that poses measured in another stable equilibrium than the predicted
+        one are compared with the one in which they were measured.
     unpredicted : tuple of str
         Measured held-out poses without a prediction.
     readings_fit, readings_held_out : ReadingErrors
-        As rmse_fit and rmse_held_out, of forces and moments on the fixtures.
+        The same errors for forces and moments on the fixtures.
     explains : bool or None
-        Whether the model explains what was measured; None where that was not judged. Where it does
-        not, its parameters have no intervals.
+        Whether the model explains the measurements; None where that was not judged. If it does not,
+        its parameters have no intervals.
     surfaces : tuple of Obstacle
-        All that the cable may touch, where the fit has it.
+        All surfaces that the cable may touch, if the fit has them.
     """
 
     name: StageName
@@ -105,12 +105,12 @@ class Stage:
 
     @property
     def other_branch(self) -> dict[str, BranchShape]:
-        """By name the poses that were measured in another equilibrium than the predicted one."""
+        """Poses, by name, that were measured in another equilibrium than the predicted one."""
         return {name: found for name, x in self.shapes.items() if (found := x.measured_branch)}
 
     @property
     def measured_side(self) -> dict[str, BranchShape]:
-        """By name the fit poses that are compared on another side than a prediction takes."""
+        """Fit poses, by name, compared on another side than the one a prediction takes."""
         return {name: found for name, x in self.shapes.items() if (found := x.measured_side)}
 
 
@@ -132,11 +132,11 @@ class PoseInput:
     to_pixels : callable, optional
         Maps board metres (M, 2) to the photograph's pixels.
     problem : str
-        Why the pose could not be read, if so.
+        Why the pose could not be read; empty if it was.
     center : (float, float), optional [m]
         Middle of the photograph in the board frame.
     camera_center : (float, float, float), optional [m]
-        Where a calibrated camera stood, see `HeldPose`.
+        Place of a calibrated camera, see `HeldPose`.
     pixel : float, optional [m]
         Size of a pixel on the board.
     weight : (K,), optional
@@ -144,17 +144,17 @@ class PoseInput:
     coverage : float, optional
         Share of the cable that was seen; 0 to 1.
     confidence : float, optional
-        Share of the line that was measured soundly; 0 to 1.
+        Share of the line that was measured reliably; 0 to 1.
     markers : tuple of int, optional
         Numbers of the board's markers that were used.
     messages : tuple of str
-        What the camera step noticed.
+        Remarks of the camera step.
     s : (K,), optional [m]
         Known arc lengths of markers.
     means : MeasuredPoints, optional
-        Of neighbouring points, for the fit, where more were measured than `points` has.
+        Means of neighbouring points, for the fit, where more were measured than `points` holds.
     views : tuple of ViewInput
-        Usable photographs of a cable in space; `points` are the line that they show together, none
+        Usable photographs of a cable in space; `points` is the line that they show together, empty
         where fewer than two agree.
     """
 
@@ -185,21 +185,21 @@ class PoseInput:
 
 @dataclass(frozen=True)
 class MeasurementSummary:
-    """How well the centre-lines were measured.
+    """Quality of the measured centre-lines.
 
     Parameters
     ----------
     poses_fit, poses_held_out : int
         Poses with a measured line.
     held_out_missing : tuple of str
-        Held-out poses without one: no error counts them.
+        Held-out poses without a measured line: no error includes them.
     points : int
     std, correlation_length : float [m]
         Of the noise of one coordinate of a point.
     noise_distance : float [m]
-        RMS distance of the points from the predicted shapes that this noise alone gives.
+        RMS distance of the points from the predicted shapes that is due to this noise alone.
     readings : int
-        Forces and moments on the fixtures, those of held-out poses too.
+        Number of forces and moments on the fixtures, held-out poses included.
     force_std, moment_std : float or None [N], [N m]
         Of one component; None where there is no such reading.
     """
@@ -226,7 +226,7 @@ class MeasurementSummary:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How many of the declared held-out poses a stage has predicted, and names of the others."""
+    """Number of declared held-out poses that a stage has predicted, and names of the others."""
 
     predicted: int
     declared: int
@@ -235,16 +235,16 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Repeatability:
-    """How well the cable comes back to the same shape.
+    """How well the cable returns to the same shape.
 
     Parameters
     ----------
     expected_spread : float [m]
         RMS distance of two repeats of a pose, at the measured points.
     source : "repeats", "poses" or None
-        Whether a pose or two were taken again and again, so that it is how far one repeat is
-        from the mean of the others, or it is what differs between poses beyond all that they have
-        in common; None where it could not be estimated.
+        "repeats": repeats of one or two poses, each compared with the mean of the others. "poses":
+        the scatter between poses that nothing common to all of them explains. None: it could not
+        be estimated.
     """
 
     expected_spread: float
@@ -262,9 +262,9 @@ class FoundEffect:
     p_value : float
         See `AddedEffect`.
     rmse_cross_validated_before, rmse_cross_validated_after : float or None [m]
-        Without and with the effect; None where a pose that was left out is not predicted.
+        Without and with the effect; None where a left-out pose is not predicted.
     indistinguishable_from : tuple of str
-        Other effects that these data cannot tell it from.
+        Other effects that fit these data equally well.
     """
 
     name: str
@@ -276,7 +276,7 @@ class FoundEffect:
 
 
 def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
-    """What was added, with the values of the last fit."""
+    """Added effects with their values in the last fit."""
     return tuple(
         FoundEffect(
             name=item.candidate.name,
@@ -295,7 +295,7 @@ def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
 def effect_parameters(fit: Fit, effect: Effect) -> dict[str, Estimate]:
     """Parameters of an effect by their names.
 
-    Those that vanish at infinity are estimated as their inverse; both are given.
+    Parameters that vanish at infinity are estimated as their inverse; both are returned.
     """
     rows: dict[str, Estimate] = {}
     for q in effect.parameters(fit.model.cable):
@@ -311,33 +311,33 @@ def effect_parameters(fit: Fit, effect: Effect) -> dict[str, Estimate]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Everything a run has found. `report/` turns it into files and figures.
+    """Everything that a run has found. `report/` turns it into files and figures.
 
     Parameters
     ----------
     verdict : Verdict or None
-        None where no diagnosis was made: nothing is claimed then.
+        None where no diagnosis was made, so that nothing is claimed.
     doubts : tuple of str
-        Why the last stage's numbers do not hold, see `doubts_of`; with them no verdict is
+        Why the last stage's numbers are unreliable, see `doubts_of`; with doubts no verdict is
         `complete` or `effect_found`.
     effects : tuple of FoundEffect
-        What was added to the declared model.
+        Effects added to the declared model.
     candidates : tuple of Ranked
         All effects that were tried, the likely ones first.
     unexplained : UnknownForce or None
-        The load that assumes no cause.
+        Fitted load that assumes no cause.
     next_pose : NextPose or None
-        The pose that separates rival explanations.
+        The pose that best separates rival explanations.
     structure : (Structure, Structure) or None
         Tests of the residual before and after.
     cross_validated : float or None [m]
-        Error of the declared model where nothing was added and every left-out pose is predicted.
+        Cross-validated error of the declared model, if nothing was added and all are predicted.
     mesh_error : float [m]
-        Largest error of a shape that the mesh of the last fit causes, from two meshes.
+        Largest error of a shape due to the mesh of the last fit, from two meshes.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
     hidden_weight : HiddenWeight or None
-        A weight that the shapes do not tell from stiffness.
+        A weight that the shapes cannot separate from stiffness.
     limits : tuple of LimitCheck
         Of all predicted poses, where the session declares limits.
     """
@@ -364,7 +364,7 @@ class Outcome:
 
     @cached_property
     def repeatability(self) -> Repeatability:
-        """How well the cable comes back to the same shape."""
+        """How well the cable returns to the same shape."""
         history, length = self.fit.problem.history, self.fit.model.cable.length
         if different_poses(history, length) >= DIFFERENT:
             return Repeatability(float(np.sqrt(2) * self.fit.repeat_error), "poses")
@@ -377,7 +377,7 @@ class Outcome:
 
     @property
     def inside_band(self) -> float | None:
-        """Share of held-out points inside the last stage's 90 % band, noise of points included.
+        """Share of held-out points inside the last stage's 90 % band, which includes their noise.
 
         None without held-out points.
         """
@@ -392,12 +392,12 @@ class Outcome:
 
     @property
     def either_side(self) -> dict[str, EitherSide]:
-        """Held-out poses by name whose side has to be reported, as the last stage predicts them."""
+        """Held-out poses, by name, whose side must be reported, as the last stage predicts them."""
         shapes = self.stages[-1].shapes.items()
         return {name: found for name, x in shapes if (found := x.either_side) and found.told}
 
     def held_out(self, stage: Stage) -> HeldOut:
-        """How many of the declared held-out poses a stage has predicted."""
+        """Number of declared held-out poses that a stage has predicted."""
         measurement = self.measurement
         missing = (*measurement.held_out_missing, *stage.unpredicted)
         declared = measurement.poses_held_out + len(measurement.held_out_missing)

@@ -1,8 +1,8 @@
-"""What was read, compared with what is declared of it: the list of questions, and those to shapes.
+"""Compare what was read with what is declared: the list of questions, and those about shapes.
 
-A question compares the session with hypotheses on what it may have been meant as. Those on units,
-frames and the order of files are in `ends`, those on directions and readings in `clamps`; here are
-those that quick fits of a few poses decide: exchanged ends, and gravity.
+A question compares the session with hypotheses on what the user may have meant. Questions about
+units, frames and the order of files are in `ends`, those about directions and readings in
+`clamps`. This file has those that quick fits of a few poses decide: exchanged ends, and gravity.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -50,14 +50,14 @@ NEVERTHELESS = (
     "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless, in "
     'Python estimation={"plausibility": False}.'
 )
-# Poses of a comparison, points of a line, elements of the mesh, coefficients of the rest curvature.
+# Per comparison: poses, points of a line, elements of the mesh, rest curvature coefficients.
 _POSES, _POINTS, _MESH, _REST = 8, 24, 12, 4
-# Poses that tell whether ends are exchanged: a misfit of a twentieth of the length shows in two.
+# Poses that decide whether ends are exchanged: two of them show a misfit of a twentieth of L.
 _FEW = 2
-# Largest relative standard deviation of a known stiffness over weight: wrong units, a factor of
-# five or more, are recognised then.
+# Largest relative standard deviation at which stiffness over weight counts as known: wrong units,
+# a factor of five or more, are then recognised.
 _SIZED = 0.5
-# What is exchanged -> the keys of a pose.
+# What is exchanged -> the pose's keys.
 _EXCHANGED = {
     "start and end exchanged": ("",),
     "start and end exchanged, and their directions": ("", "_heading", "_orientation"),
@@ -69,20 +69,20 @@ def without_implausible(
 ) -> tuple[tuple[PoseInput, ...], list[str]]:
     """Leave out single poses that contradict the configuration.
 
-    With the option `estimation.plausibility` off, all poses stay.
+    With `estimation.plausibility` off, all poses stay.
 
     Returns
     -------
     inputs : tuple of PoseInput
-        Those left out have no points and say why.
+        Poses left out have no points but a reason.
     odd : list of str
-        What looks like a mistake but stays.
+        Likely mistakes that stay in the session.
 
     Raises
     ------
     MeasurementError
-        If the measured lines of the session contradict the configuration beyond doubt, or if those
-        of most poses do.
+        If the measured lines of the session, or of most of its poses, contradict the configuration
+        beyond doubt.
     """
     found = find_suspicions(config, inputs)
     if not config.estimation.plausibility:
@@ -111,7 +111,7 @@ def find_suspicions(
 ) -> tuple[Suspicion, ...]:
     """Everything in a session that looks like a mistake, see `QUESTIONS`.
 
-    Without `fits` only what takes none, and the direction in which the lines seem to be pulled.
+    Without `fits`: only questions that need no fit, and the direction of the pull on the lines.
     """
     read = tuple(item for item in inputs if len(item.points))
     session = ReadSession(config, read)
@@ -139,9 +139,9 @@ class Coarse(NamedTuple):
     fit : Fit or None
         None where no equilibria were found near the shapes.
     rms : float [m]
-        Distance that it leaves; without a fit as far as ends that contradict a pose.
+        RMS residual; without a fit the distance at which ends count as contradicting a pose.
     weight : bool
-        Whether the shapes tell stiffness over weight.
+        Whether the shapes determine stiffness over weight.
     """
 
     fit: Fit | None
@@ -150,9 +150,9 @@ class Coarse(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """The declared session beside the hypothesis `what` that explains its shapes best.
+    """The declared session and the hypothesis `what` that explains its shapes best, both fitted.
 
-    Both are fitted; `length` [m] is that of the cable.
+    `length` [m]: of the cable.
     """
 
     what: str
@@ -162,7 +162,7 @@ class Comparison(NamedTuple):
 
     @property
     def told(self) -> str:
-        """What both leave, in words."""
+        """Describe the residuals of both."""
         left = f"the lines are {self.own.rms:.3g} m RMS from the fitted shapes, but"
         if self.own.fit is None:
             left = "no equilibria were found near the lines, but they are within"
@@ -172,8 +172,8 @@ class Comparison(NamedTuple):
     def better(self) -> bool:
         """Whether the declaration leaves more than noise, and the hypothesis clearly less.
 
-        Where the declaration has no fit the hypothesis has to show a weight: a fit of few points
-        may fail, or not, by chance.
+        If the declaration has no fit, the hypothesis must determine a weight: a fit of few points
+        may fail by chance.
         """
         if self.own.fit is None and not self.other.weight:
             return False
@@ -188,24 +188,24 @@ class Comparison(NamedTuple):
 
     @property
     def shows_weight(self) -> bool:
-        """Whether only the hypothesis shows a weight, and it explains the shapes, and better.
+        """Whether only the hypothesis determines a weight, explains the shapes, and fits better.
 
-        Under gravity against the weight the best fit is a cable too stiff to show any.
+        If gravity points the wrong way, the best fit is a cable too stiff to show any weight.
         """
         (fit, other, weight), own = self.other, self.own
         if fit is None or not weight or own.weight or other > BEYOND_EFFECTS * self.length:
             return False
-        # Difference in log likelihood of two models with the same unknowns.
+        # Difference in log likelihood of two models with equally many unknowns.
         return bool(fit.problem.n_residuals * np.log(own.rms / other) > EVIDENCE_APART)
 
 
 def compare(
     session: ReadSession, hypotheses: Sequence[Hypothesis[ReadSession]], most: int = _POSES
 ) -> Comparison | None:
-    """Fit the declared session, and each hypothesis until one explains all; the best one.
+    """Fit the declared session, then hypotheses until one explains everything; return the best.
 
-    Of `most` poses at most. None where there is no hypothesis, or the declared session explains
-    its shapes and weight.
+    At most `most` poses are used. None if there is no hypothesis, or if the declared session
+    explains its shapes and weight.
     """
     length = session.config.cable.length
     own = coarse_fit(session, most) if hypotheses else None
@@ -220,7 +220,7 @@ def compare(
 
 
 def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
-    """Quick fit of at most `most` poses, evenly spaced, fitted and held-out ones."""
+    """Quick fit of at most `most` poses, evenly spaced, held-out ones included."""
     measured, length = [], session.config.cable.length
     for k in spread(len(session.read), most):
         item = session.read[k]
@@ -277,7 +277,7 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
 def ends_exchanged(session: ReadSession) -> tuple[Suspicion, ...]:
     """Whether lines that leave both clamps backwards fit with start and end exchanged.
 
-    Points far apart do not show the directions at the clamps, but the way to them does.
+    Sparse points do not show the directions at clamps; the vectors from clamp to first point do.
     """
     boundary = session.config.experiment.boundary
     if not (len(session.read) and boundary.start == boundary.end == "clamped"):
@@ -298,7 +298,7 @@ def ends_exchanged(session: ReadSession) -> tuple[Suspicion, ...]:
 
 
 def _exchanged(session: ReadSession, keys: Sequence[str]) -> ReadSession:
-    """The session with start and end exchanged; lines then begin where they ended."""
+    """The session with start and end exchanged: lines then begin where they ended."""
     pairs = [(f"start{key}", f"end{key}") for key in keys]
     both = [*pairs, *((b, a) for a, b in pairs)]
     poses = tuple(
@@ -310,7 +310,7 @@ def _exchanged(session: ReadSession, keys: Sequence[str]) -> ReadSession:
 
 
 def _off(session: ReadSession) -> float:
-    """Median angle [rad] of clamps from the way to the points nearest to them."""
+    """Median angle [rad] between a clamp's axis and the vector to the point nearest to it."""
     cosines = []
     for item, (side, first, sign) in product(session.read, (("start", 0, 1), ("end", -1, -1))):
         pose = session.declared[item.name]
@@ -325,9 +325,9 @@ def _off(session: ReadSession) -> float:
 
 
 def hangs_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Whether the shapes fit only with gravity turned, or the points mirrored.
+    """Whether the shapes fit only with gravity rotated, or with the points mirrored.
 
-    Where the lines seem to be pulled along gravity nothing is fitted.
+    Nothing is fitted where the lines seem to be pulled along gravity.
     """
     gravity = np.array(session.config.experiment.gravity)
     if not (len(session.read) and gravity.any()):
@@ -354,7 +354,7 @@ def hangs_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
 
 
 def pulled_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Whether the lines seem to be pulled along another axis than gravity, without any fit."""
+    """Whether the lines seem to be pulled along another axis than gravity; without any fit."""
     gravity = np.array(session.config.experiment.gravity)
     pull = shown_pull(session)
     axes = np.vstack([np.eye(len(gravity)), -np.eye(len(gravity))])
@@ -374,9 +374,9 @@ def pulled_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
 def _other_gravity(
     session: ReadSession, pull: FloatArray | None
 ) -> Iterator[Hypothesis[ReadSession]]:
-    """Gravity along other axes, and points with exchanged or mirrored axes that keep their ends.
+    """Hypotheses: gravity along other axes; points with exchanged or mirrored axes, ends kept.
 
-    Those alone along whose gravity the lines seem to be pulled; all if they show no pull.
+    Only those whose gravity agrees with the pull on the lines; all if the lines show no pull.
     """
     experiment, length = session.config.experiment, session.config.cable.length
     gravity = np.array(experiment.gravity)
@@ -390,7 +390,7 @@ def _other_gravity(
             meant = session.with_experiment(gravity=tuple(way.tolist()))
             yield Hypothesis(f"gravity ({listed(way + 0.0, 'g')}) m/s^2", meant)
     if experiment.boundary.start == experiment.boundary.end == "pinned":
-        return  # between pins it is the same to turn the points, and gravity
+        return  # between pins, rotating the points equals rotating gravity
     kept = [_kept_by_turning(session.declared[item.name], length) for item in session.read]
     for axes in frames:
         if np.allclose(axes, np.eye(len(gravity))):
@@ -405,7 +405,7 @@ def _other_gravity(
 
 
 def _kept_by_turning(pose: Pose, length: float) -> FloatArray:
-    """Vectors (n, d) that a turn of a pose must keep: end from start [lengths], clamps."""
+    """Vectors (n, d) that a rotation of a pose must keep: end minus start [lengths], and clamps."""
     kept: list[FloatArray] = [np.zeros(len(pose.start))]
     if pose.end is not None:
         kept.append((np.array(pose.end) - pose.start) / length)
@@ -415,16 +415,16 @@ def _kept_by_turning(pose: Pose, length: float) -> FloatArray:
 
 
 def _angle(pull: FloatArray | None, way: FloatArray) -> float:
-    """Angle [rad] of a direction from the pull that lines show; zero where they show none."""
+    """Angle [rad] between a direction and the pull that lines show; zero if they show none."""
     if pull is None:
         return 0.0
     cosine = float(pull @ way) / float(np.linalg.norm(pull) * np.linalg.norm(way))
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-# Functions from a session to what they find, in groups. Of alternatives only the first that finds
-# anything counts. A group that finds anything certain is the last one; poses that it doubts are
-# left out of the next.
+# Groups of functions from a session to suspicions. In a group of alternatives only the first that
+# finds anything counts. A certain finding ends the search after its group; poses in doubt are left
+# out of the next group.
 Question = Callable[[ReadSession], tuple[Suspicion, ...]]
 QUESTIONS: tuple[tuple[tuple[Question, ...], ...], ...] = (
     (ENDS,),

@@ -1,4 +1,4 @@
-"""One pose as one stage of a fit sees it."""
+"""One pose in one stage of a fit."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,11 +19,11 @@ class BranchShape:
     Parameters
     ----------
     rmse : float [m]
-        Root mean square distance of the measured points to it.
+        Root mean square distance of the measured points from it.
     branch : "ccw", "cw", "previous" or None
-        What the pose has to name for it to be predicted; None if no name does.
+        Value of `branch` with which it is predicted; None if there is none.
     turns : 0.5, -0.5 or None
-        Or tell, see `HeldPose`.
+        Value of `turns` with which it is predicted, see `HeldPose`.
     """
 
     rmse: float
@@ -32,7 +32,7 @@ class BranchShape:
 
     @property
     def chosen_by(self) -> str | None:
-        """What a pose has to hold for it to be predicted, as in a configuration."""
+        """The entry that a pose needs in its configuration for it to be predicted."""
         if self.turns:
             return f"turns: {self.turns:g}"
         return f"branch: {self.branch}" if self.branch else None
@@ -40,15 +40,15 @@ class BranchShape:
 
 @dataclass(frozen=True)
 class EitherSide:
-    """A pose on both of the sides on which its cable may hang, see `CableModel.tipped_by`.
+    """A pose on both sides on which its cable may hang, see `CableModel.tipped_by`.
 
     Parameters
     ----------
     predicted, other : BranchShape
         On the predicted side, and on the other one.
     tipping : Tipping or None
-        How near the clamp is to where both are equally low; None where no angle of it makes them
-        so, to first order: `turns` may also tell between arcs to different sides.
+        Clamp angle from the pose at which both sides have equal energy; None where no angle has, to
+        first order: `turns` may also distinguish arcs to different sides.
     """
 
     predicted: BranchShape
@@ -57,53 +57,52 @@ class EitherSide:
 
     @property
     def told(self) -> bool:
-        """Whether the pose was measured on the other side, or the lower one is uncertain."""
+        """Whether the pose was measured on the other side, or the lower side is uncertain."""
         near = self.tipping is not None and self.tipping.either
         return near or self.other.rmse < self.predicted.rmse
 
 
 @dataclass(frozen=True)
 class PoseShape:
-    """One pose as one stage sees it.
+    """One pose in one stage.
 
     Parameters
     ----------
     curve : (M, d) [m]
-        Predicted from the end conditions alone, as the camera would see it.
+        Shape predicted from the end conditions alone, as the camera would see it.
     rmse : float or None [m]
-        Root mean square distance of the measured points to it; None without points.
+        Root mean square distance of the measured points from it; None without points.
     s : (K,) [m]
         Arc lengths of the measured points.
     gap : (K, d) [m]
         Measured minus predicted points.
     residual : (K,) or (K, 2) [m]
-        Distance of the measured points across the prediction: in the plane to its left, in space
-        along two normals, which at the start are the axes y and z of the cable's frame there and
-        are carried along without twist.
+        Distance of the measured points across the prediction. In the plane: to its left. In
+        space: along two normals that start as the axes y and z of the cable's frame and are
+        carried along without twist.
     energy : float [J]
     forces : (2, d) [N]
-        Of the cable on what holds its start and its end.
+        Force of the cable on what holds its start and its end.
     readings : mapping
-        Forces [N] and moments [N m] on the fixtures that were measured, by their names: measured,
-        and as a sensor would show the predicted ones.
+        Forces [N] and moments [N m] that were measured on the fixtures, by name: measured values,
+        and predicted ones as a sensor would show them.
     spread : (M,) or (M, 2) or None [m]
-        Standard deviation across the curve of the next repeat, as the residual; None if it was
+        Standard deviation of the next repeat across the curve, like the residual; None if it was
         not computed.
     missed, expected : (K,) or None [m]
-        Distance of each measured point from the prediction in the directions in which it is
-        compared, and its RMS that the noise and the next repeat let expect; None if they were not
-        computed.
+        Distance of each measured point from the prediction in the compared directions, and its
+        RMS expected from noise and the scatter of a repeat; None if they were not computed.
     measured_branch : BranchShape or None
-        Where the pose was measured in another stable equilibrium than the predicted one.
+        Set where the pose was measured in another stable equilibrium than the predicted one.
     undecided : bool
-        Whether uncertain parameters, fixtures and the cable's scatter leave open that that one is
-        the lowest.
+        Whether that equilibrium may be the lowest one, given the uncertainty of parameters and
+        fixtures and the cable's scatter.
     measured_side : BranchShape or None
-        Of a fit pose that is compared on the side where it was measured, not the lower one.
+        Set for a fit pose that is compared on the side where it was measured, not on the lower one.
     either_side : EitherSide or None
-        Of a held-out pose that tells no side, where there are two; None if it was not computed.
+        Set for a held-out pose without a declared side that has two; None if it was not computed.
     clips : tuple of dict
-        What the cable does to its clips, see `clip_rows`.
+        Forces and moments on its clips, see `clip_rows`.
     contacts : tuple of dict
         Where it touches obstacles, see `Contact.row`.
     """
@@ -128,7 +127,7 @@ class PoseShape:
     contacts: tuple[Mapping[str, Any], ...] = ()
 
     def inside_band(self, length: float, noise: float) -> BoolArray:
-        """Whether each measured point (K,) lies in its 90 % band, noise included."""
+        """Whether each measured point (K,) lies in its 90 % band, which includes noise."""
         assert self.spread is not None
         places = np.linspace(0.0, length, len(self.spread))
         spread = self.spread.reshape((len(places), -1))

@@ -1,4 +1,4 @@
-"""What a user should be warned of."""
+"""Warnings to the user."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -20,9 +20,9 @@ from dlo_casadi.thresholds import FIXTURES, UNSEEN
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
-    """What the camera step noticed, pose by pose, and which poses were not read at all.
+    """Remarks of the camera step pose by pose, and poses that were not read at all.
 
-    `skipped`: what the configuration leaves out; poses that are among the inputs say so themselves.
+    `skipped`: poses that the configuration leaves out; poses among the inputs have their own text.
     """
     shown = {item.name for item in inputs}
     lines = [
@@ -41,7 +41,7 @@ def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
 
 
 def _noticed(inputs: Sequence[PoseInput]) -> list[str]:
-    """Messages of poses and photographs, the same ones once, with the names of all."""
+    """Messages of poses and photographs; equal ones once, with all names."""
     names: dict[str, list[str]] = {}
     for item in inputs:
         views = {view.name for view in item.views}
@@ -64,8 +64,8 @@ def held_out_missing(
 def branch_warnings(stages: Sequence[Stage]) -> list[str]:
     """Poses measured in another stable equilibrium than the one of lowest energy.
 
-    Of the last stage: what the model before lacked is no longer a mistake. Held-out poses on the
-    other side are told with the verdict.
+    Only the last stage counts: earlier models lacked something. The verdict reports held-out poses
+    on the other side.
     """
     lines = []
     for stage in stages[-1:]:
@@ -101,7 +101,7 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
 
 
 def _by_choice(found: Mapping[str, BranchShape]) -> Iterator[tuple[str | None, list[str]]]:
-    """Names of poses that the same choice puts on the measured branch."""
+    """Groups of poses that one choice would put on the measured branch."""
     for chosen_by in dict.fromkeys(shape.chosen_by for shape in found.values()):
         yield chosen_by, [name for name, shape in found.items() if shape.chosen_by == chosen_by]
 
@@ -113,9 +113,9 @@ def _cure(chosen_by: str | None) -> str:
 
 
 def weight_warning(weight: HiddenWeight, expected: float) -> str:
-    """What an undeclared weight would do, and which measurement would reveal it.
+    """Consequence of an undeclared weight, and the measurement that would reveal it.
 
-    `expected` [m]: distance of a pose from its prediction if nothing is missing.
+    `expected` [m]: distance of a pose from its prediction if the model is complete.
     """
     low, high = weight.stiffness_95
     text = (
@@ -137,7 +137,7 @@ def weight_warning(weight: HiddenWeight, expected: float) -> str:
 def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
     """Simpler stages that come nearer to the fit poses than the last one, if that is a fit.
 
-    By more than chance: the root mean square of K points is known to 1/sqrt(2 K) of it.
+    Only by more than chance: the RMS of K points has a relative uncertainty of 1/sqrt(2 K).
     """
     lines = []
     for batch in stages[-1:]:
@@ -155,15 +155,14 @@ def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
 
 
 def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> tuple[str, ...]:
-    """Why the numbers of the last stage do not hold, even if its residual looks like noise.
+    """Reasons why the last stage's numbers are unreliable even if its residual looks like noise.
 
-    Its fit has not converged; or poses are predicted, from their ends alone, worse than UNSEEN
-    times what noise, fixtures, parameters and the cable's scatter let expect. A held-out pose that
-    hangs on the other side (see `EitherSide`), and one whose equilibrium has no name but the way
-    that led there, tells of the model what it tells there; but where all poses were measured in
-    another equilibrium, and a simpler model comes nearer, nothing is predicted. A pose does not
-    count whose lowest equilibrium is open, by the uncertain parameters, its fixtures or the
-    cable's scatter.
+    Either its fit has not converged, or poses are predicted from their ends alone with more than
+    UNSEEN times the error expected from noise, fixtures, parameters and the cable's scatter.
+    Held-out poses on the other side (see `EitherSide`), and poses whose equilibrium only a history
+    can name, are compared where they were measured; but if all poses were measured in another
+    equilibrium and a simpler model comes nearer, nothing is predicted. A pose does not count if
+    uncertain parameters, fixtures or scatter leave its lowest equilibrium undecided.
     """
     lines, stage = [], stages[-1]
     if fit.failed:
@@ -202,7 +201,7 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
 
 
 def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
-    """That all poses were measured in another equilibrium, and a simpler stage comes nearer."""
+    """Report that all poses are in another equilibrium and that a simpler stage comes nearer."""
     stage = stages[-1]
     shown = {name for name, shape in stage.shapes.items() if shape.rmse is not None}
     simpler = [x for x in stages if x.name in SIMPLER and x.rmse_fit is not None]
@@ -221,13 +220,13 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
 
 
 def _judged(stage: Stage) -> set[str]:
-    """Poses whose errors tell of the model: an equilibrium that is open tells nothing."""
+    """Poses whose errors count against the model: those whose equilibrium is decided."""
     known = (name for name, shape in stage.shapes.items() if shape.expected is not None)
     return {name for name in known if not stage.shapes[name].undecided}
 
 
 def _errors(shape: PoseShape) -> FloatArray:
-    """Squares (2, K) [m^2] of a pose's distances from its prediction: measured, expected."""
+    """Squared distances (2, K) [m^2] of a pose from its prediction: measured, expected."""
     assert shape.expected is not None
     assert shape.missed is not None
     expected, there = shape.expected**2, shape.measured_branch
@@ -237,7 +236,7 @@ def _errors(shape: PoseShape) -> FloatArray:
 
 
 def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[str]:
-    """What a fit cannot promise.
+    """Limits of what a fit can promise.
 
     `error` [m]: of its mesh. `declared` [m]: noise of the points.
     """
@@ -302,7 +301,7 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
 
 
 def _own(scatter: PoseScatter, fit: Fit) -> str:
-    """What differs in each pose, with its size, and what cannot be distinguished from it."""
+    """What differs from pose to pose, with its size, and what cannot be distinguished from it."""
     each = [
         f"{one.words} of {one.std:.2g} {one.unit(fit.model)}" for one in (scatter, *scatter.rivals)
     ]
@@ -310,7 +309,7 @@ def _own(scatter: PoseScatter, fit: Fit) -> str:
 
 
 def _beside(fit: Fit, floor: float) -> str:
-    """What the noise, which alone gives a distance `floor` [m], is to the repeats of a pose."""
+    """Compare the noise, which alone gives a distance `floor` [m], with the repeats of a pose."""
     std, length = 1e3 * fit.noise.std, 1e3 * fit.noise.length
     if fit.noise.source == "repeats":
         return f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable"
@@ -318,9 +317,9 @@ def _beside(fit: Fit, floor: float) -> str:
 
 
 def _scatter(fit: Fit) -> str:
-    """How far the poses' fixtures are from their declared places, one standard deviation."""
+    """Standard deviation of the fixtures' places about the declared ones."""
     scatter = dict(zip(fit.model.deviation_names, fit.problem.priors.scatter, strict=True))
-    # All components of a position, or of a turn, share one scatter.
+    # All components of a position, or of a rotation, share one scatter.
     place, turn = fit.model.node.axes[0], fit.model.node.turns[0]
     parts = {
         f"end_{place}": f"{1e3 * scatter[f'end_{place}']:.2g} mm at the end",

@@ -1,4 +1,4 @@
-"""An exported cable relaxed in its simulator, beside our prediction and what was measured."""
+"""Compare an exported cable relaxed in its simulator with our prediction and the measurement."""
 
 import hashlib
 from collections.abc import Iterator
@@ -19,15 +19,15 @@ from dlo_casadi.export.targets import Target, require
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.measure import Step, measured_poses, read_session
 
-# Whose stiffness a simulator is given, in the order of tables.
+# Fits whose stiffness a simulator is given, in the order of tables.
 CASES = ("default", "first guess", "identified")
-# Chords of a relaxed shape that measured points are compared with.
+# Number of chords of a relaxed shape that measured points are compared with.
 _CHORDS = 400
 
 
 @dataclass(frozen=True)
 class Distance:
-    """Root mean square and largest distance of two shapes, as shares of the length."""
+    """Root mean square and largest distance of two shapes, relative to the length."""
 
     rms: float
     largest: float
@@ -47,17 +47,17 @@ class Relaxation:
     ----------
     pose, case : str
     to_prediction : Distance or None
-        From our prediction with the identified cable, at equal arc lengths; None if it did not
-        come to rest, see `problem`.
+        From our prediction with the identified cable, at equal arc lengths; None if the simulation
+        did not come to rest, see `problem`.
     to_measured : Distance or None
-        From the measured points, as a fit compares them.
+        From the measured points, compared as in a fit.
     force, predicted_force : (3,) [N]
-        Of the cable on its end fixture: in the simulator, and as we predict it.
+        Force of the cable on its end fixture, in the simulator and in our prediction.
     measured_force : (d,) [N] or None
     points, predicted, measured : (K, d) [m]
-        What is drawn.
+        Shapes to draw.
     lost : tuple of str
-        Features of the identified cable that the target cannot carry.
+        Features of the identified cable that the target cannot represent.
     """
 
     pose: str
@@ -76,9 +76,9 @@ class Relaxation:
 
 
 def session_of(cable: FittedCable, given: Path | None) -> Config:
-    """The session that a cable was fitted to: as given, or by its name near its results and here.
+    """The session that a cable was fitted to: as given, or found by name near its results and here.
 
-    Raises ConfigError if it cannot be found, or is another one.
+    Raises ConfigError if it cannot be found, or if it is a different session.
     """
     name, source = f"{cable.metadata.config}.yaml", cable.metadata.path
     places = [Path(), Path("configs"), *([] if source is None else source.resolve().parents[1:4])]
@@ -101,9 +101,9 @@ def round_trip(
     step: Step,
     poses: int | None = None,
 ) -> Iterator[Relaxation]:
-    """Relax a cable in every held-out pose; in every pose if none was held out.
+    """Relax a cable in every held-out pose, or in every pose if none was held out.
 
-    With a number of `poses`, in so many of them, and of the fitted ones if those are too few.
+    `poses` limits their number; fitted poses make up for too few held-out ones.
     Raises DloError if the target is not installed.
     """
     require(target)

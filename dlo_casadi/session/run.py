@@ -1,4 +1,4 @@
-"""One session of measurements from configuration to outcome."""
+"""Run one session of measurements from its configuration to the outcome."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -44,14 +44,14 @@ class Progress(Protocol):
     """Receiver of a run's progress."""
 
     def step(self, name: str, done: int, total: int) -> None:
-        """`done` of `total` parts of the named work are finished."""
+        """Report that `done` of `total` parts of the named work are finished."""
 
 
 TIMED = ("vision", "algorithm1", "batch", "diagnosis")
 
 
 class Clock:
-    """Wall-clock time [s] per part of the run; parts that run beside one another both count."""
+    """Wall-clock time [s] per part of a run; parts that run in parallel both count in full."""
 
     def __init__(self) -> None:
         self._begin = self._last = time.perf_counter()
@@ -64,7 +64,7 @@ class Clock:
         self._last = now
 
     def add(self, name: str, seconds: float) -> None:
-        """Add the time [s] of a part that ran beside others, if it is one of `TIMED`."""
+        """Add the time [s] of a part that ran in parallel, if it is one of `TIMED`."""
         if name in self.parts:
             self.parts[name] += seconds
 
@@ -81,7 +81,7 @@ def run_session(
     Parameters
     ----------
     executor : Executor, optional
-        Where what can be done at the same time is done; in this process by default.
+        Runs independent parts in parallel; in this process by default.
 
     Raises
     ------
@@ -95,13 +95,13 @@ def run_session(
     step = nobody if progress is None else progress.step
     clock = Clock()
     executor = executor or InProcess()
-    begin(executor, software)  # another process starts, and imports what fits, meanwhile
+    begin(executor, software)  # meanwhile another process starts and imports what fits need
     config, inputs = read_session(config, step)
     try:
         with one_thread():
             return fit_session(config, inputs, clock, step, executor)
     except DloError as error:
-        error.poses = inputs  # for the page of the failure, which shows what had been read
+        error.poses = inputs  # for the page of a failure, which shows what was read
         raise
 
 
@@ -135,7 +135,7 @@ def fit_session(
     reported = _parameters_of({item.name for item in config.model.effects}, fit.model)
 
     def staged(fit: Fit) -> Stage:
-        # Intervals are taken after a diagnosis: a model that does not come to its points has none.
+        # Intervals follow the diagnosis: a model that does not explain the points gets none.
         diagnosed = config.diagnosis.enabled
         intervals = dict.fromkeys(profiled(fit)) if diagnosed else profile_intervals(fit)
         return fit_stage("batch", fit, measured, intervals, reported)
@@ -185,7 +185,7 @@ def fit_session(
 
 
 def judged(outcome: Outcome) -> Outcome:
-    """An outcome with what is said of its fit, and its verdict if that stands."""
+    """Add the remarks on its fit to an outcome, and the verdict if no doubt forbids it."""
     fit, stages, verdict = outcome.fit, outcome.stages, outcome.verdict
     doubts = remarks.doubts_of(stages, outcome.poses, fit)
     declared = outcome.config.experiment.measurement.std
@@ -206,7 +206,7 @@ def judged(outcome: Outcome) -> Outcome:
 
 
 def _told(stage: Stage, explains: bool) -> Stage:
-    """A stage of which it is known if its model explains the data: without intervals if not."""
+    """Mark a stage by whether its model explains the data; if not, remove the intervals."""
     found = stage.parameters
     if not explains:
         found = {name: replace(estimate, interval_95=None) for name, estimate in found.items()}
@@ -225,19 +225,19 @@ def close_the_loop(
     step: Step,
     executor: Executor,
 ) -> tuple[Fit, float, dict[str, Any]]:
-    """Diagnose the declared model's residual and add what is missing.
+    """Diagnose the declared model's residual and add missing effects.
 
     Parameters
     ----------
     declared : Fit
         Of the declared model.
     nearest : Fit
-        The same; or to its misfit, where that comes nearer to the poses: what is reported unless
-        effects are found, or nothing is missing.
+        The declared fit, or a fit with the misfit as noise where that comes nearer to the poses.
+        It is reported unless effects are found, or nothing is missing.
     stages : list of Stage
-        Its stage, the last one, gets its intervals; another one follows where effects are added.
+        Its last stage, the declared one, gets its intervals; another follows if effects are added.
     reported : sequence of str
-        Parameters of effects that the configuration declares.
+        Parameters of the effects that the configuration declares.
 
     Returns
     -------
@@ -245,7 +245,7 @@ def close_the_loop(
     error : float [m]
         Of its mesh.
     found : dict
-        What an `Outcome` holds of the diagnosis, by its fields.
+        The diagnosis in the fields of an `Outcome`.
     """
     options, kept_mesh = config.diagnosis, config.model.n is not None
     fine = declared.model.n > SEARCH_MESH and not kept_mesh
@@ -273,7 +273,7 @@ def close_the_loop(
         parameters = fitted_parameters(declared, profile_intervals(declared), reported)
         stages[-1] = replace(stages[-1], parameters=parameters)
     else:
-        # Nothing is missing: the declared model's own noise, estimated as that of a complete one.
+        # Nothing is missing: estimate the declared model's noise as that of a complete one.
         fit = as_measured(fit)
         stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
     if confirming is not None:
@@ -303,7 +303,7 @@ def close_the_loop(
 
 
 def _confirmed(fit: Fit, confirming: Callable[[], fitting.Minimum], clock: Clock) -> Fit:
-    """A fit compared with the minimum that IPOPT has found meanwhile."""
+    """Compare a fit with the minimum that IPOPT has found in the meantime."""
     found = confirming()
     clock.add("batch", found.seconds)
     return fitting.confirmed(fit, found)

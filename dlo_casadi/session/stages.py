@@ -53,7 +53,7 @@ def pose_shape(
     item: MeasuredPose,
     other: MeasuredBranch | None,
 ) -> PoseShape:
-    """One predicted pose beside its measured points."""
+    """Combine one predicted pose with its measured points."""
     curve, eq = prediction.curve, prediction.equilibrium
     s: FloatArray = np.zeros(0)
     gap: FloatArray = np.zeros((0, curve.d))
@@ -86,7 +86,7 @@ def _branch_shape(found: MeasuredBranch, item: MeasuredPose) -> BranchShape:
 
 
 def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArray:
-    """Components across the cable, see `PoseShape.residual`, of gaps (K, d) [m] at s (K,) [m]."""
+    """Components of gaps (K, d) [m] at s (K,) [m] across the cable, see `PoseShape.residual`."""
     curve, start = prediction.curve, prediction.equilibrium.x[:1]
     if curve.d == 2:
         return np.asarray(np.einsum("knd,kd->kn", curve.normals(s), gap)[:, 0])
@@ -99,7 +99,7 @@ def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArra
 
 @dataclass(frozen=True)
 class _Model:
-    """A model with its parameters; of a fit also how well they are known, to say what to expect."""
+    """A model with its parameters; for a fit also their uncertainty, to give expected errors."""
 
     model: CableModel
     p: FloatArray
@@ -108,17 +108,17 @@ class _Model:
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """What makes its predictions uncertain."""
+        """Uncertainty of its predictions."""
         return uncertainty_of(self.fit) if self.fit else None
 
     @cached_property
     def roughest(self) -> Uncertainty | None:
-        """The same with a rest curvature as rough as the data allow."""
+        """The same uncertainty with a rest curvature as rough as the data allow."""
         return uncertainty_of(with_roughest_rest(self.fit)) if self.fit else None
 
     @property
     def nodes(self) -> dict[str, FloatArray]:
-        """Of the fitted poses, by name."""
+        """Nodes of the fitted poses, by name."""
         if self.fit is None:
             return {}
         problem, x = self.fit.problem, self.fit.point.shapes.x
@@ -126,7 +126,7 @@ class _Model:
 
     @property
     def noise(self) -> float:
-        """Of a point [m] beside other repeats."""
+        """Standard deviation [m] of a point about other repeats."""
         return self.fit.noise.of_points.beside_repeats if self.fit else 0.0
 
     def stage(
@@ -138,7 +138,7 @@ class _Model:
         chi2_per_dof: float | None = None,
         note: str = "",
     ) -> Stage:
-        """Predictions of all poses, and their errors."""
+        """Predict all poses and compute their errors."""
         poses = [item.pose for item in measured]
         predictions = predict_poses(self.model, self.p, self.rest, poses)
         others = measured_branches(self.model, self.p, self.rest, measured, predictions, self.nodes)
@@ -146,7 +146,7 @@ class _Model:
         for j, (item, known, other) in enumerate(zip(measured, predictions, others, strict=True)):
             side = None
             if other is not None and other.other_side and not item.held_out:
-                # A fit has used on which side the cable of its poses hangs.
+                # A fit has used the side on which the cable of each pose hangs.
                 side = _branch_shape(other, item)
                 known, other = other.prediction, None
                 predictions[j], others[j] = known, other
@@ -181,7 +181,7 @@ class _Model:
     def _told(
         self, item: MeasuredPose, known: Prediction, other: MeasuredBranch | None, shape: PoseShape
     ) -> PoseShape:
-        """A predicted pose with its uncertainty, and with that of its next repeat."""
+        """Add to a predicted pose its uncertainty and that of its next repeat."""
         if self.uncertainty is None:
             return shape
         places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
@@ -200,7 +200,7 @@ class _Model:
             line = item.traced
 
             def distances(moved: FloatArray) -> FloatArray:
-                """Lengths (K,) [m] of displacements (K, d, q) as the sensor compares points."""
+                """Lengths (K,) [m] of displacements (K, d, q) in the sensor's directions."""
                 rows = line.components(curve, shape.s, moved)[line.on_points]
                 return np.asarray(np.sqrt(np.bincount(line.point_of, (rows**2).sum(axis=1))))
 
@@ -222,7 +222,7 @@ class _Model:
         measured: MeasuredBranch | None,
         uncertainty: Uncertainty,
     ) -> EitherSide | None:
-        """A held-out pose on both sides, see `EitherSide`; None where there is but one."""
+        """A held-out pose on both sides, see `EitherSide`; None where there is only one."""
         if not (item.held_out and item.readable):
             return None
         if measured is not None and measured.other_side:
@@ -247,7 +247,7 @@ class _Model:
         return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
 
     def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
-        """Whether parameters, fixtures and scatter leave open in which equilibrium a pose is."""
+        """Whether parameters, fixtures and scatter leave the equilibrium of a pose undecided."""
         pair = other.prediction.equilibrium, known.equilibrium
 
         def left_open_by(uncertain: Uncertainty | None) -> bool:
@@ -269,7 +269,7 @@ class _Model:
 
 
 def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple[LimitCheck, ...]:
-    """Checks of all poses that have a prediction, in their order; none without limits."""
+    """Check the limits of all predicted poses, in their order; empty without limits."""
     if not limits.given:
         return ()
     found, known = predict_poses(fit.model, fit.p, fit.rest, poses), uncertainty_of(fit)
@@ -291,7 +291,7 @@ def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple
 def _reading_errors(
     measured: Sequence[MeasuredPose], shapes: Mapping[str, PoseShape], held_out: bool
 ) -> ReadingErrors:
-    """Errors of the readings of one role; none where one of its poses has no prediction."""
+    """Errors of the readings of one role; none if one of its poses has no prediction."""
     names = [x.pose.name for x in measured if x.held_out is held_out and x.reactions]
     if not shapes.keys() >= set(names):
         return ReadingErrors()
@@ -341,7 +341,7 @@ def algorithm1_stage(
     model: CableModel,
     note: str = "",
 ) -> Stage:
-    """The paper's loop; empty where it cannot apply."""
+    """The paper's loop; empty where it does not apply."""
     if result is None:
         return Stage("algorithm1", None, None, None, {}, _no_rest(model), {}, note)
     h = model.cable.length / (len(result.theta_0) + 1)
@@ -362,10 +362,10 @@ def fit_stage(
     intervals: Mapping[str, Interval | None],
     reported: Sequence[str] = (),
 ) -> Stage:
-    """A fit of the batch problem.
+    """Stage of a fit of the batch problem.
 
-    `intervals`: of the stiffnesses and of the mass's factor, by name; None where none is to be
-    told. `reported`: qualified names of the parameters that are effects, not nuisances.
+    `intervals`: of the stiffnesses and of the mass's factor, by name; None where none is reported.
+    `reported`: qualified names of the parameters that are effects, not nuisances.
     """
     return _Model(fit.model, fit.p, fit.rest, fit).stage(
         name,
@@ -379,7 +379,7 @@ def fit_stage(
 def fitted_parameters(
     fit: Fit, intervals: Mapping[str, Interval | None], reported: Sequence[str] = ()
 ) -> dict[str, Estimate]:
-    """What a fit says of its parameters; see `fit_stage`."""
+    """Estimates of a fit's parameters; see `fit_stage`."""
     model = fit.model
     parameters: dict[str, Estimate] = {}
     for full, interval in intervals.items():

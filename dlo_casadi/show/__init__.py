@@ -1,1 +1,1 @@
-"""How numbers and figures look, the same everywhere."""
+"""Format numbers and figures, the same everywhere."""

@@ -1,4 +1,4 @@
-"""The style of all figures, drawn without a screen, and how one becomes a file."""
+"""The style of all figures, drawn without a screen, and how a figure becomes a file."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.io.files import write_file
 
-# Colours that the colour-blind can tell apart, each at least 4.5 to 1 against white.
+# Colours that the colour-blind can distinguish, each with contrast 4.5 to 1 or more on white.
 BLACK, GREY = "#1F2933", "#6B7280"
 ORANGE, BLUE, GREEN, VERMILLION = "#B35A00", "#0067A3", "#00805A", "#9E2A00"
-HELD_OUT = "#8C3B6C"  # poses that no fit saw
+HELD_OUT = "#8C3B6C"  # poses not used in any fit
 FORCE = "#6A3D9A"
 # Lines of obstacles, and of the stretches of a cable that touch them.
 OBSTACLE: dict[str, Any] = {"color": "#A08A6A", "lw": 0.9}
@@ -34,9 +34,9 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.6,
     "font.family": "DejaVu Sans",
-    "text.parse_math": False,  # a name with two dollar signs is no formula
+    "text.parse_math": False,  # a name with two dollar signs is not a formula
 }
-# An arrow's head, as a share of its length: how long and how wide.
+# Length and width of an arrow's head, relative to the arrow's length.
 _HEAD = (0.28, 0.1)
 
 
@@ -52,14 +52,14 @@ def styled(
 
 
 def save_figure(path: Path, drawing: Figure, dpi: float = 150) -> None:
-    """Write a figure in the format of the file's ending, whole or not at all."""
+    """Write a figure in the format of the file's extension, completely or not at all."""
     with mpl.rc_context(STYLE):
         lay_out(drawing, dpi)
         write_file(path, lambda stream: drawing.savefig(stream, format=path.suffix[1:], dpi=dpi))
 
 
 def lay_out(drawing: Figure, dpi: float) -> None:
-    """Lay a figure out once: one that still has an engine is drawn twice each time."""
+    """Lay a figure out once: with a layout engine left it would be drawn twice each time."""
     drawing.set_dpi(dpi)
     layout = drawing.get_layout_engine()
     if layout is not None:
@@ -68,9 +68,9 @@ def lay_out(drawing: Figure, dpi: float) -> None:
 
 
 def arrow(root: FloatArray, shaft: FloatArray) -> FloatArray:
-    """One line (K, d) that draws an arrow from a root (d,) along a shaft (d,).
+    """Return one line (K, d) that draws an arrow from a root (d,) along a shaft (d,).
 
-    Two barbs in a plane, four in space, where it is seen from anywhere.
+    It has two barbs in a plane and four in space, visible from any side.
     """
     size = max(float(np.linalg.norm(shaft)), 1e-12)
     if len(shaft) == 2:

@@ -16,7 +16,7 @@ def vector(components: Iterable[float], form: str, unit: str) -> str:
 
 
 def plus_minus(value: float, std: float) -> str:
-    """A value with the digits that its standard deviation leaves: two of the latter."""
+    """A value rounded to two significant digits of its standard deviation."""
     if not std > 0:
         return f"{value:.4g}"
     decimals = 1 - math.floor(math.log10(std))
@@ -26,7 +26,7 @@ def plus_minus(value: float, std: float) -> str:
 
 
 def html_table(title: str, rows: Sequence[Sequence[str]], remarks: Iterable[str] = ()) -> str:
-    """HTML table with everything escaped; the remarks below it."""
+    """HTML table with everything escaped; the remarks follow below it."""
     columns = max(map(len, rows))
     full = [[*row, *[""] * (columns - len(row))] for row in rows]
     cells = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in full]

@@ -1,4 +1,4 @@
-"""Photographs to centre-lines: arrays in, arrays out."""
+"""Turn photographs into centre-lines: arrays in, arrays out."""
 
 from dlo_casadi.vision.board import Board, locate_board, locate_camera
 from dlo_casadi.vision.calibration import Calibration, calibrate_camera

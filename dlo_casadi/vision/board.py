@@ -1,4 +1,4 @@
-"""The board's ArUco markers, and the pose of the camera from them."""
+"""Find the board's ArUco markers, and the pose of the camera from them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,13 +11,13 @@ from dlo_casadi.errors import VisionError, counted
 from dlo_casadi.vision.camera import Array, Camera, CameraPose, Picture, View
 from dlo_casadi.vision.image import spoilt
 
-MAX_ERROR_PX = 2.0  # largest error of a marker that is where the configuration says
-LEAST_MARKERS = 3  # fewest markers for the pose of a camera: two span no more than a line
-CORNERS_THAT_SHARE = 4  # corners of a marker with a common error (light, blur, print): count as one
+MAX_ERROR_PX = 2.0  # largest error of a marker at its declared place
+LEAST_MARKERS = 3  # fewest markers for a camera's pose: two define only a line
+CORNERS_THAT_SHARE = 4  # corners of a marker share an error (light, blur, print): they count as one
 _BEST_CORNER_PX = 0.05  # smallest error of a corner, from sampling and rounding to grey levels
-_RESIZED = 20.0  # largest factor by which a picture may have been scaled
+_RESIZED = 20.0  # largest factor by which a picture may have been resized
 
-# Mistakes in marker_centers: what was written -> the board's axes, x right and y up.
+# Mistakes in marker_centers: axes as written -> the board's axes, x right and y up.
 _AXES = {
     "y pointing up": [[1, 0], [0, -1]],
     "x pointing right": [[-1, 0], [0, 1]],
@@ -62,7 +62,7 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
     ------
     VisionError
         If no marker of the board is found, if the markers found contradict their declared
-        places, or if a standoff is asked for without a camera.
+        places, or if a standoff is given without a camera.
     """
     if camera is None and board.standoff != 0.0:
         raise VisionError(
@@ -90,8 +90,8 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> CameraPose:
     one, other, shift = fit.plane.T
     rotation = np.column_stack([one, other, np.cross(one, other)])
     at = np.vstack([board.corners(n) for n in fit.found]) @ rotation[:, :2].T + shift
-    # Corners of a marker have a common error: 4 (J^T J)^-1 s^2 with the corners' scatter s^2 = sum
-    # / (2 K - 6). On rendered boards the error of poses is up to five times that of sixteen
+    # Corners of a marker share an error: 4 (J^T J)^-1 s^2 with the corners' scatter s^2 = sum /
+    # (2 K - 6). On rendered boards the error of poses is up to five times that of sixteen
     # independent corners.
     by_shift = camera.project(at)[1]
     J = np.concatenate([np.cross(at[:, None, :], by_shift), by_shift], axis=2).reshape(-1, 6)
@@ -121,7 +121,7 @@ class _Fit:
 def _located(
     image: Picture, board: Board, camera: Camera | None, least: int = 0
 ) -> tuple[_Fit, dict[str, Any]]:
-    """Fit of the markers that agree with their declared places, and the fields of a Photograph."""
+    """Fit of the markers that agree with their declared places, with the fields of a Photograph."""
     seen, repeated = detect_markers(image, board)
     copies = [
         f"marker {n} is seen more than once and not used. Try: cover or remove the copy."
@@ -170,7 +170,7 @@ def _located(
 
 
 def _fit(found: dict[int, Array], board: Board, camera: Camera | None) -> _Fit:
-    """Fit the board's plane to markers; of the two poses that a plane allows the better one."""
+    """Fit the board's plane to markers; of the two poses that fit a plane, return the better."""
     pixels = np.vstack(list(found.values()))
     points = np.vstack([board.corners(marker) for marker in found])
     if camera is None:
@@ -193,7 +193,7 @@ def _fit(found: dict[int, Array], board: Board, camera: Camera | None) -> _Fit:
 
 
 def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, int]) -> str:
-    """Sentence on a camera matrix of another picture size, or of a rotated one; empty if it fits.
+    """Sentence on a camera matrix of another picture size or a rotated picture; empty if it fits.
 
     A principal point is near the middle of the picture from which it was estimated.
     """
@@ -223,7 +223,7 @@ def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, in
 
 
 def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) -> str:
-    """Sentence on other axes with which the declared places would fit, if there are any."""
+    """Sentence on other axes for which the declared places would fit, if there are any."""
     for what, axes in _AXES.items():
         centers = {n: np.array(axes) @ np.array(board.marker_centers[n], float) for n in found}
         fit = _fit(found, replace(board, marker_centers=centers), camera)

@@ -1,4 +1,4 @@
-"""The camera from a session's own photographs of the board."""
+"""Calibrate the camera from a session's own photographs of the board."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -17,15 +17,15 @@ from dlo_casadi.vision.board import (
 )
 from dlo_casadi.vision.camera import Array, Camera, Picture
 
-_LEAST_PHOTOGRAPHS = 3  # each gives two equations for the five numbers of the matrix
+_LEAST_PHOTOGRAPHS = 3  # each gives two equations for the five numbers of the camera matrix
 _GOOD_FOCAL = 0.005  # largest relative std of a good focal length: 0.5 % of lengths along the view
-# Smallest angle [deg] between the most different directions; below, focal length and distance mix.
+# Smallest angle [deg] between the most different views; below it focal length and distance mix.
 _TILTED = 20.0
 # Std of a coordinate of marker_centers [m], measured with a ruler. The error is the same in all
-# photographs and does not show in the residuals: on drawn corners with markers off by this, three
+# photographs and invisible in the residuals: for drawn corners with markers off by this, three
 # photographs within 12 degrees gave errors up to 5.7 %, where the scatter alone predicted 2 %.
 _PLACED = 1e-3
-_APART = "30 to 90 degrees apart"  # directions that separate focal length from distance
+_APART = "30 to 90 degrees apart"  # view angles that separate focal length from distance
 _FILLED = 0.5  # smallest share of the picture with corners: beyond them the lens is extrapolated
 # Lenses, by the coefficients that are fitted: none, k1, k1 k2, k1 k2 p1 p2 k3.
 _STRAIGHT = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
@@ -66,15 +66,15 @@ def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibr
     """Find matrix and lens of the camera that took several photographs of the board.
 
     All poses, the matrix and the lens minimise the reprojection error of all corners, from the
-    closed solution for a plane seen from several directions. Of four lenses (straight; k1; k1, k2;
-    k1, k2, p1, p2, k3) the one of least
+    closed-form solution for a plane seen from several directions. Of four lenses (straight; k1; k1,
+    k2; k1, k2, p1, p2, k3) the one with the smallest
 
         N log(error^2) + k log(N)
 
-    with k numbers and N independent corners is taken (Schwarz).
+    with k numbers and N independent corners is chosen (Schwarz).
 
-    The photographs (H, W, 3) uint8, by their names, are all taken with one camera at one focus and
-    zoom. The board's standoff does not count.
+    The photographs (H, W, 3) uint8, by name, are all taken with one camera at one focus and
+    zoom. The board's standoff is ignored.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def _solve(
     ):
         projected, slope = cv2.projectPoints(corners, turn, shift, matrix, lens)
         slopes.append(slope[:, : 10 + fitted])
-        # A shift of a marker on the board moves its corners as a shift of the board would.
+        # Moving a marker on the board moves its corners like moving the board would.
         moved = slope[:, 3:6] @ cv2.Rodrigues(turn)[0][:, :2]
         own = [
             np.kron(np.array(list(markers)) == n, np.ones(8))[:, None] * moved
@@ -185,8 +185,8 @@ def _solve(
 def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Array:
     """Marginal standard deviations (4,) [px] of the matrix, over poses and lens.
 
-    They include the scatter of corners, those of a marker counting as one, and errors of the
-    declared markers. OpenCV's omit directions that photographs from one place do not determine.
+    They include the scatter of corners, where the corners of a marker count as one, and errors of
+    the declared markers. OpenCV's omit directions that photographs from one place do not determine.
 
     `slopes` (2 K, 10 + k) are derivatives of the corners of each photograph by its place (6), the
     matrix (4) and the lens, `displaced` (2 K, 2 m) by the places of the m markers on the board
@@ -204,7 +204,7 @@ def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Arra
 
 
 def _advice(found: Calibration, filled: float) -> Iterator[str]:
-    """Advice on better photographs; corners are seen in the share `filled` of the picture."""
+    """Advice on better photographs; corners cover the share `filled` of the picture."""
     if found.focal_uncertainty > _GOOD_FOCAL or found.spread < _TILTED:
         yield (
             f"the focal length is known to {100 * found.focal_uncertainty:.1f} % only, from "

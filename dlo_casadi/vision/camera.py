@@ -1,4 +1,4 @@
-"""Cameras: pixels to the cable's plane and back, and the image of a round cable in space."""
+"""Cameras: map pixels to the cable's plane and back, and project a round cable in space."""
 
 from dataclasses import dataclass, field, fields, replace
 
@@ -16,7 +16,7 @@ Indices = NDArray[np.intp]
 Picture = NDArray[np.uint8]
 
 # Stopping rule of OpenCV's fixed-point inversion of a lens. Its five default steps leave 0.6 px
-# where a lens moves the corners by 60 px; 1e-10 px takes thirty steps there, ten for 10 px.
+# if a lens moves the corners by 60 px; 1e-10 px takes thirty steps there, ten for 10 px.
 _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
 
 
@@ -117,7 +117,7 @@ class View(Photograph):
 
     @property
     def scale(self) -> float:
-        """Pixels per metre about the middle of the picture."""
+        """Pixels per metre near the middle of the picture."""
         height, width = self.shape
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
         x, y = self.to_board(middle + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])).T
@@ -236,8 +236,8 @@ def project_outline(
     Returns
     -------
     Middles (K, 2) [px] between the two edges, unit vectors (K, 2) across the projected axis, and
-    d(pixel)/d(point) (K, 2, 3) [px/m] in the board frame, that of the axis: the middle follows it
-    to a part in 1e-4.
+    d(pixel)/d(point) (K, 2, 3) [px/m] in the board frame. The derivative is that of the axis, which
+    the middle follows to one part in 1e4.
 
     The two planes through the camera that touch a straight cylinder of radius r about the axis
     through p (in the camera's frame) along t are at +-a from the plane of the axis, with sin a =

@@ -25,18 +25,18 @@ from dlo_casadi.vision.profiles import (
 from dlo_casadi.vision.workplane import ALONG_BOARD, ExpectedLine, KnownCable, rectify
 
 _STEP = 1 / 8  # of the diameter: distance between profiles
-_RAW, FINE = 0.15, 0.7  # diameters over which profiles are averaged: to judge them, to measure
-# Relative difference in height or width from which a profile is unlike others. Both vary by 1.5 %
+_RAW, FINE = 0.15, 0.7  # diameters over which profiles are averaged: to judge them, and to measure
+# Relative difference in height or width beyond which a profile is unusual. Both vary by 1.5 %
 # along a cable of seven pixels, and by 6 % half a width from its end.
 _UNLIKE = 0.05
 _WHITE = 248  # grey level
-_FLOOR_PX = 0.06  # smallest error over centimetres, by a photograph's sampling and compression
+_FLOOR_PX = 0.06  # smallest error averaged over centimetres, due to sampling and compression
 SPACING = 0.0025  # m, distance between points of a line
 _MOST_POINTS = 400
-_FAR = 0.2  # largest distance of the line's end from a fixture in the picture, of the length
-_LEAST = 0.2  # least part of the length that must be measured
-_DOUBTFUL = 0.8  # confidence below which a message says why
-_SHORT = 0.97  # of the length: a shorter line between both fixtures is not to scale
+_FAR = 0.2  # of the length: largest distance of the line's end from a fixture in the picture
+_LEAST = 0.2  # smallest share of the length that must be measured
+_DOUBTFUL = 0.8  # confidence below which a message gives the reason
+_SHORT = 0.97  # share of the length: a shorter line between both fixtures has a wrong scale
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ def trace_cable(
         shape = edge_shape(smooth, direction, usual, guess)
         rough = find_edges(smooth, direction, shape)
         sound = raw.inside & _is_usual(rough, usual, diameter)
-        # Not in front of the board: with it the interval of EI from ten rendered poses was half as
-        # wide and did not contain the truth.
+        # Not in front of the board: with it the interval of EI from ten rendered poses was half
+        # as wide as without, and did not contain the truth.
         if not varied:
             sound &= ~_beside_end(rough, t, sound, diameter)
         if sound.sum() < 8:
@@ -92,7 +92,7 @@ def trace_cable(
         curve = fit_curve(t, points, sound.astype(float), 2 * diameter, 0.5 * diameter)
         usual = sound
         raw = sample_profiles(bright, view, curve, t, diameter)
-    # In a plane, light shifts the edges alike in all photographs, which `edge_bias` models better:
+    # In a plane, light shifts the edges equally in all photographs. `edge_bias` models this better:
     # EI of the rendered `connector` is 0.2 % off with it, 2 % with a correction here.
     rough = find_edges(raw.average(raw.inside, _RAW * diameter), direction, shape, varied)
     fine = find_edges(raw.average(sound, FINE * diameter), direction, shape, varied)
@@ -111,8 +111,8 @@ def trace_cable(
 def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BSpline, Array]:
     """Smooth curve through the strands, extended straight at both ends, and its samples t.
 
-    It is extended to a near fixture, otherwise by two diameters: a skeleton ends half a width
-    early, and the profiles show where the cable ends.
+    It is extended to a near fixture, otherwise by two diameters: a skeleton ends half a width too
+    early, and the profiles show the cable's end.
     """
     diameter = expected.diameter
     points = np.vstack(strands)
@@ -142,9 +142,9 @@ def _is_usual(found: Crossings, usual: Flags, diameter: float) -> Flags:
 
 
 def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Flags:
-    """Profiles near a line's end, within a diameter, up to the last that differs from inner ones.
+    """Profiles within a diameter of a line's end, up to the last one that differs from inner ones.
 
-    The blur of the cable's end, or its holder, moves the middle before a profile is unusual.
+    Blur of the cable's end, or a holder, moves the middle before a profile looks unusual.
     """
     beside = np.zeros(len(t), bool)
     inwards = np.flatnonzero(sound)
@@ -162,8 +162,8 @@ def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Fl
 def _without_rims(sound: Flags) -> Flags:
     """Leave out short sound intervals, and the neighbourhood of long unsound ones.
 
-    Beside a holder, a pin or an occluder its colour leaks into profiles that still look sound. The
-    same holds for the line's ends, at the fixtures.
+    Beside a holder, a pin or an occluder its colour leaks into profiles that still look sound. This
+    also happens at the line's ends, at the fixtures.
     """
     rim = round(0.35 / _STEP)
     sound = sound.copy()

@@ -26,12 +26,12 @@ from dlo_casadi.vision.workplane import (
 
 _State: TypeAlias = tuple[float, tuple[int, ...], float, float]  # cost, path, seen, total
 _BEAM = 40  # number of chains that are followed at a time
-_LENGTH_TOLERANCE = 0.05  # relative; two clicked reference points are no better than this
+_LENGTH_TOLERANCE = 0.05  # relative; two clicked reference points are no more accurate
 _LEAST = 0.25  # smallest share of the length that must be seen
-_TWIN = 0.5  # of the cable's length: a longer strand beside it is a second cable
-_TWIN_CONTRAST = 0.6  # least contrast of a second cable, relative to the first
-_ROOT = 3.0  # diameters: largest distance from the chain at which a strand covered twice begins
-_ALIKE = 0.5  # largest difference in colour of a cable's strands, over that from the surroundings
+_TWIN = 0.5  # share of the cable's length: a longer strand beside the cable is a second cable
+_TWIN_CONTRAST = 0.6  # smallest contrast of a second cable, relative to the first
+_ROOT = 3.0  # diameters: largest distance from the chain at which a doubly covered strand begins
+_ALIKE = 0.5  # largest colour difference of a cable's strands, over that from the surroundings
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def _strands(
 ) -> list[Strand]:
     """Strands of a mask in metres, smoothed, and cut where they pass a fixture.
 
-    The tail of the cable beyond a fixture is then no part of the measured line.
+    The cable's tail beyond a fixture is thus not part of the measured line.
     """
     plane, width_px = contrast.plane, expected.diameter / contrast.plane.pixel
     margin = max(2, round(width_px))
@@ -241,8 +241,8 @@ def _links(ways: list[Array], diameter: float, scene: Scene) -> tuple[Array, Arr
 def _of_one_colour(strands: list[Strand], chosen: list[Strand]) -> list[Strand]:
     """Strands of the same colour as the longest of the chosen ones, without shadows.
 
-    Away from the board a shadow is a line of its own; the cable's contrast changes with its
-    background, but not its colour.
+    In front of the board a shadow is a separate line. The cable's contrast changes with its
+    background, but its colour does not.
     """
     ours = max(chosen, key=lambda strand: strand.length)
     most = _ALIKE * float(np.linalg.norm(ours.step))
@@ -253,7 +253,7 @@ def _with_folds(chain: StrandChain, strands: list[Strand], diameter: float) -> S
     """The chain with strands inserted that the cable follows forth and back.
 
     Seen from its side, a bend is a strand with a free end that the cable covers twice. It begins
-    where the chain turns back, and both parts of the chain there lead into it.
+    where the chain turns back, and both adjacent parts of the chain lead into it.
     """
 
     def step(line: Array) -> Array:
@@ -288,8 +288,8 @@ def _refuse_twins(
 ) -> None:
     """Raise if strands away from the chain look like a second cable.
 
-    Within reach of the fixtures all of them count together; beyond, where the cable cannot be
-    anyway, only one long strand does.
+    Within reach of the fixtures the total length of all of them counts; beyond, where the cable
+    cannot be, only a single long strand does.
     """
     diameter, length = expected.diameter, expected.typical
     plane, candidate = contrast.plane, workings.candidate

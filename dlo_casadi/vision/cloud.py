@@ -1,4 +1,4 @@
-"""The line of a cable in a cloud of points that a depth camera has seen of its surface."""
+"""Find the line of a cable in a depth camera's cloud of points on its surface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ from dlo_casadi.vision.chain import Strand, order_strands
 from dlo_casadi.vision.profiles import fit_curve
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
-_ALIKE = 40.0  # distance in CIE Lab within which a colour is that of the cable
-_REACH = 2.0  # diameters: distance of points that are neighbours, and from the line
-_LONELY = 0.2  # of the usual number of neighbours: a point with fewer is none of the cable
+_ALIKE = 40.0  # distance in CIE Lab within which a colour counts as the cable's
+_REACH = 2.0  # diameters: distance of neighbouring points, and of points from the line
+_LONELY = 0.2  # share of the usual number of neighbours: a point with fewer is not on the cable
 _SHORTEST = 2.0  # diameters: shorter strands are left out
 _KNOT, _SMOOTH = 5.0, 2.0  # diameters, of the spline
-_ROUNDS = 4  # of assigning points to the spline and fitting it again; it settles in three
+_ROUNDS = 4  # rounds of assigning points to the spline and refitting it; it converges in three
 SPACING = 0.01  # m, distance between points of the line
-_FEWEST = 5  # points of the cloud that make one of the line
+_FEWEST = 5  # points of the cloud needed for one point of the line
 _LEAST = 0.25  # smallest share of the length that must be seen
-_TOLD = 0.05  # of the length: a hidden part that is mentioned
+_TOLD = 0.05  # share of the length: a longer hidden part is reported
 
 
 @dataclass(frozen=True)
@@ -55,20 +55,20 @@ def of_color(colors: FloatArray, wanted: Sequence[float]) -> Flags:
 def line_in_cloud(points: FloatArray, cable: KnownCable, camera: FloatArray | None) -> CloudLine:
     """Find the line of a cable in a cloud of its surface.
 
-    Neighbouring points make strands, which are ordered as those in a photograph are; a spline
-    through them is fitted to all points nearby. A camera sees the near half of the surface alone:
+    Neighbouring points form strands, which are ordered like those in a photograph; a spline
+    through them is fitted to all points nearby. A camera sees only the near half of the surface:
     a point at the distance u from the middle, across the line of sight, lies sqrt(r^2 - u^2) before
-    the axis, r being the cable's radius, and is moved back by that much. The points of the line are
-    means over a centimetre each.
+    the axis, r being the cable's radius, and is moved back by this distance. Each point of the line
+    is a mean over a centimetre.
 
     Parameters
     ----------
     points : (K, 3) [m]
-        Of the cable; a few others do no harm.
+        Of the cable; a few others are harmless.
     cable : KnownCable
         Its fixtures, (3,) [m] each, and its size.
     camera : (3,) [m] or None
-        Where the camera stands. Without it the line lies pi r / 4 before the axis.
+        Place of the camera. Without it the line lies pi r / 4 before the axis.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def _strands(points: Array, diameter: float) -> list[Strand]:
     tree = cKDTree(points)
     count = tree.query_ball_point(points, reach, return_length=True)
     points = points[count > _LONELY * np.median(count)]
-    # One point in each cube of half a diameter, moved to the mean of its neighbours.
+    # One point per cube of half a diameter, moved to the mean of its neighbours.
     cubes = np.floor(points / (0.5 * diameter)).astype(int)
     first = np.unique(cubes, axis=0, return_index=True)[1]
     tree = cKDTree(points)

@@ -1,4 +1,4 @@
-"""Photographs: complete ones read from disk, and the steps of an extraction drawn."""
+"""Read photographs, refusing incomplete ones, and draw the steps of an extraction."""
 
 import warnings
 from collections.abc import Callable
@@ -17,12 +17,12 @@ from dlo_casadi.vision.chain import Workings
 # Blue, green, red.
 _BLUE, _ORANGE, _RED = (178, 114, 0), (0, 159, 230), (0, 94, 213)
 _GREEN, _GREY = (115, 158, 0), (150, 150, 150)
-_SATURATED = 4.0  # contrast that is drawn white, over the cut
-_WHITE, _MUCH_WHITE = 250, 0.3  # grey level; share of it from which a picture is overexposed
+_SATURATED = 4.0  # contrast that is drawn white, relative to the cut
+_WHITE, _MUCH_WHITE = 250, 0.3  # grey level; share of such pixels in an overexposed picture
 _BLURRED_PX = 2.0  # std of blurred edges beyond which markers of some 30 px cannot be read
 
-# Largest number of pixels of a picture. The camera step holds 15 bytes a pixel, measured: 1.5 GB
-# for this many, which show a board of 1 m at 0.1 mm a pixel.
+# Largest number of pixels of a picture. The camera step was measured to need 15 bytes per pixel:
+# 1.5 GB for this number, which shows a board of 1 m at 0.1 mm per pixel.
 MOST_PIXELS = 100_000_000
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
@@ -104,7 +104,7 @@ def _is_whole(picture: ImageFile.ImageFile) -> bool:
 def spoilt(image: Picture) -> str:
     """Sentence for a photograph (H, W, 3) that is overexposed or blurred; empty if it is neither.
 
-    A step of the height h blurred by the standard deviation s is nowhere steeper than
+    A step of height h blurred by the standard deviation s has the largest slope
     h / (s sqrt(2 pi)).
     """
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -136,12 +136,12 @@ def draw_steps(image: Picture, workings: Workings) -> dict[str, Picture]:
     pictures: dict[str, Picture] = {}
     plane, candidate, cut = workings.plane, workings.candidate, workings.cut
     if plane is not None:
-        # what the cable cannot reach, and the markers, are dimmed
+        # dimmed: markers, and what the cable cannot reach
         pictures["1_workplane"] = picture = plane.image.copy()
         picture[~plane.reachable] //= 3
         _mark_fixtures(picture, workings, plane.to_pixels, 0.5)
     if plane is not None and candidate is not None:
-        # contrast in grey; what is above the cut, and within reach, in orange
+        # contrast in grey; orange above the cut and within reach
         grey = np.clip(candidate / max(_SATURATED * cut, 1e-6) * 255, 0, 255).astype(np.uint8)
         pictures["2_contrast"] = picture = np.repeat(grey[..., None], 3, axis=2)
         above = (candidate > cut) & plane.reachable

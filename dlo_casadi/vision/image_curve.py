@@ -1,4 +1,4 @@
-"""The centre-line of a cable in space in one photograph, and its pixels matched with others."""
+"""Find a cable in space in one photograph, and match its pixels with other photographs."""
 
 from dataclasses import dataclass, replace
 
@@ -14,14 +14,14 @@ from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.profiles import normals
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
-_NEAREST = 0.2  # m: smallest distance from which a cable is photographed
-_BESIDE = 1.6  # widths: distance of two parts of the line below which they share an edge
+_NEAREST = 0.2  # m: smallest distance from which a cable can be photographed
+_BESIDE = 1.6  # widths: distance between two parts of the line below which they share an edge
 _APART = 2.0  # widths: distance along the line from which two places are different parts
-TIP = 4.0  # widths: distance from a fixture beyond which a message names the line's end
+TIP = 4.0  # widths: distance from a fixture beyond which a message reports the line's end
 _CAP = 3.0  # standard deviations at which a pair costs as much as an unmatched pixel
 _GOOD = 2.0  # standard deviations: largest distance of the pixels of a pair
-_STEP = 0.05  # cost of a pair, which prefers the shortest of equal ways along an epipolar line
-_NEAR_PX = 2.0  # error of a projected curve; pixels three times as far do not belong to it
+_STEP = 0.05  # cost of a pair, which prefers the shortest of equal paths along an epipolar line
+_NEAR_PX = 2.0  # error of a projected curve; pixels three times as far off do not belong to it
 _POSE_PX = 0.5  # error of an epipolar line from the cameras' poses
 
 
@@ -124,8 +124,8 @@ def _expected_line(cable: KnownCable, viewpoint: CameraPose, distance: float) ->
     """The expected line in the facing plane, with bounds on its length there.
 
     The lower bound is the distance of the fixtures there, or some diameters. The upper bound is the
-    cable's length where it is nearest: half of its length beyond the distance of the fixtures may
-    lead towards the camera, with a free end all of it.
+    cable's length at the smallest possible depth: half of the length beyond the distance of the
+    fixtures may lead towards the camera; with a free end all of it.
     """
     flat = viewpoint.flattened(cable.fixtures, distance)
     fixtures, length = viewpoint.in_camera(cable.fixtures), cable.length

@@ -15,16 +15,16 @@ from dlo_casadi.vision.camera import Array, Flags, View
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
 _BESIDE = 2.2  # blurs beyond the edge: where the surroundings begin
-_BODY = 0.4  # widths: half of the middle part that shows the cable's own level
+_BODY = 0.4  # widths: half of the middle part that has the cable's own level
 _LOCAL = 2.0  # diameters along the cable over which steps are averaged
-# Widths along the cable, to either side, of constant illumination. Beside a card that hides part of
-# a rendered cable, lines on a board are 0.93 mm off with 2, 0.73 mm with 5 and 0.69 mm with 12.
+# Widths along the cable, to either side, of constant illumination. Beside a card that hides part
+# of a rendered cable, lines on a board are 0.93 mm off with 2, 0.73 mm with 5, 0.69 mm with 12.
 _LIT = 5.0
-_INNER = 0.15  # of the width: nearer to the middle both sides look the same
+_INNER = 0.15  # of the width: nearer to the middle both sides look alike
 _CLEAR = 1.3  # blurs inside an edge where nine tenths of the step are reached
-_MOST_SHADE = 0.5  # of the step: largest difference by shading
+_MOST_SHADE = 0.5  # of the step: largest difference due to shading
 _FAINT = 0.3  # of the usual step: the smallest step of the cable
-_BARE = 0.35  # share of the cable's width without highlights
+_BARE = 0.35  # share of the cable's width free of highlights
 DEGREE = 3  # of all splines
 
 
@@ -175,12 +175,11 @@ def find_edges(
 ) -> Crossings:
     """Find both edges of every profile, and the middle between them.
 
-    The direction (3,) or (K, 3) weighs the colours. An edge is where the brightness is half-way
-    between the cable and its surroundings, those of its own side and close by: a shadow that falls
-    beside the cable changes the level of one side, not the place of the edge. Instead of one
-    crossing the mean over all levels from 1/4 to 3/4 is taken; with q the share of the way from
-    surroundings (0) to cable (1), and Q(x) the largest q from x outwards, which passes over a
-    highlight wherever it lies,
+    The direction (3,) or (K, 3) weights the colours. An edge is where the brightness is half-way
+    between the cable and its surroundings on the same side and close by: a shadow beside the cable
+    changes the level of one side, not the place of the edge. Instead of one crossing, the mean over
+    all levels from 1/4 to 3/4 is used. With q the share of the way from surroundings (0) to cable
+    (1), and Q(x) the largest q from x outwards, which ignores a highlight wherever it lies,
 
         x_edge = integral_0^out clip(2 Q(x) - 1/2, 0, 1) dx
 

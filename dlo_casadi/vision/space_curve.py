@@ -30,7 +30,7 @@ _WANDER, _WANDER_NEXT = np.logspace(-1.0, 5.0, 13), np.array([0.3, 0.6, 1.0, 1.7
 # Maximum number of iterations, and largest step at convergence [m]: a quarter of the smallest std
 # of a line from three photographs.
 _LOOPS, _TOLERANCE = 15, 3e-5
-_FINE = np.linspace(0.0, 1.0, 1001)  # places along a line in space, closely spaced
+_FINE = np.linspace(0.0, 1.0, 1001)  # closely spaced places along a line in space
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def fit_curve_to_images(
     rough = np.asarray(block_diag(bending, np.zeros((6 * m, 6 * m))), float)
     wander = _WANDER * curve.length**2
     for loop in range(_LOOPS):
-        # Rows that hold the curve along itself, which no photograph does.
+        # Rows that fix the curve's motion along itself, which no photograph shows.
         t = np.linspace(0.0, 1.0, 3 * n)
         still = curve.design(t)[:, :, None] * curve.tangent(t)[:, None, :] / _TANGENTIAL
         rows = [np.hstack([still.reshape(3 * n, -1), np.zeros((3 * n, 6 * m))])]

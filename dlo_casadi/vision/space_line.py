@@ -1,4 +1,4 @@
-"""The line in space that the photographs of one pose agree on, without any model."""
+"""The line in space on which the photographs of one pose agree, without any model."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from dlo_casadi.vision.workplane import KnownCable
 
 _AGREE = 0.6  # smallest share of a photograph's pixels on the common line: each may hide parts
 _READINGS = 8  # largest number of orders of loops that are tried
-_SURE = 0.9  # share of pixels from which the first curve of a pair is good enough
+_SURE = 0.9  # share of pixels beyond which the first curve of a pair is good enough
 _AGREE_PX = 1.0  # px, errors of the cameras' poses, added to four standard deviations
 _FAR = 0.05  # of the length: largest distance of the line's end from its fixture
 _LONGER = 1.1  # of the cable's length: largest length of a line in space up to its fixtures
@@ -40,9 +40,9 @@ _NARROW = np.radians(5.0)  # smallest angle of two cameras: depths are then ten 
 # space from rendered photographs change by less than a tenth of their std.
 _SPAN = 2.0
 _SPANS = (20, 100)  # smallest and largest number of spans
-_UNKNOWN = 0.05  # of the length: unknown part beyond which a message says why
+_UNKNOWN = 0.05  # of the length: unknown part beyond which a message gives the reason
 _KNOWN = 0.25  # diameters: largest standard deviation of a point
-_MISSING = 0.1  # of the length: a line shorter by more lacks a hidden part
+_MISSING = 0.1  # of the length: a line that is shorter by more lacks a hidden part
 
 
 @dataclass(frozen=True)

@@ -108,9 +108,9 @@ def rectify(image: Picture, view: View, expected: ExpectedLine) -> WorkPlane:
     """Resample the photograph onto the cable's plane, where the cable is `CABLE_PX` wide.
 
     A cable of length L between two fixtures stays inside the ellipse |p - start| + |p - end| <= L,
-    which with the foci +-c and the long half axis a has the half sides sqrt(a^2 - |c|^2 + c_i^2);
-    with a free end inside the disc |p - start| <= L. Both are widened a little, since the scale
-    may be off. The picture is larger where a second cable is searched for.
+    whose half sides are sqrt(a^2 - |c|^2 + c_i^2), with the foci +-c and the long half axis a. With
+    a free end it stays inside the disc |p - start| <= L. Both are widened a little, since the scale
+    may be wrong. The picture is larger if a second cable is searched for.
     """
     height, width = image.shape[:2]
     fixtures, diameter, length = expected.fixtures, expected.diameter, expected.longest
@@ -197,7 +197,7 @@ def local_contrast(plane: WorkPlane, width_px: float) -> Contrast:
     """Subtract the median over a window of four cable widths, which a cable does not change.
 
     Slow changes of the light and steps at the edges of larger objects are in the median and cancel;
-    a cable, whether darker, brighter or of another colour, does not.
+    a cable does not, whether it is darker, brighter or of another colour.
     """
     background = cv2.medianBlur(plane.image, 2 * round(2.0 * width_px) + 1)
     difference = plane.image.astype(np.float32) - background.astype(np.float32)
@@ -276,7 +276,7 @@ def find_strands(mask: Flags, width_px: float) -> list[tuple[Indices, float]]:
     depth = cv2.distanceTransform(filled, cv2.DIST_L2, 5)
     lines = cv2.ximgproc.thinning(filled, thinningType=cv2.ximgproc.THINNING_ZHANGSUEN) > 0
     lines &= depth < _WIDEST / 2 * width_px + 0.5
-    # At a junction of three or more lines there are as many steps from off to on around a pixel; a
+    # At a junction of three or more lines there are as many steps from off to on around a pixel. A
     # corner of a staircase has many neighbours, but only two such steps.
     ring = [(0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0), (0, 0)]
     padded, (height, width) = np.pad(lines, 1), lines.shape
