@@ -351,14 +351,15 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
 
 
 def nearest_to_poses(
-    fit: Fit, stages: Sequence[Stage], staged: Callable[[Fit], Stage]
+    fit: Fit, stages: Sequence[Stage], staged: Callable[[Fit], Stage], *, diagnosed: bool
 ) -> tuple[Fit, Stage]:
     """Return a fit and its stage; if the model is incomplete, the fit nearest to the fit poses.
 
     A fit that trusts each point to its noise distorts ends and rest shape to make up for a missing
     effect, and may predict worse than a straight cable. It is then repeated with a noise that
     includes the misfit, from itself and from each simpler fit; the best prediction wins.
-    `stages`: as in `not_worse`. `staged`: makes the stage of a fit.
+    `stages`: as in `not_worse`. `staged`: makes the stage of a fit. `diagnosed`: a diagnosis
+    follows, after which a complete model is reported whatever is nearest here.
     """
     *others, own = stages
     simpler = [stage for stage in others if stage.name in SIMPLER]
@@ -368,7 +369,7 @@ def nearest_to_poses(
         if not fit.problem.priors.pose_scatter.std:
             return fit, own
         # By more than chance, where the whole residual may be scatter from pose to pose.
-        least *= 1 + 1 / np.sqrt(2 * len(fit.problem.used))
+        least *= 1.0 if diagnosed else 1 + 1 / np.sqrt(2 * len(fit.problem.used))
     if _off(own) <= least:
         return fit, own
     first = fit if misfit else fit_to_misfit(fit)

@@ -133,10 +133,10 @@ def fit_session(
 
     step("compare with simpler fits", 0, 1)
     reported = _parameters_of({item.name for item in config.model.effects}, fit.model)
+    diagnosed = config.diagnosis.enabled
 
     def staged(fit: Fit) -> Stage:
         # Intervals follow the diagnosis: a model that does not explain the points gets none.
-        diagnosed = config.diagnosis.enabled
         intervals = dict.fromkeys(profiled(fit)) if diagnosed else profile_intervals(fit)
         return fit_stage("batch", fit, measured, intervals, reported)
 
@@ -148,7 +148,7 @@ def fit_session(
     best = _confirmed(fit, confirming, clock)
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])
-    if not config.diagnosis.enabled:
+    if not diagnosed:
         near = at_random(fit)
         if near is not None:
             fit, error = near, mesh_error(near)
@@ -156,12 +156,12 @@ def fit_session(
                 fit, error = fine_enough(near, near.model.n)
         fit = as_measured(fit)
     own = own if fit is best else staged(fit)
-    nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged)
+    nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged, diagnosed=diagnosed)
     stages = [*stages, own]
     step("compare with simpler fits", 1, 1)
     clock.lap("fit")
     found: dict[str, Any] = {}
-    if config.diagnosis.enabled:
+    if diagnosed:
         fit, error, found = close_the_loop(
             config, fit, nearest, stages, measured, reported, center, clock, step, executor
         )

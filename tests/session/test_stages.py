@@ -184,10 +184,11 @@ def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable():
     def staged(found):
         return fit_stage("batch", found, poses, {})
 
-    nearest, stage = nearest_to_poses(fit, stages, staged)
+    nearest, stage = nearest_to_poses(fit, stages, staged, diagnosed=True)
     assert nearest.noise.source == "misfit"
     assert stage.rmse_fit_measured_branch < stages[0].rmse_fit_measured_branch
-    assert nearest_to_poses(nearest, [stages[0], stage], staged) == (nearest, stage)
+    again = [stages[0], stage]
+    assert nearest_to_poses(nearest, again, staged, diagnosed=True) == (nearest, stage)
 
 
 def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():
