@@ -323,11 +323,12 @@ def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, Float
 
 
 def survival(score: float, dof: int, noise_dof: float) -> float:
-    """Probability of a larger score if nothing is missing: chi-square, or F.
+    """Probability of a larger score if nothing is missing: chi-square, or F; 1 if it is negative.
 
     `dof`: degrees of freedom of the score, at least one. `noise_dof`: those with which the noise is
     known; inf if it is declared.
     """
+    score = max(score, 0.0)
     if np.isinf(noise_dof):
         return float(chdtrc(dof, score))
     return float(fdtrc(dof, noise_dof, score / dof))

@@ -6,6 +6,7 @@ import pytest
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
+from dlo_casadi.diagnosis.screening import survival
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -112,3 +113,8 @@ def test_an_effect_that_stands_for_the_error_of_the_mesh_is_dropped_on_a_finer_o
 
     assert len(left) == kept
     assert (smaller.model.n == 20) == kept
+
+
+@pytest.mark.parametrize("noise_degrees", [np.inf, 1000.0])
+def test_a_gain_that_rounding_makes_negative_shows_nothing(noise_degrees):
+    assert survival(-1e-9, 1, noise_degrees) == pytest.approx(1.0)
