@@ -169,15 +169,17 @@ class Quadratic(Arc):
 
 
 def _stiffening(x: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Relative stiffness of a bubble and its derivative: 1 + x for x >= -1/2, above 1/4 for any x.
+    """Relative stiffness of a bubble and its derivative: 1 + x for x >= -0.1, above 1/4 for any x.
 
     x is positive under tension. Without the lower bound, elements of a limp cable buckle one by one
     on the way to an equilibrium. The function is twice differentiable. Equilibria pressed by
     obstacles reach x = -0.03; there an error of O(x^3) changed energies by 3e-8 of m g L + EI/L.
+    With 1 + x for x >= -1/2, 7 of 144 descents of a limp cable on a strong tether did not converge.
     """
-    a = 4 * ca.fmin(x + 0.5, 0)
+    y, room = x + 0.1, 0.65
+    a = ca.fmin(y, 0) / room
     pressed = 1 - a + a**2
-    return ca.fmax(x + 0.5, 0) + 0.25 + 0.25 / pressed, (1 - 2 * a) / pressed**2
+    return ca.fmax(y, 0) + 0.25 + room / pressed, (1 - 2 * a) / pressed**2
 
 
 class Helix(Element):

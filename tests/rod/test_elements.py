@@ -295,12 +295,12 @@ def test_rest_curvature_inside_few_cells_and_beside_clamps():
 # ---- the bubble --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tension", [0.0, 2.0, 20.0, -0.5, -20.0])
+@pytest.mark.parametrize("tension", [0.0, 2.0, 20.0, -0.2, -0.5, -20.0])
 def test_the_bubble_minimises_the_energy_of_its_element(tension):
     """A load f across the chord and a tension N along it: the Lagrangian, minimised by hand.
 
     V = EI/2 int (dphi/ds)^2 ds - int (N, f) . t(u) ds. Under compression the bubble's stiffness
-    is that of V down to half of the section's own, and above a quarter of it for any.
+    is that of V down to nine tenths of the section's own, and above a quarter of it for any.
     """
     chain, stiffness, across = Chain(LENGTH, 2, "quadratic"), 0.05, 0.02
     kind = chain.kind
@@ -325,5 +325,5 @@ def test_the_bubble_minimises_the_energy_of_its_element(tension):
     else:
         stiff = torque / number(found.inner) / own
         assert 0.25 < stiff <= 1.0
-        if x > -0.5:
+        if x > -0.1:
             assert stiff == pytest.approx(1 + x, rel=1e-12)
