@@ -350,8 +350,9 @@ class MeasurementEffect(Effect):
 
         Parameters
         ----------
-        State of a node at that point: in a plane its heading [rad]. Maps that depend on it are
-        differentiated along the cable in a plane only.
+        frame : (coordinates,)
+            State of a node at that point: in a plane its heading [rad]. Maps that depend on it are
+            differentiated along the cable in a plane only.
         """
         return point
 
