@@ -161,7 +161,7 @@ class Quadratic(Arc):
     def expanded(
         self, segment: Segment, energy: ca.SX, elastic: Callable[[Segment], ca.SX]
     ) -> ca.SX:
-        """To second order in the bubble, as in `condensed`."""
+        """To second order in the bubble; as `condensed` where `_stiffening` is 1 + x."""
         torque = ca.gradient(energy, segment.inner)
         whole = [energy, torque, ca.jacobian(torque, segment.inner)]
         given, torque, stiffness = ca.substitute(whole, [segment.inner], [ca.SX(0)])
