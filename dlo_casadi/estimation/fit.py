@@ -46,8 +46,8 @@ FIRST_REST_TURNS = 0.05
 # turns of 0.06 rad, treated to first order, left 1.25.
 EXPLAINED = 1.5
 FINEST_MESH = 160
-# Maximum number of elements in the search for missing effects, which takes a hundred refits. Effects
-# that it has found are tested on up to FINEST_MESH.
+# Maximum number of elements in the search for missing effects, which takes a hundred refits.
+# Effects that it has found are tested on up to FINEST_MESH.
 SEARCH_MESH = 80
 
 
