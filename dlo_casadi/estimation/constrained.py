@@ -70,10 +70,13 @@ def student_95(fit: Fit, name: str) -> float:
 def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
     """Rise of twice the objective at the ends of a parameter's interval.
 
-    (t + b)^2 times the excess of the residual over the noise. t is Student's t of 95 % where the
-    sizes of noise and scatter are estimated, and 1.96 where they are declared. b is used for a
-    declared noise: the whitened norm of a systematic error of SYSTEMATIC_SHARE in all points.
+    (t + b)^2 times the parameter's marginal variance over that at the given noise and roughness,
+    at which all refits are made. t is Student's t of 95 % where the sizes of noise and scatter are
+    estimated, and 1.96 where they are declared. b is used for a declared noise: the whitened norm
+    of a systematic error of SYSTEMATIC_SHARE in all points.
     """
+    k = fit.problem.unknowns.names.index(name)
+    more = fit.marginal_covariance[k, k] / fit.covariance[k, k]
     square = 0.0
     for j, white in zip(fit.problem.used, fit.problem.whitening, strict=True):
         if fit.noise.source != "declared":
@@ -83,7 +86,7 @@ def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
         constant[item.on_points] = item.relative_std[item.point_of]
         constant *= SYSTEMATIC_SHARE * fit.noise.std
         square += float(((white @ constant) ** 2).sum())
-    return (student_95(fit, name) + np.sqrt(square)) ** 2 * fit.inflation**2
+    return float((student_95(fit, name) + np.sqrt(square)) ** 2 * more)
 
 
 def profiled(fit: Fit) -> list[str]:
@@ -102,9 +105,8 @@ def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     The parameter is fixed and everything else is refitted; its own prior does not count. The
     default `name` is the bending stiffness.
     """
-    limit = threshold(fit, name)
-    std = fit.std(name) / fit.inflation / fit.value(name)
-    first = min(max(np.sqrt(limit) * std, 1e-4), 0.7)
+    k, limit = fit.problem.unknowns.names.index(name), threshold(fit, name)
+    first = min(max(np.sqrt(limit * fit.covariance[k, k]), 1e-4), 0.7)
     ends = [_crossing(_Profile(fit, name), limit, direction * first) for direction in (-1, 1)]
     low, high = (None if end is None else float(np.exp(end) * fit.value(name)) for end in ends)
     return Interval(low, high)

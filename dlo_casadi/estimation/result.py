@@ -14,6 +14,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.estimation.problem import (
+    FIRST_ROUGHNESS,
     NO_INFORMATION,
     Linearization,
     Normal,
@@ -22,9 +23,13 @@ from dlo_casadi.estimation.problem import (
     Problem,
 )
 from dlo_casadi.estimation.repeats import different_poses, repeat_std
+from dlo_casadi.estimation.unknowns import REST_TURNS_STD
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import DIFFERENT, LEAST_NOISE_DEGREES
+
+# Logarithms of roughness over the likeliest one at which `marginal_covariance` is evaluated.
+ROUGHNESS_GRID = np.linspace(-3.0, 4.0, 29)
 
 
 @dataclass(frozen=True)
@@ -114,9 +119,40 @@ class Fit:
         return self._inverse(self._by_bounds)
 
     @cached_property
-    def inflated_covariance(self) -> FloatArray:
-        """`covariance` times the residual's excess over the noise, which bounds do not have."""
-        return self.inflation**2 * self._inverse(self.inflation**2 * self._by_bounds)
+    def marginal_covariance(self) -> FloatArray:
+        """Covariance (size, size) of theta for any roughness of the rest curvature.
+
+            sum_k w_k (C_k + d_k d_k^T),   w_k ~ prior(roughness_k) evidence(roughness_k)
+
+        C_k: `covariance` at another roughness; d_k: how far theta moves. Both follow from the
+        normal equations. Where shapes hardly tell the rest curvature, the likeliest roughness is
+        small, and `covariance` is that of a rest curvature known to be smooth. The prior is
+        half-Cauchy. Includes the residual's excess over the noise, which bounds do not have.
+
+        References
+        ----------
+        Gelman, Bayesian Analysis 1 (2006).
+        """
+        unknowns, excess = self.problem.unknowns, self.inflation**2
+        bounds, n = excess * self._by_bounds, unknowns.n_parameters
+        if unknowns.n_rest < 3:
+            return excess * self._inverse(bounds)
+        known, theta = self.problem.priors.roughness_std, self.point.theta
+        rough = np.zeros((unknowns.size, unknowns.size))
+        rough[n:, n:] = self.model.roughness.T @ self.model.roughness
+        curvatures = np.maximum(np.linalg.eigvalsh(rough[n:, n:]), 0.0)
+        logs, covariances = [], []
+        for std in known * np.exp(ROUGHNESS_GRID):
+            more = 1 / std**2 - 1 / known**2
+            own = self._inverse(bounds + more * rough)
+            moved = -more * own @ rough @ theta
+            energy = more * theta @ rough @ theta + more * theta @ rough @ moved
+            prior = np.log(curvatures / std**2 + 1 / REST_TURNS_STD**2).sum()
+            logs.append((prior + np.linalg.slogdet(own)[1] - energy) / 2)
+            logs[-1] += np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2))
+            covariances.append(own + np.outer(moved, moved))
+        weights = np.exp(np.array(logs) - max(logs))
+        return np.asarray(excess * np.average(covariances, axis=0, weights=weights))
 
     def _inverse(self, more: FloatArray) -> FloatArray:
         """Inverse of the reduced Hessian with more precision on its diagonal."""
@@ -137,7 +173,7 @@ class Fit:
         if name not in unknowns.names:
             return None
         k = unknowns.names.index(name)
-        return bool(2 * self.inflated_covariance[k, k] < unknowns.widest[k] ** 2)
+        return bool(2 * self.marginal_covariance[k, k] < unknowns.widest[k] ** 2)
 
     @cached_property
     def determined_unknowns(self) -> float:
@@ -334,7 +370,7 @@ class Fit:
             return 0.0
         k = unknowns.names.index(name)
         slope = unknowns.derivatives(self.point.theta)[k]
-        return float(abs(slope) * np.sqrt(self.inflated_covariance[k, k]))
+        return float(abs(slope) * np.sqrt(self.marginal_covariance[k, k]))
 
     @property
     def named_covariance(self) -> tuple[tuple[str, ...], FloatArray]:
@@ -344,7 +380,7 @@ class Fit:
         """
         unknowns = self.problem.unknowns
         slopes = unknowns.derivatives(self.point.theta)
-        scaled = self.inflated_covariance * np.outer(slopes, slopes)
+        scaled = self.marginal_covariance * np.outer(slopes, slopes)
         return unknowns.names, np.asarray((scaled + scaled.T) / 2)
 
     def value(self, name: str) -> float:

@@ -7,7 +7,6 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.problem import FIRST_ROUGHNESS
 from dlo_casadi.estimation.repeats import (
     MOST_POSES,
     RestLikelihood,
@@ -34,9 +33,6 @@ FIRST_FORCE = 0.01
 # Minimum number of degrees of freedom to estimate the size of the noise.
 LEAST_SPARE = 3.0
 ROUGHNESS_FLOOR = 1e-3
-# Largest loss of log evidence accepted for a rougher rest curvature than the likeliest: half the
-# 95 % point of chi-square with one degree of freedom.
-ALLOWED = 1.92
 # Smallest scatter of the poses' ends, as a share of the tolerance.
 SCATTER_FLOOR = 0.05
 
@@ -306,29 +302,6 @@ def roughness_of(fit: Fit) -> float:
     well_determined = len(rough) - float(np.trace(covariance @ prior))
     energy = float(((rough @ fit.point.theta[rest]) ** 2).sum())
     return float(max(np.sqrt(energy / max(well_determined, 1e-2)), ROUGHNESS_FLOOR))
-
-
-def with_roughest_rest(fit: Fit) -> Fit:
-    """A fit whose rest curvature is as rough as the data allow.
-
-    Where shapes hardly determine the rest curvature, a small roughness is the likeliest and bands
-    are too narrow. For a simulated cable between pins it was 0.008: the rest curvature in the
-    middle was 0.6 +- 0.4 1/m, in truth -1.3. At 0.03 the log evidence is 1.5 less, and the band
-    +- 1.3 1/m. If a rougher fit reaches a fold of its equilibria, the last one before is used.
-    """
-    found, least = fit, fit.log_evidence - ALLOWED
-    while fit.problem.unknowns.n_rest and found.problem.priors.roughness_std < FIRST_ROUGHNESS:
-        rougher = 2 * found.problem.priors.roughness_std
-        priors = replace(found.problem.priors, roughness_std=rougher)
-        try:
-            other = descend(found.reweighed(fit.noise, priors))
-            likely = other.log_evidence > least
-        except EstimationError:
-            break
-        if not likely:
-            break
-        found = other
-    return found
 
 
 def scatter_of(fit: Fit) -> FloatArray:

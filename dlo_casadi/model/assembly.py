@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, Clipped, Unheld, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
@@ -134,8 +134,9 @@ class Assembly:
             return None
         d = self.node.dimension
 
-        def advances(lam: FloatArray) -> FloatArray:
-            return self._under(lam, "segment_curve", shapes, given)[0][:, :, :d, 0]
+        def advances(lam: FloatArray, rows: IntArray) -> FloatArray:
+            some = shapes.subset(rows), given.subset(rows)
+            return self._under(lam, "segment_curve", *some)[0][:, :, :d, 0]
 
         start, offsets = given.poses[:, :d], given.p @ self._outwards.T
         soft = self.depth, self.everywhere

@@ -21,7 +21,7 @@ Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002): primal-dual active sets a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -113,38 +113,34 @@ class Touching:
         offsets: FloatArray,
         depth: float,
         everywhere: bool,
-        advances: Callable[[FloatArray], FloatArray],
+        advances: Callable[[FloatArray, IntArray], FloatArray],
     ) -> Touching:
         """Determine which nodes touch.
 
-        `advances`: those of the segments (m, n, d) [m] under forces (m, n, n_lam). The forces on
-        obstacles bend the segments, and round surfaces turn these forces. Gaps are therefore found
-        by fixed-point iteration, starting with all positive forces. `everywhere`: forces act
-        whatever the gaps.
+        `advances`: those of the segments (q, n, d) [m] of some poses, given forces (q, n, n_lam)
+        and the poses' indices (q,). The forces on obstacles bend the segments, and round surfaces
+        turn these forces. Gaps are therefore found by fixed-point iteration, for each pose until
+        its own have settled, starting with all positive forces. `everywhere`: forces act whatever
+        the gaps.
         """
         m, d = start.shape
         count, sizes = model.n_contacts, border[:, model.n_lam :]
-        nowhere = (
-            np.zeros((m, count, d)),
-            np.zeros((m, count, d, d - 1)),
-            np.full((m, count), np.inf),
-        )
-        found = cls(model, border, start, offsets, depth, *nowhere, np.zeros((m, count), bool))
-        felt = None
+        normal, bends = np.zeros((m, count, d)), np.zeros((m, count, d, d - 1))
+        gap, felt = np.full((m, count), np.inf), np.full((m, model.n, model.n_lam), np.nan)
         for touching in (np.ones_like(sizes, dtype=bool),) if everywhere else (sizes > 0, None):
-            active = (
-                sizes * gap_per_force(model, BALANCED) > found.gap if touching is None else touching
-            )
+            active = sizes * gap_per_force(model, BALANCED) > gap if touching is None else touching
+            rows = np.arange(m)
             for _ in range(LOOKS):
-                before, found = found.gap, replace(found, active=active)
-                if felt is not None and np.array_equal(found.lam, felt):
+                found = cls(model, border, start, offsets, depth, normal, bends, gap, active)
+                rows = rows[(found.lam != felt)[rows].any(axis=(1, 2))]
+                if not len(rows):
                     break
-                felt = found.lam
-                gap, normal, bends = found._near(advances(felt))
-                found = replace(found, gap=gap, normal=normal, bends=bends)
-                if np.all(np.abs(gap - before) < SAME_GAP * model.cable.length):
-                    break
-        return found
+                felt[rows], before = found.lam[rows], gap[rows]
+                gap, normal, bends = gap.copy(), normal.copy(), bends.copy()
+                gap[rows], normal[rows], bends[rows] = found._near(rows, advances(felt[rows], rows))
+                settled = np.abs(gap[rows] - before) < SAME_GAP * model.cable.length
+                rows = rows[~settled.all(axis=1)]
+        return cls(model, border, start, offsets, depth, normal, bends, gap, active)
 
     @property
     def sizes(self) -> FloatArray:
@@ -206,11 +202,11 @@ class Touching:
         """Energy (m,) [J] by which the depth under the contact forces lowers that of a pose."""
         return np.asarray((self.felt**2 * self.softness).sum(axis=1) / 2)
 
-    def _near(self, advances: FloatArray) -> Surface:
-        """Gaps, normals and bends of all obstacles."""
-        some = np.concatenate([self.start[:, None], advances], axis=1).cumsum(axis=1)
+    def _near(self, poses: IntArray, advances: FloatArray) -> Surface:
+        """Gaps, normals and bends of all obstacles at some poses (q,)."""
+        some = np.concatenate([self.start[poses, None], advances], axis=1).cumsum(axis=1)
         found = surfaces_near(self.model.surfaces, some[:, 1 : 1 + _count(self.model)])
-        outwards = np.repeat(self.offsets, _count(self.model), axis=1)
+        outwards = np.repeat(self.offsets[poses], _count(self.model), axis=1)
         return found._replace(distance=found.distance - outwards - self.model.cable.diameter / 2)
 
     def added(
@@ -221,7 +217,8 @@ class Touching:
         The gradient ends with the contacts' conditions [m]: -g - lam / c for active ones; those of
         the others drive their forces to zero.
         """
-        gaps = np.where(self.active, self._near(advances).distance, 0.0)
+        all_poses = np.arange(len(advances))
+        gaps = np.where(self.active, self._near(all_poses, advances).distance, 0.0)
         y = np.concatenate([force.y, (-gaps - self.sizes * self.softness)[..., None]], axis=1)
         y[:, self.model.no_pull] = 0.0
         work = (self.beyond * advances).sum(axis=(1, 2))

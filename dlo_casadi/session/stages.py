@@ -33,7 +33,6 @@ from dlo_casadi.estimation.prediction import (
 )
 from dlo_casadi.estimation.result import Fit, uncertainty_of
 from dlo_casadi.estimation.stiffness import StiffnessFit
-from dlo_casadi.estimation.variances import with_roughest_rest
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
 from dlo_casadi.model.clips import clip_rows
 from dlo_casadi.model.contact import surfaces_at
@@ -110,11 +109,6 @@ class _Model:
     def uncertainty(self) -> Uncertainty | None:
         """Uncertainty of its predictions."""
         return uncertainty_of(self.fit) if self.fit else None
-
-    @cached_property
-    def roughest(self) -> Uncertainty | None:
-        """The same uncertainty with a rest curvature as rough as the data allow."""
-        return uncertainty_of(with_roughest_rest(self.fit)) if self.fit else None
 
     @property
     def nodes(self) -> dict[str, FloatArray]:
@@ -248,24 +242,20 @@ class _Model:
 
     def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
         """Whether parameters, fixtures and scatter leave the equilibrium of a pose undecided."""
-        pair = other.prediction.equilibrium, known.equilibrium
-
-        def left_open_by(uncertain: Uncertainty | None) -> bool:
-            assert uncertain is not None
-            std = np.sqrt(np.maximum(np.diag(uncertain.covariance), 1e-300))
-            by_p, by_rest = uncertain.unknowns_in(self.model)
-            gap = EnergyGap.between(
-                self.model,
-                item.pose,
-                pair,
-                (self.p, known.rest),
-                (by_p * std, by_rest * std),
-                uncertain.covariance / np.outer(std, std),
-            )
-            own = gap_std_of_repeats(self.model, self.p, known.rest, item.pose, pair, uncertain)
-            return bool(gap.value < UNSEEN * np.hypot(gap.std, own))
-
-        return left_open_by(self.uncertainty) or left_open_by(self.roughest)
+        pair, uncertain = (other.prediction.equilibrium, known.equilibrium), self.uncertainty
+        assert uncertain is not None
+        std = np.sqrt(np.maximum(np.diag(uncertain.covariance), 1e-300))
+        by_p, by_rest = uncertain.unknowns_in(self.model)
+        gap = EnergyGap.between(
+            self.model,
+            item.pose,
+            pair,
+            (self.p, known.rest),
+            (by_p * std, by_rest * std),
+            uncertain.covariance / np.outer(std, std),
+        )
+        own = gap_std_of_repeats(self.model, self.p, known.rest, item.pose, pair, uncertain)
+        return bool(gap.value < UNSEEN * np.hypot(gap.std, own))
 
 
 def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple[LimitCheck, ...]:
@@ -422,7 +412,7 @@ def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
     basis = np.kron(np.eye(axes), model.rest.basis(s))
     tail = slice(unknowns.n_parameters, unknowns.size)
     scaled = basis * model.cable.curvature_scale
-    variance = np.einsum("ik,kl,il->i", scaled, fit.inflated_covariance[tail, tail], scaled)
+    variance = np.einsum("ik,kl,il->i", scaled, fit.marginal_covariance[tail, tail], scaled)
     std = np.sqrt(np.maximum(variance, 0))
     value = basis @ fit.coefficients
     return RestCurvatureEstimate(s, *np.reshape([value, std], (2, axes, len(s))).squeeze())
