@@ -7,17 +7,17 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Literal
 
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import REACHED
-from dlo_casadi.diagnosis.next_measurement import HiddenWeight, hidden_weight
+from dlo_casadi.diagnosis.next_measurement import hidden_weight
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
+    Diagnosis,
     Found,
     Ranked,
     added_by,
@@ -28,16 +28,11 @@ from dlo_casadi.diagnosis.selection import (
     ranking,
     sidak,
 )
-from dlo_casadi.diagnosis.structure import (
-    Structure,
-    noise_degrees,
-    screening_degrees,
-    structure_of,
-)
+from dlo_casadi.diagnosis.structure import noise_degrees, screening_degrees, structure_of
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
 from dlo_casadi.effects import PointLoad, StateEffect
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import FINEST_MESH, at_random, fine_enough
+from dlo_casadi.estimation.fit import FINEST_MESH, as_repeating, at_random, fine_enough
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
@@ -53,48 +48,7 @@ from dlo_casadi.thresholds import (
     WORTH,
 )
 
-Verdict = Literal["complete", "effect_found", "unexplained"]
 NOT_NEAR = "does not come near the measured shapes"
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Result of a search for missing effects.
-
-    Parameters
-    ----------
-    before, after : Fit
-        The declared model, and the model with the effects that were added.
-    validation_before, validation_after : CrossValidation
-    structure_before, structure_after : Structure
-    ranked : tuple of Ranked
-        All candidates of the first step: the refitted ones by `support`, then the others by score.
-    unexplained : bool
-        Whether structure is left, or most left-out poses are not predicted.
-    pull : UnknownForce or None
-        If unexplained: the load that assumes no cause; None if no load fits.
-    weight : HiddenWeight or None
-        Hidden weight that the fit would not notice.
-    """
-
-    before: Fit
-    after: Fit
-    validation_before: CrossValidation
-    validation_after: CrossValidation
-    structure_before: Structure
-    structure_after: Structure
-    added: tuple[AddedEffect, ...] = ()
-    ranked: tuple[Ranked, ...] = ()
-    unexplained: bool = False
-    pull: UnknownForce | None = None
-    weight: HiddenWeight | None = None
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the model is complete, an effect was found, or neither explains the data."""
-        if self.unexplained:
-            return "unexplained"
-        return "effect_found" if self.added else "complete"
 
 
 def diagnose(
@@ -230,22 +184,30 @@ class Search:
     def _searched(self) -> Found:
         """Search from the measured shapes: first if the fit leaves far more than noise, else last.
 
-        Also last if a scatter from pose to pose is left, because a scatter explains anything.
+        A scatter from pose to pose explains anything: if the declared model and the result have
+        one, the search is repeated as if there were none, then also from the measured shapes.
         """
-        # In such a fit a first effect absorbs what two explain; others then fit what it leaves.
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
+        # In such a fit a first effect absorbs what two explain; others then fit what it leaves.
         first = of_shapes.run() if may_be_far and self.declared.chi2_per_dof > REACHED else None
         if first is not None and not first.unexplained:
             return first
-        found = self.run()
-        found = found.or_better(self.of_simpler_effects(found))
-        scatters = found.fit.problem.priors.pose_scatter.std > 0
-        if may_be_far and (found.unexplained or scatters):
+        found = self._forwards()
+        if self.several and found.fit.scatters and self.declared.scatters:
+            with suppress(EstimationError):
+                repeating = replace(self, declared=as_repeating(self.declared))
+                found = found.or_better(repeating._forwards(), EVIDENCE_APART)
+        if may_be_far and (found.unexplained or found.fit.scatters):
             found = found.or_better(first or of_shapes.run())
         # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.validation.complete
         return self._or_causes(found)[0] if lost else found
+
+    def _forwards(self) -> Found:
+        """Result of `run`, or of the same among simpler effects if that is better."""
+        found = self.run()
+        return found.or_better(self.of_simpler_effects(found))
 
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise or left-out data are predicted no better.
@@ -268,13 +230,7 @@ class Search:
                 # With this effect the model may now be complete.
                 known = winner.fit.noise.source != "misfit"
                 closed = settle(winner.fit) if known else winner.fit
-                p_value = max(p_values[item.candidate.name] for item in winner.each)
-                scatters = current.problem.priors.pose_scatter.std > 0
-                misfit = self._astray(current)
-                if (scatters or not closed.errors_known) and not misfit:
-                    again = p_with_closed_noise(current, closed, winner, len(screened))
-                    # A scatter from pose to pose may be due to the effect alone.
-                    p_value = again if scatters else max(p_value, again)
+                p_value = self._p_value(current, closed, winner, p_values)
                 if p_value > self.significance:
                     names = [item.candidate.name for item in chosen]
                     lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
@@ -291,6 +247,17 @@ class Search:
             added += added_by(winner, rivals, p_value, before, validation)
         self.step("search for a missing effect", self.max_effects, self.max_effects)
         return self._ended(*self._pruned(current, added), tuple(ranked))
+
+    def _p_value(
+        self, current: Fit, closed: Fit, winner: Confirmed, p_values: Mapping[str, float]
+    ) -> float:
+        """Significance of a refit's candidates, also under the noise that is left with them."""
+        p_value = max(p_values[item.candidate.name] for item in winner.each)
+        if self._astray(current) or not (current.scatters or not closed.errors_known):
+            return p_value
+        again = p_with_closed_noise(current, closed, winner, len(p_values))
+        # A scatter from pose to pose may be due to the effect alone.
+        return again if current.scatters else max(p_value, again)
 
     def _refitted(
         self, current: Fit, force: UnknownForce | None, added: int
@@ -345,8 +312,7 @@ class Search:
         Effects found in a misfit were never tested against the scatter that they leave: the mean
         over 12 poses of a scatter of 8 mm was taken for an offset. From this fit on they are.
         """
-        scatter = found.fit.problem.priors.pose_scatter
-        if self.declared.noise.source != "misfit" or not (found.unexplained or scatter.std):
+        if self.declared.noise.source != "misfit" or not (found.unexplained or found.fit.scatters):
             return None
         near = at_random(self.declared)
         if near is None:
@@ -382,16 +348,47 @@ class Search:
             if needless:
                 fit = settle(smaller)
                 added = [item for item in added if item is not effect]
+            elif effect.after is not added[-1].after:
+                fit, chosen = self._judged_again(fit, smaller, effect)
+                added = [chosen if item is effect else item for item in added]
         return fit, added
+
+    def _judged_again(self, fit: Fit, smaller: Fit, effect: AddedEffect) -> tuple[Fit, AddedEffect]:
+        """The likeliest candidate beside effects that were added later, and its rivals.
+
+        Sequential replacement (Miller 1990): an effect may be the best one alone, and another one
+        beside what was still missing then. Alone, a force explained a tilt and a drift better than
+        either. `smaller` lacks the effect.
+        """
+        screened, before, name = self._screened(smaller), cross_validate(smaller), effect.name
+        p_values = p_values_of(screened)
+        tried = self._leading(smaller, screened, p_values)
+        chosen, _ = choose(tried, smaller, before, self.doubt)
+        others = tuple(item for item in chosen if item.name != name)
+        if len(others) < len(chosen):
+            effect = replace(effect, rivals=others)
+        if not chosen or chosen[0].name == name:
+            return fit, effect
+        winner = chosen[0]
+        with suppress(EstimationError):
+            better = settle(winner.fit)
+            p_value = self._p_value(smaller, better, winner, p_values)
+            if better.log_evidence > fit.log_evidence and p_value <= self.significance:
+                after = cross_validate(better)
+                (other,) = added_by(winner, chosen[1:], p_value, before, after)
+                return better, other
+        rivals = {item.name: item for item in (*effect.rivals, winner)}
+        return fit, replace(effect, rivals=tuple(rivals.values()))
 
     def _leading(
         self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
     ) -> list[Confirmed | None]:
         """Refits of the significant candidates with the highest scores."""
         # A scatter from pose to pose may hide the effect: test the refit with what is left.
-        any_ = current.problem.priors.pose_scatter.std > 0
         significant = [
-            x for x in screened if any_ or p_values[x.candidate.name] < self.significance
+            x
+            for x in screened
+            if current.scatters or p_values[x.candidate.name] < self.significance
         ]
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
@@ -399,7 +396,8 @@ class Search:
         new = [item for item in worthy if item.candidate.name not in known]
         found = map_in_order(self.executor, partial(refits.confirm, current), new)
         known.update(zip((item.candidate.name for item in new), found, strict=True))
-        return [known[item.candidate.name] for item in worthy]
+        tried = [known[item.candidate.name] for item in worthy]
+        return refits.loads_from_best(current, worthy, tried, self.executor)
 
     def _from_data(
         self, current: Fit, added: int

@@ -41,8 +41,9 @@ COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; for a
 # strict balance, relative to that of shapes that need not balance.
 REACHED = 1.5
-# Number of candidates to which a second one is added, and number of second ones. In a session with
-# a drift and a force, the drift left second least, and the force scored highest beside it.
+# Number of candidates that get a second one at a time, and number of second ones. In a
+# session with a drift and a force, the drift left second least, and the force scored highest beside
+# it. Beside a tether, a drift had no score: the pair was found from the drift, which came seventh.
 FIRST, SECOND = 3, 3
 # Trial bending stiffnesses for a contact, in weights times length squared: from cables that their
 # weight hardly bends down to chains.
@@ -208,7 +209,7 @@ class RelaxedStart:
 def likeliest(screened: Sequence[Screened]) -> list[Screened]:
     """Candidates whose score at the measured shapes is close to the highest."""
     scored = [x for x in screened if x.candidate.effect.gradual]
-    return [x for x in scored if x.score >= NEAR_LEADER * scored[0].score][:REFITTED]
+    return [x for x in scored if x.score >= NEAR_LEADER * scored[0].score]
 
 
 def nearest(
@@ -224,19 +225,32 @@ def nearest(
 ) -> list[RelaxedStart]:
     """Starts whose objective is close to the least one, best first.
 
-    The least one is that of the candidates, or `least` of another start. If none of them reaches
-    the noise of the relaxed shapes, pairs are tried, provided `pairs` may be added; pairs are
-    returned if REACHED times their objective is less.
+    The least one is that of the first REFITTED candidates, or `least` of another start. If none of
+    them reaches the noise of the relaxed shapes, pairs are tried, provided `pairs` may be added: of
+    FIRST candidates and likely second ones, then of the next ones, at last of those beyond
+    REFITTED, until one reaches the noise. Pairs are returned if REACHED times their objective is
+    less.
     """
     noise = REACHED * near.point.data
-    alone = map_in_order(executor, partial(RelaxedStart.of, near), likely)
+    start = partial(RelaxedStart.of, near)
+    second = partial(RelaxedStart.and_second, softness=softness, center=center, exclude=exclude)
+    alone, later = map_in_order(executor, start, likely[:REFITTED]), likely[REFITTED:]
     begun = _near_least(alone, noise, least)
     if not pairs or not begun or begun[0].left < noise:
         return begun
-    second = partial(RelaxedStart.and_second, softness=softness, center=center, exclude=exclude)
-    both = [x for found in map_in_order(executor, second, begun[:FIRST]) for x in found]
-    own = {frozenset(x.names): x for x in sorted(both, key=lambda x: -x.left)}
-    kept = _near_least(own.values(), noise)
+    own: dict[frozenset[str], RelaxedStart] = {}
+    kept: list[RelaxedStart] = []
+    firsts = sorted(alone, key=lambda x: x.left)
+    while firsts and not (kept and kept[0].left < noise):
+        both = [x for found in map_in_order(executor, second, firsts[:FIRST]) for x in found]
+        ordered = sorted((*own.values(), *both), key=lambda x: -x.left)
+        own = {frozenset(x.names): x for x in ordered}
+        kept, firsts = _near_least(own.values(), noise), firsts[FIRST:]
+        if not firsts and later:
+            firsts, later = sorted(map_in_order(executor, start, later), key=lambda x: x.left), []
+            begun = _near_least((*begun, *firsts), noise, least)
+            if begun[0].left < noise:
+                return begun
     return kept if kept and REACHED * kept[0].left < begun[0].left else begun
 
 

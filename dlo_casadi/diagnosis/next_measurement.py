@@ -9,7 +9,7 @@ from scipy.special import chdtri
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
-from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.selection import AddedEffect, HiddenWeight
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -32,34 +32,6 @@ PROFILE_95 = float(chdtri(1, 0.05))
 # Number of trial end poses, drawn within the region that the session has explored.
 TRIED = 30
 SEED = 0
-
-
-@dataclass(frozen=True)
-class HiddenWeight:
-    """A weight that the data cannot distinguish from stiffness.
-
-    Parameters
-    ----------
-    mass : float [kg]
-        Largest trial weight that fits as well as none.
-    position : float [m]
-        Arc length at which it would make the stiffness most uncertain.
-    stiffness_95 : (float, float) [N m^2]
-        Interval of EI if there is no weight, or any up to that one.
-    force : float [N]
-        Force of that weight: it changes the force measured on the start fixture by this amount.
-    heading : float or None [rad]
-        Direction of the start clamp in a plane at which shapes with and without it differ most.
-    difference : float or None [m]
-        That difference, RMS along the cable.
-    """
-
-    mass: float
-    position: float
-    stiffness_95: tuple[float, float]
-    force: float
-    heading: float | None
-    difference: float | None
 
 
 def hidden_weight(fit: Fit, exclude: Sequence[str] = ()) -> HiddenWeight | None:

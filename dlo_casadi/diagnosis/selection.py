@@ -1,10 +1,10 @@
-"""Which of the refitted candidates is added: evidence, cross-validation, significance."""
+"""What a search finds, and which refitted candidates it adds: evidence, cross-validation."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import comb, log
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -13,12 +13,15 @@ from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
 from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
+from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of
 from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
+
+Verdict = Literal["complete", "effect_found", "unexplained"]
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,11 @@ class AddedEffect:
     equivalents: tuple[str, ...] = ()
 
     @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.candidate.name
+
+    @property
     def rival_candidates(self) -> list[Candidate]:
         """Candidates that the data could not distinguish from it."""
         return [rival.candidate for rival in self.rivals]
@@ -63,6 +71,74 @@ class Ranked:
     p_value: float
     rmse_cross_validated: float | None
     reason: str = ""
+
+
+@dataclass(frozen=True)
+class HiddenWeight:
+    """A weight that the data cannot distinguish from stiffness.
+
+    Parameters
+    ----------
+    mass : float [kg]
+        Largest trial weight that fits as well as none.
+    position : float [m]
+        Arc length at which it would make the stiffness most uncertain.
+    stiffness_95 : (float, float) [N m^2]
+        Interval of EI if there is no weight, or any up to that one.
+    force : float [N]
+        Force of that weight: it changes the force measured on the start fixture by this amount.
+    heading : float or None [rad]
+        Direction of the start clamp in a plane at which shapes with and without it differ most.
+    difference : float or None [m]
+        That difference, RMS along the cable.
+    """
+
+    mass: float
+    position: float
+    stiffness_95: tuple[float, float]
+    force: float
+    heading: float | None
+    difference: float | None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of a search for missing effects.
+
+    Parameters
+    ----------
+    before, after : Fit
+        The declared model, and the model with the effects that were added.
+    validation_before, validation_after : CrossValidation
+    structure_before, structure_after : Structure
+    ranked : tuple of Ranked
+        All candidates of the first step: the refitted ones by `support`, then the others by score.
+    unexplained : bool
+        Whether structure is left, or most left-out poses are not predicted.
+    pull : UnknownForce or None
+        If unexplained: the load that assumes no cause; None if no load fits.
+    weight : HiddenWeight or None
+        Hidden weight that the fit would not notice.
+    """
+
+    before: Fit
+    after: Fit
+    validation_before: CrossValidation
+    validation_after: CrossValidation
+    structure_before: Structure
+    structure_after: Structure
+    added: tuple[AddedEffect, ...] = ()
+    ranked: tuple[Ranked, ...] = ()
+    unexplained: bool = False
+    pull: UnknownForce | None = None
+    weight: HiddenWeight | None = None
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the model is complete, an effect was found, or neither explains the data."""
+        if self.unexplained:
+            return "unexplained"
+        return "effect_found" if self.added else "complete"
 
 
 @dataclass(frozen=True)
@@ -95,14 +171,17 @@ class Found:
         unexplained |= fit.noise.source == "misfit"
         return cls(fit, tuple(added), ranked, validation, structure, unexplained)
 
-    def or_better(self, other: Self | None) -> Self:
-        """The other search's result if only that explains the data, or better; else this one."""
+    def or_better(self, other: Self | None, margin: float = 0.0) -> Self:
+        """The other search's result if only that explains the data, or better; else this one.
+
+        `margin`: log evidence by which the other one has to be better if both explain the data.
+        """
         if other is None:
             return self
         candidates = max(len(self.ranked), len(other.ranked))
         if self.unexplained == other.unexplained:
             likelier = likelier_by(self.fit, other.fit) - other._sets(candidates)
-            better = likelier + self._sets(candidates) > 0
+            better = likelier + self._sets(candidates) > margin
         else:
             better = self.unexplained
         if not better:

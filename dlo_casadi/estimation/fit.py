@@ -118,6 +118,11 @@ def fit_model(
     return fit
 
 
+def as_repeating(fit: Fit) -> Fit:
+    """Refit as if nothing differed at random from pose to pose, with the noise as it is."""
+    return descend(fit.reweighed(priors=replace(fit.problem.priors, pose_scatter=PoseScatter())))
+
+
 def at_random(fit: Fit) -> Fit | None:
     """Refit of a misfit with a random effect from pose to pose, if that explains it; else None."""
     different = different_poses(fit.problem.history, fit.model.cable.length)

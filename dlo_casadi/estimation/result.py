@@ -28,8 +28,9 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import DIFFERENT, LEAST_NOISE_DEGREES
 
-# Logarithms of roughness over the likeliest one at which `marginal_covariance` is evaluated.
-ROUGHNESS_GRID = np.linspace(-3.0, 4.0, 29)
+# Roughness at which `marginal_covariance` is evaluated: from the smallest estimate to thirty scales
+# of its prior, which is flat below one scale and falls with the square above.
+ROUGHNESSES = np.geomspace(1e-3, 30 * FIRST_ROUGHNESS, 40)
 
 
 @dataclass(frozen=True)
@@ -78,12 +79,17 @@ class Fit:
     def beyond_noise(self) -> bool:
         """Whether more than noise is left: chi-square two std too high, or a scatter of poses."""
         excess = 2 * np.sqrt(2 / self.degrees_of_freedom)
-        return self.problem.priors.pose_scatter.std > 0 or self.chi2_per_dof > 1 + excess
+        return self.scatters or self.chi2_per_dof > 1 + excess
+
+    @property
+    def scatters(self) -> bool:
+        """Whether something differs at random from pose to pose."""
+        return self.problem.priors.pose_scatter.std > 0
 
     @property
     def errors_known(self) -> bool:
         """Whether no noise or scatter was estimated from the residuals themselves."""
-        return self.noise.known and self.problem.priors.pose_scatter.std == 0
+        return self.noise.known and not self.scatters
 
     @property
     def p(self) -> FloatArray:
@@ -120,14 +126,15 @@ class Fit:
 
     @cached_property
     def marginal_covariance(self) -> FloatArray:
-        """Covariance (size, size) of theta for any roughness of the rest curvature.
+        """Covariance (size, size) of theta with the roughness of the rest curvature integrated out.
 
-            sum_k w_k (C_k + d_k d_k^T),   w_k ~ prior(roughness_k) evidence(roughness_k)
+            sum_k w_k (c C_k + d_k d_k^T),   w_k ~ prior(roughness_k) evidence(roughness_k)
 
-        C_k: `covariance` at another roughness; d_k: how far theta moves. Both follow from the
-        normal equations. Where shapes hardly tell the rest curvature, the likeliest roughness is
-        small, and `covariance` is that of a rest curvature known to be smooth. The prior is
-        half-Cauchy. Includes the residual's excess over the noise, which bounds do not have.
+        C_k: `covariance` at another roughness; d_k: how far theta moves; both follow from the
+        normal equations. c: the residual's excess over the noise, which also divides the log
+        evidence; bounds do not have it. Where shapes hardly tell the rest curvature, its likeliest
+        roughness is small, and `covariance` is that of a rest curvature known to be smooth. The
+        prior is half-Cauchy with the scale FIRST_ROUGHNESS.
 
         References
         ----------
@@ -142,17 +149,18 @@ class Fit:
         rough[n:, n:] = self.model.roughness.T @ self.model.roughness
         curvatures = np.maximum(np.linalg.eigvalsh(rough[n:, n:]), 0.0)
         logs, covariances = [], []
-        for std in known * np.exp(ROUGHNESS_GRID):
+        for std in ROUGHNESSES:
             more = 1 / std**2 - 1 / known**2
             own = self._inverse(bounds + more * rough)
             moved = -more * own @ rough @ theta
             energy = more * theta @ rough @ theta + more * theta @ rough @ moved
             prior = np.log(curvatures / std**2 + 1 / REST_TURNS_STD**2).sum()
-            logs.append((prior + np.linalg.slogdet(own)[1] - energy) / 2)
-            logs[-1] += np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2))
-            covariances.append(own + np.outer(moved, moved))
+            evidence = (prior + np.linalg.slogdet(own)[1] - energy / excess) / 2
+            # On a grid of equal ratios a density of the roughness is weighed by the roughness.
+            logs.append(evidence + np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2)))
+            covariances.append(excess * own + np.outer(moved, moved))
         weights = np.exp(np.array(logs) - max(logs))
-        return np.asarray(excess * np.average(covariances, axis=0, weights=weights))
+        return np.asarray(np.average(covariances, axis=0, weights=weights))
 
     def _inverse(self, more: FloatArray) -> FloatArray:
         """Inverse of the reduced Hessian with more precision on its diagonal."""
@@ -337,7 +345,8 @@ class Fit:
         It covers distances of points and wrench measurements, converted by `NoiseModel.units`.
         Causes: noise, scatter of the fixtures, uncertain parameters, and how the cable repeats.
         """
-        return self.expected_with([self.covariance] * len(self.problem.used))
+        covariance = self.marginal_covariance / self.inflation**2
+        return self.expected_with([covariance] * len(self.problem.used))
 
     def expected_with(self, covariances: Sequence[FloatArray]) -> float:
         """`expected_error`, but with a given covariance of the unknowns for each fitted pose.

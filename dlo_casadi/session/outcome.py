@@ -12,9 +12,8 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config
-from dlo_casadi.diagnosis.diagnose import Diagnosis, Verdict
-from dlo_casadi.diagnosis.next_measurement import HiddenWeight, NextPose
-from dlo_casadi.diagnosis.selection import Ranked
+from dlo_casadi.diagnosis.next_measurement import NextPose
+from dlo_casadi.diagnosis.selection import Diagnosis, HiddenWeight, Ranked, Verdict
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import Effect

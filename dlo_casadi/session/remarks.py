@@ -6,7 +6,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import SkippedPose
-from dlo_casadi.diagnosis.next_measurement import HiddenWeight
+from dlo_casadi.diagnosis.selection import HiddenWeight
 from dlo_casadi.diagnosis.structure import alike, limiting_spread
 from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import counted

@@ -158,7 +158,9 @@ def test_an_effect_found_in_a_misfit_has_to_hold_beside_the_scatter_from_pose_to
         priors = SimpleNamespace(pose_scatter=PoseScatter(0.008, source="end_offset"))
         noise, problem = SimpleNamespace(source=source), SimpleNamespace(priors=priors)
         model = SimpleNamespace(n=10)
-        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, model=model)
+        return SimpleNamespace(
+            log_evidence=evidence, noise=noise, problem=problem, model=model, scatters=True
+        )
 
     near = scattering(3040.0 - behind)
     monkeypatch.setattr(module, "at_random", lambda _: near)
@@ -174,7 +176,9 @@ def test_evidence_of_scatter_and_of_effects_is_compared_on_one_mesh(monkeypatch)
         priors = SimpleNamespace(pose_scatter=PoseScatter(0.007, source="end_offset"))
         noise, problem = SimpleNamespace(source=source), SimpleNamespace(priors=priors)
         model = SimpleNamespace(n=n)
-        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, model=model)
+        return SimpleNamespace(
+            log_evidence=evidence, noise=noise, problem=problem, model=model, scatters=True
+        )
 
     coarse, fine = scattering(3065.6, 10), scattering(3072.0, 15)
     monkeypatch.setattr(module, "at_random", lambda _: coarse)

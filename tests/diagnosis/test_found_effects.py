@@ -8,16 +8,20 @@ from functools import cache
 import numpy as np
 import pytest
 
+from dlo_casadi.diagnosis import crossval
 from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
+from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.diagnosis.refits import start_from
+from dlo_casadi.diagnosis.refits import confirm, loads_from_best, start_from
+from dlo_casadi.diagnosis.screening import Screened
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import nuisances
 
@@ -114,9 +118,51 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     places = [seen[j].curve.at(np.array([position]))[0] for j in fit.problem.used]
     pull = UnknownForce(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
     listed = {c.name: c for c in candidates(fit.model, setup_of(fit.model, n_poses=len(ENDS)))}
-    start = start_from(pull, listed["tether"])
+    given = pull.fit, pull.position, pull.force_per_pose
+    start = start_from(*given, listed["tether"])
     names = ("stiffness", "position", "anchor_x", "anchor_y")
     assert [start[f"tether.{name}"] for name in names] == pytest.approx(TETHER, rel=1e-9)
     # A weight has no force across gravity: what comes closest along it.
-    mass = start_from(pull, listed["lumped_mass"])["lumped_mass.mass"]
+    mass = start_from(*given, listed["lumped_mass"])["lumped_mass.mass"]
     assert mass == pytest.approx(max(0.0, -pull.force_per_pose[:, 1].mean() / 9.81))
+
+
+def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one():
+    """A force that its own start has led astray, or nowhere: half of its misfit is gone."""
+    base = session("tether", *TETHER)
+    listed = {c.name: c for c in candidates(base.model, setup_of(base.model, n_poses=len(ENDS)))}
+
+    def started(name, **values):
+        start = {f"{name}.{key}": value for key, value in values.items()}
+        return Screened(listed[name], 1.0, 0.0, start)
+
+    names = ("stiffness", "position", "anchor_x", "anchor_y")
+    screened = [
+        started("point_force", fx=0.5, fy=0.5, position=0.4),
+        started("tether", **dict(zip(names, TETHER, strict=True))),
+        started("stiffness_gradient", slope=0.1),
+    ]
+    force, tether, gradient = tried = [confirm(base, x) for x in screened]
+    found, *same = loads_from_best(base, screened, tried, InProcess())
+    assert same == [tether, gradient]
+    assert found.name == "point_force"
+    assert found.fit.point.objective < force.fit.point.objective - 1000
+    nowhere, *_ = loads_from_best(base, screened, [None, tether, gradient], InProcess())
+    assert nowhere.fit.point.objective == found.fit.point.objective
+    # The likeliest is no load.
+    assert loads_from_best(base, screened[2:], tried[2:], InProcess()) == [gradient]
+
+
+def test_left_out_poses_are_no_less_likely_than_to_first_order(monkeypatch):
+    """Where one step of a product, stiffness and anchor, leads to another shape."""
+    base = session("tether", *TETHER)
+    listed = {c.name: c for c in candidates(base.model, setup_of(base.model, n_poses=len(ENDS)))}
+    start = dict(zip(listed["tether"].frees, TETHER, strict=True))
+    fit = confirm(base, Screened(listed["tether"], 1.0, 0.0, start)).fit
+    whole, predicted = cross_validate(fit), crossval._predicted
+    monkeypatch.setattr(crossval, "_predicted", lambda fit, *_: [None] * len(ENDS))
+    first_order = cross_validate(fit).densities
+    assert whole.densities == pytest.approx(first_order, abs=1.0)
+    assert (whole.densities > first_order).any()
+    monkeypatch.setattr(crossval, "_predicted", lambda *given: predicted(*given)[::-1])
+    assert cross_validate(fit).densities == pytest.approx(first_order)

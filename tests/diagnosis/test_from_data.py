@@ -1,6 +1,7 @@
 """Where the declared model is astray, an effect is found from the measured shapes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -109,6 +110,29 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypa
         found = nearest(near, softness, wrong, InProcess(), pairs=pairs)
         assert [start.names for start in found] == [{"stiffness_gradient"}]
         assert bool(asked) == pairs
+
+
+def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
+    """A drift had no score beside a tether, and came seventh alone."""
+    near, seconds = SimpleNamespace(point=SimpleNamespace(data=1.0)), []
+
+    def start(left, *names):
+        return SimpleNamespace(names=set(names), left=left)
+
+    def and_second(first, **_):
+        (name,) = first.names
+        seconds.append(name)
+        return [start(1.0 if name == "6" else 50.0, name, "other")]
+
+    monkeypatch.setattr(RelaxedStart, "of", lambda near, x: start(100.0 + int(x), x))
+    monkeypatch.setattr(RelaxedStart, "and_second", and_second)
+    (found,) = nearest(near, 0.01, "01234567", InProcess())
+    assert found.names == {"6", "other"}
+    assert seconds == list("01234567")
+
+    seconds.clear()
+    (found,) = nearest(near, 0.01, "612345", InProcess())
+    assert seconds == list("123") + list("456")
 
 
 TABLE = -0.25

@@ -11,12 +11,17 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 import hidden_sets
 from hidden_sets import simulated
 
+from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
-from dlo_casadi.effects import CableData
+from dlo_casadi.diagnosis.refits import confirm
+from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, gap_std_of_repeats
 from dlo_casadi.estimation.constrained import profile_interval
+from dlo_casadi.estimation.fit import as_repeating
+from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, sources_in
 from dlo_casadi.runtime.executors import InProcess
@@ -24,7 +29,7 @@ from dlo_casadi.runtime.parallel import generator_of
 from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs
 from dlo_casadi.session.stages import fit_stage
-from dlo_casadi.thresholds import SIGNIFICANCE
+from dlo_casadi.thresholds import EVIDENCE_APART, SIGNIFICANCE
 
 PLANE = CableData(0.6, 0.04, 0.005, 0.01)
 SPACE = CableData(0.6, 0.04, 0.005, 0.01, torsional_stiffness=0.008)
@@ -98,16 +103,63 @@ def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_w
     assert np.sqrt((gap**2).mean()) < hidden_sets.FINE
 
 
+def searched(seed, index, count, random="", among=()):
+    """A simulated session and the search in its declared fit, among these effects or all."""
+    found = simulated(generator_of(seed, index), 2, count, random)
+    measured = measured_poses(found.session, read_inputs(found.session))
+    fit, _ = fit_declared(found.session, declared_model(found.session), measured)
+    exclude = [name for name in EFFECTS if among and name not in among]
+    return found, Search(fit, None, exclude, SIGNIFICANCE, 4, lambda *_: None, InProcess())
+
+
 def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
     """22 moments tell their variance as well as that: F of 18 degrees of freedom, no chi-square."""
-    session = simulated(generator_of(3301, 6), 2, 0, "pin_moment").session
-    measured = measured_poses(session, read_inputs(session))
-    fit, _ = fit_declared(session, declared_model(session), measured)
-    assert fit.problem.priors.pose_scatter.source == "pin_moment"
-    search = Search(fit, None, (), SIGNIFICANCE, 4, lambda name, done, total: None, InProcess())
+    among = ("rest_curvature_drift", "stiffness_gradient", "gravity_tilt", "lumped_mass")
+    _, search = searched(3301, 6, 0, "pin_moment", among=among)
+    assert search.declared.problem.priors.pose_scatter.source == "pin_moment"
     found = search.run()
     assert not found.added
     assert not found.unexplained
+    without = replace(search, declared=as_repeating(search.declared)).run()
+    assert found.or_better(without, EVIDENCE_APART) is found
+
+
+def test_a_drift_that_a_scatter_explains_as_well_is_found_without_it():
+    """Beside its scatter a drift gained nothing; alone it is e^28 likelier than that scatter."""
+    truth, search = searched(2061, 25, 2, among=("rest_curvature_drift", "tether"))
+    assert search.declared.scatters
+    found = search._searched()
+    assert [item.name for item in found.added] == ["rest_curvature_drift"]
+    assert not found.unexplained
+    assert not found.fit.scatters
+    assert found.fit.log_evidence > search.declared.log_evidence + 25
+    interval = profile_interval(found.fit)
+    assert interval.low < truth.values["bending_stiffness"] < interval.high
+
+
+def test_the_first_effect_is_judged_again_beside_the_second():
+    """A tilt and a drift: alone, a force explained most; beside the drift the tilt is likelier."""
+    among = ("rest_curvature_drift", "point_force", "gravity_tilt")
+    _, search = searched(2061, 13, 2, among=among)
+    base = as_repeating(search.declared)
+    search = replace(search, declared=base)
+    listed = {x.candidate.name: x for x in search.first}
+    drift = confirm(base, listed["rest_curvature_drift"]).fit
+    beside = {x.candidate.name: x for x in search._screened(drift)}
+    fit = settle(confirm(drift, beside["point_force"]).fit)
+    force = AddedEffect(
+        listed["point_force"].candidate, 1e-9, cross_validate(base), cross_validate(fit), ()
+    )
+    better, judged = search._judged_again(fit, drift, force)
+    assert judged.name == "gravity_tilt"
+    assert better.log_evidence > fit.log_evidence
+    assert "point_force" not in {x.name for x in better.model.effects}
+    again, same = search._judged_again(better, drift, judged)
+    assert again is better
+    assert same.name == "gravity_tilt"
+    # Where no candidate may be added, what was known of rivals stays.
+    alone = replace(search, exclude=[*search.exclude, *among])
+    assert alone._judged_again(better, drift, judged) == (better, judged)
 
 
 def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():

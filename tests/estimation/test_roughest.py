@@ -11,6 +11,8 @@ from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import FIRST_ROUGHNESS
+from dlo_casadi.estimation.result import ROUGHNESSES
+from dlo_casadi.estimation.unknowns import REST_TURNS_STD
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -57,4 +59,33 @@ def test_the_covariance_is_that_of_refits_at_many_roughnesses(fit):
     refitted = np.average(covariances, axis=0, weights=weights)
     stds = [np.sqrt(np.diag(x)) for x in (fit.covariance, fit.marginal_covariance, refitted)]
     assert max(stds[2] / stds[0]) > 2
-    assert stds[1] / fit.inflation == pytest.approx(stds[2], rel=0.05)
+    assert fit.inflation == 1.0
+    assert stds[1] == pytest.approx(stds[2], rel=0.05)
+
+
+def test_a_misfit_widens_the_errors_and_not_how_far_the_estimate_moves(fit):
+    """A noise of half the size: all precisions are divided by the excess, which is then 4."""
+    priors = replace(fit.problem.priors, roughness_std=2 * fit.problem.priors.roughness_std)
+    trusted = fit.reweighed(replace(fit.noise, std=fit.noise.std / 2), priors)
+    excess = trusted.inflation**2
+    assert excess == pytest.approx(4.0, rel=0.1)
+    n, theta = trusted.problem.unknowns.n_parameters, trusted.point.theta
+    rough = np.zeros_like(trusted.covariance)
+    rough[n:, n:] = trusted.model.roughness.T @ trusted.model.roughness
+    hessian, known = np.linalg.inv(trusted.covariance), priors.roughness_std
+    plain = np.eye(len(theta) - n) / REST_TURNS_STD**2
+    means, logs = [], []
+    for std in ROUGHNESSES:
+        precision = (hessian + (1 / std**2 - 1 / known**2) * rough) / excess
+        way = -(1 / std**2 - 1 / known**2) * rough @ theta / excess
+        moved = np.linalg.solve(precision, way)
+        left = moved @ precision @ moved
+        fixed = (1 / std**2 - 1 / known**2) * theta @ rough @ theta / excess
+        prior = np.linalg.slogdet(rough[n:, n:] / std**2 + plain)[1]
+        log = (prior - np.linalg.slogdet(precision)[1] - fixed + left) / 2
+        logs.append(log + np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2)))
+        means.append(np.linalg.inv(precision) + np.outer(moved, moved))
+    weights = np.exp(np.array(logs) - max(logs))
+    assert max(weights[0], weights[-1]) < 0.02 * weights.sum()
+    expected = np.average(means, axis=0, weights=weights)
+    assert np.diag(trusted.marginal_covariance) == pytest.approx(np.diag(expected), rel=1e-3)

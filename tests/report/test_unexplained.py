@@ -6,7 +6,7 @@ import pytest
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cli import main
-from dlo_casadi.diagnosis.diagnose import Verdict
+from dlo_casadi.diagnosis.selection import Verdict
 from dlo_casadi.report.documents import parameters_text, report_dict
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.tables import NO_FIT, fitted_rows, footnotes
