@@ -114,7 +114,7 @@ def searched(seed, index, count, random="", among=()):
 
 def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
     """22 moments tell their variance as well as that: F of 18 degrees of freedom, no chi-square."""
-    among = ("rest_curvature_drift", "stiffness_gradient", "gravity_tilt", "lumped_mass")
+    among = ("stiffness_gradient", "gravity_tilt", "lumped_mass")
     _, search = searched(3301, 6, 0, "pin_moment", among=among)
     assert search.declared.problem.priors.pose_scatter.source == "pin_moment"
     found = search.run()
@@ -126,7 +126,7 @@ def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
 
 def test_a_drift_that_a_scatter_explains_as_well_is_found_without_it():
     """Beside its scatter a drift gained nothing; alone it is e^28 likelier than that scatter."""
-    truth, search = searched(2061, 25, 2, among=("rest_curvature_drift", "tether"))
+    truth, search = searched(2061, 25, 2, among=("rest_curvature_drift",))
     assert search.declared.scatters
     found = search._searched()
     assert [item.name for item in found.added] == ["rest_curvature_drift"]
@@ -154,9 +154,6 @@ def test_the_first_effect_is_judged_again_beside_the_second():
     assert judged.name == "gravity_tilt"
     assert better.log_evidence > fit.log_evidence
     assert "point_force" not in {x.name for x in better.model.effects}
-    again, same = search._judged_again(better, drift, judged)
-    assert again is better
-    assert same.name == "gravity_tilt"
     # Where no candidate may be added, what was known of rivals stays.
     alone = replace(search, exclude=[*search.exclude, *among])
     assert alone._judged_again(better, drift, judged) == (better, judged)
