@@ -336,7 +336,7 @@ class Search:
         before, fit = fit, self._fine(fit, FINEST_MESH) if added else fit
         significant = added[-1:] if fit is before and not self.from_shapes else []
         for effect in added:
-            smaller = refits.refit_without(fit, effect.candidate, self.declared.model)
+            smaller = refits.refit_without(fit, effect.candidate, self.declared)
             if smaller is None:
                 continue
             needless = smaller.log_evidence > fit.log_evidence

@@ -313,9 +313,20 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
     return best
 
 
-def refit_without(fit: Fit, candidate: Candidate, before: CableModel) -> Fit | None:
-    """Fit without a candidate; a nuisance is held as in `before`. None without equilibria."""
-    return _followed(fit, candidate.remove_from(fit.model, before), {})
+def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
+    """Fit without a candidate; a nuisance is held as declared. None without equilibria.
+
+    The poses of a cable that has taken a set are far from equilibrium without it, and may be lost
+    on the way. So the fit also starts from the declared model's if it ends above that one, which is
+    nested in it.
+    """
+    model = candidate.remove_from(fit.model, declared.model)
+    found = _followed(fit, model, {})
+    nested = declared.reweighed(fit.noise, fit.problem.priors)
+    if found is None or found.point.objective > nested.point.objective:
+        values = {name: fit.value(name) for name in fit.model.names}
+        found = _followed(nested, model, values) or found
+    return found
 
 
 def start_from(

@@ -22,7 +22,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import energy_slope
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
+from dlo_casadi.estimation.prediction import Prediction, measured_elsewhere, predict_poses
 from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -301,9 +301,7 @@ def as_measured(fit: Fit) -> Fit:
 def _gaps(fit: Fit) -> list[EnergyGap]:
     """Energy of each fitted pose as measured, minus that of its prediction, along the unknowns."""
     problem, model, unknowns = fit.problem, fit.model, fit.problem.unknowns
-    poses = [item.pose for item in problem.history]
-    predictions = predict_poses(model, fit.p, fit.rest, poses)
-    own = [predictions[k] for k in problem.indices]
+    own = _predicted_next(fit)
     nodes = {problem.measured[j].pose.name: fit.point.shapes.x[j] for j in problem.used}
     others = measured_elsewhere(model, fit.p, fit.rest, problem.measured, own, nodes)
     along = unknowns.slopes(fit.point.theta), unknowns.rest_slopes
@@ -316,6 +314,23 @@ def _gaps(fit: Fit) -> list[EnergyGap]:
             given = fit.p, known.rest
             gaps.append(EnergyGap.between(model, pose, pair, given, along, fit.covariance))
     return gaps
+
+
+def _predicted_next(fit: Fit) -> list[Prediction | None]:
+    """Predictions of a problem's own poses, each after the others as fitted.
+
+    Where a cable carries a state, one pose that is predicted in another equilibrium than it was in
+    would lead all later ones astray.
+    """
+    problem, poses = fit.problem, [item.pose for item in fit.problem.history]
+    if not fit.model.has_state:
+        predictions = predict_poses(fit.model, fit.p, fit.rest, poses)
+        return [predictions[k] for k in problem.indices]
+    fitted = [*fit.point.shapes.x]
+    return [
+        predict_poses(fit.model, fit.p, fit.rest, poses[: k + 1], [*fitted[:k], None])[k]
+        for k in range(len(poses))
+    ]
 
 
 def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:

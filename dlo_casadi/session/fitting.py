@@ -12,6 +12,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, EstimationOptions, declared_setup, wrong_effects
 from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
+from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.errors import ConfigError, EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import CONVERGED, descend, least_decrease
@@ -237,13 +238,19 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
 
     IPOPT's minimum replaces the fit where it is lower by more than the descent's tolerance. Where
     both agree, the fit counts as converged; where IPOPT fails, it does not. In space, with clips,
-    and where IPOPT ends higher, the fit stays as it is.
+    and where IPOPT ends higher, the fit stays as it is. It also stays where IPOPT has moved a pose
+    that is not fitted to another equilibrium: no point keeps it in the one it was in, and a cable
+    that takes a set carries it on. A drift between clamps got its EI wrong by 65 %.
     """
     point, own = found.point, fit.point.objective
     if not found.searched:
         return fit
     if point is None:
         return replace(fit, converged=False)
+    others = set(range(fit.problem.equilibria.m)) - set(fit.problem.used)
+    both = fit.point.shapes.x, point.shapes.x
+    if not all(fit.model.node.same(*(x[j] for x in both), NEARBY) for j in others):
+        return fit
     if point.objective < own - least_decrease(fit.problem, fit.point):
         return Fit(fit.problem, point, converged=True)
     same = point.objective <= own + SAME_MINIMUM * abs(own)

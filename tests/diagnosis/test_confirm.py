@@ -1,10 +1,12 @@
 """What is declared as fixed stays so when an effect is added or dropped."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen
@@ -67,7 +69,7 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
     }
     slope, std = (f("stiffness_gradient.slope") for f in (larger.value, larger.std))
     assert abs(slope - 0.4) < 3 * std
-    smaller = refit_without(larger, taper, base.model)
+    smaller = refit_without(larger, taper, base)
     assert kept(smaller) == FIXED
     assert "lumped_mass.mass" not in smaller.problem.unknowns.names
 
@@ -81,3 +83,20 @@ def test_a_fixed_effect_stays_on_another_mesh_and_beside_an_unknown_pull(base):
     )
     assert kept(found) == FIXED
     assert not unknowns.free[1:3].any()
+
+
+def test_a_fit_that_loses_its_poses_starts_again_from_the_declared_model(base, monkeypatch):
+    """Without an effect it is no worse than the declared model, which is nested in it."""
+    (screened,) = Screen(base, [taper_of(base.model)]).run(np.inf)
+    larger, followed, lost = refit_with(base, screened), refits._followed, []
+
+    def first_lost(start, *others):
+        found = followed(start, *others)
+        if not lost:
+            lost.append(found)
+            found = replace(found, point=replace(found.point, objective=1e9))
+        return found
+
+    monkeypatch.setattr(refits, "_followed", first_lost)
+    smaller = refit_without(larger, taper_of(base.model), base)
+    assert smaller.point.objective == pytest.approx(lost[0].point.objective, rel=1e-6)
