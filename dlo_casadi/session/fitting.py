@@ -248,8 +248,8 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
     if point is None:
         return replace(fit, converged=False)
     others = set(range(fit.problem.equilibria.m)) - set(fit.problem.used)
-    both = fit.point.shapes.x, point.shapes.x
-    if not all(fit.model.node.same(*(x[j] for x in both), NEARBY) for j in others):
+    own_x, x = fit.point.shapes.x, point.shapes.x
+    if not all(fit.model.node.same(own_x[j], x[j], NEARBY) for j in others):
         return fit
     if point.objective < own - least_decrease(fit.problem, fit.point):
         return Fit(fit.problem, point, converged=True)
