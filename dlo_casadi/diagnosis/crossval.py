@@ -93,10 +93,6 @@ class CrossValidation:
         """Log predictive density of all left-out data, as estimated in `densities`."""
         return float(self.densities.sum())
 
-    def loses_more_than(self, other: CrossValidation) -> bool:
-        """Whether some fold is not predicted that the other validation predicts."""
-        return bool((np.isinf(self.squares) & np.isfinite(other.squares)).any())
-
     def chance_of_gain(self, other: CrossValidation) -> float:
         """Probability of a gain as large as the other's if the other predicts no better.
 

@@ -272,8 +272,6 @@ def shortcoming(
     decide: if left-out repeats were predicted no better, a gain as large must have a
     probability below `doubt` (Student's t).
     """
-    if item.validation.loses_more_than(validation):
-        return "with it a pose that is left out cannot be predicted"
     if (behind := -support(item, base, validation)) >= 0:
         return f"makes the data less likely than no effect: log likelihood {behind:.3g} behind"
     chance = 0.0 if doubt is None else validation.chance_of_gain(item.validation)
