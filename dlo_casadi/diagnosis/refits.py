@@ -121,7 +121,8 @@ class NearData:
     screened : list of Screened
         All candidates, best first.
     nearest : list of Screened
-        Those that fit the shapes best; of pairs the second candidate.
+        Those that fit the shapes best, and loads with the forces of one of them; of pairs the
+        second candidate.
     tried : list of Confirmed or None
         Their fits, and those of contacts.
     far : list of str
@@ -243,11 +244,13 @@ def near_data(
             tried[k] = confirm_rolled(base, start, item)
         if explains(tried[k]):
             break
+    tried = loads_from_best(base, screened, tried, executor)
     fitted = {item.name: item.screened for item in touching}
     screened = in_order([fitted.get(x.candidate.name, x) for x in screened])
     names = set().union(*(start.names for start in kept))
     far = [x.candidate.name for x in likely[:REFITTED] if x.candidate.name not in names]
-    return NearData(screened, [start.screened for start in kept], [*touching, *tried], far)
+    best = [*(start.screened for start in kept), *(x.screened for x in tried if x is not None)]
+    return NearData(screened, best, [*touching, *tried], far)
 
 
 def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
@@ -358,25 +361,29 @@ def loads_from_best(
 ) -> list[Confirmed | None]:
     """Refits; if the likeliest adds a load at one place, other loads also start from its forces.
 
-    `tried`: refits of the `screened` candidates. From its own start a force was 2.0 mm from the
-    left-out poses of a cable with a force, from those of a tether 1.0 mm, as close as the tether.
+    `screened`: candidates in its place. From its own start a force was 2.0 mm from the left-out
+    poses of a cable with a force, from those of a tether 1.0 mm, as close as the tether.
     """
     best = max(filter(None, tried), key=lambda item: item.fit.log_evidence, default=None)
-    if best is None or not isinstance(best.candidate.effect, PointLoad):
+    load = next((x for x in best.beside_others() if _is_load(x.screened)), None) if best else None
+    if load is None:
         return list(tried)
-    others = [x for x in screened if isinstance(x.candidate.effect, PointLoad)]
-    loads = [x for x in others if x.candidate != best.candidate]
-    again = map_in_order(executor, partial(_confirm_load, base, best), loads)
-    from_best = dict(zip((x.candidate.name for x in loads), again, strict=True))
-    found = []
-    for own, item in zip(screened, tried, strict=True):
-        both = [x for x in (item, from_best.get(own.candidate.name)) if x is not None]
-        found.append(min(both, key=lambda x: x.fit.point.objective, default=None))
-    return found
+    loads = [x for x in screened if _is_load(x) and x.candidate != load.candidate]
+    again = map_in_order(executor, partial(_confirm_load, base, load), loads)
+    found: dict[str, Confirmed] = {}
+    for item in filter(None, (*tried, *again)):
+        known = found.setdefault(item.name, item)
+        if item.fit.point.objective < known.fit.point.objective:
+            found[item.name] = item
+    return [*found.values()]
+
+
+def _is_load(screened: Screened) -> bool:
+    return isinstance(screened.candidate.effect, PointLoad)
 
 
 def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed | None:
-    """Refit with a load, from the place and the forces of another load."""
+    """Refit with a load in place of another one, from its place and forces."""
     model, effect = best.fit.model, best.candidate.effect
     assert isinstance(effect, PointLoad)
     known = {
@@ -388,8 +395,10 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
     law = ca.Function("force", [at], [effect.force(at, gravity, params)])
     forces = np.array([np.array(law(place)).ravel() for place in _places(best.fit, position)])
     values = start_from(best.fit, position, forces, screened.candidate)
-    fit = _followed(best.fit, screened.candidate.add_to(base.model), values, MOST_STEPS)
-    return Confirmed.of(screened, base, fit)
+    without = best.candidate.remove_from(model, base.model)
+    fit = _followed(best.fit, screened.candidate.add_to(without), values, MOST_STEPS)
+    as_likely = replace(screened, p_value=min(screened.p_value, best.screened.p_value))
+    return Confirmed.of(as_likely, base, fit, best.beside)
 
 
 def _places(fit: Fit, position: float) -> FloatArray:

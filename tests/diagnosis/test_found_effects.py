@@ -3,6 +3,7 @@
 The sessions are simulated by this package's own model on a finer mesh, with 0.3 mm of noise.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -147,8 +148,13 @@ def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one():
     assert same == [tether, gradient]
     assert found.name == "point_force"
     assert found.fit.point.objective < force.fit.point.objective - 1000
-    nowhere, *_ = loads_from_best(base, screened, [None, tether, gradient], InProcess())
+    *_, nowhere = loads_from_best(base, screened, [None, tether, gradient], InProcess())
     assert nowhere.fit.point.objective == found.fit.point.objective
+    # It stays beside the other effect of a pair, whose data are as sure of it as of the tether.
+    pair = replace(tether, beside=(gradient.screened,))
+    other = loads_from_best(base, screened, [None, pair, None], InProcess())[1]
+    assert other.name == "stiffness_gradient and point_force"
+    assert other.screened.p_value == tether.screened.p_value
     # The likeliest is no load.
     assert loads_from_best(base, screened[2:], tried[2:], InProcess()) == [gradient]
 
