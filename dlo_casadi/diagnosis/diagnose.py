@@ -23,6 +23,7 @@ from dlo_casadi.diagnosis.selection import (
     added_by,
     choose,
     likelier_by,
+    p_of_removal,
     p_values_of,
     p_with_closed_noise,
     ranking,
@@ -341,10 +342,8 @@ class Search:
                 continue
             needless = smaller.log_evidence > fit.log_evidence
             if not needless and effect not in significant:
-                gain = 2 * (smaller.point.objective - fit.point.objective)
-                single = survival(gain, len(effect.candidate.frees), noise_degrees(fit))
                 tried = len(candidates_of(smaller, self.center, self.exclude))
-                needless = sidak(single, tried) > self.significance
+                needless = p_of_removal(fit, smaller, effect.candidate, tried) > self.significance
             if needless:
                 fit = settle(smaller)
                 added = [item for item in added if item is not effect]

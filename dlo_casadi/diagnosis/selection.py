@@ -18,7 +18,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.variances import errors_of
+from dlo_casadi.estimation.variances import errors_of, settle
 from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
 
 Verdict = Literal["complete", "effect_found", "unexplained"]
@@ -247,6 +247,18 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
     dof = len(winner.candidate.frees)
     return sidak(survival(gain, dof, noise_degrees(larger)), tried)
+
+
+def p_of_removal(fit: Fit, smaller: Fit, candidate: Candidate, tried: int) -> float:
+    """Significance of an effect, from a fit and the same without the effect.
+
+    A scatter from pose to pose is estimated anew without it, as it may explain as much. With the
+    few degrees of freedom of the given scatter, a length 9 tolerances off was not significant.
+    """
+    gain, degrees = 2 * (smaller.point.objective - fit.point.objective), noise_degrees(fit)
+    if fit.scatters:
+        gain, degrees = 2 * (fit.log_evidence - settle(smaller).log_evidence), np.inf
+    return sidak(survival(gain, len(candidate.frees), degrees), tried)
 
 
 def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
