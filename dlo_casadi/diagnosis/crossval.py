@@ -93,6 +93,11 @@ class CrossValidation:
         """Log predictive density of all left-out data, as estimated in `densities`."""
         return float(self.densities.sum())
 
+    def loses_most_of(self, other: CrossValidation) -> bool:
+        """Whether most folds that the other validation predicts are not predicted."""
+        known = np.isfinite(other.squares)
+        return bool(2 * np.isinf(self.squares[known]).sum() > known.sum())
+
     def chance_of_gain(self, other: CrossValidation) -> float:
         """Probability of a gain as large as the other's if the other predicts no better.
 

@@ -48,7 +48,7 @@ from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import REFITTED
+from dlo_casadi.thresholds import EVIDENCE_APART, REFITTED
 
 # Shares of the one-step estimate from which a refit is tried, in this order.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -121,7 +121,7 @@ class NearData:
     screened : list of Screened
         All candidates, best first.
     nearest : list of Screened
-        Those that fit the shapes best, and loads with the forces of one of them; of pairs the
+        Those that fit the shapes best, and loads started from the forces of one; of pairs the
         second candidate.
     tried : list of Confirmed or None
         Their fits, and those of contacts.
@@ -247,7 +247,8 @@ def near_data(
     tried = loads_from_best(base, screened, tried, executor)
     fitted = {item.name: item.screened for item in touching}
     screened = in_order([fitted.get(x.candidate.name, x) for x in screened])
-    names = set().union(*(start.names for start in kept))
+    refitted = [x for item in tried if item is not None for x in item.each]
+    names = {x.candidate.name for x in refitted}.union(*(start.names for start in kept))
     far = [x.candidate.name for x in likely[:REFITTED] if x.candidate.name not in names]
     best = [*(start.screened for start in kept), *(x.screened for x in tried if x is not None)]
     return NearData(screened, best, [*touching, *tried], far)
@@ -328,7 +329,8 @@ def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
     nested = declared.reweighed(fit.noise, fit.problem.priors)
     if found is None or found.point.objective > nested.point.objective:
         values = {name: fit.value(name) for name in fit.model.names}
-        found = _followed(nested, model, values) or found
+        both = [x for x in (found, _followed(nested, model, values)) if x is not None]
+        found = min(both, key=lambda x: x.point.objective, default=None)
     return found
 
 
@@ -359,22 +361,25 @@ def loads_from_best(
     tried: Sequence[Confirmed | None],
     executor: Executor,
 ) -> list[Confirmed | None]:
-    """Refits; if the likeliest adds a load at one place, other loads also start from its forces.
+    """Refits; if the likeliest adds a load at one place, others also start from its forces.
 
-    `screened`: candidates in its place. From its own start a force was 2.0 mm from the left-out
-    poses of a cable with a force, from those of a tether 1.0 mm, as close as the tether.
+    `screened`: candidates, of which loads are tried in its place. The refits are those of `tried`
+    and of these loads, the likelier one for each set of effects. From its own start a force was
+    2.0 mm from the left-out poses of a cable with a force, from those of a tether 1.0 mm.
     """
     best = max(filter(None, tried), key=lambda item: item.fit.log_evidence, default=None)
     load = next((x for x in best.beside_others() if _is_load(x.screened)), None) if best else None
-    if load is None:
+    if best is None or load is None:
         return list(tried)
-    loads = [x for x in screened if _is_load(x) and x.candidate != load.candidate]
+    present = {x.candidate.effect.label for x in best.each}
+    loads = [x for x in screened if _is_load(x) and x.candidate.effect.label not in present]
     again = map_in_order(executor, partial(_confirm_load, base, load), loads)
-    found: dict[str, Confirmed] = {}
+    found: dict[frozenset[str], Confirmed] = {}
     for item in filter(None, (*tried, *again)):
-        known = found.setdefault(item.name, item)
-        if item.fit.point.objective < known.fit.point.objective:
-            found[item.name] = item
+        names = frozenset(x.candidate.name for x in item.each)
+        known = found.setdefault(names, item)
+        if item.fit.log_evidence > known.fit.log_evidence:
+            found[names] = item
     return [*found.values()]
 
 
@@ -397,8 +402,14 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
     values = start_from(best.fit, position, forces, screened.candidate)
     without = best.candidate.remove_from(model, base.model)
     fit = _followed(best.fit, screened.candidate.add_to(without), values, MOST_STEPS)
-    as_likely = replace(screened, p_value=min(screened.p_value, best.screened.p_value))
-    return Confirmed.of(as_likely, base, fit, best.beside)
+    with suppress(EstimationError):
+        found = Confirmed.of(screened, base, fit, best.beside)
+        if found and found.fit.log_evidence > best.fit.log_evidence - EVIDENCE_APART:
+            # It explains as much as the load that was tested.
+            p_value = min(screened.p_value, best.screened.p_value)
+            found = replace(found, screened=replace(screened, p_value=p_value))
+        return found
+    return None
 
 
 def _places(fit: Fit, position: float) -> FloatArray:

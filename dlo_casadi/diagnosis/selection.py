@@ -252,13 +252,21 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
 def p_of_removal(fit: Fit, smaller: Fit, candidate: Candidate, tried: int) -> float:
     """Significance of an effect, from a fit and the same without the effect.
 
-    A scatter from pose to pose is estimated anew without it, as it may explain as much. With the
-    few degrees of freedom of the given scatter, a length 9 tolerances off was not significant.
+    A scatter from pose to pose is estimated anew without the effect, as it may explain as much: a
+    length 9 tolerances off, which no scatter explains, was not significant beside the given one.
+    2 log L of two fits that estimate one variance with nu degrees of freedom is
+    (nu + dof) log(1 + dof F / nu) (Gaussian residuals); the evidence takes the place of log L.
     """
-    gain, degrees = 2 * (smaller.point.objective - fit.point.objective), noise_degrees(fit)
+    gain = 2 * (smaller.point.objective - fit.point.objective)
+    dof, degrees = len(candidate.frees), noise_degrees(fit)
     if fit.scatters:
-        gain, degrees = 2 * (fit.log_evidence - settle(smaller).log_evidence), np.inf
-    return sidak(survival(gain, len(candidate.frees), degrees), tried)
+        try:
+            gain = 2 * (fit.log_evidence - settle(smaller).log_evidence)
+        except EstimationError:  # without the effect poses are lost
+            return 0.0
+        if np.isfinite(degrees):
+            gain = degrees * np.expm1(min(gain / (degrees + dof), 500.0))
+    return sidak(survival(gain, dof, degrees), tried)
 
 
 def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
@@ -284,6 +292,8 @@ def shortcoming(
     decide: if left-out repeats were predicted no better, a gain as large must have a
     probability below `doubt` (Student's t).
     """
+    if item.validation.loses_most_of(validation):
+        return "with it most poses that are left out cannot be predicted"
     if (behind := -support(item, base, validation)) >= 0:
         return f"makes the data less likely than no effect: log likelihood {behind:.3g} behind"
     chance = 0.0 if doubt is None else validation.chance_of_gain(item.validation)

@@ -302,7 +302,7 @@ def _gaps(fit: Fit) -> list[EnergyGap]:
     """Energy of each fitted pose as measured, minus that of its prediction, along the unknowns."""
     problem, model, unknowns = fit.problem, fit.model, fit.problem.unknowns
     own = _predicted_next(fit)
-    nodes = {problem.measured[j].pose.name: fit.point.shapes.x[j] for j in problem.used}
+    nodes = {x.pose.name: fit.point.shapes.x[j] for j, x in enumerate(problem.measured)}
     others = measured_elsewhere(model, fit.p, fit.rest, problem.measured, own, nodes)
     along = unknowns.slopes(fit.point.theta), unknowns.rest_slopes
     gaps = []
@@ -317,7 +317,7 @@ def _gaps(fit: Fit) -> list[EnergyGap]:
 
 
 def _predicted_next(fit: Fit) -> list[Prediction | None]:
-    """Predictions of a problem's own poses, each after the others as fitted.
+    """Predictions of a problem's own poses, each after those before it in their fitted equilibria.
 
     Where a cable carries a state, one pose that is predicted in another equilibrium than it was in
     would lead all later ones astray.
@@ -326,11 +326,13 @@ def _predicted_next(fit: Fit) -> list[Prediction | None]:
     if not fit.model.has_state:
         predictions = predict_poses(fit.model, fit.p, fit.rest, poses)
         return [predictions[k] for k in problem.indices]
-    fitted = [*fit.point.shapes.x]
-    return [
-        predict_poses(fit.model, fit.p, fit.rest, poses[: k + 1], [*fitted[:k], None])[k]
-        for k in range(len(poses))
-    ]
+    fitted, out, last, rest = [*fit.point.shapes.x], [], slice(0, 0), fit.rest
+    for k, known in enumerate(predict_poses(fit.model, fit.p, fit.rest, poses, fitted)):
+        near = [*poses[last], poses[k]], [*fitted[last], None]
+        out.append(predict_poses(fit.model, fit.p, rest, *near)[-1])
+        if known is not None:
+            last, rest = slice(k, k + 1), known.rest
+    return out
 
 
 def _refitted(fit: Fit, gaps: Sequence[EnergyGap]) -> Fit:

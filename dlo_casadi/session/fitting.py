@@ -238,23 +238,31 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
 
     IPOPT's minimum replaces the fit where it is lower by more than the descent's tolerance. Where
     both agree, the fit counts as converged; where IPOPT fails, it does not. In space, with clips,
-    and where IPOPT ends higher, the fit stays as it is. It also stays where IPOPT has moved a pose
-    that is not fitted to another equilibrium: no point keeps it in the one it was in, and a cable
-    that takes a set carries it on. A drift between clamps got its EI wrong by 65 %.
+    and where IPOPT ends higher, the fit stays as it is. No point keeps a pose that is not fitted in
+    its equilibrium, which a cable that takes a set carries on. Where IPOPT has moved one elsewhere,
+    its unknowns are used with the fit's equilibria: a drift between clamps had its EI 65 % off.
     """
     point, own = found.point, fit.point.objective
     if not found.searched:
         return fit
     if point is None:
         return replace(fit, converged=False)
-    others = set(range(fit.problem.equilibria.m)) - set(fit.problem.used)
-    own_x, x = fit.point.shapes.x, point.shapes.x
-    if not all(fit.model.node.same(own_x[j], x[j], NEARBY) for j in others):
-        return fit
+    if _moves_others(fit, point):
+        followed = fit.problem.balanced(replace(point, shapes=fit.point.shapes))
+        point = None if followed is None else descend(Fit(fit.problem, followed)).point
+        if point is None or _moves_others(fit, point):
+            return fit
     if point.objective < own - least_decrease(fit.problem, fit.point):
         return Fit(fit.problem, point, converged=True)
     same = point.objective <= own + SAME_MINIMUM * abs(own)
     return replace(fit, converged=True) if same and not fit.converged else fit
+
+
+def _moves_others(fit: Fit, point: Point) -> bool:
+    """Whether a pose that is not fitted has another shape at a point than in a fit."""
+    others = set(range(fit.problem.equilibria.m)) - set(fit.problem.used)
+    own, x = fit.point.shapes.x, point.shapes.x
+    return not all(fit.model.node.same(own[j], x[j], NEARBY) for j in others)
 
 
 def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:

@@ -86,7 +86,7 @@ def test_a_fixed_effect_stays_on_another_mesh_and_beside_an_unknown_pull(base):
 
 
 def test_a_fit_that_loses_its_poses_starts_again_from_the_declared_model(base, monkeypatch):
-    """Without an effect it is no worse than the declared model, which is nested in it."""
+    """If it ends above that model, which is nested in it."""
     (screened,) = Screen(base, [taper_of(base.model)]).run(np.inf)
     larger, followed, lost = refit_with(base, screened), refits._followed, []
 

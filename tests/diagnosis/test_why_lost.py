@@ -32,11 +32,11 @@ def refit(name, evidence, predictive):
     return Confirmed(screened, fit, told, evidence)
 
 
-def lost(*args):
-    """The same, where one step leads beyond the stability of a pose: its density tells enough."""
+def lost(poses, *args):
+    """The same, where one step leads beyond the stability of some poses."""
     found = refit(*args)
     squares = found.validation.squares.copy()
-    squares[2] = np.inf
+    squares[poses] = np.inf
     return replace(found, validation=replace(found.validation, squares=squares))
 
 
@@ -47,7 +47,8 @@ TRIED = [
     refit("bent", 85.0, 20.0),
     refit("costly", -3.0, 5.0),
     refit("worse", 50.0, -40.0),
-    lost("edge", 49.0, 55.0),
+    lost([2], "edge", 49.0, 55.0),
+    lost([0, 1, 2, 3], "lost", 49.0, 55.0),
     None,
 ]
 
@@ -59,6 +60,7 @@ def test_each_reason_has_its_number():
         "behind": "log likelihood 8.17 behind winner",
         "bent": "log likelihood 20 behind winner",
         "costly": "makes the data less likely than no effect: log likelihood 3 behind",
+        "lost": "with it most poses that are left out cannot be predicted",
         "worse": "makes the data less likely than no effect: log likelihood 40 behind",
     }
 

@@ -25,7 +25,7 @@ NOISE, HELD_OUT, HANGING = 3e-4, 2, 4
 def session() -> list[MeasuredPose]:
     """Eight poses of arches, one of which hangs, and one of which is held out."""
     p = np.array([TRUE.get(q.name, q.nominal) for q in MODEL.parameters])
-    rng, poses, starts = np.random.default_rng(4), [], []
+    rng, poses = np.random.default_rng(4), []
     for _ in range(8):
         place = (rng.uniform(0.5, 0.7) * CABLE.length, rng.uniform(-0.1, 0.1))
         poses.append(HeldPose((0.0, 0.0), place, *rng.uniform(-0.4, 0.4, 2)))
