@@ -364,7 +364,7 @@ def loads_from_best(
     """Refits; if the likeliest adds a load at one place, others also start from its forces.
 
     `screened`: candidates, of which loads are tried in its place. The refits are those of `tried`
-    and of these loads, the likelier one for each set of effects. From its own start a force was
+    and of these loads, the lower one for each set of effects. From its own start a force was
     2.0 mm from the left-out poses of a cable with a force, from those of a tether 1.0 mm.
     """
     best = max(filter(None, tried), key=lambda item: item.fit.log_evidence, default=None)
@@ -378,7 +378,7 @@ def loads_from_best(
     for item in filter(None, (*tried, *again)):
         names = frozenset(x.candidate.name for x in item.each)
         known = found.setdefault(names, item)
-        if item.fit.log_evidence > known.fit.log_evidence:
+        if item.fit.point.objective < known.fit.point.objective:
             found[names] = item
     return [*found.values()]
 
