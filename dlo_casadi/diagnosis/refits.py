@@ -320,9 +320,9 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
 def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
     """Fit without a candidate; a nuisance is held as declared. None without equilibria.
 
-    The poses of a cable that has taken a set are far from equilibrium without it, and may be lost
-    on the way. So the fit also starts from the declared model's if it ends above that one, which is
-    nested in it.
+    Without its set, the poses of a cable that has taken one are far from equilibrium, and the fit
+    may end in other equilibria. The declared model has fewer effects: a fit that ends above it is
+    not the minimum, and starts again from the declared model's fit.
     """
     model = candidate.remove_from(fit.model, declared.model)
     found = _followed(fit, model, {})
@@ -361,11 +361,12 @@ def loads_from_best(
     tried: Sequence[Confirmed | None],
     executor: Executor,
 ) -> list[Confirmed | None]:
-    """Refits; if the likeliest adds a load at one place, others also start from its forces.
+    """Refits; if the likeliest adds a load at one place, other loads also start from its forces.
 
-    `screened`: candidates, of which loads are tried in its place. The refits are those of `tried`
-    and of these loads, the lower one for each set of effects. From its own start a force was
-    2.0 mm from the left-out poses of a cable with a force, from those of a tether 1.0 mm.
+    `screened`: candidates, of which the loads are tried in place of that load. If a set of effects
+    was fitted twice, the fit with the lower objective counts: with the likelier one, which may have
+    another noise, the tether of a session in space was lost. From its own start a force was 2.0 mm
+    from the left-out poses of a cable with a force, from those of a tether 1.0 mm.
     """
     best = max(filter(None, tried), key=lambda item: item.fit.log_evidence, default=None)
     load = next((x for x in best.beside_others() if _is_load(x.screened)), None) if best else None

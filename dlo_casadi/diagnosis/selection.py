@@ -254,17 +254,19 @@ def p_of_removal(fit: Fit, smaller: Fit, candidate: Candidate, tried: int) -> fl
 
     A scatter from pose to pose is estimated anew without the effect, as it may explain as much: a
     length 9 tolerances off, which no scatter explains, was not significant beside the given one.
-    2 log L of two fits that estimate one variance with nu degrees of freedom is
-    (nu + dof) log(1 + dof F / nu) (Gaussian residuals); the evidence takes the place of log L.
+    If both fits estimate one variance of Gaussian residuals, with the effect from nu degrees of
+    freedom, twice the log likelihood ratio is (nu + dof) log(1 + dof F / nu). F is computed from
+    this, with the ratio of the evidences, which also counts the parameters, for the likelihoods'.
     """
     gain = 2 * (smaller.point.objective - fit.point.objective)
     dof, degrees = len(candidate.frees), noise_degrees(fit)
     if fit.scatters:
         try:
             gain = 2 * (fit.log_evidence - settle(smaller).log_evidence)
-        except EstimationError:  # without the effect poses are lost
+        except EstimationError:  # without the effect there is no fit
             return 0.0
         if np.isfinite(degrees):
+            # A larger exponent would overflow; its probability is zero anyway.
             gain = degrees * np.expm1(min(gain / (degrees + dof), 500.0))
     return sidak(survival(gain, dof, degrees), tried)
 

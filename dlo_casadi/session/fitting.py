@@ -238,9 +238,11 @@ def confirmed(fit: Fit, found: Minimum) -> Fit:
 
     IPOPT's minimum replaces the fit where it is lower by more than the descent's tolerance. Where
     both agree, the fit counts as converged; where IPOPT fails, it does not. In space, with clips,
-    and where IPOPT ends higher, the fit stays as it is. No point keeps a pose that is not fitted in
-    its equilibrium, which a cable that takes a set carries on. Where IPOPT has moved one elsewhere,
-    its unknowns are used with the fit's equilibria: a drift between clamps had its EI 65 % off.
+    and where IPOPT ends higher, the fit stays as it is.
+
+    A held-out pose has no points that would keep it in its equilibrium, and the next poses depend
+    on it if the cable takes a set. Where IPOPT has moved such a pose to another equilibrium, its
+    unknowns are used with the fit's equilibria: a drift between clamps had its EI 65 % off.
     """
     point, own = found.point, fit.point.objective
     if not found.searched:

@@ -63,7 +63,7 @@ def test_another_minimum_may_not_move_a_pose_that_no_point_holds(drifting):
 
 
 def test_a_pose_in_another_equilibrium_leads_no_later_one_astray(drifting):
-    """As told from the end conditions alone every later pose would start from a wrong state."""
+    """Predicted from the ends alone, every later pose would start from a wrong state."""
     model, fitted = drifting.model, drifting.point.shapes.x
     alone = predict_poses(
         model, drifting.p, drifting.rest, [item.pose for item in drifting.problem.history]
