@@ -1,0 +1,56 @@
+"""Functions of segments over many poses: vectorised ones give the same numbers, bit for bit."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from dlo_casadi.effects import BendingSoftening, CableData, PointForce, StiffSection
+from dlo_casadi.model import stacked
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.stacked import Mapped, vectorised
+from dlo_casadi.rod.chain import ELEMENTS_IN_SPACE
+
+CABLE = CableData(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
+EFFECTS = PointForce(), StiffSection(), BendingSoftening()
+NAMES = "segment", "segment_slope", "segment_curve", "segment_curve_slopes", "segment_sensitivity"
+
+
+def arguments(function: ca.Function, m: int, count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [rng.uniform(0.1, 1, (m, count, function.numel_in(i))) for i in range(function.n_in())]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("torsion", [None, 0.015])
+@pytest.mark.parametrize("element", ELEMENTS_IN_SPACE)
+def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
+    element, torsion, name, monkeypatch
+):
+    cable = replace(CABLE, torsional_stiffness=torsion)
+    gravity = (0.0, -9.81) if torsion is None else (0.0, 0.0, -9.81)
+    model = CableModel(cable, 6, element, effects=EFFECTS, gravity=gravity)
+    function = getattr(functions_of(model), name)
+    monkeypatch.setattr(stacked, "WORTH", 0)
+    mapped, given = Mapped(function, 6), arguments(function, 13, 6)  # 78 segments: two blocks
+    first = mapped(*given)
+    monkeypatch.setattr(stacked, "PAID", 0)
+    after = mapped(*given)
+    assert mapped._vectorised is not None
+    alone = [mapped(*(block[k : k + 1] for block in given)) for k in (0, 12)]
+    for number, (one, other) in enumerate(zip(first, after, strict=True)):
+        assert np.isfinite(one).all()
+        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(one[[0, 12]], [x[number][0] for x in alone])
+
+
+def test_a_vectorised_function_of_constants_and_selections():
+    x, y = ca.SX.sym("x", 2), ca.SX.sym("y", 0)
+    found = ca.vertcat(x[1], 3, ca.if_else(x[0] > 0, ca.sqrt(ca.fabs(x[1])), -x[0]))
+    function = ca.Function("f", [x, y], [ca.densify(found), ca.SX(0, 1)])
+    rows = np.array([[1.0, 4.0], [-1.0, 9.0], [0.0, -16.0]])
+    values, nothing = vectorised(function, 3)(rows, np.zeros((3, 0)))
+    np.testing.assert_array_equal(values, [[4, 3, 2], [9, 3, 1], [-16, 3, 0]])
+    assert nothing.shape == (3, 0)
