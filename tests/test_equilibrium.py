@@ -576,3 +576,12 @@ def test_poses_solved_together_are_those_solved_alone_and_ipopt_finds_nothing_lo
         assert held is not None
         assert held.stable
         np.testing.assert_allclose(held.x, eq.x, atol=1e-9)
+
+
+def test_ipopt_finds_an_equilibrium_where_no_guess_leads_to_one():
+    """A coil of 2.5 mm radius, pulled straight."""
+    model = CableModel(CableData(0.5, 0.02, 0.006, 0.002), 8, n_rest=0)
+    pose = HeldPose((0.0, 0.0), (0.4999, 0.0))
+    (eq,) = solve_equilibria(model, model.nominal, np.full(model.chain.n_rests, 400.0), [pose])
+    assert isinstance(eq, Equilibrium)
+    assert eq.stable

@@ -39,6 +39,8 @@ def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
     monkeypatch.setattr(stacked, "PAID", 0)
     after = mapped(*given)
     assert mapped._vectorised is not None
+    assert [x.shape for x in mapped(*(x[:0] for x in given))] == [(0, *x.shape[1:]) for x in first]
+    monkeypatch.setattr(stacked, "FEWEST", 0)
     alone = [mapped(*(block[k : k + 1] for block in given)) for k in (0, 12)]
     for number, (one, other) in enumerate(zip(first, after, strict=True)):
         assert np.isfinite(one).all()

@@ -1,4 +1,4 @@
-"""Cross-validation over whole poses, without fitting again for each.
+"""Cross-validation over whole poses, mostly without fitting again.
 
 Leaving pose j out of the normal equations gives the unknowns without it in one Gauss-Newton step,
 
@@ -17,7 +17,7 @@ Vehtari, Gelman and Gabry, Practical Bayesian model evaluation, Statistics and C
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -40,7 +40,7 @@ from dlo_casadi.thresholds import EVIDENCE_APART
 # Number of stretches into which the arc of a single pose is cut.
 STRETCHES = 5
 # Steps of a fit without a pose, and the decrease of the objective at which it ends.
-STEPS, TOLERANCE = 10, 0.1
+REFIT_STEPS, REFIT_TOLERANCE = 10, 0.1
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class CrossValidation:
         the parameters' uncertainty given the other folds. Not given for stretches of a single pose.
     densities : (folds,)
         Log density of each fold under the covariance from which `expected` comes. To first order
-        if the fold could not be predicted, which is an upper estimate.
+        if the fold could not be predicted, also after a refit: an upper estimate.
     """
 
     squares: FloatArray
@@ -121,8 +121,8 @@ class CrossValidation:
 def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
-    All folds are solved together, in some 6 ms each. If a state is carried, each fold is a task of
-    its own instead, in this process unless an executor is given.
+    All folds are solved together, in some 6 ms each. Fits without a pose, and if a state is carried
+    each fold, are tasks of their own, in this process unless an executor is given.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
@@ -137,39 +137,45 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
         theta, covariance = _without(fit, total.hessian - h_j, total.gradient - g_j)
         thetas.append(theta)
         covariances.append(covariance)
-    predicted = _predicted(fit, thetas, executor or InProcess())
-    densities = []
-    for k, covariance in enumerate(covariances):
-        linear = _density(fit, k, _first_order(fit, k, thetas[k]), covariance)
-        density = _density_of(fit, k, predicted[k], covariance)
-        if density < linear - EVIDENCE_APART:
-            again = _predicted_after_refit(fit, k)
-            if again is not None:
-                predicted[k], density = again, _density_of(fit, k, again, covariance)
-        densities.append(density if np.isfinite(density) else linear)
+    run = executor or InProcess()
+    predicted = _predicted(fit, dict(enumerate(thetas)), run)
+    linear = [
+        _density(fit, k, _first_order(fit, k, theta), covariances[k])
+        for k, theta in enumerate(thetas)
+    ]
+    densities = [_density_of(fit, k, predicted[k], covariances[k]) for k in range(len(thetas))]
+    missed = [k for k, density in enumerate(densities) if density < linear[k] - EVIDENCE_APART]
+    refitted = zip(missed, map_in_order(run, partial(_fitted_without, fit), missed), strict=True)
+    for k, seen in _predicted(fit, {k: x for k, x in refitted if x is not None}, run).items():
+        predicted[k], densities[k] = seen, _density_of(fit, k, seen, covariances[k])
+    densities = [x if np.isfinite(x) else known for x, known in zip(densities, linear, strict=True)]
     items = [problem.measured[j] for j in problem.used]
     errors = [
         None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
-        for item, seen in zip(items, predicted, strict=True)
+        for item, seen in zip(items, predicted.values(), strict=True)
     ]
     expected = fit.expected_with(covariances)
     return replace(_validation(errors), expected=expected, densities=np.array(densities))
 
 
-def _predicted_after_refit(fit: Fit, k: int) -> Observed | None:
-    """Measurements of the k-th fitted pose as predicted by a fit to the others; None if lost."""
-    problem = fit.problem
-    left_out = problem.fitted[k]
+def _fitted_without(fit: Fit, k: int) -> FloatArray | None:
+    """Unknowns fitted to all poses but the k-th fitted one; None if poses are lost."""
+    problem, shapes = fit.problem, fit.point.shapes
     history = list(problem.history)
-    history[left_out] = replace(history[left_out], held_out=True)
+    history[problem.fitted[k]] = replace(history[problem.fitted[k]], held_out=True)
     kept = [i for i in range(len(problem.used)) if i != k]
-    shapes = fit.point.shapes if fit.model.has_state else fit.point.shapes.subset(kept)
+    if fit.model.has_state:  # the pose is still in the history, but no point shows its deviations
+        own = shapes.deviation.copy()
+        own[problem.used[k]] = 0.0
+        shapes = replace(shapes, deviation=own)
+    else:
+        shapes = shapes.subset(kept)
     places = [fit.point.projections[i] for i in kept]
     others = replace(problem, history=history, weights=tuple(problem.whitening[i] for i in kept))
-    with suppress(EstimationError):
-        point = others.evaluate(Values(fit.point.theta, shapes, places))
-        theta = descend(Fit(others, point), STEPS, TOLERANCE).point.theta
-        return _predict_all(fit, theta)[problem.used[k]]
+    with suppress(EstimationError, np.linalg.LinAlgError):
+        point = others.balanced(Values(fit.point.theta, shapes, places))
+        if point is not None:
+            return descend(Fit(others, point), REFIT_STEPS, REFIT_TOLERANCE).point.theta
     return None
 
 
@@ -180,12 +186,15 @@ def _first_order(fit: Fit, k: int, theta: FloatArray) -> FloatArray:
     return np.asarray(lin.residuals[k] + a @ (theta - fit.point.theta) - own)
 
 
-def _density(fit: Fit, k: int, white: FloatArray, covariance: FloatArray) -> float:
-    """Log density of whitened residuals of the k-th fitted pose; `covariance`: of the unknowns."""
+def _density(fit: Fit, k: int, off: FloatArray, covariance: FloatArray) -> float:
+    """Log density of whitened residuals of the k-th fitted pose.
+
+    `covariance`: of the unknowns without it, to first order about the fit.
+    """
     a, own = fit.linearization.by_theta[k], fit.linearization.by_deviation[k]
     ways = np.concatenate([a @ root_of(covariance), own * fit.problem.deviation_std], axis=1)
     whitening = fit.problem.whitening[k]
-    return _log_density(white, ways) + float(np.linalg.slogdet(whitening)[1])
+    return _log_density(off, ways) + float(np.linalg.slogdet(whitening)[1])
 
 
 def _density_of(fit: Fit, k: int, seen: Observed | None, covariance: FloatArray) -> float:
@@ -226,28 +235,31 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[Float
     return np.clip(fit.point.theta - covariance @ gradient, lower, upper), covariance
 
 
-def _predicted(fit: Fit, thetas: list[FloatArray], executor: Executor) -> list[Observed | None]:
-    """Predicted measurements of each fitted pose at its own unknowns, from declared ends."""
+def _predicted(
+    fit: Fit, thetas: Mapping[int, FloatArray], executor: Executor
+) -> dict[int, Observed | None]:
+    """Predicted measurements of fitted poses at their own unknowns, from declared ends."""
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
+    if not thetas:
+        return {}
     if fit.model.has_state:
-        folds = map_in_order(executor, partial(_predict_all, fit), thetas)
-        return [seen[j] for j, seen in zip(problem.used, folds, strict=True)]
+        folds = map_in_order(executor, partial(_predict_all, fit), [*thetas.values()])
+        return {k: seen[problem.used[k]] for k, seen in zip(thetas, folds, strict=True)}
     p = np.repeat(fit.p[None], equilibria.m, axis=0)
     rest = np.repeat(fit.rest[None], equilibria.m, axis=0)
-    for j, theta in zip(problem.used, thetas, strict=True):
-        p[j], rest[j] = unknowns.p(theta), unknowns.rest(theta)
+    for k, theta in thetas.items():
+        p[k], rest[k] = unknowns.p(theta), unknowns.rest(theta)
     solved, converged = equilibria.solve(_declared(fit), p, rest)
     seen = equilibria.seen(solved, p, rest)
-    return [seen[j] if converged[j] else None for j in problem.used]
+    return {k: seen[k] if converged[k] else None for k in thetas}
 
 
 def _predict_all(fit: Fit, theta: FloatArray) -> list[Observed | None]:
-    """Predicted measurements of all poses at one theta; None if lost, with a state all or none."""
+    """Predicted measurements of all poses in order at one theta, with the state carried along."""
     equilibria, unknowns = fit.problem.equilibria, fit.problem.unknowns
     p, rest = unknowns.p(theta), unknowns.rest(theta)
     solved, converged = equilibria.solve(_declared(fit), p, rest)
-    seen = equilibria.seen(solved, p, rest)
-    return [item if found else None for item, found in zip(seen, converged, strict=True)]
+    return [*equilibria.seen(solved, p, rest)] if converged.all() else [None] * equilibria.m
 
 
 def _declared(fit: Fit) -> Shapes:

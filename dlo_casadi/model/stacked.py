@@ -86,20 +86,20 @@ class Tangents:
     tangent: BandMatrix | None = None
 
 
-# Segments in a block. An instruction of a vectorised function takes 16 ns and 0.25 ns per segment;
-# one of CasADi's scalar interpreter 2 to 4 ns per segment.
+# Segments in a block. An instruction of a vectorised function takes 16 ns and 0.25 ns per segment,
+# those that fill up a block included; one of CasADi's scalar interpreter 2 to 4 ns per segment.
 BLOCK = 64
-# Instructions, over all segments, from which on a call is vectorised: some 0.1 ms of interpreter.
-# Segments after which the conversion, of 10 us per instruction, has paid.
-WORTH, PAID = 3e4, 5000
+# Calls are vectorised from this many segments and, over all of them, instructions: 0.1 ms of
+# interpreter. They are so after as many segments as pay for the conversion, 10 us per instruction.
+FEWEST, WORTH, PAID = 8, 3e4, 5000
 
 
 class Mapped:
     """A CasADi function of a segment (or node), mapped over the segments of poses.
 
     It reads and writes NumPy's memory, because conversion to CasADi's matrices takes several times
-    as long as the evaluation. Once it has been evaluated often, it is `vectorised`, which gives the
-    same numbers, bit for bit, five to ten times as fast.
+    as long as the evaluation. Once it has been evaluated often, large calls are `vectorised`: they
+    give the same numbers, bit for bit, up to eight times as fast.
     """
 
     def __init__(self, function: ca.Function, count: int) -> None:
@@ -115,9 +115,10 @@ class Mapped:
         """Arguments (m, count, rows) -> outputs (m, count, rows, columns)."""
         m = len(arguments[0])
         given = [block.reshape(m * self._count, block.shape[2]) for block in arguments]
-        self._evaluated += len(given[0])
-        work = len(given[0]) * self._function.n_instructions()
-        often = self._evaluated > PAID and work > WORTH
+        number = len(given[0])
+        self._evaluated += number
+        large = number >= FEWEST and number * self._function.n_instructions() > WORTH
+        often = large and self._evaluated > PAID
         outputs = self._in_blocks(given) if often else self._one_by_one(given)
         shaped = zip(outputs, self._shapes, strict=True)
         return [out.reshape(m, *shape).transpose(0, 1, 3, 2) for out, shape in shaped]
@@ -125,10 +126,12 @@ class Mapped:
     def _one_by_one(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
         """Arguments (segments, rows) -> outputs (segments, size)."""
         number = len(arguments[0])
+        outputs: list[FloatArray] = [np.empty((number, a * b)) for _, a, b in self._shapes]
+        if not number:
+            return outputs
         if number not in self._buffers:
             self._buffers[number] = self._function.map(number).buffer()
         given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
-        outputs: list[FloatArray] = [np.empty((number, *shape[1:])) for shape in self._shapes]
         _run(self._buffers[number], given, outputs)
         return outputs
 
@@ -140,7 +143,7 @@ class Mapped:
         blocks = np.minimum(np.arange(-(-number // BLOCK) * BLOCK), number - 1).reshape(-1, BLOCK)
         given = [np.ascontiguousarray(x[blocks].transpose(0, 2, 1), dtype=float) for x in arguments]
         outputs: list[FloatArray] = [
-            np.empty((len(blocks), shape[1] * shape[2], BLOCK)) for shape in self._shapes
+            np.empty((len(blocks), a * b, BLOCK)) for _, a, b in self._shapes
         ]
         for k in range(len(blocks)):
             _run(self._vectorised, [x[k] for x in given], [x[k] for x in outputs])
@@ -169,6 +172,8 @@ def vectorised(function: ca.Function, size: int) -> ca.Function:
     ----------
     function : ca.Function
         Of scalars (SX), with dense arguments and outputs.
+    size : int
+        Number of rows.
 
     Returns
     -------
