@@ -41,10 +41,13 @@ def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
     assert mapped._vectorised is not None
     assert [x.shape for x in mapped(*(x[:0] for x in given))] == [(0, *x.shape[1:]) for x in first]
     monkeypatch.setattr(stacked, "FEWEST", 0)
+    few = mapped(*(block[:2] for block in given))
+    assert [x.strides for x in few] == [x.strides for x in first]
     alone = [mapped(*(block[k : k + 1] for block in given)) for k in (0, 12)]
     for number, (one, other) in enumerate(zip(first, after, strict=True)):
         assert np.isfinite(one).all()
         np.testing.assert_array_equal(one, other)
+        assert one.strides == other.strides
         np.testing.assert_array_equal(one[[0, 12]], [x[number][0] for x in alone])
 
 

@@ -147,7 +147,9 @@ class Mapped:
         ]
         for k in range(len(blocks)):
             _run(self._vectorised, [x[k] for x in given], [x[k] for x in outputs])
-        return [x.transpose(0, 2, 1).reshape(blocks.size, -1)[:number] for x in outputs]
+        # Contiguous, as one by one: sums over other strides are rounded otherwise.
+        rows = [np.ascontiguousarray(x.transpose(0, 2, 1)) for x in outputs]
+        return [x.reshape(blocks.size, -1)[:number] for x in rows]
 
 
 def _run(

@@ -161,16 +161,15 @@ def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one():
     assert loads_from_best(base, screened[2:], tried[2:], InProcess()) == [gradient]
 
 
-def test_left_out_poses_are_no_less_likely_than_to_first_order(monkeypatch):
-    """Where one step of a product, stiffness and anchor, leads to another shape."""
+def test_left_out_poses_that_no_fit_predicts_count_to_first_order(monkeypatch):
+    """Where a load's unknowns are a product, stiffness and anchor."""
     base = session("tether", *TETHER)
     listed = {c.name: c for c in candidates(base.model, setup_of(base.model, n_poses=len(ENDS)))}
     start = dict(zip(listed["tether"].frees, TETHER, strict=True))
     fit = confirm(base, Screened(listed["tether"], 1.0, 0.0, start)).fit
-    whole, predicted = cross_validate(fit), crossval._predicted
-    monkeypatch.setattr(crossval, "_predicted", lambda fit, *_: [None] * len(ENDS))
-    first_order = cross_validate(fit).densities
-    assert whole.densities == pytest.approx(first_order, abs=1.0)
-    assert (whole.densities > first_order).any()
-    monkeypatch.setattr(crossval, "_predicted", lambda *given: predicted(*given)[::-1])
-    assert cross_validate(fit).densities == pytest.approx(first_order)
+    whole = cross_validate(fit)
+    assert whole.complete
+    monkeypatch.setattr(crossval, "_predicted", lambda fit, thetas, _: dict.fromkeys(thetas))
+    lost = cross_validate(fit)
+    assert lost.densities == pytest.approx(whole.densities, abs=1.0)
+    assert lost.error == np.inf
