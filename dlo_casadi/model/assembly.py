@@ -36,7 +36,7 @@ _TURN = 10.0
 
 def _repeated(rows: FloatArray, count: int) -> FloatArray:
     """Rows (m, k) of poses, repeated for `count` segments or stations (m, count, k)."""
-    return np.broadcast_to(rows[:, None], (len(rows), count, rows.shape[1]))
+    return rows[:, None].repeat(count, axis=1)
 
 
 class Assembly:
