@@ -300,7 +300,8 @@ def shortcoming(
         return f"makes the data less likely than no effect: log likelihood {behind:.3g} behind"
     chance = 0.0 if doubt is None else validation.chance_of_gain(item.validation)
     if doubt is not None and chance >= doubt:
-        return f"predicts what is left out no better than by chance: p = {chance:.2g}"
+        least = f"p = {chance:.2g}, not below {doubt:.2g}"
+        return f"may predict left-out poses better by chance: {least}"
     return ""
 
 
