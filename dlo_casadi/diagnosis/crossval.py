@@ -40,7 +40,7 @@ from dlo_casadi.thresholds import EVIDENCE_APART
 # Number of stretches into which the arc of a single pose is cut.
 STRETCHES = 5
 # Steps of a fit without a pose, and the decrease of the objective at which it ends.
-REFIT_STEPS, REFIT_TOLERANCE = 10, 0.1
+REFIT_STEPS, REFIT_TOLERANCE = 3, 0.1
 
 
 @dataclass(frozen=True)
