@@ -59,3 +59,14 @@ def test_a_vectorised_function_of_constants_and_selections():
     values, nothing = vectorised(function, 3)(rows, np.zeros((3, 0)))
     np.testing.assert_array_equal(values, [[4, 3, 2], [9, 3, 1], [-16, 3, 0]])
     assert nothing.shape == (3, 0)
+
+
+def test_a_function_that_calls_another_stays_scalar(monkeypatch):
+    monkeypatch.setattr(stacked, "WORTH", 0)
+    monkeypatch.setattr(stacked, "PAID", 0)
+    x = ca.SX.sym("x", 2)
+    called = ca.Function("called", [x], [ca.sumsqr(x)], {"never_inline": True})
+    mapped = Mapped(ca.Function("f", [x], [ca.densify(2 * called(x))]), 10)
+    (given,) = arguments(mapped._function, 3, 10)
+    (found,) = mapped(given)
+    np.testing.assert_allclose(found[..., 0, 0], 2 * (given**2).sum(axis=2))

@@ -62,8 +62,8 @@ class CrossValidation:
         Expected error of everything, to first order: from noise, fixtures, the cable's scatter and
         the parameters' uncertainty given the other folds. Not given for stretches of a single pose.
     densities : (folds,)
-        Log density of each fold under the covariance from which `expected` comes. To first order
-        if the fold could not be predicted, also after a refit: an upper estimate.
+        Log density of each fold under the covariance from which `expected` comes. If a fold could
+        not be predicted, not even after a refit, its first order, which is an upper estimate.
     """
 
     squares: FloatArray
@@ -121,8 +121,8 @@ class CrossValidation:
 def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
-    All folds are solved together, in some 6 ms each. Fits without a pose, and if a state is carried
-    each fold, are tasks of their own, in this process unless an executor is given.
+    All folds are solved together, in some 6 ms each; if a state is carried, each is a task of its
+    own. So is each fit without a pose. Tasks run in this process unless an executor is given.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)

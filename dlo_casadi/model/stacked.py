@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -89,8 +90,9 @@ class Tangents:
 # Segments in a block. An instruction of a vectorised function takes 16 ns and 0.25 ns per segment,
 # those that fill up a block included; one of CasADi's scalar interpreter 2 to 4 ns per segment.
 BLOCK = 64
-# Calls are vectorised from this many segments and, over all of them, instructions: 0.1 ms of
-# interpreter. They are so after as many segments as pay for the conversion, 10 us per instruction.
+# Smallest calls that are vectorised: number of segments, and of instructions over all segments,
+# which take the interpreter 0.1 ms. The conversion takes 10 us per instruction, which has paid
+# after that number of segments.
 FEWEST, WORTH, PAID = 8, 3e4, 5000
 
 
@@ -118,10 +120,16 @@ class Mapped:
         number = len(given[0])
         self._evaluated += number
         large = number >= FEWEST and number * self._function.n_instructions() > WORTH
-        often = large and self._evaluated > PAID
+        often = large and self._evaluated > PAID and self._inlined
         outputs = self._in_blocks(given) if often else self._one_by_one(given)
         shaped = zip(outputs, self._shapes, strict=True)
         return [out.reshape(m, *shape).transpose(0, 1, 3, 2) for out, shape in shaped]
+
+    @cached_property
+    def _inlined(self) -> bool:
+        """Whether the function calls no others, as one of a user's effect may: not `vectorised`."""
+        count = self._function.n_instructions()
+        return ca.OP_CALL not in map(self._function.instruction_id, range(count))
 
     def _one_by_one(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
         """Arguments (segments, rows) -> outputs (segments, size)."""
@@ -152,15 +160,13 @@ class Mapped:
         return [x.reshape(blocks.size, -1)[:number] for x in rows]
 
 
-def _run(
-    function: tuple[Any, Any], arguments: Sequence[FloatArray], outputs: Sequence[FloatArray]
-) -> None:
+def _run(function: tuple[Any, Any], arguments: Sequence[Any], outputs: Sequence[Any]) -> None:
     """Evaluate a buffered function on NumPy's memory."""
     buffer, run = function
     for i, given in enumerate(arguments):
-        buffer.set_arg(i, memoryview(given))  # type: ignore[arg-type]
+        buffer.set_arg(i, memoryview(given))
     for i, out in enumerate(outputs):
-        buffer.set_res(i, memoryview(out))  # type: ignore[arg-type]
+        buffer.set_res(i, memoryview(out))
     run()
 
 
