@@ -34,7 +34,7 @@ def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
     model = CableModel(cable, 6, element, effects=EFFECTS, gravity=gravity)
     function = getattr(functions_of(model), name)
     monkeypatch.setattr(stacked, "WORTH", 0)
-    mapped, given = Mapped(function, 6), arguments(function, 13, 6)  # 78 segments: two blocks
+    mapped, given = Mapped(function), arguments(function, 13, 6)  # 78 segments: two blocks
     first = mapped(*given)
     monkeypatch.setattr(stacked, "PAID", 0)
     after = mapped(*given)
@@ -66,7 +66,7 @@ def test_a_function_that_calls_another_stays_scalar(monkeypatch):
     monkeypatch.setattr(stacked, "PAID", 0)
     x = ca.SX.sym("x", 2)
     called = ca.Function("called", [x], [ca.sumsqr(x)], {"never_inline": True})
-    mapped = Mapped(ca.Function("f", [x], [ca.densify(2 * called(x))]), 10)
+    mapped = Mapped(ca.Function("f", [x], [ca.densify(2 * called(x))]))
     (given,) = arguments(mapped._function, 3, 10)
     (found,) = mapped(given)
     np.testing.assert_allclose(found[..., 0, 0], 2 * (given**2).sum(axis=2))

@@ -227,7 +227,7 @@ def kernels_of(
         return Kernels(
             (Kernel(whole, own[:, :0], plain, moved),), _ends(bare, parameters), shared, holder
         )
-    kinds = places[:, 1:] - [0, 1, 0, 0] * places[:, :1]
+    kinds = places[:, 1:] - [0, 1, 0, 0, 0] * places[:, :1]
     # A point force acts on a whole segment, on none of it, or from a place inside it.
     shares = np.array([np.array(lagrangian_of(bare).shares(p, place)).ravel() for place in places])
     within = (shares > 0) & (shares < 1)
@@ -257,9 +257,9 @@ def _told(model: CableModel, p: ca.SX, width: int, held: Held | None = None) -> 
     row, lam, own = (ca.SX.sym("i", size) for size in (width + inside, d, d))
     x = ca.SX.sym("x", 2 * model.node.coordinates)
     start, length, share = row[0], row[1], row[width] if inside else ca.SX(0)
-    length = length if model.clamped_between else ca.SX(model.chain.h)
-    advancing = model.chain.layout.segments[0, 4]
-    place = ca.vertcat(start, length, start, length, advancing, start + share * length)
+    has_cell, mesh = model.chain.layout.segments[0, 4:]
+    length = length if model.clamped_between else ca.SX(mesh)
+    place = ca.vertcat(start, length, start, length, has_cell, mesh, start + share * length)
     still = ca.SX.zeros(len(model.deviation_names))
     shares = ca.vertcat(*ca.vertsplit(terms.shares(p, place))[:-1], share)
     numbers = SegmentNumbers(p, row[2:width], place, still, shares)

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -54,7 +53,6 @@ class Assembly:
         # Number of values that determine the rest strains inside a segment.
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
-        self._functions: dict[tuple[str, int, bool], Mapped] = {}
         self.depth, self.everywhere, self._outwards = DEPTH, False, outwards(model)
 
     def softened(self, depth: float) -> Assembly:
@@ -68,10 +66,6 @@ class Assembly:
         other = copy(self)
         other.everywhere = True
         return other
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickle without compiled functions: another process makes its own."""
-        return {**self.__dict__, "_functions": {}}
 
     @cached_property
     def turn_per_slip(self) -> FloatArray:
@@ -87,12 +81,8 @@ class Assembly:
 
     # ---- calls ---------------------------------------------------------------------------------
 
-    def _mapped(self, name: str, count: int, unheld: bool = False) -> Mapped:
-        key = name, count, unheld
-        if key not in self._functions:
-            function = getattr(functions_of(self.model, unheld), name)
-            self._functions[key] = Mapped(function, count)
-        return self._functions[key]
+    def _mapped(self, name: str, unheld: bool = False) -> Mapped:
+        return functions_of(self.model, unheld).mapped(name)
 
     def _call_segments(
         self, name: str, shapes: Shapes, given: Inputs, touching: Touching | None = None
@@ -109,7 +99,7 @@ class Assembly:
         p, deviation = (_repeated(one, count) for one in (given.p, shapes.deviation))
         both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
         if not self.model.clips:
-            return self._mapped(name, count)(both, lam, p, own, table, deviation)
+            return self._mapped(name)(both, lam, p, own, table, deviation)
         pulls = [self.model.end_pull, *self.model.pulls[self.model.n_springs :]]
         width = None if self.model.clamped_between else self.chain.h
         unheld = Unheld.of(table, self.model.clips, pulls, width)
@@ -151,7 +141,7 @@ class Assembly:
         both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
         others = (shapes.lam[:, : self.n_lam], given.p, given.poses, shapes.deviation)
         rows = [both, *(one[:, None] for one in others)]
-        return [out[:, 0] for out in self._mapped(name, 1)(*rows)]
+        return [out[:, 0] for out in self._mapped(name)(*rows)]
 
     def _at_nodes(
         self, first: FloatArray, last: FloatArray, start: FloatArray, end: FloatArray
@@ -326,7 +316,7 @@ class Assembly:
         places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
         x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
         p, ends = _repeated(given.p, count), _repeated(given.poses, count)
-        return self._mapped(name, count)(places, rates, x, p, ends)
+        return self._mapped(name)(places, rates, x, p, ends)
 
     def curve_slopes(self, shapes: Shapes, given: Inputs) -> CurveSlopes:
         """`curve` and the parts of its derivatives."""

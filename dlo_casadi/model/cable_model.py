@@ -239,6 +239,11 @@ class CableModel:
         """Return the same model on another mesh."""
         return replace(self, n=n, element=element or self.element)
 
+    @cached_property
+    def unmeshed(self) -> Self:
+        """One model for all meshes, rest splines and priors: their expressions are the same."""
+        return replace(self, n=2, n_rest=0, priors={})
+
     @property
     def extensible(self) -> bool:
         """Whether some effect lets the cable stretch under tension."""

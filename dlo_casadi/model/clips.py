@@ -192,7 +192,7 @@ class Clipped:
         return both
 
     def segments(self) -> FloatArray:
-        """Rows of the layout (m, n_segments, 5 + k), with the arc lengths of the clips."""
+        """Rows of the layout (m, n_segments, 6 + k), with the arc lengths of the clips."""
         even = self.chain.layout.segments
         table = np.broadcast_to(even, (len(self.at), *even.shape))
         if not self.at.shape[1]:
@@ -314,23 +314,23 @@ class Unheld:
     def evaluated(
         self,
         name: str,
-        mapped: Callable[[str, int, bool], Callable[..., list[FloatArray]]],
+        mapped: Callable[[str, bool], Callable[..., list[FloatArray]]],
         arguments: Sequence[FloatArray],
         first: int,
     ) -> list[FloatArray]:
         """Outputs (m, n_segments, rows, columns) of a function of segments.
 
-        `mapped` (name, number of segments, unheld) -> the function. Its second argument is the
-        border, whose rows start at `first` in outputs that have them.
+        `mapped` (name, unheld) -> the function. Its second argument is the border, whose rows start
+        at `first` in outputs that have them.
         """
         both, lam, *others = arguments
-        found = mapped(name, lam.shape[1], True)(both, self.summed(lam), *others)
+        found = mapped(name, True)(both, self.summed(lam), *others)
         for out, axes in zip(found, _BORDER_AXES.get(name, ((),) * len(found)), strict=True):
             for axis in axes:
                 self._spread(out, axis, first)
         if self.inside.size:
             here = np.arange(len(lam))[:, None], self.inside
-            held = mapped(name, self.inside.shape[1], False)(*(one[here] for one in arguments))
+            held = mapped(name, False)(*(one[here] for one in arguments))
             for out, one in zip(found, held, strict=True):
                 out[here] = one
         return found

@@ -13,6 +13,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import MODELS, SegmentNumbers, lagrangian_of
+from dlo_casadi.model.stacked import Mapped
 from dlo_casadi.rod.element import LAYOUT_SIZE, Cell, Segment
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
@@ -42,6 +43,13 @@ class Functions:
             border[row] = s
         self._by = ca.vertcat(self.terms.delta, *border)
         self._numbers = ca.vertcat(p, rest, deviation)
+        self._mapped: dict[str, Mapped] = {}
+
+    def mapped(self, name: str) -> Mapped:
+        """The function of that name over many segments (or nodes) of many poses."""
+        if name not in self._mapped:
+            self._mapped[name] = Mapped(getattr(self, name))
+        return self._mapped[name]
 
     def _here(
         self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
@@ -403,7 +411,9 @@ class Functions:
         return ca.Function("dead_load", [self.terms.p], [ca.densify(load)])
 
 
-@lru_cache(maxsize=MODELS)
 def functions_of(model: CableModel, unheld: bool = False) -> Functions:
-    """The functions of a model, made once."""
-    return Functions(model, unheld)
+    """The functions of a model, made once for all its meshes."""
+    return _functions_of(model.unmeshed, unheld)
+
+
+_functions_of = lru_cache(maxsize=MODELS)(Functions)

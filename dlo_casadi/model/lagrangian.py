@@ -80,7 +80,7 @@ class Lagrangian:
         Coordinates of a segment's two nodes, or of the first and last node; their increments.
     rest_strains : (3 strains,) [1/m]
         Rest strains inside a segment, see `Chain.rest_stencils`.
-    place : (5 + n_clips,)
+    place : (6 + n_clips,)
         A row of `Layout.segments`, then the arc lengths of the clips.
     inner : (n_inner,)
         Internal unknowns of an element, which are eliminated.
@@ -220,17 +220,11 @@ class Lagrangian:
     def segment(
         self, ratio: ca.SX, inner: ca.SX, square: ca.SX, local: ca.SX | None = None
     ) -> Segment:
-        """The segment's symbols; values that all segments share are constants."""
-        table = self.model.chain.layout.segments
-        alike = np.all(table == table[0], axis=0)
-        if self.model.clamped_between:  # their nodes are moved along the cable
-            alike[:4] = False
-        place = [ca.SX(table[0, i]) if alike[i] else self.place[i] for i in range(len(alike))]
+        """The segment's symbols."""
         return Segment(
             local=self.local if local is None else local,
             rest=self.rest_strains,
-            place=ca.vertcat(*place),
-            mesh=self.model.chain.h,
+            place=self.place[:LAYOUT_SIZE],
             stretch=self.stretch,
             ratio=ratio,
             inner=inner,
@@ -292,9 +286,9 @@ class Lagrangian:
         return ca.Function("shares", [self.p, self.place], [ca.vertcat(ca.SX.zeros(0), *found)])
 
     @property
-    def length(self) -> ca.SX | float:
+    def length(self) -> ca.SX:
         """Length of a segment [m], of all the same without clamped clips."""
-        return self.place[1] if self.model.clamped_between else self.model.chain.h
+        return self.place[1 if self.model.clamped_between else 5]
 
     def with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Expressions with the shares in place of their symbols."""
@@ -442,7 +436,9 @@ class Lagrangian:
         return total - ca.dot(self.total_load, true.start)
 
 
-@lru_cache(maxsize=MODELS)
 def lagrangian_of(model: CableModel, unheld: bool = False) -> Lagrangian:
-    """The expressions of a model, made once."""
-    return Lagrangian(model, unheld)
+    """The expressions of a model, made once for all its meshes."""
+    return _lagrangian_of(model.unmeshed, unheld)
+
+
+_lagrangian_of = lru_cache(maxsize=MODELS)(Lagrangian)

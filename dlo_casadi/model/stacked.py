@@ -104,10 +104,10 @@ class Mapped:
     give the same numbers, bit for bit, up to eight times as fast.
     """
 
-    def __init__(self, function: ca.Function, count: int) -> None:
-        self._function, self._count, self._evaluated = function, count, 0
+    def __init__(self, function: ca.Function) -> None:
+        self._function, self._evaluated = function, 0
         self._shapes = [
-            (count, function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
+            (function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
         ]
         # By number of segments. Any, here and below: CasADi's stubs do not allow NumPy memory.
         self._buffers: dict[int, tuple[Any, Any]] = {}
@@ -115,15 +115,15 @@ class Mapped:
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
         """Arguments (m, count, rows) -> outputs (m, count, rows, columns)."""
-        m = len(arguments[0])
-        given = [block.reshape(m * self._count, block.shape[2]) for block in arguments]
-        number = len(given[0])
+        m, count, _ = arguments[0].shape
+        number = m * count
+        given = [block.reshape(number, block.shape[2]) for block in arguments]
         self._evaluated += number
         large = number >= FEWEST and number * self._function.n_instructions() > WORTH
         often = large and self._evaluated > PAID and self._inlined
         outputs = self._in_blocks(given) if often else self._one_by_one(given)
         shaped = zip(outputs, self._shapes, strict=True)
-        return [out.reshape(m, *shape).transpose(0, 1, 3, 2) for out, shape in shaped]
+        return [out.reshape(m, count, *shape).transpose(0, 1, 3, 2) for out, shape in shaped]
 
     @cached_property
     def _inlined(self) -> bool:
@@ -134,7 +134,7 @@ class Mapped:
     def _one_by_one(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
         """Arguments (segments, rows) -> outputs (segments, size)."""
         number = len(arguments[0])
-        outputs: list[FloatArray] = [np.empty((number, a * b)) for _, a, b in self._shapes]
+        outputs: list[FloatArray] = [np.empty((number, a * b)) for a, b in self._shapes]
         if not number:
             return outputs
         if number not in self._buffers:
@@ -150,9 +150,7 @@ class Mapped:
         number = len(arguments[0])
         blocks = np.minimum(np.arange(-(-number // BLOCK) * BLOCK), number - 1).reshape(-1, BLOCK)
         given = [np.ascontiguousarray(x[blocks].transpose(0, 2, 1), dtype=float) for x in arguments]
-        outputs: list[FloatArray] = [
-            np.empty((len(blocks), a * b, BLOCK)) for _, a, b in self._shapes
-        ]
+        outputs: list[FloatArray] = [np.empty((len(blocks), a * b, BLOCK)) for a, b in self._shapes]
         for k in range(len(blocks)):
             _run(self._vectorised, [x[k] for x in given], [x[k] for x in outputs])
         # Contiguous, as one by one: sums over other strides are rounded otherwise.

@@ -232,7 +232,7 @@ def _segment_arguments(
             x[:, node], places[node] = frame, at[k]
         low, width = places[:-1].T, (places[1:] - places[:-1]).T
         if clamped:
-            place = ca.vertcat(low, width, low, width, ca.DM.ones(1, chain.n_segments))
+            place = ca.vertcat(low, width, low, width, place[4:, :])
             rest = moved_rest(chain, rest, low, width)
         place = ca.vertcat(place, ca.repmat(ca.vertcat(*at), 1, chain.n_segments))
     after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)

@@ -17,7 +17,7 @@ from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.rod.node import Node
 
 # Number of values per segment in `Layout.segments`.
-LAYOUT_SIZE = 5
+LAYOUT_SIZE = 6
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Cell:
 
     low: ca.SX
     width: ca.SX
-    mesh: float
+    mesh: ca.SX | float
 
     @property
     def middle(self) -> ca.SX:
@@ -96,9 +96,9 @@ class Layout:
     ----------
     nodes : (N,) [m]
         Arc lengths of the nodes.
-    segments : (S, 5) [m, m, m, m, 1]
+    segments : (S, 6) [m, m, m, m, 1, m]
         For each segment: start and length of the piece of cable it covers, start and width of its
-        bending cell, and whether it has a cell (1 or 0).
+        bending cell, whether it has a cell (1 or 0), and the length of an element.
     stations : (n + 1, 2) int
         The two nodes whose mean direction is that of the cable at each element boundary.
     """
@@ -134,10 +134,8 @@ class Segment:
         Local coordinates of its nodes, see `Element.local`.
     rest : (3 strains,) [1/m]
         Rest strains of the cell: for each strain the mean, linear and quadratic variation.
-    place : (5,)
+    place : (6,)
         A row of `Layout.segments`.
-    mesh : float [m]
-        Declared length of an element.
     stretch : scalar
         True length over declared length without tension, the same for all segments.
     ratio : scalar
@@ -151,7 +149,6 @@ class Segment:
     local: ca.SX
     rest: ca.SX
     place: ca.SX
-    mesh: float
     stretch: ca.SX
     ratio: ca.SX
     inner: ca.SX
@@ -180,7 +177,7 @@ class Segment:
     @property
     def cell(self) -> Cell:
         """Its bending cell."""
-        return Cell(self.place[2], self.place[3], self.mesh)
+        return Cell(self.place[2], self.place[3], self.place[5])
 
     @property
     def has_cell(self) -> ca.SX:
@@ -244,7 +241,7 @@ class Element(ABC):
         """
         nodes = np.linspace(0.0, length, n + 1)
         width = np.full(n, length / n)
-        segments = np.column_stack([nodes[:-1], width, nodes[:-1], width, np.ones(n)])
+        segments = np.column_stack([nodes[:-1], width, nodes[:-1], width, np.ones(n), width])
         return Layout(nodes, segments, np.stack([np.arange(n + 1)] * 2, axis=1))
 
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:

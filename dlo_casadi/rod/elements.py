@@ -71,7 +71,8 @@ class Link(Element):
         width = np.concatenate([np.diff(nodes), nodes[-1:] - nodes[-2:-1]])
         has_cell = np.ones(len(nodes))
         has_cell[-1] = 0.0
-        return Layout(nodes, np.column_stack([links, low, width, has_cell]), stations)
+        rows = np.column_stack([links, low, width, has_cell, np.full(len(nodes), h)])
+        return Layout(nodes, rows, stations)
 
     def strain(self, segment: Segment) -> ca.SX:
         """Bend of the hinge divided by the width of its cell."""

@@ -36,7 +36,6 @@ def segments_of(chain: Chain, phi: np.ndarray, *, rest=None, stretch=1.0, bubble
             local=ca.SX([float(phi[j]), float(phi[after[j]])]),
             rest=ca.SX(ca.DM(inside[j])),
             place=ca.SX(ca.DM(chain.layout.segments[j])),
-            mesh=chain.h,
             stretch=ca.SX(stretch),
             ratio=ca.SX(stretch),
             inner=inner,
