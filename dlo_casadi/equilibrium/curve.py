@@ -11,23 +11,9 @@ from dlo_casadi.arrays import FloatArray, IntArray, cross
 from dlo_casadi.equilibrium.pose import HeldPose
 
 _NEWTON_STEPS = 12
-# Polynomial coefficients (powers of u, weights) of the interpolants' derivatives by u.
-_HERMITE = np.array(
-    [
-        [[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]],
-        [[0, 0, 1, 0], [-6, 6, -4, -2], [6, -6, 3, 3], [0, 0, 0, 0]],
-        [[-6, 6, -4, -2], [12, -12, 6, 6], [0, 0, 0, 0], [0, 0, 0, 0]],
-    ],
-    dtype=float,
-)
-_LINEAR = np.array(
-    [
-        [[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
-        [[-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
-        [[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
-    ],
-    dtype=float,
-)
+# Coefficients (powers of u, weights) of the interpolants.
+_HERMITE = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]], dtype=float)
+_LINEAR = np.array([[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
 
 
 @dataclass(frozen=True)
@@ -80,13 +66,6 @@ class NodeCurve:
         e = np.minimum(u.astype(np.intp), self.n - 1)
         return e, u - e
 
-    def weights(self, s: FloatArray, derivative: int = 0) -> tuple[IntArray, FloatArray]:
-        """Element index (K,) and weights (K, 4) of [r_e, r_(e+1), h t_e, h t_(e+1)] at s [m]."""
-        e, u = self._local(s)
-        h = self.length / self.n
-        powers = u[:, None] ** np.arange(4)
-        return e, powers @ self._table[derivative] / h**derivative
-
     @cached_property
     def _handles(self) -> FloatArray:
         """Per element [r_e, r_(e+1), h t_e, h t_(e+1)] (n, 4, d)."""
@@ -96,16 +75,21 @@ class NodeCurve:
         slopes = self.slopes * (self.length / self.n)
         return np.stack([self.nodes[:-1], self.nodes[1:], slopes[:-1], slopes[1:]], axis=1)
 
+    @cached_property
+    def _polynomials(self) -> FloatArray:
+        """Coefficients (4, d, n) of the positions in each element, by powers of u."""
+        return np.ascontiguousarray((self._table @ self._handles).transpose(1, 2, 0))
+
     def frame(self, s: FloatArray, derivatives: int) -> list[FloatArray]:
-        """Position (K, d) [m] and its first derivatives by s at arc lengths s."""
+        """Position (K, d) [m] and its first derivatives by s, at most two, at arc lengths s."""
         e, u = self._local(s)
-        powers = u[:, None] ** np.arange(4)
-        handles = self._handles[e]
-        scale = self.n / self.length
-        return [
-            np.einsum("kw,kwd->kd", powers @ self._table[d], handles) * scale**d
-            for d in range(derivatives + 1)
-        ]
+        a, b, c, d = self._polynomials.take(e, axis=2)
+        found, scale, bend = [((d * u + c) * u + b) * u + a], self.n / self.length, 3 * d * u
+        if derivatives > 0:
+            found.append(scale * ((bend + 2 * c) * u + b))
+        if derivatives > 1:
+            found.append(2 * scale**2 * (bend + c))
+        return [one.T for one in found]
 
     def at(self, s: FloatArray, derivative: int = 0) -> FloatArray:
         """Positions (K, d) [m] at arc lengths s, or derivatives by s."""
@@ -113,8 +97,8 @@ class NodeCurve:
 
     def moved(self, s: FloatArray, change: FloatArray) -> FloatArray:
         """Change (K, d, q) [m] at fixed s, from the change (n + 1, d or 2 d, q) of `numbers`."""
-        e, w = self.weights(s)
-        w = w[:, :, None, None]
+        e, u = self._local(s)
+        w = (np.vander(u, 4, increasing=True) @ self._table)[:, :, None, None]
         out = w[:, 0] * change[e, : self.d] + w[:, 1] * change[e + 1, : self.d]
         if self.slopes is not None:
             h = self.length / self.n
@@ -131,8 +115,9 @@ class NodeCurve:
         """
         s, limit = guess.copy(), 0.5 * self.length / self.n
         for _ in range(_NEWTON_STEPS):
-            change = np.nan_to_num(np.clip(step(s), -limit, limit))
-            new = np.clip(s + change, 0.0, self.length)
+            change = step(s)
+            change = np.where(np.isnan(change), 0.0, np.minimum(np.maximum(change, -limit), limit))
+            new = np.minimum(np.maximum(s + change, 0.0), self.length)
             done = np.abs(new - s).max() < tolerance * self.length
             s = new
             if done:

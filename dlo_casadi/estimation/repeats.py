@@ -234,9 +234,9 @@ class Variances:
 
 @dataclass(frozen=True)
 class InformedDeviance(Deviance):
-    """Deviance with the average information (k, k)."""
+    """Deviance with the average information by the logarithm of the random part's size."""
 
-    information: FloatArray
+    information: float
 
 
 class RestLikelihood:
@@ -265,12 +265,13 @@ class RestLikelihood:
         )
         left = left[:, values > 1e-6 * max(values[:1].max(initial=0.0), 1e-300)]
         blocks = np.split(left, np.cumsum([len(sample.e) for sample in samples])[:-1])
-        self.free = self.count - left.shape[1]
-        fixed = [np.column_stack([x, s.e]) for x, s in zip(blocks, samples, strict=True)]
-        self.fixed = np.array([x.T @ x for x in fixed]).sum(axis=0)
-        random = [np.column_stack([s.random, s.own]) for s in samples]
-        self.random = np.array([z.T @ z for z in random])
-        self.cross = np.array([z.T @ x for z, x in zip(random, fixed, strict=True)])
+        # Products of each pose's columns (Z, X, y), also with its own ones, made orthogonal.
+        both = zip(samples, blocks, strict=True)
+        columns = [np.column_stack([one.random, x, one.e]) for one, x in both]
+        self.products = np.array([a.T @ a for a in columns])
+        self.own, turns = np.linalg.eigh(np.array([one.own.T @ one.own for one in samples]))
+        crossed = [one.own.T @ a for one, a in zip(samples, columns, strict=True)]
+        self.crossed = turns.swapaxes(1, 2) @ np.array(crossed)
         self.distances = distances
         square = (distances**2).sum() / max(self.m * (self.m - 1), 1)
         # If all poses are repeats of one, they are alike at any range.
@@ -281,50 +282,70 @@ class RestLikelihood:
     ) -> InformedDeviance:
         """Restricted deviance by the logarithms of the three sizes, see `sensing.restricted`.
 
-        By Woodbury's identity for the random parts, V = noise^2 1 + Z B Z^T: pose by pose, or in
-        one block of all poses if these are correlated.
+            V = V_0 + Z B Z^T,   V_0 = noise^2 1 + U U^T,   P = V^-1 - V^-1 X (...)^-1 X^T V^-1
+
+        by Woodbury's identity, first for the other quantities U of each pose alone, then for the
+        random ones Z: pose by pose, or in one block of all poses if these are correlated.
         """
-        m, q, r = self.m, self.random.shape[1], self.modes
+        m, r, variance = self.m, self.modes, noise**2
+        less = 1 / (variance + self.own)
+        first = self._weighted(less) / variance  # (Z, X, y)^T V_0^-1 (Z, X, y)
+        second = self._weighted(less * (2 - self.own * less)) / variance**2  # with V_0^-2
         sizes = PoseScatter(1.0, smoothness, source=self.source).sizes(r) ** 2
-        rest = np.diag(np.pad(sizes, (0, q - r)))
-        own: FloatArray = np.diag((np.arange(q) >= r) * 1.0)
-        by_std: FloatArray = 2 * std**2 * rest
-        by_systematic: FloatArray = np.zeros((q, q))
-        inside, cross = self.random, self.cross
-        if systematic > 0 and m > 1:
-            alike = np.exp(-((self.distances / range_) ** 2) / 2)
-            by_systematic = 2 * systematic**2 * np.kron(alike, rest)
-            by_std, own = np.kron(np.eye(m), by_std), np.kron(np.eye(m), own)
-            inside, cross = block_diag(*inside)[None], cross.reshape((1, m * q, -1))
-        between, count = own + (by_std + by_systematic) / 2, inside.shape[1]
-        matrix = noise**2 * np.eye(count) + inside @ between
+        joined = systematic > 0 and m > 1
+        alike = np.exp(-((self.distances / range_) ** 2) / 2) if joined else np.eye(m)
+        poses = std**2 * np.eye(m) + systematic**2 * joined * alike
+        inside, cross, between = first[:, :r, :r], first[:, :r, r:], std**2 * np.diag(sizes)
+        if joined:
+            inside, cross = block_diag(*inside)[None], cross.reshape((1, m * r, -1))
+            between = np.kron(poses, np.diag(sizes))
+        count = len(between)
+        matrix = np.eye(count) + inside @ between
         solved = np.linalg.solve(matrix, np.concatenate([inside, cross], axis=2))
         inside, taken = solved[:, :, :count], solved[:, :, count:]  # Z^T V^-1 Z, Z^T V^-1 (X, y)
-        gram = self.fixed - np.einsum("mqa,mqb->ab", between @ cross, taken)
-        gram /= noise**2
-        x, y, spare = gram[:-1, :-1], gram[:-1, -1:], self.count - len(matrix) * count
+        moved = between @ taken
+        gram = first[:, r:, r:].sum(axis=0) - (cross.transpose(0, 2, 1) @ moved).sum(axis=0)
+        x, y = gram[:-1, :-1], gram[:-1, -1]
         root = np.linalg.cholesky(x + 1e-9 * np.trace(x) / max(len(x), 1) * np.eye(len(x)))
-        explained = np.linalg.solve(root, y)
-        hidden = np.linalg.solve(root, taken[:, :, :-1].transpose(0, 2, 1))
-        pull = taken[:, :, -1] - (explained.T @ hidden)[:, 0]  # Z^T P y
-        quadratic = float(gram[-1, -1] - (explained**2).sum())
-        logdet = 2 * float(np.log(root.diagonal()).sum() + spare * np.log(noise))
+        half = np.linalg.inv(root)
+        explained = half @ y
+        quadratic = float(gram[-1, -1] - explained @ explained)
+        logdet = 2 * float(np.log(root.diagonal()).sum()) - float(np.log(less).sum())
+        logdet += (self.count - less.size) * float(np.log(variance))
         logdet += float(np.linalg.slogdet(matrix)[1].sum())
 
-        ways = [between, by_std, by_systematic]
-        diagonal = inside.sum(axis=0) - np.einsum("mpa,mpb->ab", hidden, hidden)
-        traces = np.array([(diagonal * way).sum() for way in ways])
-        moved = np.stack([pull @ way for way in ways])
-        squares = np.einsum("jmq,mq->j", moved, pull)
-        seen = np.einsum("mpq,jmq->jp", hidden, moved)
-        bend = np.einsum("jmq,mqk,imk->ji", moved, inside, moved, optimize=True) - seen @ seen.T
-        # P V P = P separates the noise's part from that of all random parts.
-        by_noise = 2 * (self.free - traces[0] - quadratic + squares[0])
-        information = bend.copy()
-        information[0] = information[:, 0] = 2 * (squares - bend[0])
-        information[0, 0] = 4 * (quadratic - 2 * squares[0] + bend[0, 0])
-        gradient = np.array([by_noise, *(traces - squares)[1:]])
+        # The noise: trace(P) and |P y|^2.
+        within = std**4 * inside
+        if joined:
+            apart = np.tensordot(poses, inside.reshape((m, r, m, r)), axes=1)
+            within = (poses[:, None, :, None] * apart).sum(axis=2)
+        within = poses.diagonal()[:, None, None] * np.diag(sizes) - sizes[:, None] * within * sizes
+        unit = np.broadcast_to(np.eye(len(gram)), (m, *gram.shape))
+        rows = np.concatenate([-moved.reshape((m, r, -1)), unit], axis=1)
+        square = (rows.transpose(0, 2, 1) @ second @ rows).sum(axis=0)  # (X, y)^T V^-2 (X, y)
+        fitted = np.append(-(half.T @ explained), 1.0)
+        trace = (self.count - (self.own * less).sum()) / variance
+        trace -= (within * second[:, :r, :r]).sum() + ((half @ square[:-1, :-1]) * half).sum()
+        by_noise = 2 * variance * float(trace - fitted @ square @ fitted)
+        # The random parts: trace(Z^T P Z ...) and Z^T P y, by pairs of poses.
+        hidden = half @ taken[:, :, :-1].transpose(0, 2, 1)
+        left = inside - hidden.transpose(0, 2, 1) @ hidden
+        pull = taken[:, :, -1] - (explained @ hidden)
+        each = pull.reshape((m, r))
+        pairs = np.diag(left.diagonal(axis1=1, axis2=2).reshape((m, r)) @ sizes)
+        if joined:
+            pairs = left.reshape((m, r, m, r)).diagonal(axis1=1, axis2=3) @ sizes
+        excess = pairs - (each * sizes) @ each.T
+        slopes = 2 * std**2 * np.trace(excess), 2 * systematic**2 * (alike * excess).sum()
+        way = 2 * std**2 * (each * sizes).reshape(pull.shape)[:, :, None]
+        information = float((way.transpose(0, 2, 1) @ left @ way).sum())
+        gradient = np.array([by_noise, *slopes])
         return InformedDeviance(logdet + quadratic, gradient, information)
+
+    def _weighted(self, own: FloatArray) -> FloatArray:
+        """Products (m, c, c) of (Z, X, y), less those with the own columns times weights (m, a)."""
+        crossed = self.crossed
+        return self.products - crossed.transpose(0, 2, 1) @ (own[:, :, None] * crossed)
 
     def best(
         self,
@@ -357,7 +378,7 @@ class RestLikelihood:
 
         q, found = most_likely(deviance, start, start + sought * _LOWEST, start + sought * _HIGHEST)
         noise, size, systematic = (np.exp(q) * [1, 1, sought[2]]).tolist()
-        known = float(max(found.information[1, 1] / 4, 1.0))
+        known = max(found.information / 4, 1.0)
         return Variances(noise, size, systematic, found.value, known)
 
 
