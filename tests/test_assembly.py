@@ -104,7 +104,7 @@ def test_gradient_by_what_the_equilibrium_depends_on(element, boundary):
     a, shapes, given = posed(element, boundary)
     names = ("p", "rest", "deviation")
     along, d = directions(a, M, *names), steps(a, *names)
-    exact = a.imbalance_by(shapes, given, along).rows
+    exact = a.balance_slopes(shapes, given).along(along).rows
     slope = central(a, lambda s, g: a.balance(s, g)[1].rows[..., 0], shapes, given, along, d)
     assert_close(exact, slope, d, 10.0)
 

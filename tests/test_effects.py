@@ -141,7 +141,7 @@ def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[
         "Lagrangian": total,
         "gradient": slope.rows,
         "Hessian": matrix.dense(),
-        "gradient by all": a.imbalance_by(shapes, given, along).rows[..., kept],
+        "gradient by all": a.balance_slopes(shapes, given).along(along).rows[..., kept],
         "curve": curve.z,
         "curve by all": curve.along(along)[..., kept],
         "rest after": after[0],
@@ -182,7 +182,7 @@ def test_gradients_and_hessians_are_finite(case, headings, values):
     shapes, given = posed(model, p, headings)
     blocks = outputs(model, p, headings)
     own = directions(assembly_of(model), 1, "p")
-    blocks["gradient by p"] = assembly_of(model).imbalance_by(shapes, given, own).rows
+    blocks["gradient by p"] = assembly_of(model).balance_slopes(shapes, given).along(own).rows
     blocks["curve by p"] = assembly_of(model).curve_slopes(shapes, given).along(own)
     for what, block in blocks.items():
         assert np.all(np.isfinite(block)), what
@@ -220,7 +220,7 @@ def test_derivatives_by_parameters_against_finite_differences(case):
     for what, exact, function in (
         (
             "balance",
-            a.imbalance_by(shapes, given, along).rows,
+            a.balance_slopes(shapes, given).along(along).rows,
             lambda s, g: a.balance(s, g)[1].rows[..., 0],
         ),
         ("curve", a.curve_slopes(shapes, given).along(along), a.curve),

@@ -6,8 +6,9 @@ Leaving pose j out of the normal equations gives the unknowns without it in one 
 
 (exact for a linear model). Pose j is then predicted from its declared end conditions. If this is
 far less likely than the linear model says, as where a tether's stiffness and anchor act as a
-product, the step was too long, and the other poses are fitted again. If there is one pose only,
-stretches of its arc take the place of poses.
+product, the step was too long. The other poses are then fitted again, or the linear model counts if
+the fit does not explain its points. If there is one pose only, stretches of its arc take the place
+of poses.
 
 References
 ----------
@@ -30,6 +31,7 @@ from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.fit import explains
 from dlo_casadi.estimation.problem import NO_INFORMATION, Values
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes
@@ -145,8 +147,8 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
     ]
     densities = [_density_of(fit, k, predicted[k], covariances[k]) for k in range(len(thetas))]
     missed = [k for k, density in enumerate(densities) if density < linear[k] - EVIDENCE_APART]
-    if fit.noise.source == "misfit":
-        # It misses most poses, and fits to the others take most of a session's time.
+    if not explains(fit):
+        # It misses most poses, and fits to the others would take most of a session's time.
         densities, missed = [*np.maximum(densities, linear)], []
     refitted = zip(missed, map_in_order(run, partial(_fitted_without, fit), missed), strict=True)
     for k, seen in _predicted(fit, {k: x for k, x in refitted if x is not None}, run).items():

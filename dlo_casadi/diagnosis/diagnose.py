@@ -22,10 +22,10 @@ from dlo_casadi.diagnosis.selection import (
     Ranked,
     added_by,
     choose,
+    closed_by,
     likelier_by,
     p_of_removal,
     p_values_of,
-    p_with_closed_noise,
     ranking,
     sidak,
 )
@@ -33,7 +33,13 @@ from dlo_casadi.diagnosis.structure import noise_degrees, screening_degrees, str
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
 from dlo_casadi.effects import PointLoad, StateEffect
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.fit import FINEST_MESH, as_repeating, at_random, fine_enough
+from dlo_casadi.estimation.fit import (
+    FINEST_MESH,
+    as_repeating,
+    at_random,
+    explains,
+    fine_enough,
+)
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
@@ -50,6 +56,7 @@ from dlo_casadi.thresholds import (
 )
 
 NOT_NEAR = "does not come near the measured shapes"
+NO_NOISE = "leaves residuals of which no noise can be estimated"
 
 
 def diagnose(
@@ -228,13 +235,12 @@ class Search:
             closed, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen
-                # With this effect the model may now be complete.
-                known = winner.fit.noise.source != "misfit"
-                closed = settle(winner.fit) if known else winner.fit
-                p_value = self._p_value(current, closed, winner, p_values)
+                closed, p_value = closed_by(winner, current, p_values, self._astray(current))
                 if p_value > self.significance:
-                    names = [item.candidate.name for item in chosen]
-                    lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
+                    reason = (
+                        NO_NOISE if closed is current else f"not significant: p = {p_value:.2g}"
+                    )
+                    lost |= dict.fromkeys((item.candidate.name for item in chosen), reason)
             if not ranked:
                 rows = ranking(screened, p_values, tried, current, validation)
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
@@ -249,35 +255,23 @@ class Search:
         self.step("search for a missing effect", self.max_effects, self.max_effects)
         return self._ended(*self._pruned(current, added), tuple(ranked))
 
-    def _p_value(
-        self, current: Fit, closed: Fit, winner: Confirmed, p_values: Mapping[str, float]
-    ) -> float:
-        """Significance of a refit's candidates, also under the noise that is left with them."""
-        p_value = max(p_values[item.candidate.name] for item in winner.each)
-        if self._astray(current) or not (current.scatters or not closed.errors_known):
-            return p_value
-        again = p_with_closed_noise(current, closed, winner, len(p_values))
-        # A scatter from pose to pose may be due to the effect alone.
-        return again if current.scatters else max(p_value, again)
-
     def _refitted(
         self, current: Fit, force: UnknownForce | None, added: int
     ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
         """Screened candidates, p-values, refits of the likely ones, and names of those far off."""
-        far: list[str] = []
         if self._astray(current) and force is None:
             return self._from_data(current, added)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:
-            return screened, p_values, self._leading(current, screened, p_values), far
+            return screened, p_values, self._leading(current, screened, p_values), []
         tried = self._causes(force, screened)
         for item in tried:
             if item is not None:
                 dof = len(item.candidate.frees)
                 single = survival(item.gain, dof, noise_degrees(current))
                 p_values[item.candidate.name] = sidak(single, len(screened))
-        return screened, p_values, tried, far
+        return screened, p_values, tried, []
 
     def _astray(self, current: Fit) -> bool:
         """Whether candidates start at the measured shapes because the fit is too far from them."""
@@ -322,7 +316,7 @@ class Search:
             n = max(near.model.n, min(found.fit.model.n, self.finest))
             near = fine_enough(near, n, finest=self.finest)[0]
         likelier = found.unexplained or likelier_by(found.fit, near) > -EVIDENCE_APART
-        return near if likelier else None
+        return near if likelier and explains(near) else None
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
         """Backward step: remove effects that later ones have made superfluous.
@@ -369,13 +363,11 @@ class Search:
         if not chosen or chosen[0].name == name:
             return fit, effect
         winner = chosen[0]
-        with suppress(EstimationError):
-            better = settle(winner.fit)
-            p_value = self._p_value(smaller, better, winner, p_values)
-            if better.log_evidence > fit.log_evidence and p_value <= self.significance:
-                after = cross_validate(better)
-                (other,) = added_by(winner, chosen[1:], p_value, before, after)
-                return better, other
+        better, p_value = closed_by(winner, smaller, p_values, self._astray(smaller))
+        if better.log_evidence > fit.log_evidence and p_value <= self.significance:
+            after = cross_validate(better)
+            (other,) = added_by(winner, chosen[1:], p_value, before, after)
+            return better, other
         rivals = {item.name: item for item in (*effect.rivals, winner)}
         return fit, replace(effect, rivals=tuple(rivals.values()))
 

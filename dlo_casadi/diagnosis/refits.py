@@ -24,7 +24,6 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
-    REACHED,
     RelaxedStart,
     from_data,
     likeliest,
@@ -41,7 +40,7 @@ from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
-from dlo_casadi.estimation.fit import misfits
+from dlo_casadi.estimation.fit import explains, misfits
 from dlo_casadi.estimation.problem import Priors
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import refine
@@ -185,13 +184,6 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
     return Confirmed.of(screened, base, fit)
 
 
-def explains(item: Confirmed | None) -> bool:
-    """Whether a refit meets its points as closely as their noise allows."""
-    if item is None or item.fit.noise.source == "misfit":
-        return False
-    return item.fit.chi2_per_dof < REACHED
-
-
 def _at_noise(fit: Fit, noise: NoiseModel) -> Fit:
     """A fit that meets its points, weighed by their noise instead of that of a misfit."""
     priors = Priors.of(fit.problem.priors.tolerances, fit.model)
@@ -232,7 +224,7 @@ def near_data(
     contacts = [x for x in screened if not x.candidate.effect.gradual]
     begun = list(map_in_order(executor, partial(RelaxedStart.of, near), contacts))
     touching = confirm_contacts(base, begun, executor)
-    explained = any(map(explains, touching))
+    explained = any(explains(item.fit) for item in touching)
     least = min(start.left for start in begun) if explained else np.inf
     among, pairs = (executor, center, exclude), pairs and not explained
     kept = nearest(near, softness, likely, *among, pairs=pairs, least=least)[:REFITTED]
@@ -240,9 +232,9 @@ def near_data(
     for k, start in () if explained else enumerate(kept):
         item = tried[k]
         # The error of a wrong end roll may look like a scatter from pose to pose.
-        if item is None or not explains(item) or item.fit.problem.priors.pose_scatter.std:
-            tried[k] = confirm_rolled(base, start, item)
-        if explains(tried[k]):
+        if item is None or not explains(item.fit) or item.fit.scatters:
+            item = tried[k] = confirm_rolled(base, start, item)
+        if item is not None and explains(item.fit):
             break
     tried = loads_from_best(base, screened, tried, executor)
     fitted = {item.name: item.screened for item in touching}
@@ -259,7 +251,7 @@ def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> C
     rolled = start.rolled()
     other = confirm_from_data(base, rolled) if rolled else None
     both = [item for item in (found, other) if item is not None]
-    return max(both, key=lambda item: (explains(item), item.fit.log_evidence), default=None)
+    return max(both, key=lambda item: (explains(item.fit), item.fit.log_evidence), default=None)
 
 
 def confirm_contacts(

@@ -224,6 +224,25 @@ def p_values_of(screened: Sequence[Screened]) -> dict[str, float]:
     return {item.candidate.name: sidak(item.p_value, len(screened)) for item in screened}
 
 
+def closed_by(
+    winner: Confirmed, current: Fit, p_values: Mapping[str, float], astray: bool
+) -> tuple[Fit, float]:
+    """A refit with its own noise, and its p-value, also under that noise unless `astray`.
+
+    If no noise can be estimated, as of a refit that has run away: the current fit and 1.
+    """
+    p_value, closed = max(p_values[item.candidate.name] for item in winner.each), winner.fit
+    try:
+        closed = settle(closed) if closed.noise.source != "misfit" else closed
+    except EstimationError:
+        return current, 1.0
+    if astray or not (current.scatters or not closed.errors_known):
+        return closed, p_value
+    again = p_with_closed_noise(current, closed, winner, len(p_values))
+    # A scatter from pose to pose may be due to the effect alone.
+    return closed, again if current.scatters else max(p_value, again)
+
+
 def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) -> float:
     """Significance of an effect under the noise that is left once it is in the model.
 

@@ -29,6 +29,8 @@ from dlo_casadi.rod.band import BandMatrix, Vector
 
 # Largest distance of a node from the start of Newton's method [rad].
 REACH = 1.5
+# Relative change of the rest curvatures after poses that counts as rounding.
+ROUNDING = 1e-14
 # The matrix is kept while successive steps shrink by this ratio and the step is below NEAR [rad];
 # otherwise it is evaluated again. Five gradients cost less than one matrix.
 CONTRACTION = 0.2
@@ -76,20 +78,23 @@ class BatchEquilibrium:
         out = np.repeat(rest[None], self.m, axis=0)
         if not self.model.has_state:
             return out
-        # If poses leave the rest curvature unchanged, it is the same for all of them.
-        after = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))[0]
-        for j in range(self.m - 1 if np.any(after != out) else 0):
-            out[j + 1] = self._after(j, shapes, p, out)[0]
+        # Newton's method for all poses at once: if a law is linear in the rest curvature, one step;
+        # of any law each step makes at least one more pose exact.
+        strains = len(self.node.strains)
+        for _ in range(self.m):
+            after, _, by_rest, _ = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))
+            change, slopes = after[:-1] - out[1:], by_rest.reshape((self.m, strains, -1, strains))
+            for j in range(1, self.m - 1):
+                before = change[j - 1].reshape((strains, -1))
+                change[j] += np.einsum("ick,kc->ic", slopes[j], before).ravel()
+            out[1:] += change
+            if not np.abs(change).max(initial=0.0) > ROUNDING * np.abs(out).max():
+                break
         return out
-
-    def _after(self, j: int, shapes: Shapes, p: FloatArray, rests: FloatArray) -> FloatArray:
-        """Rest curvature (1, n_rests) after pose j."""
-        given = Inputs.of(p, rests[[j]], self._ends[[j]])
-        return self.assembly.state_after(shapes.subset([j]), given)[0]
 
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Rest curvature (n_rests,) after the last pose."""
-        return self._after(self.m - 1, shapes, p, self.rests(shapes, p, rest))[0]
+        return self.assembly.state_after(shapes, self.given(shapes, p, rest))[0][-1]
 
     def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Size (m, n_cells) [1/m] of the curvature minus the rest curvature before each pose."""
@@ -325,12 +330,10 @@ class BatchEquilibrium:
         x, lam = np.zeros((self.m, a.n, a.b, q)), np.zeros((self.m, a.k, q))
         return Tangents(x, lam, p, rest, deviation)
 
-    def _solved(
-        self, shapes: Shapes, given: Inputs, still: Tangents, matrix: BandMatrix | None = None
-    ) -> Tangents:
+    def _solved(self, shapes: Shapes, given: Inputs, still: Tangents) -> Tangents:
         """Directions, completed by the resulting change of nodes and multipliers."""
-        matrix = self.assembly.balance(shapes, given)[2] if matrix is None else matrix
-        found = matrix.factor().solve(self.assembly.imbalance_by(shapes, given, still))
+        _, _, matrix = self.assembly.balance(shapes, given)
+        found = matrix.factor().solve(self.assembly.balance_slopes(shapes, given).along(still))
         return replace(still, x=still.x - found.x, lam=still.lam - found.y, tangent=matrix)
 
     def _in_order(
@@ -343,6 +346,7 @@ class BatchEquilibrium:
     ) -> Tangents:
         """As `_solved`; the rest curvature of each pose is computed from the pose before."""
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
+        factor, by_inputs = matrix.factor(), self.assembly.balance_slopes(shapes, given)
         for j in range(self.m):
             one = np.array([j])
             parts = (x[one], lam[one], along.p[one], rest[one], along.deviation[one])
@@ -350,7 +354,8 @@ class BatchEquilibrium:
             moving = np.any([part.any(axis=tuple(range(part.ndim - 1))) for part in parts], axis=0)
             now = Tangents(*(part[..., moving] for part in parts))
             if now.p.any() or now.rest.any() or now.deviation.any():
-                now = self._solved(shapes.subset(one), given.subset(one), now, matrix.subset(one))
+                found = factor.subset(one).solve(by_inputs.subset(one).along(now))
+                now = replace(now, x=now.x - found.x, lam=now.lam - found.y)
             x[j][..., moving], lam[j][..., moving] = now.x[0], now.lam[0]
             if j + 1 < self.m:
                 slopes = tuple(part[one] for part in after)

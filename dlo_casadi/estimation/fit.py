@@ -42,8 +42,8 @@ STUCK = 2.0
 # First std of each repeat's own rest curvature, in turns per length: several times that measured on
 # heavy cables, 0.1 to 0.3 1/m.
 FIRST_REST_TURNS = 0.05
-# Largest chi-square per degree of freedom at which a scatter from pose to pose explains a misfit:
-# turns of 0.06 rad, treated to first order, left 1.25.
+# Largest chi-square per degree of freedom at which a fit explains its points: a scatter of turns of
+# 0.06 rad, treated to first order, left 1.25.
 EXPLAINED = 1.5
 FINEST_MESH = 160
 # Maximum number of elements in the search for missing effects, which takes a hundred refits.
@@ -135,7 +135,7 @@ def at_random(fit: Fit) -> Fit | None:
     with suppress(EstimationError):
         priors = replace(fit.problem.priors, pose_scatter=found)
         near = refine(fit.reweighed(known, priors), first=True)
-        return near if near.chi2_per_dof < EXPLAINED else None
+        return near if explains(near) else None
     return None
 
 
@@ -176,6 +176,11 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
 def misfits(fit: Fit) -> bool:
     """Whether the residuals are so large that the model must lack something."""
     return fit.residual_rms > SearchSettings.of(fit.model).misfit * fit.model.cable.length
+
+
+def explains(fit: Fit) -> bool:
+    """Whether a fit meets its points as closely as their noise allows."""
+    return fit.noise.source != "misfit" and fit.chi2_per_dof < EXPLAINED
 
 
 def fit_to_misfit(near: Fit) -> Fit:

@@ -265,7 +265,7 @@ class Relaxation:
         along = self._along(values, given)
         _, force, matrix = self._assembly.balance(values.shapes, given)
         still = replace(along, x=np.zeros_like(along.x), lam=np.zeros_like(along.lam))
-        rows = self._assembly.imbalance_by(values.shapes, given, still).rows
+        rows = self._assembly.balance_slopes(values.shapes, given).along(still).rows
         tangent = matrix.dense()
         rows[:, :, :nodes] += tangent[:, :, :nodes]
         rows += tangent[:, :, nodes:] @ along.lam

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.stacked import Inputs as Inputs
-from dlo_casadi.model.stacked import Mapped
+from dlo_casadi.model.stacked import Mapped, repeated
 from dlo_casadi.model.stacked import Shapes as Shapes
 from dlo_casadi.model.stacked import Tangents as Tangents
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -31,11 +32,6 @@ from dlo_casadi.rod.ends import reaction_rows
 _SLIP = 1e-6
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
-
-
-def _repeated(rows: FloatArray, count: int) -> FloatArray:
-    """Rows (m, k) of poses, repeated for `count` segments or stations (m, count, k)."""
-    return rows[:, None].repeat(count, axis=1)
 
 
 class Assembly:
@@ -89,14 +85,14 @@ class Assembly:
     ) -> list[FloatArray]:
         """Evaluate a function for all segments: outputs (m, n_segments, rows, columns)."""
         touching = touching or self.touching(shapes, given)
-        lam = touching.lam if touching else _repeated(shapes.lam, self._segments)
+        lam = touching.lam if touching else repeated(shapes.lam, self._segments)
         return self._under(lam, name, shapes, given)
 
     def _under(self, lam: FloatArray, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """As `_call_segments`, under forces lam (m, n_segments, n_lam)."""
         count, clipped = self._segments, self.clipped(shapes, given)
         own = clipped.rest(self.chain.rest_inside(given.rest[..., None]))[..., 0]
-        p, deviation = (_repeated(one, count) for one in (given.p, shapes.deviation))
+        p, deviation = (repeated(one, count) for one in (given.p, shapes.deviation))
         both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
         if not self.model.clips:
             return self._mapped(name)(both, lam, p, own, table, deviation)
@@ -139,9 +135,8 @@ class Assembly:
     def _call_ends(self, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """Evaluate a function of both ends: outputs (m, rows, columns)."""
         both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
-        others = (shapes.lam[:, : self.n_lam], given.p, given.poses, shapes.deviation)
-        rows = [both, *(one[:, None] for one in others)]
-        return [out[:, 0] for out in self._mapped(name)(*rows)]
+        rows = (both[:, 0], shapes.lam[:, : self.n_lam], given.p, given.poses, shapes.deviation)
+        return [out[:, 0] for out in self._mapped(name)(*(row[:, None] for row in rows))]
 
     def _at_nodes(
         self, first: FloatArray, last: FloatArray, start: FloatArray, end: FloatArray
@@ -238,27 +233,15 @@ class Assembly:
 
     def work(self, shapes: Shapes, gradient: Vector) -> FloatArray:
         """Work (m,) [J] of the multipliers in the Lagrangian, given its gradient."""
-        own = shapes.lam * gradient.y[:, :, 0] * self.model.are_multipliers
-        return np.asarray(own.sum(axis=1))
+        return np.asarray(
+            (shapes.lam * gradient.y[:, :, 0] * self.model.are_multipliers).sum(axis=1)
+        )
 
-    def imbalance_by(self, shapes: Shapes, given: Inputs, along: Tangents) -> Vector:
-        """Change of the gradient at fixed nodes and multipliers, along p, rest and deviation."""
-        touching = self.touching(shapes, given)
-        (segments,) = self._call_segments("segment_sensitivity", shapes, given, touching)
+    def balance_slopes(self, shapes: Shapes, given: Inputs) -> BalanceSlopes:
+        """Parts of the derivatives of the gradient at fixed nodes and multipliers."""
+        (segments,) = self._call_segments("segment_sensitivity", shapes, given)
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
-        n_p = along.p.shape[1]
-        at_ends = ends[..., :n_p] @ along.p + ends[..., n_p:] @ along.deviation
-        clipped = self.clipped(shapes, given)
-        changed = self.add_by_numbers(0.0, segments, along, clipped)
-        total = self._added(changed, at_ends)
-        if touching:
-            moved = changed[:, :, self._pull]
-            total = touching.along(total, moved, self._outwards @ along.p)
-        for slip, (more, less) in self.slipped(given, along):
-            change = self.imbalance(shapes, more) - self.imbalance(shapes, less)
-            total = total + Vector(change.x * slip[:, None, None], change.y * slip[:, None])
-        clipped.hold(total, shapes.x, np.zeros(len(shapes.x)))
-        return total
+        return BalanceSlopes(self, shapes, given, segments, ends)
 
     def slipped(
         self, given: Inputs, along: Tangents
@@ -315,7 +298,7 @@ class Assembly:
         m, count = len(shapes.x), self.chain.n + 1
         places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
         x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
-        p, ends = _repeated(given.p, count), _repeated(given.poses, count)
+        p, ends = repeated(given.p, count), repeated(given.poses, count)
         return self._mapped(name)(places, rates, x, p, ends)
 
     def curve_slopes(self, shapes: Shapes, given: Inputs) -> CurveSlopes:
@@ -327,17 +310,15 @@ class Assembly:
         even = self.clipped(shapes, given).evenly(rows)[..., 0]
         return CurveSlopes(self, shapes, given, even, by_moving, by_others, by_station, by_p)
 
-    def reactions(self, shapes: Shapes, given: Inputs) -> FloatArray:
+    def reactions(self, shapes: Shapes, given: Inputs, name: str = "reactions") -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `reaction_rows`."""
-        found = self._call_ends("reactions", shapes, given)[0][..., 0]
+        found = self._call_ends(name, shapes, given)[0][..., 0]
         touching = self.touching(shapes, given)
         return touching.held(found) if touching else found
 
     def readings(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """`reactions` as the sensors measure them."""
-        found = self._call_ends("readings", shapes, given)[0][..., 0]
-        touching = self.touching(shapes, given)
-        return touching.held(found) if touching else found
+        return self.reactions(shapes, given, "readings")
 
     def contacts(self, shapes: Shapes, given: Inputs) -> list[tuple[Contact, ...]]:
         """Where the cables touch obstacles, for each of m poses."""
@@ -400,6 +381,36 @@ class Assembly:
 def assembly_of(model: CableModel) -> Assembly:
     """The assembly of a model, made once."""
     return Assembly(model)
+
+
+@dataclass(frozen=True)
+class BalanceSlopes:
+    """Derivatives of the gradient by p, rest and deviation, of each segment and of the ends."""
+
+    assembly: Assembly
+    shapes: Shapes
+    given: Inputs
+    segments: FloatArray
+    ends: FloatArray
+
+    def subset(self, index: Any) -> BalanceSlopes:
+        """Those of some of the poses."""
+        inputs = self.shapes.subset(index), self.given.subset(index)
+        return BalanceSlopes(self.assembly, *inputs, self.segments[index], self.ends[index])
+
+    def along(self, directions: Tangents) -> Vector:
+        """Change of the gradient at fixed nodes and multipliers."""
+        a, d, shapes, given = self.assembly, directions, self.shapes, self.given
+        clipped = a.clipped(shapes, given)
+        changed = a.add_by_numbers(0.0, self.segments, d, clipped)
+        total = a._added(changed, self.ends @ np.concatenate([d.p, d.deviation], axis=1))
+        if touching := a.touching(shapes, given):
+            total = touching.along(total, changed[:, :, a._pull], a._outwards @ d.p)
+        for slip, (more, less) in a.slipped(given, d):
+            change = a.imbalance(shapes, more) - a.imbalance(shapes, less)
+            total = total + Vector(change.x * slip[:, None, None], change.y * slip[:, None])
+        clipped.hold(total, shapes.x, np.zeros(len(shapes.x)))
+        return total
 
 
 @dataclass(frozen=True)

@@ -87,6 +87,11 @@ class Tangents:
     tangent: BandMatrix | None = None
 
 
+def repeated(rows: FloatArray, count: int) -> FloatArray:
+    """Rows (m, k) of poses, repeated for `count` segments or stations (m, count, k)."""
+    return rows[:, None].repeat(count, axis=1)
+
+
 # Segments in a block. An instruction of a vectorised function takes 16 ns and 0.25 ns per segment,
 # those that fill up a block included; one of CasADi's scalar interpreter 2 to 4 ns per segment.
 BLOCK = 64

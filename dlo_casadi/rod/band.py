@@ -15,6 +15,7 @@ Heller, SIAM J. Numer. Anal. 13 (1976); Haynsworth, Linear Algebra Appl. 1 (1968
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -85,6 +86,10 @@ class _Level:
     def counts(self) -> tuple[int, int]:
         """Number of odd nodes, and of those that have a next one."""
         return self.left.shape[1], self.right.shape[1]
+
+    def subset(self, index: IntArray) -> _Level:
+        """The reduction of some of the poses."""
+        return _Level(self.inverse[index], self.left[index], self.right[index])
 
     def reduced(self, diagonal: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Diagonal and couplings of the even nodes after elimination of the odd ones."""
@@ -252,6 +257,19 @@ class BandFactor:
         self._arm = self._nodes(matrix.border)
         arm = self._arm.reshape(matrix.columns.shape)
         self.schur = matrix.corner - _transposed(matrix.columns) @ arm
+
+    def subset(self, index: IntArray) -> BandFactor:
+        """The elimination of some of the poses."""
+        other = copy(self)
+        vars(other).pop("negative", None)
+        other._conditions = self._conditions[0][index], self._conditions[1][index]
+        other.matrix = self.matrix.subset(index)
+        other._levels = [level.subset(index) for level in self._levels]
+        other._eigenvalues = [values[index] for values in self._eigenvalues]
+        other._of_alone, other._not_counted = self._of_alone[index], self._not_counted[index]
+        other._least, other._top = self._least[index], self._top[index]
+        other._arm, other.schur = self._arm[index], self.schur[index]
+        return other
 
     def _inverse(self, pivots: FloatArray) -> FloatArray:
         """Inverses of pivots (m, h, b, b); nearly singular ones are shifted by `LEAST_PIVOT`."""

@@ -17,7 +17,7 @@ from dlo_casadi.errors import ConfigError, EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import CONVERGED, descend, least_decrease
 from dlo_casadi.estimation.fit import (
-    EXPLAINED,
+    explains,
     fine_enough,
     fit_model,
     fit_to_misfit,
@@ -381,14 +381,14 @@ def nearest_to_poses(
     *others, own = stages
     simpler = [stage for stage in others if stage.name in SIMPLER]
     least = min(map(_off, simpler), default=np.inf)
-    misfit, lacks = fit.noise.source == "misfit", fit.chi2_per_dof > EXPLAINED
-    if not misfit and not lacks:
+    if explains(fit):
         if not fit.problem.priors.pose_scatter.std:
             return fit, own
         # By more than chance, where the whole residual may be scatter from pose to pose.
         least *= 1.0 if diagnosed else 1 + 1 / np.sqrt(2 * len(fit.problem.used))
     if _off(own) <= least:
         return fit, own
+    misfit = fit.noise.source == "misfit"
     first = fit if misfit else fit_to_misfit(fit)
     found = [None if misfit else first, *(_from_simpler(first, stage, True) for stage in simpler)]
     return min(

@@ -157,10 +157,8 @@ def test_an_effect_found_in_a_misfit_has_to_hold_beside_the_scatter_from_pose_to
     def scattering(evidence, source="declared"):
         priors = SimpleNamespace(pose_scatter=PoseScatter(0.008, source="end_offset"))
         noise, problem = SimpleNamespace(source=source), SimpleNamespace(priors=priors)
-        model = SimpleNamespace(n=10)
-        return SimpleNamespace(
-            log_evidence=evidence, noise=noise, problem=problem, model=model, scatters=True
-        )
+        known = {"model": SimpleNamespace(n=10), "scatters": True, "chi2_per_dof": 1.0}
+        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, **known)
 
     near = scattering(3040.0 - behind)
     monkeypatch.setattr(module, "at_random", lambda _: near)
@@ -172,13 +170,11 @@ def test_an_effect_found_in_a_misfit_has_to_hold_beside_the_scatter_from_pose_to
 def test_evidence_of_scatter_and_of_effects_is_compared_on_one_mesh(monkeypatch):
     """On 10 elements and on 15 it differed by 7."""
 
-    def scattering(evidence, n, source="declared"):
+    def scattering(evidence, n, source="declared", chi2=1.0):
         priors = SimpleNamespace(pose_scatter=PoseScatter(0.007, source="end_offset"))
         noise, problem = SimpleNamespace(source=source), SimpleNamespace(priors=priors)
-        model = SimpleNamespace(n=n)
-        return SimpleNamespace(
-            log_evidence=evidence, noise=noise, problem=problem, model=model, scatters=True
-        )
+        known = {"model": SimpleNamespace(n=n), "scatters": True, "chi2_per_dof": chi2}
+        return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, **known)
 
     coarse, fine = scattering(3065.6, 10), scattering(3072.0, 15)
     monkeypatch.setattr(module, "at_random", lambda _: coarse)
@@ -187,6 +183,8 @@ def test_evidence_of_scatter_and_of_effects_is_compared_on_one_mesh(monkeypatch)
     search = Search(scattering(0.0, 10, "misfit"), None, (), 0.005, 4, lambda *_: None, None, 80)
     found = SimpleNamespace(fit=scattering(3072.3, 15), unexplained=False)
     assert search.at_random(found) is fine
+    refined[15] = scattering(3072.0, 15, chi2=676.0)  # the fit was lost on the finer mesh
+    assert search.at_random(found) is None
 
 
 def test_the_score_predicts_the_gain_of_a_refit(session):

@@ -14,12 +14,12 @@ from dlo_casadi.diagnosis.from_data import (
     nearest,
     screened_from_data,
 )
-from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data, explains
+from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data
 from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import refit
-from dlo_casadi.estimation.fit import fit_model, mesh_error, misfits, resting_height
+from dlo_casadi.estimation.fit import explains, fit_model, mesh_error, misfits, resting_height
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.runtime.executors import InProcess
@@ -169,7 +169,7 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
     start = RelaxedStart.of(near, contact)
     (found,) = confirm_contacts(on_a_table, [start], InProcess())
     assert found.name == "contact_plane"
-    assert explains(found)
+    assert explains(found.fit)
     assert found.screened.p_value < 1e-9
     assert found.fit.value("bending_stiffness") == pytest.approx(0.02, rel=0.03)
     assert found.fit.value("contact_plane.height") == pytest.approx(TABLE, abs=5e-4)

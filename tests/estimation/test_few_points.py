@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2, t
 from test_problem import CABLE, STD, measured_from
 
-from dlo_casadi.diagnosis.selection import p_with_closed_noise
+from dlo_casadi.diagnosis.selection import closed_by, p_with_closed_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import threshold
@@ -116,6 +117,8 @@ def test_an_effect_that_leaves_no_point_over_is_not_significant():
     noise = replace(fit.noise, source="estimated")
     fit = replace(fit, problem=replace(fit.problem, noise=noise))
     assert p_with_closed_noise(fit, fit, winner=None, tried=1) == 1.0
+    winner = SimpleNamespace(fit=fit, each=[SimpleNamespace(candidate=SimpleNamespace(name="x"))])
+    assert closed_by(winner, fit, {"x": 0.001}, astray=False) == (fit, 1.0)
 
 
 def test_noise_of_few_points_beside_readings():
