@@ -65,7 +65,8 @@ class CrossValidation:
         the parameters' uncertainty given the other folds. Not given for stretches of a single pose.
     densities : (folds,)
         Log density of each fold under the covariance from which `expected` comes. If a fold could
-        not be predicted, not even after a refit, its first order, which is an upper estimate.
+        not be predicted, not even after a refit, or one step led too far and the fit does not
+        explain its points, its first order, which is an upper estimate.
     """
 
     squares: FloatArray
@@ -148,8 +149,9 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
     densities = [_density_of(fit, k, predicted[k], covariances[k]) for k in range(len(thetas))]
     missed = [k for k, density in enumerate(densities) if density < linear[k] - EVIDENCE_APART]
     if not explains(fit):
-        # It misses most poses, and fits to the others would take most of a session's time.
-        densities, missed = [*np.maximum(densities, linear)], []
+        # Most poses are missed then: a fit for each took most of the time of some sessions.
+        densities = [linear[k] if k in missed else x for k, x in enumerate(densities)]
+        missed = []
     refitted = zip(missed, map_in_order(run, partial(_fitted_without, fit), missed), strict=True)
     for k, seen in _predicted(fit, {k: x for k, x in refitted if x is not None}, run).items():
         predicted[k], densities[k] = seen, _density_of(fit, k, seen, covariances[k])

@@ -56,7 +56,7 @@ from dlo_casadi.thresholds import (
 )
 
 NOT_NEAR = "does not come near the measured shapes"
-NO_NOISE = "leaves residuals of which no noise can be estimated"
+RAN_AWAY = "ran away: its noise or p-value cannot be estimated"
 
 
 def diagnose(
@@ -237,10 +237,10 @@ class Search:
                 winner, *rivals = chosen
                 closed, p_value = closed_by(winner, current, p_values, self._astray(current))
                 if p_value > self.significance:
-                    reason = (
-                        NO_NOISE if closed is current else f"not significant: p = {p_value:.2g}"
-                    )
-                    lost |= dict.fromkeys((item.candidate.name for item in chosen), reason)
+                    names = [item.candidate.name for item in chosen]
+                    lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
+                    if closed is current:
+                        lost |= dict.fromkeys((x.candidate.name for x in winner.each), RAN_AWAY)
             if not ranked:
                 rows = ranking(screened, p_values, tried, current, validation)
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
@@ -264,7 +264,8 @@ class Search:
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:
-            return screened, p_values, self._leading(current, screened, p_values), []
+            known = self.refitted if current is self.declared else {}
+            return screened, p_values, self._leading(current, screened, p_values, known), []
         tried = self._causes(force, screened)
         for item in tried:
             if item is not None:
@@ -355,7 +356,9 @@ class Search:
         """
         screened, before, name = self._screened(smaller), cross_validate(smaller), effect.name
         p_values = p_values_of(screened)
-        tried = self._leading(smaller, screened, p_values)
+        own = [item for item in screened if item.candidate.name == name]
+        known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}
+        tried = self._leading(smaller, screened, p_values, known)
         chosen, _ = choose(tried, smaller, before, self.doubt)
         others = tuple(item for item in chosen if item.name != name)
         if len(others) < len(chosen):
@@ -364,17 +367,22 @@ class Search:
             return fit, effect
         winner = chosen[0]
         better, p_value = closed_by(winner, smaller, p_values, self._astray(smaller))
-        if better.log_evidence > fit.log_evidence and p_value <= self.significance:
-            after = cross_validate(better)
-            (other,) = added_by(winner, chosen[1:], p_value, before, after)
-            return better, other
+        with suppress(EstimationError):
+            if better.log_evidence > fit.log_evidence and p_value <= self.significance:
+                after = cross_validate(better)
+                (other,) = added_by(winner, chosen[1:], p_value, before, after)
+                return better, other
         rivals = {item.name: item for item in (*effect.rivals, winner)}
         return fit, replace(effect, rivals=tuple(rivals.values()))
 
     def _leading(
-        self, current: Fit, screened: Sequence[Screened], p_values: Mapping[str, float]
+        self,
+        current: Fit,
+        screened: Sequence[Screened],
+        p_values: Mapping[str, float],
+        known: dict[str, Confirmed | None],
     ) -> list[Confirmed | None]:
-        """Refits of the significant candidates with the highest scores."""
+        """Refits, beside `known` ones, of the significant candidates with the highest scores."""
         # A scatter from pose to pose may hide the effect: test the refit with what is left.
         significant = [
             x
@@ -383,7 +391,6 @@ class Search:
         ]
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
-        known = self.refitted if current is self.declared else {}
         new = [item for item in worthy if item.candidate.name not in known]
         found = map_in_order(self.executor, partial(refits.confirm, current), new)
         known.update(zip((item.candidate.name for item in new), found, strict=True))

@@ -229,18 +229,18 @@ def closed_by(
 ) -> tuple[Fit, float]:
     """A refit with its own noise, and its p-value, also under that noise unless `astray`.
 
-    If no noise can be estimated, as of a refit that has run away: the current fit and 1.
+    A refit that is weighed by its misfit stays so. The current fit and 1 if no noise can be
+    estimated, or poses are lost with it, as of a refit that has run away.
     """
     p_value, closed = max(p_values[item.candidate.name] for item in winner.each), winner.fit
-    try:
+    with suppress(EstimationError):
         closed = settle(closed) if closed.noise.source != "misfit" else closed
-    except EstimationError:
-        return current, 1.0
-    if astray or not (current.scatters or not closed.errors_known):
-        return closed, p_value
-    again = p_with_closed_noise(current, closed, winner, len(p_values))
-    # A scatter from pose to pose may be due to the effect alone.
-    return closed, again if current.scatters else max(p_value, again)
+        if astray or not (current.scatters or not closed.errors_known):
+            return closed, p_value
+        again = p_with_closed_noise(current, closed, winner, len(p_values))
+        # A scatter from pose to pose may be due to the effect alone.
+        return closed, again if current.scatters else max(p_value, again)
+    return current, 1.0
 
 
 def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) -> float:

@@ -88,7 +88,8 @@ class BatchEquilibrium:
                 before = change[j - 1].reshape((strains, -1))
                 change[j] += np.einsum("ick,kc->ic", slopes[j], before).ravel()
             out[1:] += change
-            if not np.abs(change).max(initial=0.0) > ROUNDING * np.abs(out).max():
+            sizes = [np.abs(x[np.isfinite(x)]).max(initial=0.0) for x in (change, out)]
+            if not sizes[0] > ROUNDING * sizes[1]:
                 break
         return out
 

@@ -83,12 +83,12 @@ class NodeCurve:
     def frame(self, s: FloatArray, derivatives: int) -> list[FloatArray]:
         """Position (K, d) [m] and its first derivatives by s, at most two, at arc lengths s."""
         e, u = self._local(s)
-        a, b, c, d = self._polynomials.take(e, axis=2)
-        found, scale, bend = [((d * u + c) * u + b) * u + a], self.n / self.length, 3 * d * u
+        once, by_u, square, cube = self._polynomials.take(e, axis=2)
+        found, scale = [((cube * u + square) * u + by_u) * u + once], self.n / self.length
         if derivatives > 0:
-            found.append(scale * ((bend + 2 * c) * u + b))
+            found.append(scale * ((3 * cube * u + 2 * square) * u + by_u))
         if derivatives > 1:
-            found.append(2 * scale**2 * (bend + c))
+            found.append(2 * scale**2 * (3 * cube * u + square))
         return [one.T for one in found]
 
     def at(self, s: FloatArray, derivative: int = 0) -> FloatArray:

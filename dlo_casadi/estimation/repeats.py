@@ -265,7 +265,8 @@ class RestLikelihood:
         )
         left = left[:, values > 1e-6 * max(values[:1].max(initial=0.0), 1e-300)]
         blocks = np.split(left, np.cumsum([len(sample.e) for sample in samples])[:-1])
-        # Products of each pose's columns (Z, X, y), also with its own ones, made orthogonal.
+        # Products of each pose's columns (Z, X, y), and of U with them; U is rotated so that its
+        # columns are orthogonal, with squares `own`.
         both = zip(samples, blocks, strict=True)
         columns = [np.column_stack([one.random, x, one.e]) for one, x in both]
         self.products = np.array([a.T @ a for a in columns])
@@ -288,13 +289,14 @@ class RestLikelihood:
         random ones Z: pose by pose, or in one block of all poses if these are correlated.
         """
         m, r, variance = self.m, self.modes, noise**2
-        less = 1 / (variance + self.own)
-        first = self._weighted(less) / variance  # (Z, X, y)^T V_0^-1 (Z, X, y)
-        second = self._weighted(less * (2 - self.own * less)) / variance**2  # with V_0^-2
+        weights = 1 / (variance + self.own)
+        first = self._without_own(weights) / variance  # (Z, X, y)^T V_0^-1 (Z, X, y)
+        twice = weights * (2 - self.own * weights)
+        second = self._without_own(twice) / variance**2  # (Z, X, y)^T V_0^-2 (Z, X, y)
         sizes = PoseScatter(1.0, smoothness, source=self.source).sizes(r) ** 2
         joined = systematic > 0 and m > 1
         alike = np.exp(-((self.distances / range_) ** 2) / 2) if joined else np.eye(m)
-        poses = std**2 * np.eye(m) + systematic**2 * joined * alike
+        poses = std**2 * np.eye(m) + systematic**2 * joined * alike  # B = poses x sizes
         inside, cross, between = first[:, :r, :r], first[:, :r, r:], std**2 * np.diag(sizes)
         if joined:
             inside, cross = block_diag(*inside)[None], cross.reshape((1, m * r, -1))
@@ -310,11 +312,11 @@ class RestLikelihood:
         half = np.linalg.inv(root)
         explained = half @ y
         quadratic = float(gram[-1, -1] - explained @ explained)
-        logdet = 2 * float(np.log(root.diagonal()).sum()) - float(np.log(less).sum())
-        logdet += (self.count - less.size) * float(np.log(variance))
+        logdet = 2 * float(np.log(root.diagonal()).sum()) - float(np.log(weights).sum())
+        logdet += (self.count - weights.size) * float(np.log(variance))
         logdet += float(np.linalg.slogdet(matrix)[1].sum())
 
-        # The noise: trace(P) and |P y|^2.
+        # The noise: trace(P) and |P y|^2, with the diagonal blocks of B - B (Z^T V^-1 Z) B.
         within = std**4 * inside
         if joined:
             apart = np.tensordot(poses, inside.reshape((m, r, m, r)), axes=1)
@@ -324,10 +326,10 @@ class RestLikelihood:
         rows = np.concatenate([-moved.reshape((m, r, -1)), unit], axis=1)
         square = (rows.transpose(0, 2, 1) @ second @ rows).sum(axis=0)  # (X, y)^T V^-2 (X, y)
         fitted = np.append(-(half.T @ explained), 1.0)
-        trace = (self.count - (self.own * less).sum()) / variance
+        trace = (self.count - (self.own * weights).sum()) / variance
         trace -= (within * second[:, :r, :r]).sum() + ((half @ square[:-1, :-1]) * half).sum()
         by_noise = 2 * variance * float(trace - fitted @ square @ fitted)
-        # The random parts: trace(Z^T P Z ...) and Z^T P y, by pairs of poses.
+        # The random parts: Z^T P Z and Z^T P y, summed over the modes, by pairs of poses.
         hidden = half @ taken[:, :, :-1].transpose(0, 2, 1)
         left = inside - hidden.transpose(0, 2, 1) @ hidden
         pull = taken[:, :, -1] - (explained @ hidden)
@@ -336,16 +338,18 @@ class RestLikelihood:
         if joined:
             pairs = left.reshape((m, r, m, r)).diagonal(axis1=1, axis2=3) @ sizes
         excess = pairs - (each * sizes) @ each.T
-        slopes = 2 * std**2 * np.trace(excess), 2 * systematic**2 * (alike * excess).sum()
-        way = 2 * std**2 * (each * sizes).reshape(pull.shape)[:, :, None]
-        information = float((way.transpose(0, 2, 1) @ left @ way).sum())
-        gradient = np.array([by_noise, *slopes])
+        by_std = 2 * std**2 * float(np.trace(excess))
+        by_systematic = 2 * systematic**2 * joined * float((alike * excess).sum())
+        way = (
+            2 * std**2 * (each * sizes).reshape(pull.shape)[:, :, None]
+        )  # dV/dlog(std) P y = Z way
+        information = float((way * (inside @ way)).sum() - ((hidden @ way).sum(axis=0) ** 2).sum())
+        gradient = np.array([by_noise, by_std, by_systematic])
         return InformedDeviance(logdet + quadratic, gradient, information)
 
-    def _weighted(self, own: FloatArray) -> FloatArray:
-        """Products (m, c, c) of (Z, X, y), less those with the own columns times weights (m, a)."""
-        crossed = self.crossed
-        return self.products - crossed.transpose(0, 2, 1) @ (own[:, :, None] * crossed)
+    def _without_own(self, weights: FloatArray) -> FloatArray:
+        """Products (m, c, c) of (Z, X, y), less those of U with them at weights (m, a)."""
+        return self.products - self.crossed.transpose(0, 2, 1) @ (weights[..., None] * self.crossed)
 
     def best(
         self,

@@ -20,7 +20,7 @@ from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
 
 
 class Functions:
-    """CasADi functions of one segment, of the ends and of one station of a model.
+    """CasADi functions of one segment, of the ends and of one station of an `unmeshed` model.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class SegmentNumbers(NamedTuple):
 
 
 class Lagrangian:
-    """The symbols and the expressions of a model: of one segment, of the ends and of one pose.
+    """Symbols and expressions of an `unmeshed` model: of one segment, the ends and one pose.
 
     Parameters
     ----------

@@ -118,7 +118,10 @@ def test_an_effect_that_leaves_no_point_over_is_not_significant():
     fit = replace(fit, problem=replace(fit.problem, noise=noise))
     assert p_with_closed_noise(fit, fit, winner=None, tried=1) == 1.0
     winner = SimpleNamespace(fit=fit, each=[SimpleNamespace(candidate=SimpleNamespace(name="x"))])
-    assert closed_by(winner, fit, {"x": 0.001}, astray=False) == (fit, 1.0)
+    current = replace(fit, converged=not fit.converged)
+    closed, p_value = closed_by(winner, current, {"x": 0.001}, astray=False)
+    assert closed is current
+    assert p_value == 1.0
 
 
 def test_noise_of_few_points_beside_readings():

@@ -15,6 +15,7 @@ from dlo_casadi.effects import (
     ImageScale,
     LengthError,
     LumpedMass,
+    PlasticSet,
     RestCurvatureDrift,
     StiffnessGradient,
 )
@@ -30,7 +31,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Point, Priors, Problem, Values
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.assembly import Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
@@ -167,6 +168,25 @@ def test_a_drift_is_carried_in_order():
     moved, converged = equilibria.solve(replace(stacked, x=stacked.x + 0.01), p, rest)
     assert converged.all()
     np.testing.assert_allclose(moved.x, stacked.x, atol=1e-8)  # IPOPT's tol
+
+
+def test_a_set_is_carried_in_order():
+    """Its law is not linear; a shape that is not finite spoils later poses only."""
+    model = CableModel(CABLE, 8, effects=(PlasticSet(),))
+    p, rest = np.array([0.06, 2.0, 0.5]), np.full(8, 0.8)
+    assert model.names[1:] == ("plastic_set.yield_curvature", "plastic_set.share")
+    poses = poses_at(5)
+    equilibria = BatchEquilibrium(model, poses)
+    shapes = equilibria.start_shapes(np.random.default_rng(0).normal(0.0, 1.0, (5, 9, 1)))
+    shapes.x[3] = np.nan
+    rests = equilibria.rests(shapes, p, rest)
+    expected = rest[None]
+    for j in range(3):
+        given = Inputs.of(p, expected, equilibria.given(shapes, p, rest).poses[[j]])
+        expected = equilibria.assembly.state_after(shapes.subset([j]), given)[0]
+        np.testing.assert_allclose(rests[j + 1], expected[0], rtol=1e-12)
+    assert np.abs(rests[3] - rest).max() > 0.1
+    assert np.isnan(rests[4]).all()
 
 
 # ---- derivatives -------------------------------------------------------------------------------

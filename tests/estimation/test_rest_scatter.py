@@ -1,5 +1,7 @@
 """Cables that do not repeat: the restricted likelihood by two routes, and what it finds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -34,9 +36,11 @@ def session(std: float, systematic: float = 0.0, seed: int = 0, rows: int = ROWS
 def test_deviance_against_the_full_covariance(systematic):
     """Woodbury, pose by pose, and the textbook form with all rows in one matrix."""
     samples, distances = session(0.1)
+    # Repeats of a pose share what they determine, which couples them whatever the scatter.
+    samples[1] = replace(samples[1], shared=samples[0].shared)
     noise, std, smoothness, range_ = 1.3, 0.15, 0.25, 0.3
     likelihood = RestLikelihood(samples, distances)
-    found = likelihood.deviance(noise, std, systematic, smoothness, range_).value
+    found = likelihood.deviance(noise, std, systematic, smoothness, range_)
     sizes = PoseScatter(1.0, smoothness).sizes(MODES)
     alike = np.exp(-((distances / range_) ** 2) / 2)
     rest = np.zeros((M * ROWS, M * MODES))
@@ -55,7 +59,10 @@ def test_deviance_against_the_full_covariance(systematic):
     projected = weight - weight @ x @ np.linalg.solve(information, x.T @ weight)
     exact = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
     exact += e @ projected @ e
-    assert found == pytest.approx(exact, rel=1e-6)
+    assert found.value == pytest.approx(exact, rel=1e-6)
+    # Average information: y^T P V_s P V_s P y, with V_s the derivative by log std.
+    moved = 2 * std**2 * rest @ rest.T @ projected @ e
+    assert found.information == pytest.approx(moved @ projected @ moved, rel=1e-6)
 
 
 @pytest.mark.parametrize("systematic", [0.0, 0.2])
@@ -68,6 +75,13 @@ def test_gradient_of_the_deviance_against_differences(systematic):
     step = 1e-5
     slopes = [(at(way).value - at(-way).value) / (2 * step) for way in step * np.eye(3)]
     np.testing.assert_allclose(at(np.zeros(3)).gradient, slopes, rtol=1e-6, atol=1e-6)
+
+
+def test_a_single_pose_has_no_systematic_part():
+    samples, distances = session(0.1, rows=30)
+    alone = RestLikelihood(samples[:1], distances[:1, :1]).deviance(1.3, 0.15, 0.2, 0.25, 0.3)
+    assert alone.gradient[2] == 0.0
+    assert alone.gradient[1] != 0.0
 
 
 def test_sizes_are_those_of_a_search_without_derivatives():
