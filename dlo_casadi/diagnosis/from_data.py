@@ -9,7 +9,7 @@ tried with a second one, screened again in its presence.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -222,36 +222,40 @@ def nearest(
     *,
     pairs: bool = True,
     least: float = np.inf,
-) -> list[RelaxedStart]:
-    """Starts whose objective is close to the least one, best first.
+) -> Iterator[list[RelaxedStart]]:
+    """Starts whose objective is close to the least one, best first; then those for a further try.
 
     The least one is that of the first REFITTED candidates, or `least` of another start. If none of
     them reaches the noise of the relaxed shapes, pairs are tried, provided `pairs` may be added: of
     FIRST candidates and likely second ones, then of the next ones, at last of those beyond
     REFITTED, until one reaches the noise. Pairs are returned if REACHED times their objective is
-    less.
+    less. If single candidates reach the noise, pairs follow for a further try.
     """
     noise = REACHED * near.point.data
     start = partial(RelaxedStart.of, near)
     second = partial(RelaxedStart.and_second, softness=softness, center=center, exclude=exclude)
     alone, later = map_in_order(executor, start, likely[:REFITTED]), likely[REFITTED:]
     begun = _near_least(alone, noise, least)
-    if not pairs or not begun or begun[0].left < noise:
-        return begun
+    reached = bool(begun) and begun[0].left < noise
+    if reached or not pairs:
+        yield begun
+    if not pairs:
+        return
     own: dict[frozenset[str], RelaxedStart] = {}
     kept: list[RelaxedStart] = []
-    firsts = sorted(alone, key=lambda x: x.left)
+    firsts = sorted(alone, key=lambda x: x.left) if begun else []
     while firsts and not (kept and kept[0].left < noise):
         both = [x for found in map_in_order(executor, second, firsts[:FIRST]) for x in found]
         ordered = sorted((*own.values(), *both), key=lambda x: -x.left)
         own = {frozenset(x.names): x for x in ordered}
         kept, firsts = _near_least(own.values(), noise), firsts[FIRST:]
-        if not firsts and later:
+        if not firsts and later and not reached:
             firsts, later = sorted(map_in_order(executor, start, later), key=lambda x: x.left), []
             begun = _near_least((*begun, *firsts), noise, least)
             if begun[0].left < noise:
-                return begun
-    return kept if kept and REACHED * kept[0].left < begun[0].left else begun
+                yield begun
+                return
+    yield kept if reached or (kept and REACHED * kept[0].left < begun[0].left) else begun
 
 
 def _near_least(

@@ -216,7 +216,8 @@ def near_data(
     """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
 
     In a misfit scores are useless, and a refit follows the declared model's error. If the best
-    candidate does not explain the shapes, its end roll is searched again, then that of the next.
+    candidate does not explain the shapes, its end roll is searched again, then that of the next. If
+    all fits misfit, too, pairs are tried even where a single candidate's start reached the noise.
     """
     near, softness = from_data(base)
     screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
@@ -227,14 +228,12 @@ def near_data(
     explained = any(explains(item.fit) for item in touching)
     least = min(start.left for start in begun) if explained else np.inf
     among, pairs = (executor, center, exclude), pairs and not explained
-    kept = nearest(near, softness, likely, *among, pairs=pairs, least=least)[:REFITTED]
-    tried = list(map_in_order(executor, partial(confirm_from_data, base), kept))
-    for k, start in () if explained else enumerate(kept):
-        item = tried[k]
-        # The error of a wrong end roll may look like a scatter from pose to pose.
-        if item is None or not explains(item.fit) or item.fit.scatters:
-            item = tried[k] = confirm_rolled(base, start, item)
-        if item is not None and explains(item.fit):
+    kept: list[RelaxedStart] = []
+    tried: list[Confirmed | None] = []
+    for starts in nearest(near, softness, likely, *among, pairs=pairs, least=least):
+        kept += starts[:REFITTED]
+        tried += _confirmed(base, starts[:REFITTED], executor, rolls=not explained)
+        if any(item is not None and item.fit.noise.source != "misfit" for item in tried):
             break
     tried = loads_from_best(base, screened, tried, executor)
     fitted = {item.name: item.screened for item in touching}
@@ -244,6 +243,21 @@ def near_data(
     far = [x.candidate.name for x in likely[:REFITTED] if x.candidate.name not in names]
     best = [*(start.screened for start in kept), *(x.screened for x in tried if x is not None)]
     return NearData(screened, best, [*touching, *tried], far)
+
+
+def _confirmed(
+    base: Fit, starts: Sequence[RelaxedStart], executor: Executor, *, rolls: bool
+) -> list[Confirmed | None]:
+    """Fits from starts; until one explains the shapes, with `rolls` other end rolls are tried."""
+    tried = list(map_in_order(executor, partial(confirm_from_data, base), starts))
+    for k, start in enumerate(starts) if rolls else ():
+        item = tried[k]
+        # The error of a wrong end roll may look like a scatter from pose to pose.
+        if item is None or not explains(item.fit) or item.fit.scatters:
+            item = tried[k] = confirm_rolled(base, start, item)
+        if item is not None and explains(item.fit):
+            break
+    return tried
 
 
 def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:

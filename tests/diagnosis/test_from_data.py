@@ -107,7 +107,7 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypa
     monkeypatch.setattr(RelaxedStart, "and_second", lambda start, **_: asked.append(start) or [])
     wrong = [screened["stiffness_gradient"]]
     for pairs in (False, True):
-        found = nearest(near, softness, wrong, InProcess(), pairs=pairs)
+        (found,) = nearest(near, softness, wrong, InProcess(), pairs=pairs)
         assert [start.names for start in found] == [{"stiffness_gradient"}]
         assert bool(asked) == pairs
 
@@ -126,13 +126,27 @@ def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
 
     monkeypatch.setattr(RelaxedStart, "of", lambda near, x: start(100.0 + int(x), x))
     monkeypatch.setattr(RelaxedStart, "and_second", and_second)
-    (found,) = nearest(near, 0.01, "01234567", InProcess())
+    ((found,),) = nearest(near, 0.01, "01234567", InProcess())
     assert found.names == {"6", "other"}
     assert seconds == list("01234567")
 
     seconds.clear()
-    (found,) = nearest(near, 0.01, "612345", InProcess())
+    ((found,),) = nearest(near, 0.01, "612345", InProcess())
     assert seconds == list("123") + list("456")
+
+
+def test_pairs_follow_a_single_candidate_that_reached_the_noise_in_vain(monkeypatch):
+    """A softening and a stiff section did; with each the fit misfits: a taper and a drift."""
+    near = SimpleNamespace(point=SimpleNamespace(data=1.0))
+    pair = SimpleNamespace(names={"0", "other"}, left=1.0)
+    alone = {x: SimpleNamespace(names={x}, left=1.0 + int(x)) for x in "01"}
+    monkeypatch.setattr(RelaxedStart, "of", lambda near, x: alone[x])
+    monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [pair])
+    lists = nearest(near, 0.01, "01", InProcess())
+    assert next(lists) == [alone["0"]]
+    assert next(lists) == [pair]
+    assert next(lists, None) is None
+    assert len(list(nearest(near, 0.01, "01", InProcess(), pairs=False))) == 1
 
 
 TABLE = -0.25
@@ -176,8 +190,8 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
 
     # The tether leaves far more than the table, which explains the shapes: it is no rival.
     among = (near, softness, [tether], InProcess())
-    assert nearest(*among, pairs=False)
-    assert not nearest(*among, pairs=False, least=start.left)
+    assert next(nearest(*among, pairs=False))
+    assert not next(nearest(*among, pairs=False, least=start.left))
 
     # Contacts change so much from 16 to 32 elements that Newton's method alone loses a pose.
     coarse = refit(found.fit, found.fit.model.with_mesh(16))
