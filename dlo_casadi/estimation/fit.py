@@ -60,6 +60,7 @@ def fit_model(
     free: Sequence[str] | None = None,
     values: FloatArray | None = None,
     readings: ReadingNoise | None = None,
+    refined: bool = True,
 ) -> Fit:
     """Fit a model to all readable fit poses.
 
@@ -75,6 +76,8 @@ def fit_model(
         Start values of the parameters, kept for those not estimated; nominal by default.
     readings : ReadingNoise, optional
         Noise of forces and moments on the fixtures; estimated by default.
+    refined : bool
+        Whether noise, roughness and scatters are estimated from the residuals.
 
     Raises
     ------
@@ -101,7 +104,10 @@ def fit_model(
         priors = replace(priors, scatter=SCATTER_FLOOR * priors.scatter)
     problem = Problem(unknowns, tuple(measured), noise, priors)
     theta = unknowns.pack(first, np.zeros(model.n_coefficients))
-    fit = _searched(problem, theta)
+    fit = _minimum(problem, theta)
+    if not refined:
+        return fit
+    fit = fit_to_misfit(fit) if misfits(fit) else refine(fit, first=True)
     different = different_poses(measured, model.cable.length)
     doubtful = fit.residual_rms > SearchSettings.of(model).other_minima * model.cable.length
     if different >= DIFFERENT and fit.beyond_noise and doubtful:
@@ -139,8 +145,8 @@ def at_random(fit: Fit) -> Fit | None:
     return None
 
 
-def _searched(problem: Problem, theta: FloatArray) -> Fit:
-    """Minimum near the measured shapes, with noise and scatters estimated.
+def _minimum(problem: Problem, theta: FloatArray) -> Fit:
+    """Minimum near the measured shapes.
 
     In space the search uses a larger standard deviation of the points: if an effect is missing,
     shapes held to a fraction of a millimetre leave no path to the minimum.
@@ -168,9 +174,7 @@ def _searched(problem: Problem, theta: FloatArray) -> Fit:
             "  Try: check the units of mass and length, the direction of gravity and the order "
             "of the poses."
         )
-    if misfits(best):
-        return fit_to_misfit(best.reweighed(problem.noise))
-    return refine(best.reweighed(problem.noise), first=True)
+    return best.reweighed(problem.noise)
 
 
 def misfits(fit: Fit) -> bool:

@@ -231,7 +231,7 @@ def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
     model = declared_model(session.config).model
     model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)
     try:
-        fit = fit_model(model, measured, Tolerances(), UNEXPLAINED * length)
+        fit = fit_model(model, measured, Tolerances(), UNEXPLAINED * length, refined=False)
     except EstimationError:
         return Coarse(None, CONTRADICTS * length, False)
     known = fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS)
