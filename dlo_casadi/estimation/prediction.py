@@ -207,11 +207,11 @@ def measured_elsewhere(
 
     Each pose is solved from its measured shape. The result counts if its headings differ from the
     prediction and it is nearer to the points. `fitted`: nodes (n_nodes, coordinates) of fitted
-    poses, by name; the other poses start from the chords of their points.
+    poses, by name, as further starts: those of a fit that lacks something may be far off.
     """
     fits, lines = fitted or {}, [item.traced for item in measured]
     starts = [
-        [fits[line.pose.name]] if line.pose.name in fits else _along_line(model, p, line)
+        [*([fits[line.pose.name]] if line.pose.name in fits else []), *_along_line(model, p, line)]
         for line in lines
     ]
     of = [j for j, ways in enumerate(starts) for _ in ways]

@@ -360,10 +360,10 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
     for stage in others:
         if stage.name in SIMPLER:
             better = not fit.converged or _off(stage) < _off(own)
-            found = _from_simpler(fit, stage, better)
-            if found is not None and found.point.objective <= fit.point.objective - CONVERGED:
-                found = found if fit.noise.source == "misfit" else refine(found)
-                best = max(best, found, key=lambda item: item.log_evidence)
+            for found in _from_simpler(fit, stage, better)[1:]:
+                if found.point.objective <= fit.point.objective - CONVERGED:
+                    found = found if fit.noise.source == "misfit" else refine(found)
+                    best = max(best, found, key=lambda item: item.log_evidence)
     return best
 
 
@@ -374,7 +374,8 @@ def nearest_to_poses(
 
     A fit that trusts each point to its noise distorts ends and rest shape to make up for a missing
     effect, and may predict worse than a straight cable. It is then repeated with a noise that
-    includes the misfit, from itself and from each simpler fit; the best prediction wins.
+    includes the misfit, from itself and from each simpler fit; the best prediction wins. At an edge
+    of stability all may predict worse: then the declared model at the simpler fit itself does.
     `stages`: as in `not_worse`. `staged`: makes the stage of a fit. `diagnosed`: a diagnosis
     follows, after which a complete model is reported whatever is nearest here.
     """
@@ -390,11 +391,9 @@ def nearest_to_poses(
         return fit, own
     misfit = fit.noise.source == "misfit"
     first = fit if misfit else fit_to_misfit(fit)
-    found = [None if misfit else first, *(_from_simpler(first, stage, True) for stage in simpler)]
-    return min(
-        [(fit, own), *((other, staged(other)) for other in found if other is not None)],
-        key=lambda pair: _off(pair[1]),
-    )
+    found = [] if misfit else [first]
+    found += [other for stage in simpler for other in _from_simpler(first, stage, True)]
+    return min([(fit, own), *((x, staged(x)) for x in found)], key=lambda pair: _off(pair[1]))
 
 
 def _off(stage: Stage) -> float:
@@ -403,8 +402,8 @@ def _off(stage: Stage) -> float:
     return np.inf if error is None else error
 
 
-def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> Fit | None:
-    """Fit that starts at a straight cable with a stage's stiffness; None if there is none.
+def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> list[Fit]:
+    """A straight cable with a stage's stiffness, and the fit that starts there; none if it is lost.
 
     Unless that cable is `better`, its objective must be below the fit's.
     """
@@ -417,7 +416,8 @@ def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> Fit | None:
     if point is None and better:
         point = problem.balanced(replace(start, shapes=predicted_shapes(problem, start)))
     if point is None or (not better and point.objective >= fit.point.objective):
-        return None
+        return []
+    found = [Fit(problem, point)]
     with suppress(EstimationError):  # at a fold of its equilibria
-        return descend(Fit(problem, point))
-    return None
+        found.append(descend(found[0]))
+    return found
