@@ -56,7 +56,7 @@ from dlo_casadi.thresholds import (
 )
 
 NOT_NEAR = "does not come near the measured shapes"
-RAN_AWAY = "ran away: its noise or p-value cannot be estimated"
+RAN_AWAY = "its fit ran away: no noise can be estimated from it"
 
 
 def diagnose(

@@ -340,9 +340,8 @@ class RestLikelihood:
         excess = pairs - (each * sizes) @ each.T
         by_std = 2 * std**2 * float(np.trace(excess))
         by_systematic = 2 * systematic**2 * joined * float((alike * excess).sum())
-        way = (
-            2 * std**2 * (each * sizes).reshape(pull.shape)[:, :, None]
-        )  # dV/dlog(std) P y = Z way
+        # The derivative of V by log(std), times P y, is Z way.
+        way = 2 * std**2 * (each * sizes).reshape(pull.shape)[:, :, None]
         information = float((way * (inside @ way)).sum() - ((hidden @ way).sum(axis=0) ** 2).sum())
         gradient = np.array([by_noise, by_std, by_systematic])
         return InformedDeviance(logdet + quadratic, gradient, information)
