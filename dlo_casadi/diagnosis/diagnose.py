@@ -11,7 +11,6 @@ from functools import cached_property, partial
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.from_data import REACHED
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import Screened, survival
@@ -198,7 +197,7 @@ class Search:
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
         # In such a fit a first effect absorbs what two explain; others then fit what it leaves.
-        first = of_shapes.run() if may_be_far and self.declared.chi2_per_dof > REACHED else None
+        first = of_shapes.run() if may_be_far and not explains(self.declared) else None
         if first is not None and not first.unexplained:
             return first
         found = self._forwards()

@@ -138,7 +138,7 @@ def test_no_force_is_asked_for_where_shapes_lead_to_an_explanation(
     """Left-out poses are not reached: only refits that began at the declared model are in doubt."""
     asked = []
     monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: asked.append(1))
-    monkeypatch.setattr(module, "REACHED", 0.0 if from_shapes else np.inf)
+    monkeypatch.setattr(module, "explains", lambda _: not from_shapes)
     explained = Found.of(found.after, found.added, found.ranked, 12, 0.005)
     monkeypatch.setattr(Search, "run", lambda *_: explained)
     monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
@@ -258,7 +258,7 @@ def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, mon
         searched.append(search.from_shapes)
         return ended if search.from_shapes else replace(ended, fit=own)
 
-    monkeypatch.setattr(module, "REACHED", np.inf)
+    monkeypatch.setattr(module, "explains", lambda _: True)
     monkeypatch.setattr(Search, "run", run)
     monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
     assert diagnose(fit).verdict == "effect_found"
