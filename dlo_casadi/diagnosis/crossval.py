@@ -149,7 +149,7 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
     densities = [_density_of(fit, k, predicted[k], covariances[k]) for k in range(len(thetas))]
     missed = [k for k, density in enumerate(densities) if density < linear[k] - EVIDENCE_APART]
     if not explains(fit):
-        # Most poses are missed then: a fit for each took most of the time of some sessions.
+        # Such a fit misses most poses, and fits without each of them would take minutes.
         densities = [linear[k] if k in missed else x for k, x in enumerate(densities)]
         missed = []
     refitted = zip(missed, map_in_order(run, partial(_fitted_without, fit), missed), strict=True)

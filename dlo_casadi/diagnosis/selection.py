@@ -227,10 +227,11 @@ def p_values_of(screened: Sequence[Screened]) -> dict[str, float]:
 def closed_by(
     winner: Confirmed, current: Fit, p_values: Mapping[str, float], astray: bool
 ) -> tuple[Fit, float]:
-    """A refit with its own noise, and its p-value, also under that noise unless `astray`.
+    """A refit with its noise estimated anew, and its p-value, also under that noise.
 
-    A refit that is weighed by its misfit stays so. The current fit and 1 if no noise can be
-    estimated, or poses are lost with it, as of a refit that has run away.
+    `astray`: the current fit is too far from the shapes for that second p-value. A refit that is
+    weighed by its misfit stays so. If no noise can be estimated, or poses are lost with it, the
+    refit has run away: the current fit and 1 are returned.
     """
     p_value, closed = max(p_values[item.candidate.name] for item in winner.each), winner.fit
     with suppress(EstimationError):

@@ -347,7 +347,7 @@ class RestLikelihood:
         return InformedDeviance(logdet + quadratic, gradient, information)
 
     def _without_own(self, weights: FloatArray) -> FloatArray:
-        """Products (m, c, c) of (Z, X, y), less those of U with them at weights (m, a)."""
+        """Products (m, c, c) of (Z, X, y), minus the weighted part (m, a) that U explains."""
         return self.products - self.crossed.transpose(0, 2, 1) @ (weights[..., None] * self.crossed)
 
     def best(

@@ -394,7 +394,7 @@ class BalanceSlopes:
     ends: FloatArray
 
     def subset(self, index: Any) -> BalanceSlopes:
-        """Those of some of the poses."""
+        """Derivatives of some of the poses."""
         inputs = self.shapes.subset(index), self.given.subset(index)
         return BalanceSlopes(self.assembly, *inputs, self.segments[index], self.ends[index])
 

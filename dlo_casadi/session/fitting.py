@@ -403,9 +403,10 @@ def _off(stage: Stage) -> float:
 
 
 def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> list[Fit]:
-    """A straight cable with a stage's stiffness, and the fit that starts there; none if it is lost.
+    """A straight cable with a stage's stiffness, and the fit that starts there.
 
-    Unless that cable is `better`, its objective must be below the fit's.
+    Empty if some pose has no equilibrium with it. Unless that cable is `better`, its objective must
+    be below the fit's.
     """
     problem, model = fit.problem, fit.model
     values = model.nominal.copy()
