@@ -8,6 +8,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import numpy as np
+
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
@@ -391,7 +393,9 @@ class Search:
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         new = [item for item in worthy if item.candidate.name not in known]
-        found = map_in_order(self.executor, partial(refits.confirm, current), new)
+        fits = [item.fit.point.objective for item in known.values() if item is not None]
+        ceiling = refits.GIVEN_UP * min(fits, default=np.inf)
+        found = map_in_order(self.executor, partial(refits.confirm, current, ceiling=ceiling), new)
         known.update(zip((item.candidate.name for item in new), found, strict=True))
         tried = [known[item.candidate.name] for item in worthy]
         return refits.loads_from_best(current, worthy, tried, self.executor)

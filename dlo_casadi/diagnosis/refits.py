@@ -56,6 +56,9 @@ PROMISED = 0.5
 # Starts whose objectives differ by less count as one minimum: smaller shares would start nearer to
 # the base still. Without this limit the reports of eighteen sessions were the same.
 ONE_PLACE = 1.0
+# A refit is given up if its minimum is predicted above this multiple of the objective of one that
+# is already known, with the same weights. Rivals differ from it by EVIDENCE_APART.
+GIVEN_UP = 2.0
 # Maximum number of Gauss-Newton steps of a refit, and of one that starts from scattered forces.
 MOST_STEPS, STEPS_FROM_FORCES = 25, 60
 
@@ -166,9 +169,12 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     return Screened(candidate, gain, survival(gain, len(start), noise_dof), start, best)
 
 
-def confirm(base: Fit, screened: Screened) -> Confirmed | None:
-    """Refit with a candidate added; None if its equilibria cannot be followed."""
-    return Confirmed.of(screened, base, screened.fit or refit_with(base, screened))
+def confirm(base: Fit, screened: Screened, ceiling: float = np.inf) -> Confirmed | None:
+    """Refit with a candidate added; None if its equilibria cannot be followed.
+
+    `ceiling`: see `descend`.
+    """
+    return Confirmed.of(screened, base, screened.fit or refit_with(base, screened, ceiling))
 
 
 def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirmed | None:
@@ -293,15 +299,19 @@ def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
 
 
 def _followed(
-    start: Fit, model: CableModel, values: Mapping[str, float], steps: int = 40
+    start: Fit,
+    model: CableModel,
+    values: Mapping[str, float],
+    steps: int = 40,
+    ceiling: float = np.inf,
 ) -> Fit | None:
     """Refit of a model with new parameters at these values; None without equilibria."""
     with suppress(EstimationError):
-        return refit(start, model, values=values, steps=steps)
+        return refit(start, model, values=values, steps=steps, ceiling=ceiling)
     return None
 
 
-def refit_with(base: Fit, screened: Screened) -> Fit | None:
+def refit_with(base: Fit, screened: Screened, ceiling: float) -> Fit | None:
     """Fit the model with a candidate added, from its one-step estimate."""
     model = screened.candidate.add_to(base.model)
     begin = dict(zip(model.names, base.values_in(model), strict=True))
@@ -311,7 +321,7 @@ def refit_with(base: Fit, screened: Screened) -> Fit | None:
             name: begin[name] + (share if name in screened.candidate.screened else 1.0) * way
             for name, way in ((q, value - begin[q]) for q, value in screened.start.items())
         }
-        fit = _followed(base, model, values, MOST_STEPS)
+        fit = _followed(base, model, values, MOST_STEPS, ceiling)
         if fit is None:
             continue
         same = best is not None and abs(fit.point.objective - best.point.objective) < ONE_PLACE
@@ -408,7 +418,8 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
     forces = np.array([np.array(law(place)).ravel() for place in _places(best.fit, position)])
     values = start_from(best.fit, position, forces, screened.candidate)
     without = best.candidate.remove_from(model, base.model)
-    fit = _followed(best.fit, screened.candidate.add_to(without), values, MOST_STEPS)
+    ceiling = GIVEN_UP * best.fit.point.objective
+    fit = _followed(best.fit, screened.candidate.add_to(without), values, MOST_STEPS, ceiling)
     with suppress(EstimationError):
         found = Confirmed.of(screened, base, fit, best.beside)
         if found and found.fit.log_evidence > best.fit.log_evidence - EVIDENCE_APART:

@@ -50,10 +50,14 @@ class BatchEquilibrium:
     ----------
     poses : sequence of HeldPose
         In the order in which they were taken.
+    wrenches : bool
+        Whether wrench measurements are predicted, too.
     """
 
-    def __init__(self, model: CableModel, poses: Sequence[HeldPose]) -> None:
-        self.model = model
+    def __init__(
+        self, model: CableModel, poses: Sequence[HeldPose], *, wrenches: bool = True
+    ) -> None:
+        self.model, self.wrenches = model, wrenches
         self.poses = tuple(poses)
         self.m = len(self.poses)
         self.assembly = assembly_of(model).softened(SOFT_DEPTH)
@@ -370,13 +374,12 @@ class BatchEquilibrium:
         """Predicted measurements of each pose, and their derivatives along directions."""
         given, length = self.given(shapes, p, rest), self.model.cable.length
         slopes = self.assembly.curve_slopes(shapes, given)
-        each = zip(
-            slopes.z,
-            self.assembly.readings(shapes, given),
-            slopes.along(along),
-            self.assembly.readings_along(shapes, given, along),
-            strict=True,
-        )
+        felt: FloatArray = np.zeros((self.m, 0))
+        changes: FloatArray = np.zeros((self.m, 0, along.x.shape[3]))
+        if self.wrenches:
+            felt = self.assembly.readings(shapes, given)
+            changes = self.assembly.readings_along(shapes, given, along)
+        each = zip(slopes.z, felt, slopes.along(along), changes, strict=True)
         return [
             (Observed(NodeCurve.of(length, z), readings), ObservedChange(change, reading_change))
             for z, readings, change, reading_change in each
@@ -385,10 +388,13 @@ class BatchEquilibrium:
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
         """Predicted measurements of each pose."""
         given, length = self.given(shapes, p, rest), self.model.cable.length
-        both = zip(
-            self.assembly.curve(shapes, given), self.assembly.readings(shapes, given), strict=True
-        )
+        felt = self.readings(shapes, p, given.rest) if self.wrenches else np.zeros((self.m, 0))
+        both = zip(self.assembly.curve(shapes, given), felt, strict=True)
         return [Observed(NodeCurve.of(length, z), readings) for z, readings in both]
+
+    def readings(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """Wrench measurements (m, n_reactions) [N, N m] that each pose would give."""
+        return self.assembly.readings(shapes, self.given(shapes, p, rest))
 
     def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> BoolArray:
         """Whether each pose is a strict minimum of the energy under its end conditions."""

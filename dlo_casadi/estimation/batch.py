@@ -29,6 +29,7 @@ from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.problem import Point, Problem, Values
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
 
 # Projections that move less than this share of the noise between solves have converged.
@@ -82,7 +83,7 @@ def solve_batch(problem: Problem, start: Point) -> tuple[Point, float]:
 def _compressed(problem: Problem, point: Point) -> list[tuple[FloatArray, FloatArray]]:
     """Triangular factor (n_rows, n_z) and target (n_rows,) of each fitted pose's residuals."""
     seen = problem.observed(point)
-    count, size = _n_rows(problem), problem.observed_size
+    count, size = _n_rows(problem), _observed_size(problem)
     unit = np.eye(size)
     out: list[tuple[FloatArray, FloatArray]] = []
     for j, s, white in zip(problem.used, point.projections, problem.whitening, strict=True):
@@ -100,10 +101,17 @@ def _compressed(problem: Problem, point: Point) -> list[tuple[FloatArray, FloatA
     return out
 
 
+def _observed_size(problem: Problem) -> int:
+    """Number of quantities the residuals depend on: the measured curve's and the wrenches'."""
+    model = problem.unknowns.model
+    curve = (model.chain.n + 1) * int(functions_of(model).station.size1_out(0))
+    return curve + problem.equilibria.wrenches * int(functions_of(model).readings.size1_out(0))
+
+
 def _n_rows(problem: Problem) -> int:
     """Number of rows of a pose's compressed residuals: the smaller of n_z and n_residuals."""
     most = max(problem.measured[j].n_residuals for j in problem.used)
-    return min(most, problem.observed_size)
+    return min(most, _observed_size(problem))
 
 
 class _BatchNlp:
@@ -149,7 +157,8 @@ class _BatchNlp:
         per_force = np.repeat([1 / self.force, 1.0], [self.n_x, self.n_lam])
         scale = per_force / model.cable.length
         imbalance = balance(model, symbols) * scale
-        z = ca.vertcat(curve(model, symbols), readings(model, symbols))
+        felt = readings(model, symbols) if problem.equilibria.wrenches else ca.SX(0, 1)
+        z = ca.vertcat(curve(model, symbols), felt)
         after = ca.SX.zeros(0)
         if model.has_state:
             after = rest_after(model, symbols) / model.cable.curvature_scale
@@ -167,7 +176,7 @@ class _BatchNlp:
         """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
         problem, m = self.problem, len(self.poses)
         unknowns, model = problem.unknowns, problem.unknowns.model
-        size, n_z, n_rows = unknowns.size, problem.observed_size, _n_rows(problem)
+        size, n_z, n_rows = unknowns.size, _observed_size(problem), _n_rows(problem)
         x = ca.MX.sym("x", size + self.stride * m)
         factor = ca.MX.sym("factor", n_rows, n_z * len(problem.used))
         target = ca.MX.sym("target", n_rows, len(problem.used))

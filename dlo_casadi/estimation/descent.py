@@ -33,11 +33,15 @@ LONGEST_MOVE = 1.5
 CONVERGED = 1e-4
 # A descent has stalled if this many steps together gain less than one converged step may.
 STALLED = 4
+# A descent is hopeless if its minimum is predicted above a ceiling in this many steps in a row.
+HOPELESS = 3
 # Uphill steps allowed before backtracking; largest rise of the objective allowed.
 WATCHED, WORSE = 2, 3.0
 
 
-def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
+def descend(
+    fit: Fit, steps: int = 40, tolerance: float = CONVERGED, ceiling: float = np.inf
+) -> Fit:
     """Levenberg-Marquardt from a problem's point, which has to be an equilibrium.
 
     Parameters
@@ -48,15 +52,17 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
         Maximum number of iterations.
     tolerance : float
         Decrease of the objective at which the fit has converged, see CONVERGED.
+    ceiling : float
+        Objective above which the minimum is of no interest, see HOPELESS.
 
     Returns
     -------
     Fit
-        The minimum, and whether it converged. A descent that stalls or runs out of iterations
-        has not converged.
+        The minimum, and whether it converged. A descent that stalls, is hopeless or runs out of
+        iterations has not converged.
     """
     problem, point = fit.problem, fit.point
-    damping, gains = 0.0, [np.inf] * STALLED
+    damping, gains, above = 0.0, [np.inf] * STALLED, 0
     lin = fit.linearization
     normal = problem.step_equations(point, lin)
     curvature = Curvature.none(len(point.theta))
@@ -84,6 +90,10 @@ def descend(fit: Fit, steps: int = 40, tolerance: float = CONVERGED) -> Fit:
         ahead = problem.step_equations(trial, lin)
         curvature = curvature.after(step, normal, ahead, gains[-1])
         point, normal = trial, ahead
+        hopeless = np.isfinite(ceiling) and point.objective - normal.promised > ceiling
+        above = above + 1 if hopeless else 0
+        if above == HOPELESS:
+            return Fit(problem, point)
     return Fit(problem, point)
 
 
@@ -216,6 +226,7 @@ def refit(
     free: Sequence[str] | None = None,
     values: Mapping[str, float] = MappingProxyType({}),
     steps: int = 40,
+    ceiling: float = np.inf,
 ) -> Fit:
     """Fit a similar model, or another mesh, starting from a fit's minimum with its weights.
 
@@ -226,8 +237,8 @@ def refit(
     values : mapping, optional
         Start values by name of parameters that the fit does not have, and fixed values of those
         that are not estimated; by default those of the fit, or nominal ones.
-    steps : int
-        Maximum number of iterations.
+    steps, ceiling
+        As of `descend`.
 
     Raises
     ------
@@ -243,7 +254,7 @@ def refit(
     point = problem.balanced(start)
     if point is None:
         raise EstimationError("the shapes of the first fit are no equilibria of the second model")
-    return descend(Fit(problem, point), steps)
+    return descend(Fit(problem, point), steps, ceiling=ceiling)
 
 
 def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shapes:

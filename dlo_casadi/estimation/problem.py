@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,6 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -216,7 +215,12 @@ class Problem:
     @cached_property
     def equilibria(self) -> BatchEquilibrium:
         """The model over the problem's own poses."""
-        return BatchEquilibrium(self.unknowns.model, [item.pose for item in self.measured])
+        return self._equilibria_of(self.unknowns.model)
+
+    def _equilibria_of(self, model: CableModel) -> BatchEquilibrium:
+        wrenches = any((item.kinds != "point").any() for item in self.measured if item.readable)
+        poses = [item.pose for item in self.measured]
+        return BatchEquilibrium(model, poses, wrenches=wrenches)
 
     @cached_property
     def _prior(self) -> tuple[FloatArray, FloatArray]:
@@ -253,13 +257,6 @@ class Problem:
         """
         return sum(self.measured[j].n_residuals for j in self.used)
 
-    @property
-    def observed_size(self) -> int:
-        """Number of quantities the residuals depend on: the measured curve's and the wrenches'."""
-        model = self.unknowns.model
-        curve = (model.chain.n + 1) * int(functions_of(model).station.size1_out(0))
-        return curve + int(functions_of(model).readings.size1_out(0))
-
     # ---- weights -----------------------------------------------------------------------------
 
     @property
@@ -286,23 +283,34 @@ class Problem:
             weights[k] = solve_triangular(factor, weights[k], lower=True)
         return replace(self, weights=tuple(weights))
 
-    def moved_by(self, values: Values, scatter: PoseScatter) -> list[FloatArray]:
-        """Change (R_j, q) of the fitted residuals by a unit of each random quantity of a pose."""
+    def moved_by(self, values: Values, *scatters: PoseScatter) -> list[list[FloatArray]]:
+        """Change (R_j, q) of the fitted residuals by a unit of a pose's random quantities.
+
+        One list of poses for each of `scatters`; they share one model, which costs less.
+        """
+        if not scatters:
+            return []
         shapes, p, rest = self.state(values)
-        model = self.unknowns.model
-        larger = BatchEquilibrium(scatter.within(model), self.equilibria.poses)
-        p, (by_p, by_rest) = scatter.values(p, model), scatter.ways(model)
+        model = reduce(lambda model, one: one.within(model), scatters, self.unknowns.model)
+        larger, p = self._equilibria_of(model), np.pad(p, (0, len(model.names) - len(p)))
+        ways = [scatter.ways(model) for scatter in scatters]
+        by_p, by_rest = (np.concatenate(parts, axis=1) for parts in zip(*ways, strict=True))
         along = larger.by_rest(shapes, p, rest, by_rest, by_p)
         seen = larger.observe(shapes, p, rest, along)
-        places = zip(self.used, values.projections, strict=True)
-        return [self.measured[j].linearized(seen[j][0], s, seen[j][1])[1] for j, s in places]
+        edges = np.cumsum([columns.shape[1] for columns, _ in ways])[:-1]
+        moved = [
+            np.split(self.measured[j].linearized(seen[j][0], s, seen[j][1])[1], edges, axis=1)
+            for j, s in zip(self.used, values.projections, strict=True)
+        ]
+        return [list(each) for each in zip(*moved, strict=True)]
 
     def own_errors(self, values: Values) -> list[FloatArray]:
         """`moved_by` for one standard deviation of each; (R_j, 0) if the cable repeats."""
         scatter = self.priors.pose_scatter
         if scatter.std == 0:
             return [np.zeros((self.measured[j].n_residuals, 0)) for j in self.used]
-        return [way * scatter.sizes(way.shape[1]) for way in self.moved_by(values, scatter)]
+        (moved,) = self.moved_by(values, scatter)
+        return [way * scatter.sizes(way.shape[1]) for way in moved]
 
     # ---- evaluation --------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.problem import NO_INFORMATION, Normal, Problem, Values
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
 from dlo_casadi.model.cable_model import STIFFNESSES
@@ -167,8 +168,13 @@ class Relaxation:
 
     # ---- evaluation --------------------------------------------------------------------------
 
-    def objectives(self, values: Values) -> tuple[FloatArray, float]:
-        """Twice the objective: the share of each pose (m,), and that of the prior."""
+    def objectives(
+        self, values: Values, seen: list[Observed] | None = None
+    ) -> tuple[FloatArray, float]:
+        """Twice the objective: the share of each pose (m,), and that of the prior.
+
+        `seen`: the measurements predicted at these values, if they are known.
+        """
         problem = self.problem
         shapes = values.shapes
         given = problem.equilibria.given(*problem.state(values))
@@ -177,15 +183,15 @@ class Relaxation:
         left *= self._weights(values.theta)
         own = shapes.deviation[:, problem.equilibria.used_deviations] / problem.deviation_std
         each = (left**2).sum(axis=1) + (own**2).sum(axis=1)
-        seen = problem.observed(values)
+        seen = problem.observed(values) if seen is None else seen
         for white, j, s in zip(problem.whitening, problem.used, values.projections, strict=True):
             each[j] += float(((white @ problem.measured[j].residual(seen[j], s)) ** 2).sum())
         gap = values.theta - problem.mean
         return each, float(gap @ problem.precision @ gap)
 
-    def objective(self, values: Values) -> float:
-        """Twice the objective; infinite where it is not a number."""
-        each, prior = self.objectives(values)
+    def objective(self, values: Values, seen: list[Observed] | None = None) -> float:
+        """Twice the objective, see `objectives`; infinite where it is not a number."""
+        each, prior = self.objectives(values, seen)
         total = float(each.sum()) + prior
         return total if np.isfinite(total) else np.inf
 
@@ -349,7 +355,9 @@ class Relaxation:
             for _ in range(REFUSED):
                 try:
                     found = self._stepped(values, linearized, damping, fixed)
-                    reached = self.objective(found)
+                    seen = self.problem.observed(found)
+                    found = replace(found, projections=self.problem.located(found, seen))
+                    reached = self.objective(found, seen)
                 except np.linalg.LinAlgError:
                     reached = np.inf
                 if reached < least:
@@ -385,7 +393,7 @@ class Relaxation:
     def _stepped(
         self, values: Values, linearized: _Linearized, damping: float, fixed: BoolArray | None
     ) -> Values:
-        """Values after a damped step within reach."""
+        """Values after a damped step within reach, with the projections before it."""
         problem, reduced = self.problem, self._reduced(linearized, damping, fixed)
         unknowns, equilibria = problem.unknowns, problem.equilibria
         nodes, border, own, known, _ = self._counts
@@ -420,8 +428,7 @@ class Relaxation:
         shapes = replace(shapes, deviation=deviation)
         theta = values.theta + taken
         theta = np.clip(np.where(unknowns.are_loads, larger * theta, theta), *unknowns.bounds)
-        moved = Values(theta, shapes, values.projections)
-        return replace(moved, projections=problem.located(moved, problem.observed(moved)))
+        return Values(theta, shapes, values.projections)
 
 
 def _bounded(rows: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:

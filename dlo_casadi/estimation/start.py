@@ -8,10 +8,12 @@ its end clamp, and which way round a pose is twisted.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.effects import Kinematics, MeasurementEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
 from dlo_casadi.equilibrium.guesses import line_nodes
@@ -284,6 +286,8 @@ _KINEMATIC_STEPS = 8
 # Evidence: eight poses with one photograph each, from two starts. Between 8 and 12 steps the
 # residual of 8 of the 16 fell by more than a tenth; between 12 and 20 steps that of 3.
 _STEPS_WITHOUT_DEPTH = 20
+# Number of results that are kept: a session asks for about twenty, of which many more than once.
+_KINEMATICS = 64
 
 
 def measured_shapes(
@@ -307,56 +311,73 @@ def measured_shapes(
     Shapes, list of (K_j,) [m]
         Shapes without multipliers, and arc lengths of the fitted poses' points.
     """
-    model, used = problem.unknowns.model, problem.used
-    chain = model.chain
-    # Without forces the internal unknowns of an element are undetermined.
-    equilibria = problem.equilibria
-    if chain.kind.n_inner:
-        equilibria = BatchEquilibrium(
-            model.with_mesh(chain.n, chain.kind.plain), problem.equilibria.poses
-        )
-    flat = np.zeros(chain.n_rests)
-    predicted = np.array(
-        [next(first_guesses(model, model.nominal, flat, item.pose))[0] for item in problem.measured]
-    )
+    model, chain = problem.unknowns.model, problem.unknowns.model.chain
+    # Without forces the internal unknowns of an element are undetermined, and loads have no effect.
+    kept = tuple(x for x in model.effects if isinstance(x, Kinematics | MeasurementEffect))
+    bare = replace(model, effects=kept, priors={}).with_mesh(chain.n, chain.kind.plain)
+    p = dict(zip(model.names, problem.unknowns.fixed.tolist(), strict=True))
+    known = tuple(p[name] for name in bare.names), problem.measured, tuple(problem.used), roll
+    x, projections = _along(bare, *known, None if turns is None else tuple(turns.tolist()))
+    return problem.equilibria.start_shapes(x.copy()), [*projections]
+
+
+@lru_cache(maxsize=_KINEMATICS)
+def _along(
+    model: CableModel,
+    p: tuple[float, ...],
+    measured: tuple[MeasuredPose, ...],
+    used: tuple[int, ...],
+    roll: float,
+    turns: tuple[float, ...] | None,
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Nodes (m, n_nodes, coordinates) of `measured_shapes`, and arc lengths of points."""
+    chain, flat = model.chain, np.zeros(model.chain.n_rests)
+    guesses = (first_guesses(model, model.nominal, flat, item.pose) for item in measured)
+    predicted = np.array([next(guess)[0] for guess in guesses])
     along = predicted.copy()
     for j in used:
-        item = problem.measured[j].traced
+        item = measured[j].traced
         pose = item.pose.rolled(roll)
-        pose = pose if turns is None else replace(pose, turns=float(turns[j]))
+        pose = pose if turns is None else replace(pose, turns=turns[j])
         along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
-    shapes, projections, cost = _kinematics(problem, equilibria, along, roll)
-    alone = [k for k, j in enumerate(used) if not problem.measured[j].has_line]
+    equilibria = BatchEquilibrium(model, [item.pose for item in measured])
+    fitted = [measured[j] for j in used]
+    shapes, projections, cost = _kinematics(equilibria, np.array(p), fitted, used, along, roll)
+    alone = [k for k, item in enumerate(fitted) if not item.has_line]
     if alone:
         # One photograph cannot distinguish a bend towards the camera from one away from it.
-        others, places, costs = _kinematics(problem, equilibria, predicted, roll)
+        others, places, costs = _kinematics(equilibria, np.array(p), fitted, used, predicted, roll)
         for k in alone:
             if costs[k] < cost[k]:
                 shapes.x[used[k]], projections[k] = others.x[used[k]], places[k]
-    return shapes, projections
+    return shapes.x, projections
 
 
 def _kinematics(
-    problem: Problem, equilibria: BatchEquilibrium, x: FloatArray, roll: float
+    equilibria: BatchEquilibrium,
+    p: FloatArray,
+    fitted: Sequence[MeasuredPose],
+    used: Sequence[int],
+    x: FloatArray,
+    roll: float,
 ) -> tuple[Shapes, list[FloatArray], list[float]]:
     """Shapes from nodes x on, arc lengths of points, and residual of each (used,) [m^2]."""
-    model, used = problem.unknowns.model, problem.used
-    lines = [item.traced if item.has_line else item for item in (problem.measured[j] for j in used)]
-    shapes = problem.equilibria.start_shapes(x)
+    model, shapes = equilibria.model, equilibria.start_shapes(x)
+    lines = [item.traced if item.has_line else item for item in fitted]
     each, flat = _each_node(equilibria), np.zeros(model.chain.n_rests)
     projections = [item.places(model.chain.length) for item in lines]
     cost = [np.inf for _ in used]
     steps = _KINEMATIC_STEPS if all(x.has_line for x in lines) else _STEPS_WITHOUT_DEPTH
     for iteration in range(steps + 1):
-        seen = equilibria.observe(shapes, problem.unknowns.fixed, flat, each)
+        seen = equilibria.observe(shapes, p, flat, each)
         for k, (j, item) in enumerate(zip(used, lines, strict=True)):
             now, change = seen[j]
             if iteration > 1:
                 projections[k] = item.located(now, projections[k])
             elif not item.has_line:
                 projections[k] = item.nearest(now.curve)
-            if iteration == steps and item is not problem.measured[j]:
-                projections[k] = problem.measured[j].nearest(now.curve)
+            if iteration == steps and item is not fitted[k]:
+                projections[k] = fitted[k].nearest(now.curve)
                 continue
             rolled = replace(item, pose=item.pose.rolled(roll))
             step, cost[k] = _kinematic_step(rolled, model, now, change, shapes.x[j], projections[k])

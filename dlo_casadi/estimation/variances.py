@@ -1,5 +1,6 @@
 """Noise, roughness of the rest curvature and scatter of the fixtures, estimated from the data."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -188,13 +189,10 @@ def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
     """Likeliest random quantity of each repeat and its size; see `estimate_pose_scatter`."""
     if different_poses(fit.problem.history, fit.model.cable.length) < DIFFERENT:
         return ScatterEstimate(PoseScatter(), 1.0, 1.0, 0.0)
-    found = _scatter_of_source(fit, noise, PoseScatter())
+    (found,) = _scatters_of(fit, noise, [PoseScatter()])
     if found.scatter.std == 0 and not (fit.beyond_noise or _beyond_tolerances(fit)):
         return found
-    others = [
-        _scatter_of_source(fit, noise, PoseScatter(source=source))
-        for source in sources_in(fit.model)
-    ]
+    others = _scatters_of(fit, noise, [PoseScatter(source=x) for x in sources_in(fit.model)])
     best, *others = sorted((found, *others), key=lambda item: item.deviance)
     near = [x.scatter for x in others if x.deviance < best.deviance + SCATTER_APART]
     alike = tuple(one for one in near if one.std > 0)
@@ -207,13 +205,14 @@ def _beyond_tolerances(fit: Fit) -> bool:
     return bool((own**2).sum() > own.size + 2 * np.sqrt(2 * own.size))
 
 
-def _scatter_of_source(fit: Fit, noise: NoiseModel, scatter: PoseScatter) -> ScatterEstimate:
-    """Estimate the size of one random quantity of each repeat."""
+def _scatters_of(
+    fit: Fit, noise: NoiseModel, scatters: Sequence[PoseScatter]
+) -> list[ScatterEstimate]:
+    """Estimate the size of each of several random quantities of a repeat as if it were alone."""
     problem, point, lin = fit.problem, fit.point, fit.linearization
     size, std = problem.unknowns.size, problem.deviation_std
-    moved = problem.moved_by(point, scatter)
     kept = range(0, len(problem.used), -(-len(problem.used) // MOST_POSES))
-    samples = []
+    poses = []
     for k in kept:
         white = problem.measured[problem.used[k]].whitening(noise, point.projections[k])
         by = white @ lin.raw_directions[k]
@@ -221,15 +220,22 @@ def _scatter_of_source(fit: Fit, noise: NoiseModel, scatter: PoseScatter) -> Sca
         # The poses' deviations are random, too: take the residual without them.
         deviation = point.shapes.deviation[problem.used[k], problem.equilibria.used_deviations]
         e = white @ lin.raw[k] - own @ (deviation / std)
-        samples.append(ScatterSample(e, white @ moved[k], own, by[:, :size]))
+        poses.append((white, e, own, by[:, :size]))
     seen = problem.observed(point)
     shapes = np.array([seen[problem.used[k]].curve.nodes for k in kept])
     shapes = shapes - shapes[:, :1]
     gap = shapes[:, None] - shapes[None]
     distances = np.sqrt((gap**2).sum(axis=3).mean(axis=2))
     sparse = max(len(s) for s in point.projections) <= MODES
-    likelihood = RestLikelihood(samples, distances, scatter.source)
-    return estimate_pose_scatter(likelihood, sparse=sparse)
+    found = []
+    for scatter, moved in zip(scatters, problem.moved_by(point, *scatters), strict=True):
+        samples = [
+            ScatterSample(e, white @ moved[k], own, shared)
+            for k, (white, e, own, shared) in zip(kept, poses, strict=True)
+        ]
+        likelihood = RestLikelihood(samples, distances, scatter.source)
+        found.append(estimate_pose_scatter(likelihood, sparse=sparse))
+    return found
 
 
 def _white_noise(fit: Fit) -> NoiseModel:
@@ -261,7 +267,7 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     size = problem.unknowns.size
     bases, left_over = [], []
     scatter = problem.priors.pose_scatter
-    rest = problem.moved_by(point, scatter) if scatter.std > 0 else None
+    rest = problem.moved_by(point, scatter)[0] if scatter.std > 0 else None
     kept = [problem.measured[j].on_points for j in problem.used]
     raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
     ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]

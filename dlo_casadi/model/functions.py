@@ -51,21 +51,14 @@ class Functions:
             self._mapped[name] = Mapped(getattr(self, name))
         return self._mapped[name]
 
-    def _here(
-        self, name: str, arguments: list[ca.SX], outputs: list[ca.SX], *, often: bool = True
-    ) -> ca.Function:
-        """A function at zero increments, with dense outputs.
-
-        With `often`, common subexpressions are eliminated, which saves a fifth of the operations.
-        For derivatives of many effects, finding them takes longer than it saves.
-        """
+    def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
+        """A function at zero increments, with dense outputs."""
         still = ca.SX.zeros(self.terms.delta.shape)
         found = ca.substitute(outputs, [self.terms.delta], [still])
-        found = ca.cse(found) if often else found
         return ca.Function(name, arguments, [ca.densify(one) for one in found])
 
-    def _of_segment(self, name: str, *outputs: ca.SX, often: bool = True) -> ca.Function:
-        return self._here(name, self._segment_arguments, list(outputs), often=often)
+    def _of_segment(self, name: str, *outputs: ca.SX) -> ca.Function:
+        return self._here(name, self._segment_arguments, list(outputs))
 
     def _of_ends(self, name: str, *outputs: ca.SX) -> ca.Function:
         return self._here(name, self._end_arguments, list(outputs))
@@ -202,7 +195,7 @@ class Functions:
                 mixed[k, :] = ca.jacobian(self._gradient[k], self._numbers)
         else:
             mixed = ca.jacobian(self._gradient, self._numbers)
-        return self._of_segment("segment_sensitivity", mixed, often=False)
+        return self._of_segment("segment_sensitivity", mixed)
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
@@ -243,7 +236,7 @@ class Functions:
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
         else:
             blocks = [ca.jacobian(self._advanced, one) for one in by]
-        return self._of_segment("segment_curve_slopes", self._advanced, *blocks, often=False)
+        return self._of_segment("segment_curve_slopes", self._advanced, *blocks)
 
     @cached_property
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:

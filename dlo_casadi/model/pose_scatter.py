@@ -12,8 +12,6 @@ from dlo_casadi.model.cable_model import CableModel
 MODES = 8
 SMOOTHNESS = (0.5, 0.25, 0.12)
 REST_CURVATURE = "rest_curvature"
-# Label of the random effect in a model.
-LABEL = "from_pose_to_pose"
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class PoseScatter:
             modes = modes_in(model)
             return np.zeros((len(model.names), modes.shape[1])), modes
         names = self.within(model).names
-        own = [k for k, name in enumerate(names) if name.startswith(f"{LABEL}.")]
+        own = [k for k, name in enumerate(names) if name.startswith(f"{_label(self.source)}.")]
         return np.eye(len(names))[:, own], np.zeros((model.chain.n_rests, len(own)))
 
 
@@ -97,7 +95,11 @@ def effect_of(source: str, model: CableModel) -> Effect | None:
     kind = RANDOM.get(source)
     if kind is None or not kind.applies(setup):
         return None
-    return replace(kind.made_for(setup), label=LABEL)
+    return replace(kind.made_for(setup), label=_label(source))
+
+
+def _label(source: str) -> str:
+    return f"{source}_from_pose_to_pose"
 
 
 def modes_in(model: CableModel) -> FloatArray:

@@ -16,7 +16,7 @@ from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Centerline, Markers, Sensor, Wrench, line_or_markers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeasuredPose:
     """One measured pose. Its residual stacks those of its sensors.
 

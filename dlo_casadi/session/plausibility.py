@@ -248,7 +248,7 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
     fit, _, sized = coarse_fit(replace(session, read=tuple(shown)))
     if fit is None:
         return ()
-    seen = fit.problem.observed(fit.point)
+    felt = fit.problem.equilibria.readings(*fit.problem.state(fit.point))
     rows = reaction_rows(fit.model.node, len(fit.model.clips))
     compared = []
     for name, at in rows.items():
@@ -258,12 +258,12 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
         if not own:
             continue
         held = getattr(fit.model, side, "clip") == "clamped"
-        forces = np.array([seen[k].readings[rows[f"{side}_force"]] for k in own])
+        forces = felt[own, rows[f"{side}_force"]]
         compared.append(
             ComparedReading(
                 name,
                 np.array([poses[k].readings[name] for k in own]),
-                np.array([seen[k].readings[at] for k in own]),
+                felt[own, at],
                 np.array([clamp_axes(poses[k], side) for k in own]) if held else None,
                 forces if kind == "moment" else None,
             )

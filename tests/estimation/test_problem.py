@@ -384,6 +384,25 @@ def test_noise_free_round_trip_is_exact():
     np.testing.assert_allclose(found.point.theta, exact, atol=1e-4)
 
 
+def test_a_descent_is_given_up_if_its_minimum_is_above_a_ceiling():
+    truth = CableModel(CABLE, 10, effects=(LumpedMass(),), n_rest=5)
+    p, coefficients = np.array([0.06, 0.04, 0.3]), np.array([0.5, 1.0, 1.5, 0.8, 0.4])
+    measured = measured_from(truth, p, coefficients, 5, 0.0)
+    model = CableModel(CABLE, 10, n_rest=5)
+    problem = Problem(all_free(model), measured, NoiseModel(1e-3), Priors.of(Tolerances(), model))
+    theta = problem.unknowns.pack(p[:1], coefficients)
+    values = projected(problem, theta, solved(problem, theta))
+    problem = problem.weighed(values)
+    start = Fit(problem, problem.evaluate(values))
+    found = descend(start)
+    least = found.point.objective
+    assert found.converged
+    assert descend(start, ceiling=1.1 * least).point.objective == least
+    given_up = descend(start, ceiling=0.9 * least)
+    assert not given_up.converged
+    assert least < given_up.point.objective < start.point.objective
+
+
 @pytest.mark.long
 def test_a_drift_comes_back():
     """Rate and stiffness from poses in order; in another one the cable seems not to repeat."""
