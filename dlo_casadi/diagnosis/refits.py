@@ -311,7 +311,7 @@ def _followed(
     return None
 
 
-def refit_with(base: Fit, screened: Screened, ceiling: float) -> Fit | None:
+def refit_with(base: Fit, screened: Screened, ceiling: float = np.inf) -> Fit | None:
     """Fit the model with a candidate added, from its one-step estimate."""
     model = screened.candidate.add_to(base.model)
     begin = dict(zip(model.names, base.values_in(model), strict=True))

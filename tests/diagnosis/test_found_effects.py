@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis import crossval
+from dlo_casadi.diagnosis import crossval, refits
 from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
@@ -128,7 +128,7 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     assert mass == pytest.approx(max(0.0, -pull.force_per_pose[:, 1].mean() / 9.81))
 
 
-def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one():
+def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one(monkeypatch):
     """A force that its own start has led astray, or nowhere: half of its misfit is gone."""
     base = session("tether", *TETHER)
     listed = {c.name: c for c in candidates(base.model, setup_of(base.model, n_poses=len(ENDS)))}
@@ -144,6 +144,9 @@ def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one():
         started("stiffness_gradient", slope=0.1),
     ]
     force, tether, gradient = tried = [confirm(base, x) for x in screened]
+    # It cannot compete with the tether, so by default it is given up.
+    assert loads_from_best(base, screened, tried, InProcess()) == tried
+    monkeypatch.setattr(refits, "GIVEN_UP", np.inf)
     found, *same = loads_from_best(base, screened, tried, InProcess())
     assert same == [tether, gradient]
     assert found.name == "point_force"

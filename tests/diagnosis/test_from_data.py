@@ -114,7 +114,7 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypa
 
 def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
     """A drift had no score beside a tether, and came seventh alone."""
-    near, seconds = SimpleNamespace(point=SimpleNamespace(data=1.0)), []
+    near, seconds, left_by_pair = SimpleNamespace(point=SimpleNamespace(data=1.0)), [], [1.3]
 
     def start(left, *names):
         return SimpleNamespace(names=set(names), left=left)
@@ -122,13 +122,19 @@ def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
     def and_second(first, **_):
         (name,) = first.names
         seconds.append(name)
-        return [start(1.0 if name == "6" else 50.0, name, "other")]
+        return [start(left_by_pair[0] if name == "6" else 50.0, name, "other")]
 
     monkeypatch.setattr(RelaxedStart, "of", lambda near, x: start(100.0 + int(x), x))
     monkeypatch.setattr(RelaxedStart, "and_second", and_second)
     ((found,),) = nearest(near, 0.01, "01234567", InProcess())
     assert found.names == {"6", "other"}
     assert seconds == list("01234567")
+
+    seconds.clear()
+    left_by_pair[0] = 1.1
+    ((found,),) = nearest(near, 0.01, "01234567", InProcess())
+    assert found.names == {"6", "other"}
+    assert seconds == list("0123456")
 
     seconds.clear()
     ((found,),) = nearest(near, 0.01, "612345", InProcess())
