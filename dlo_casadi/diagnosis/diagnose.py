@@ -393,8 +393,8 @@ class Search:
         leading = sorted(significant, key=lambda item: -item.score)[:REFITTED]
         worthy = [item for item in leading if item.score >= WORTH * leading[0].score]
         new = [item for item in worthy if item.candidate.name not in known]
-        fits = [item.fit.point.objective for item in known.values() if item is not None]
-        ceiling = refits.GIVEN_UP * min(fits, default=np.inf)
+        among = [known.get(item.candidate.name) for item in worthy]
+        ceiling = min((refits.ceiling_beside(x.fit) for x in among if x), default=np.inf)
         found = map_in_order(self.executor, partial(refits.confirm, current, ceiling=ceiling), new)
         known.update(zip((item.candidate.name for item in new), found, strict=True))
         tried = [known[item.candidate.name] for item in worthy]

@@ -20,10 +20,11 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.continuation import loosely_relaxed, relaxed, with_springs_in_place
 from dlo_casadi.estimation.fit import FIRST_STD
+from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, fit_from, measured_shapes, retry_outlying_poses
+from dlo_casadi.estimation.start import begin, fit_from, retry_outlying_poses
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
@@ -41,8 +42,8 @@ COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; for a
 # strict balance, relative to that of shapes that need not balance.
 REACHED = 1.5
-# The same beyond doubt, so that no other pairs are tried. In five sessions in space the pair that
-# was hidden left 1.01 to 1.14 in four and 1.54 in one, other pairs 1.5 and more.
+# Sum of squares, relative to that of the relaxed shapes, below which no further pair is tried. In
+# four sessions in space the hidden pair left 1.01, 1.10, 1.14 and 1.54, other pairs 1.5 and more.
 SURELY_REACHED = 1.2
 # Sum of squares per residual that most poses leave, above which no pose is tried again: not a pose,
 # but the candidate is wrong. In a session in space seven of eleven such starts gained by a second
@@ -240,8 +241,9 @@ def nearest(
     The least one is that of the first REFITTED candidates, or `least` of another start. If none of
     them reaches the noise of the relaxed shapes, pairs are tried, provided `pairs` may be added: of
     FIRST candidates and likely second ones, then of the next ones, at last of those beyond
-    REFITTED, until one reaches the noise. Pairs are returned if REACHED times their objective is
-    less. If single candidates reach the noise, pairs follow for a further try.
+    REFITTED, until one reaches the noise; one that surely does is the last. Pairs are returned if
+    REACHED times their objective is less. If single candidates reach the noise, pairs follow for a
+    further try.
     """
     noise, start = REACHED * near.point.data, partial(RelaxedStart.of, near)
     second = partial(

@@ -56,9 +56,9 @@ PROMISED = 0.5
 # Starts whose objectives differ by less count as one minimum: smaller shares would start nearer to
 # the base still. Without this limit the reports of eighteen sessions were the same.
 ONE_PLACE = 1.0
-# A refit is given up if its minimum is predicted above this multiple of the objective of one that
-# is already known, with the same weights. Rivals differ from it by EVIDENCE_APART.
-GIVEN_UP = 2.0
+# A refit beside a known one is given up if its minimum is predicted higher by this, ten times the
+# log likelihood by which a rival may fall short, and by the known objective itself.
+GIVEN_UP = 10 * EVIDENCE_APART
 # Maximum number of Gauss-Newton steps of a refit, and of one that starts from scattered forces.
 MOST_STEPS, STEPS_FROM_FORCES = 25, 60
 
@@ -188,6 +188,11 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
     if fit is not None and base.noise.before is not None and not misfits(fit):
         fit = _at_noise(fit, base.noise.before)
     return Confirmed.of(screened, base, fit)
+
+
+def ceiling_beside(fit: Fit) -> float:
+    """Objective above which another refit of the same data cannot be a rival, see `descend`."""
+    return fit.point.objective + max(GIVEN_UP, fit.point.objective)
 
 
 def _at_noise(fit: Fit, noise: NoiseModel) -> Fit:
@@ -418,8 +423,8 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
     forces = np.array([np.array(law(place)).ravel() for place in _places(best.fit, position)])
     values = start_from(best.fit, position, forces, screened.candidate)
     without = best.candidate.remove_from(model, base.model)
-    ceiling = GIVEN_UP * best.fit.point.objective
-    fit = _followed(best.fit, screened.candidate.add_to(without), values, MOST_STEPS, ceiling)
+    larger, ceiling = screened.candidate.add_to(without), ceiling_beside(best.fit)
+    fit = _followed(best.fit, larger, values, MOST_STEPS, ceiling)
     with suppress(EstimationError):
         found = Confirmed.of(screened, base, fit, best.beside)
         if found and found.fit.log_evidence > best.fit.log_evidence - EVIDENCE_APART:

@@ -388,7 +388,8 @@ class BatchEquilibrium:
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
         """Predicted measurements of each pose."""
         given, length = self.given(shapes, p, rest), self.model.cable.length
-        felt = self.readings(shapes, p, given.rest) if self.wrenches else np.zeros((self.m, 0))
+        felt: FloatArray = np.zeros((self.m, 0))
+        felt = self.assembly.readings(shapes, given) if self.wrenches else felt
         both = zip(self.assembly.curve(shapes, given), felt, strict=True)
         return [Observed(NodeCurve.of(length, z), readings) for z, readings in both]
 

@@ -90,8 +90,8 @@ def descend(
         ahead = problem.step_equations(trial, lin)
         curvature = curvature.after(step, normal, ahead, gains[-1])
         point, normal = trial, ahead
-        hopeless = np.isfinite(ceiling) and point.objective - normal.promised > ceiling
-        above = above + 1 if hopeless else 0
+        if ceiling < np.inf:
+            above = above + 1 if point.objective - normal.promised > ceiling else 0
         if above == HOPELESS:
             return Fit(problem, point)
     return Fit(problem, point)

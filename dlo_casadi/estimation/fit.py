@@ -12,10 +12,11 @@ from dlo_casadi.effects.cable import height_of
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
+from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, fit_from, measured_shapes, weighed
+from dlo_casadi.estimation.start import begin, fit_from, weighed
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.estimation.variances import (
     SCATTER_FLOOR,
@@ -236,7 +237,9 @@ def mesh_error(fit: Fit) -> float:
     equilibria nearby on the finer mesh.
     """
     model = fit.model.with_mesh(2 * fit.model.n)
-    equilibria = BatchEquilibrium(model, [item.pose for item in fit.problem.measured])
+    equilibria = BatchEquilibrium(
+        model, [item.pose for item in fit.problem.measured], wrenches=False
+    )
     state = fit.p, model.rest_basis @ fit.coefficients
     start = on_other_mesh(fit.point.shapes, fit.model, model)
     shapes, converged = equilibria.solve_or_descend(start, *state)

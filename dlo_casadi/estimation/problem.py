@@ -218,9 +218,8 @@ class Problem:
         return self._equilibria_of(self.unknowns.model)
 
     def _equilibria_of(self, model: CableModel) -> BatchEquilibrium:
-        wrenches = any((item.kinds != "point").any() for item in self.measured if item.readable)
-        poses = [item.pose for item in self.measured]
-        return BatchEquilibrium(model, poses, wrenches=wrenches)
+        poses, wrenches = zip(*((x.pose, bool(x.reactions)) for x in self.measured), strict=True)
+        return BatchEquilibrium(model, poses, wrenches=any(wrenches))
 
     @cached_property
     def _prior(self) -> tuple[FloatArray, FloatArray]:
@@ -286,7 +285,7 @@ class Problem:
     def moved_by(self, values: Values, *scatters: PoseScatter) -> list[list[FloatArray]]:
         """Change (R_j, q) of the fitted residuals by a unit of a pose's random quantities.
 
-        One list of poses for each of `scatters`; they share one model, which costs less.
+        One list of poses for each of `scatters`. All are evaluated in one model, which is cheaper.
         """
         if not scatters:
             return []

@@ -8,25 +8,19 @@ its end clamp, and which way round a pose is twisted.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
-from dlo_casadi.effects import Kinematics, MeasurementEffect
-from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.curve import Observed, ObservedChange
-from dlo_casadi.equilibrium.guesses import line_nodes
-from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.estimation.continuation import loosened, relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_each
 from dlo_casadi.estimation.problem import Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.assembly import Shapes, Tangents
-from dlo_casadi.model.cable_model import END_ROLL, CableModel
-from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import END_ROLL
 
 # First trial rolls of the end [rad]. Rolls 1.2 rad away from a trial were still found.
 ROLLS = (0.0, 1.2, -1.2, 2.4, -2.4)
@@ -205,7 +199,7 @@ def retry_outlying_poses(
     line that no stable equilibrium has: 9 of 12 flat cables in 6 poses had such a pose even at
     their true parameters. From distant parameters 3 fits missed the noise; with this all reach it.
 
-    `typical`: largest sum of squares per residual of most poses.
+    `typical`: no pose is tried again if most poses leave more than this per residual.
     """
     relaxation = Relaxation(problem, softness)
     left = _left(relaxation, values)
@@ -282,163 +276,3 @@ def _from_ends_and_lines(problem: Problem, values: Values, among: BoolArray) -> 
         nearest = [problem.measured[j].nearest(seen[j].curve) for j in problem.used]
         found.append(replace(moved, projections=nearest))
     return found
-
-
-# ---- along the measured lines --------------------------------------------------------------------
-
-_KINEMATIC_STEPS = 8
-# Evidence: eight poses with one photograph each, from two starts. Between 8 and 12 steps the
-# residual of 8 of the 16 fell by more than a tenth; between 12 and 20 steps that of 3.
-_STEPS_WITHOUT_DEPTH = 20
-# Number of results that are kept: a session asks for about twenty, of which many more than once.
-_KINEMATICS = 64
-
-
-def measured_shapes(
-    problem: Problem, roll: float = 0.0, turns: FloatArray | None = None
-) -> tuple[Shapes, list[FloatArray]]:
-    """Shapes of all poses: along the measured line if there is one, else a first guess.
-
-    Gauss-Newton on the kinematics alone, all poses at once: distances of the points, with a small
-    penalty on the second differences of the headings where no point determines them.
-
-    Parameters
-    ----------
-    roll : float [rad]
-        Roll of the cable in its end clamp, in space: it selects the smallest twist that reaches
-        the clamp.
-    turns : (m,), optional
-        Turns of twist to which each pose is nearest, see `HeldPose`; by default as poses name them.
-
-    Returns
-    -------
-    Shapes, list of (K_j,) [m]
-        Shapes without multipliers, and arc lengths of the fitted poses' points.
-    """
-    model, chain = problem.unknowns.model, problem.unknowns.model.chain
-    # Without forces the internal unknowns of an element are undetermined, and loads have no effect.
-    kept = tuple(x for x in model.effects if isinstance(x, Kinematics | MeasurementEffect))
-    bare = replace(model, effects=kept, priors={}).with_mesh(chain.n, chain.kind.plain)
-    p = dict(zip(model.names, problem.unknowns.fixed.tolist(), strict=True))
-    known = tuple(p[name] for name in bare.names), problem.measured, tuple(problem.used), roll
-    x, projections = _along(bare, *known, None if turns is None else tuple(turns.tolist()))
-    return problem.equilibria.start_shapes(x.copy()), [*projections]
-
-
-@lru_cache(maxsize=_KINEMATICS)
-def _along(
-    model: CableModel,
-    p: tuple[float, ...],
-    measured: tuple[MeasuredPose, ...],
-    used: tuple[int, ...],
-    roll: float,
-    turns: tuple[float, ...] | None,
-) -> tuple[FloatArray, list[FloatArray]]:
-    """Nodes (m, n_nodes, coordinates) of `measured_shapes`, and arc lengths of points."""
-    chain, flat = model.chain, np.zeros(model.chain.n_rests)
-    guesses = (first_guesses(model, model.nominal, flat, item.pose) for item in measured)
-    predicted = np.array([next(guess)[0] for guess in guesses])
-    along = predicted.copy()
-    for j in used:
-        item = measured[j].traced
-        pose = item.pose.rolled(roll)
-        pose = pose if turns is None else replace(pose, turns=turns[j])
-        along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
-    equilibria = BatchEquilibrium(model, [item.pose for item in measured])
-    fitted = [measured[j] for j in used]
-    shapes, projections, cost = _kinematics(equilibria, np.array(p), fitted, used, along, roll)
-    alone = [k for k, item in enumerate(fitted) if not item.has_line]
-    if alone:
-        # One photograph cannot distinguish a bend towards the camera from one away from it.
-        others, places, costs = _kinematics(equilibria, np.array(p), fitted, used, predicted, roll)
-        for k in alone:
-            if costs[k] < cost[k]:
-                shapes.x[used[k]], projections[k] = others.x[used[k]], places[k]
-    return shapes.x, projections
-
-
-def _kinematics(
-    equilibria: BatchEquilibrium,
-    p: FloatArray,
-    fitted: Sequence[MeasuredPose],
-    used: Sequence[int],
-    x: FloatArray,
-    roll: float,
-) -> tuple[Shapes, list[FloatArray], list[float]]:
-    """Shapes from nodes x on, arc lengths of points, and residual of each (used,) [m^2]."""
-    model, shapes = equilibria.model, equilibria.start_shapes(x)
-    lines = [item.traced if item.has_line else item for item in fitted]
-    each, flat = _each_node(equilibria), np.zeros(model.chain.n_rests)
-    projections = [item.places(model.chain.length) for item in lines]
-    cost = [np.inf for _ in used]
-    steps = _KINEMATIC_STEPS if all(x.has_line for x in lines) else _STEPS_WITHOUT_DEPTH
-    for iteration in range(steps + 1):
-        seen = equilibria.observe(shapes, p, flat, each)
-        for k, (j, item) in enumerate(zip(used, lines, strict=True)):
-            now, change = seen[j]
-            if iteration > 1:
-                projections[k] = item.located(now, projections[k])
-            elif not item.has_line:
-                projections[k] = item.nearest(now.curve)
-            if iteration == steps and item is not fitted[k]:
-                projections[k] = fitted[k].nearest(now.curve)
-                continue
-            rolled = replace(item, pose=item.pose.rolled(roll))
-            step, cost[k] = _kinematic_step(rolled, model, now, change, shapes.x[j], projections[k])
-            if iteration < steps:
-                shapes.x[j] = model.node.moved(shapes.x[j], step)
-    return shapes, projections, cost
-
-
-def _each_node(equilibria: BatchEquilibrium) -> Tangents:
-    """Directions: each increment of each node."""
-    a, m = equilibria.assembly, equilibria.m
-    q = a.n * a.b
-    x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
-    model = equilibria.model
-    counts = (a.k, len(model.parameters), model.chain.n_rests, len(model.deviation_names))
-    lam, p, rest, deviation = (np.zeros((m, count, q)) for count in counts)
-    return Tangents(x, lam, p, rest, deviation)
-
-
-def _kinematic_step(
-    item: MeasuredPose,
-    model: CableModel,
-    now: Observed,
-    change: ObservedChange,
-    x: FloatArray,
-    s: FloatArray,
-) -> tuple[FloatArray, float]:
-    """Increments (n_nodes, b) towards the points, at most half a radian, and what is left [m^2]."""
-    chain, node = model.chain, model.node
-    n, b, d = len(x), node.increment, node.dimension
-    curve, slopes = now.curve, change.curve
-    bends = node.difference(x[:-1], x[1:])
-    # Weight of 3 mm noise per point against bends that vary by 0.3 turns per length between cells.
-    weight = 0.003 / (0.3 * model.cable.curvature_scale * chain.h)
-    rough = weight * np.kron(np.diff(np.eye(n), n=2, axis=0), np.eye(b))
-    if item.has_line:
-        towards = [*curve.moved(s, slopes).transpose((1, 0, 2))]
-        gaps = [*(item.points - curve.at(s)).T]
-    else:  # a single photograph does not show depth
-        on = item.on_points
-        residual, moved = item.linearized(now, s, change)
-        towards, gaps = [-moved[on]], [residual[on]]
-    system: list[FloatArray] = [*towards, rough]
-    target: list[FloatArray] = [*gaps, -weight * np.diff(bends, axis=0).ravel()]
-    if item.pose.end is not None:
-        system.append(10 * slopes[-1, :d])
-        target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))
-    for held, index, frame in (
-        (model.start == "clamped", 0, item.pose.frames[0]),
-        (model.end == "clamped", n - 1, item.pose.frames[1]),
-    ):
-        if held:
-            rows = np.zeros((b, n * b))
-            rows[:, index * b : (index + 1) * b] = 0.01 * np.eye(b)
-            system.append(rows)
-            target.append(0.01 * node.difference(x[index], frame))
-    stacked, left = np.concatenate(system), np.concatenate(target)
-    step = np.linalg.solve(stacked.T @ stacked, stacked.T @ left)
-    step *= min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
-    return step.reshape((n, b)), float(left @ left)

@@ -45,7 +45,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     the prediction there, or on that on which the pose was measured.
     """
     used = [item for item in measured if item.readable and not item.held_out]
-    equilibria = BatchEquilibrium(model, [item.pose for item in used])
+    equilibria = BatchEquilibrium(model, [item.pose for item in used], wrenches=False)
     rest = np.zeros(model.chain.n_rests)
     n_points = sum(len(item.traced.points) for item in used)
 

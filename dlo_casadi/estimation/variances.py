@@ -208,7 +208,7 @@ def _beyond_tolerances(fit: Fit) -> bool:
 def _scatters_of(
     fit: Fit, noise: NoiseModel, scatters: Sequence[PoseScatter]
 ) -> list[ScatterEstimate]:
-    """Estimate the size of each of several random quantities of a repeat as if it were alone."""
+    """Size of each random quantity of a repeat, estimated as the only one."""
     problem, point, lin = fit.problem, fit.point, fit.linearization
     size, std = problem.unknowns.size, problem.deviation_std
     kept = range(0, len(problem.used), -(-len(problem.used) // MOST_POSES))

@@ -99,6 +99,7 @@ def effect_of(source: str, model: CableModel) -> Effect | None:
 
 
 def _label(source: str) -> str:
+    """Label of a random effect in a model, which may also have that effect as one of all poses."""
     return f"{source}_from_pose_to_pose"
 
 

@@ -106,16 +106,17 @@ class Mapped:
 
     It reads and writes NumPy's memory, because conversion to CasADi's matrices takes several times
     as long as the evaluation. Once it has been evaluated often, large calls are `vectorised`, and
-    small ones are `simplified`: they give the same numbers, bit for bit, up to eight times as fast.
+    small ones `simplified`: they give the same numbers, bit for bit, up to eight times as fast.
+    Large calls of simplified functions would be a fifth faster still, but these take long to find.
     """
 
     def __init__(self, function: ca.Function) -> None:
-        self._function, self._evaluated = function, 0
+        self._function, self._evaluated, self._simplified = function, 0, False
         self._shapes = [
             (function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
         ]
-        # Any, here and below: CasADi's stubs do not allow NumPy memory.
-        self._buffers: dict[tuple[bool, int], tuple[Any, Any]] = {}
+        # By number of segments. Any, here and below: CasADi's stubs do not allow NumPy memory.
+        self._buffers: dict[int, tuple[Any, Any]] = {}
         self._vectorised: tuple[Any, Any] | None = None
 
     def __call__(self, *arguments: FloatArray) -> list[FloatArray]:
@@ -126,7 +127,10 @@ class Mapped:
         self._evaluated += number
         large = number >= FEWEST and number * self._function.n_instructions() > WORTH
         often = self._evaluated > PAID and self._inlined
-        outputs = self._in_blocks(given) if often and large else self._one_by_one(given, often)
+        if often and not large and not self._simplified:
+            self._function, self._buffers = simplified(self._function), {}
+            self._simplified = True
+        outputs = self._in_blocks(given) if often and large else self._one_by_one(given)
         shaped = zip(outputs, self._shapes, strict=True)
         return [out.reshape(m, count, *shape).transpose(0, 1, 3, 2) for out, shape in shaped]
 
@@ -136,22 +140,16 @@ class Mapped:
         count = self._function.n_instructions()
         return ca.OP_CALL not in map(self._function.instruction_id, range(count))
 
-    @cached_property
-    def _simplified(self) -> ca.Function:
-        return simplified(self._function)
-
-    def _one_by_one(self, arguments: Sequence[FloatArray], often: bool) -> list[FloatArray]:
+    def _one_by_one(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
         """Arguments (segments, rows) -> outputs (segments, size)."""
         number = len(arguments[0])
         outputs: list[FloatArray] = [np.empty((number, a * b)) for a, b in self._shapes]
         if not number:
             return outputs
-        key = (often, number)
-        if key not in self._buffers:
-            function = self._simplified if often else self._function
-            self._buffers[key] = function.map(number).buffer()
+        if number not in self._buffers:
+            self._buffers[number] = self._function.map(number).buffer()
         given = [np.ascontiguousarray(x, dtype=float) for x in arguments]
-        _run(self._buffers[key], given, outputs)
+        _run(self._buffers[number], given, outputs)
         return outputs
 
     def _in_blocks(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
@@ -180,7 +178,7 @@ def _run(function: tuple[Any, Any], arguments: Sequence[Any], outputs: Sequence[
 
 
 def simplified(function: ca.Function) -> ca.Function:
-    """The same function without common subexpressions: a fifth of the instructions fewer."""
+    """The same function, each common subexpression computed once: a fifth fewer instructions."""
     arguments = [ca.SX.sym("x", *function.size_in(i)) for i in range(function.n_in())]
     return ca.Function(function.name(), arguments, ca.cse(function.call(arguments)))
 

@@ -23,6 +23,7 @@ from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -263,3 +264,25 @@ def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, mon
     monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
     assert diagnose(fit).verdict == "effect_found"
     assert searched == ([False, True] if scatter else [False])
+
+
+def test_only_rivals_of_the_same_search_tell_which_refit_is_given_up(monkeypatch):
+    """An effect that a search among simpler ones excludes may stand for two of them."""
+    ceilings = []
+
+    def confirm(current, screened, ceiling):
+        ceilings.append(ceiling)
+
+    monkeypatch.setattr(module.refits, "confirm", confirm)
+    monkeypatch.setattr(module.refits, "loads_from_best", lambda *_: [])
+
+    def scored(name):
+        return SimpleNamespace(candidate=SimpleNamespace(name=name), score=100.0)
+
+    screened = [scored("known"), scored("new")]
+    search = SimpleNamespace(executor=InProcess(), significance=0.01)
+    fit = SimpleNamespace(point=SimpleNamespace(objective=300.0), scatters=False)
+    confirmed, p_values = SimpleNamespace(fit=fit), {"known": 0.0, "new": 0.0}
+    Search._leading(search, fit, screened, p_values, {"known": confirmed})
+    Search._leading(search, fit, screened[1:], p_values, {"excluded": confirmed})
+    assert ceilings == [600.0, np.inf]

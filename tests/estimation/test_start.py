@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_relaxation import HELD, NOISE, ROLL, problem_of
 
-from dlo_casadi.effects import BendingAnisotropy, CableData
+from dlo_casadi.effects import BendingAnisotropy, CableData, PointForce
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.continuation import relaxed
+from dlo_casadi.estimation.measured_shapes import _along, measured_shapes
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
@@ -17,7 +18,6 @@ from dlo_casadi.estimation.start import (
     _either_way,
     begin,
     fit_from,
-    measured_shapes,
     retry_outlying_poses,
 )
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -46,6 +46,20 @@ def test_twists_are_turned_the_way_that_fits():
     assert true[0] > 2.0
     assert before[0] < -2.0
     np.testing.assert_allclose(after, true + OFF, atol=0.2)
+
+
+def test_measured_shapes_are_computed_once_for_all_loads():
+    problem, _ = problem_of()
+    model = problem.unknowns.model.with_effect(PointForce())
+    unknowns = Unknowns(model, np.ones(len(model.names), dtype=bool), 2 * model.nominal)
+    alone, hits = measured_shapes(problem, ROLL), _along.cache_info().hits
+    loaded = measured_shapes(replace(problem, unknowns=unknowns), ROLL)
+    assert _along.cache_info().hits == hits + 1
+    np.testing.assert_array_equal(loaded[0].x, alone[0].x)
+    loaded[0].x[:], loaded[1][0][:] = np.nan, np.nan
+    again = measured_shapes(problem, ROLL)
+    np.testing.assert_array_equal(again[0].x, alone[0].x)
+    np.testing.assert_array_equal(again[1][0], alone[1][0])
 
 
 TRUE = {"bending_anisotropy.ratio": 1.9, "bending_anisotropy.angle": 0.3}
