@@ -112,7 +112,8 @@ def errors_figure(outcome: Outcome) -> Figure:
             np.mean([y for y, (own, *_) in zip(places, rows, strict=True) if own == k])
             for k in range(len(outcome.stages))
         ]
-        names = [textwrap.fill(words.label_of(stage, outcome), 18) for stage in outcome.stages]
+        labels = [words.label_of(stage, outcome) for stage in outcome.stages]
+        names = [textwrap.fill(label, 18, break_long_words=False) for label in labels]
         axes.set_yticks(middles, names)
         axes.set_ylim(min(places) - 0.7, 0.7)
         handles = [canvas.dot(kind, *_KINDS[kind]) for kind in shown]

@@ -43,8 +43,8 @@ MOST_REPEATS = 20
 
 
 def score_text(score: float) -> str:
-    """A candidate's score with two significant digits, or as an integer."""
-    return f"{score:,.0f}" if score >= 100 else f"{score:.2g}"
+    """A candidate's score with two significant digits, or as an integer; 0 below 0.01."""
+    return f"{score:,.0f}" if score >= 100 or score < 0.01 else f"{score:.2g}"
 
 
 def missing(pose: PoseInput) -> str:

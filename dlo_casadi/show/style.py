@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.io.files import write_file
@@ -46,7 +47,9 @@ def styled(
 ) -> Iterator[Figure]:
     """Open a figure of a size [inch], to be drawn in the style of all figures."""
     with mpl.rc_context(STYLE):
-        drawing = Figure(figsize=size, layout=layout)
+        # Text is a little wider at other resolutions than that of the layout.
+        engine = ConstrainedLayoutEngine(w_pad=0.08) if layout else None
+        drawing = Figure(figsize=size, layout=engine)
         FigureCanvasAgg(drawing)
         yield drawing
 
