@@ -46,7 +46,7 @@ REACHED = 1.5
 # four sessions in space the hidden pair left 1.01, 1.10, 1.14 and 1.54, other pairs 1.5 and more.
 SURELY_REACHED = 1.2
 # Sum of squares per residual that most poses leave, above which no pose is tried again: not a pose,
-# but the candidate is wrong. In a session in space seven of eleven such starts gained by a second
+# but the candidate is wrong. In a session in space seven of thirteen such starts gained by a second
 # trial of outlying poses, but none came below 20 times the noise, and it took half of the time.
 WRONG = 10.0
 # Number of candidates that get a second one at a time, and number of second ones. In a

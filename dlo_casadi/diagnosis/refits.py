@@ -56,8 +56,8 @@ PROMISED = 0.5
 # Starts whose objectives differ by less count as one minimum: smaller shares would start nearer to
 # the base still. Without this limit the reports of eighteen sessions were the same.
 ONE_PLACE = 1.0
-# A refit beside a known one is given up if its minimum is predicted higher by this, ten times the
-# log likelihood by which a rival may fall short, and by the known objective itself.
+# A refit is given up if its minimum is predicted above that of a known one by more than this (ten
+# times the log likelihood by which a rival may fall short) and by more than the known minimum.
 GIVEN_UP = 10 * EVIDENCE_APART
 # Maximum number of Gauss-Newton steps of a refit, and of one that starts from scattered forces.
 MOST_STEPS, STEPS_FROM_FORCES = 25, 60

@@ -388,8 +388,7 @@ class BatchEquilibrium:
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
         """Predicted measurements of each pose."""
         given, length = self.given(shapes, p, rest), self.model.cable.length
-        felt: FloatArray = np.zeros((self.m, 0))
-        felt = self.assembly.readings(shapes, given) if self.wrenches else felt
+        felt = self.assembly.readings(shapes, given) if self.wrenches else np.zeros((self.m, 0))
         both = zip(self.assembly.curve(shapes, given), felt, strict=True)
         return [Observed(NodeCurve.of(length, z), readings) for z, readings in both]
 

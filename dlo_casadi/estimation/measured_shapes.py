@@ -53,6 +53,7 @@ def measured_shapes(
     kept = tuple(effect for effect in model.effects if isinstance(effect, moving))
     bare = replace(model, effects=kept, priors={}).with_mesh(chain.n, chain.kind.plain)
     p = dict(zip(model.names, problem.unknowns.fixed.tolist(), strict=True))
+    # These change nothing here: with the same values for all fits, results are found again.
     p |= dict.fromkeys(p.keys() & {*STIFFNESSES, END_ROLL}, 1.0)
     x, projections = _along(
         bare,

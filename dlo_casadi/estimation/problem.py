@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -218,8 +218,8 @@ class Problem:
         return self._equilibria_of(self.unknowns.model)
 
     def _equilibria_of(self, model: CableModel) -> BatchEquilibrium:
-        poses, wrenches = zip(*((x.pose, bool(x.reactions)) for x in self.measured), strict=True)
-        return BatchEquilibrium(model, poses, wrenches=any(wrenches))
+        wrenches = any(item.reactions for item in self.measured)
+        return BatchEquilibrium(model, [item.pose for item in self.measured], wrenches=wrenches)
 
     @cached_property
     def _prior(self) -> tuple[FloatArray, FloatArray]:
@@ -289,9 +289,10 @@ class Problem:
         """
         if not scatters:
             return []
-        shapes, p, rest = self.state(values)
-        model = reduce(lambda model, one: one.within(model), scatters, self.unknowns.model)
-        larger, p = self._equilibria_of(model), np.pad(p, (0, len(model.names) - len(p)))
+        (shapes, p, rest), model = self.state(values), self.unknowns.model
+        for scatter in scatters:
+            p, model = scatter.values(p, model), scatter.within(model)
+        larger = self._equilibria_of(model)
         ways = [scatter.ways(model) for scatter in scatters]
         by_p, by_rest = (np.concatenate(parts, axis=1) for parts in zip(*ways, strict=True))
         along = larger.by_rest(shapes, p, rest, by_rest, by_p)
