@@ -217,6 +217,14 @@ class Pose(ConfigSection):
         return {well_formed(path.stem): path for path in self.paths}
 
     @property
+    def labelled(self) -> dict[str, Path]:
+        """Its files by names that other poses' files do not have: they begin with the pose's."""
+        return {
+            name if name.startswith(self.name) else f"{self.name}_{name}": path
+            for name, path in self.photographs.items()
+        }
+
+    @property
     def readings(self) -> dict[str, tuple[float, ...]]:
         """Forces and moments that were measured, by names of `ends.reaction_rows`."""
         found = {name: getattr(self, name) for name in REACTIONS}

@@ -10,7 +10,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
@@ -165,10 +164,8 @@ def symmetric_interval(estimate: Estimate) -> str:
 def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = ()) -> str:
     """The text of failed.html: configuration, error, and the poses that were read."""
     known = {pose.name: pose for pose in poses}
-    nothing = np.zeros((0, len(config.experiment.gravity)))
     shown = [
-        known.get(pose.name, PoseInput(pose.name, pose.role, nothing))
-        for pose in config.experiment.poses
+        known.get(pose.name, PoseInput.unread(config, pose)) for pose in config.experiment.poses
     ]
     heading, _, rest = error.message.partition("\n")
     return _render(

@@ -251,7 +251,7 @@ def _board(config: Config, scene: Scene, lines: Sequence[FloatArray]) -> Backgro
 def _photographed(declared: Pose, pose: PoseInput, board: Background, budget: int) -> Background:
     """The photograph of a pose, if it was located and can be read; else the board."""
     located = pose.to_pixels is not None or not len(pose.points)
-    photograph = photograph_of(declared.paths[0], budget) if located else None
+    photograph = photograph_of(declared.paths[0], budget) if located and declared.paths else None
     if photograph is None:
         return board
     uri, width, height = photograph

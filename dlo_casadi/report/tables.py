@@ -278,13 +278,16 @@ def summary_text(outcome: Outcome) -> str:
     ]
     warnings = [*outcome.doubts, *words.all_warnings(outcome)]
     verdict, *more = words.verdict_lines(outcome)
+    doubt = ""
+    if outcome.stages[-1].explains is False:
+        doubt = " of a model that does not fit: the standard deviations hold within it only"
     lines = [
         f"{outcome.config.cable.name}: {verdict}",
         *more,
         f"  {poses} ({measurement.poses_held_out} held out), "
         f"{counted(measurement.points, 'point')}",
         *("  " + "  ".join(filter(None, row)) for row in error_rows(outcome)),
-        "Parameters",
+        f"Parameters{doubt}",
         *(f"  {name:{width}}  {found}" for name, found in shown.items()),
     ]
     if pairs:

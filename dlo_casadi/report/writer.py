@@ -77,7 +77,7 @@ class ResultsFolder(FolderDraft):
                 with FolderDraft(self.path) as draft:
                     write_file(draft.folder / FAILURE, page)
                     draft.put_in_place()
-            except OutputError:
+            except Exception:
                 return  # the user must see the original error
             error.add_note(f"Pose by pose: {self.path / FAILURE}")
 

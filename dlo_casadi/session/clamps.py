@@ -185,7 +185,7 @@ def _ways(
 ) -> Sequence[FloatArray]:
     """Directions (d,) that a line may have at its clamp, from start to end.
 
-    None where the line begins too far from the fixture, or where its first piece (between
+    Empty where the line begins too far from the fixture, or where its first piece (between
     sparse points) ends farther than `reach` [m] from it. Markers begin at the fixture, whose place
     is inexact, so that the second piece is used as well.
     """

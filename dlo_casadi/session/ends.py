@@ -69,10 +69,11 @@ def wrong_units(session: ReadSession) -> tuple[Suspicion, ...]:
     if apart.sum() > 1 and whole:
         spans = declared[apart] / np.maximum(measured[apart], 1e-12)
         for (unit, size), sign in product(UNITS.items(), (-1, 1)):
+            wrong = "start and end of all poses" if sign > 0 else "points and cable.length"
             ends = (
                 f"the ends of the lines are {np.median(measured[apart]):.4g} m apart (median), "
                 f"start and end of their poses {np.median(declared[apart]):.4g} m: the factor of "
-                f"{unit}. Try: start and end of all poses in metres."
+                f"{unit}. Try: {wrong} in metres."
             )
             meant.append(Hypothesis(ends, spans * size**sign))
 
@@ -230,7 +231,11 @@ def out_of_step(session: ReadSession) -> tuple[Suspicion, ...]:
     ]
     more = f", and {len(pairs) - 4} more" if len(pairs) > 4 else ""
     step = set((best - order)[wrong].tolist())
-    shift = f" (all of them {abs(step.pop())} further in the list)" if len(step) == 1 else ""
+    shift = ""
+    if len(step) == 1:
+        places = step.pop()
+        way = "further" if places > 0 else "earlier"
+        shift = f" (all of them {abs(places)} {way} in the list)"
     text = (
         f"{len(pairs)} of {len(own)} files belong to other entries of the list of poses{shift}: "
         f"{'; '.join(pairs[:4])}{more}. Try: put file names and end positions in step."

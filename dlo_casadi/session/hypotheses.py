@@ -41,7 +41,7 @@ _SPARSE = 60
 class Suspicion(NamedTuple):
     """A likely mistake and what to do about it.
 
-    It is certain where nothing else explains the whole session; for a single pose, `name` is set.
+    `certain`: nothing else explains the whole session. `pose`: its name, if it concerns only one.
     """
 
     message: str

@@ -63,7 +63,7 @@ def _read(config: Config, pose: Pose) -> PoseInput:
         return _reader(config, pose)(config, pose)
     except MeasurementError as error:
         said = error.message.removeprefix(f"{pose.name}: ")  # a photograph may have the pose's name
-        return PoseInput(pose.name, pose.role, np.zeros((0, 2)), problem=said)
+        return PoseInput.unread(config, pose, said)
 
 
 def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[MeasuredPose, ...]:
@@ -210,8 +210,8 @@ def _held(config: Config, pose: Pose) -> vision.KnownCable:
 def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
     """Pictures (h, w, 3) of each step of the camera, up to the step that failed.
 
-    Keys: name of the photograph and of the step. Raises VisionError if none of its photographs can
-    be read.
+    Keys: name of the photograph, see `Pose.labelled`, and of the step. Raises VisionError if none
+    of its photographs can be read.
     """
     reader = _reader(config, pose)
     if reader in (_read_csv, _read_points):
@@ -219,7 +219,7 @@ def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
     cable = _held(config, pose)
     drawn: dict[str, np.ndarray] = {}
     unread = None
-    for name, path in pose.photographs.items():
+    for name, path in pose.labelled.items():
         try:
             image = vision.read_image(path)
         except MeasurementError as error:
@@ -356,7 +356,7 @@ def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration
     paths = {
         name: path
         for pose in config.experiment.poses
-        for name, path in pose.photographs.items()
+        for name, path in pose.labelled.items()
         if path.suffix.lower() != ".csv"
     }
     images = {}

@@ -1,5 +1,7 @@
 """What a session of measurements has found: plain results, computed elsewhere."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,7 +13,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck
-from dlo_casadi.config import Config
+from dlo_casadi.config import Config, Pose
 from dlo_casadi.diagnosis.next_measurement import NextPose
 from dlo_casadi.diagnosis.selection import Diagnosis, HiddenWeight, Ranked, Verdict
 from dlo_casadi.diagnosis.structure import Structure
@@ -176,6 +178,12 @@ class PoseInput:
     means: MeasuredPoints | None = None
     views: tuple[ViewInput, ...] = ()
 
+    @classmethod
+    def unread(cls, config: Config, pose: Pose | PoseInput, problem: str = "") -> PoseInput:
+        """A pose of which nothing is known but why it could not be read."""
+        nothing = np.zeros((0, len(config.experiment.gravity)))
+        return cls(pose.name, pose.role, nothing, problem=problem)
+
     @property
     def readable(self) -> bool:
         """Whether there is anything to compare with."""
@@ -258,7 +266,7 @@ class FoundEffect:
     ----------
     name : str
     parameters : dict of Estimate
-    p_value : float
+    p_value : float or None
         See `AddedEffect`.
     rmse_cross_validated_before, rmse_cross_validated_after : float or None [m]
         Without and with the effect; None where a left-out pose is not predicted.

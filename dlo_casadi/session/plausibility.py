@@ -88,12 +88,14 @@ def without_implausible(
     if not config.estimation.plausibility:
         return tuple(inputs), [item.message for item in found]
     bad = {item.pose: item.message for item in found if item.pose}
+    # Poses that could not be read may contradict the configuration, too.
+    judged = bad.keys() | {item.name for item in inputs if len(item.points)}
     read = [item for item in inputs if len(item.points)]
     fit_left = [item for item in read if item.role == "fit" and item.name not in bad]
     refused = [item.message for item in found if item.certain]
-    if not refused and bad and (2 * len(bad) > len(read) or not fit_left):
+    if not refused and bad and (2 * len(bad) > len(judged) or not fit_left):
         refused = [
-            f"the configuration is contradicted by {len(bad)} of {counted(len(read), 'pose')}:",
+            f"the configuration is contradicted by {len(bad)} of {counted(len(judged), 'pose')}:",
             *(f"  {message}" for message in bad.values()),
         ]
     if refused:
@@ -102,7 +104,7 @@ def without_implausible(
     for k, item in enumerate(inputs):
         if item.name in bad:
             reason = bad[item.name].removeprefix(item.name).lstrip(": ")
-            kept[k] = PoseInput(item.name, item.role, np.zeros((0, 2)), problem=reason)
+            kept[k] = PoseInput.unread(config, item, reason)
     return tuple(kept), [item.message for item in found if not item.pose]
 
 

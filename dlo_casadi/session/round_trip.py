@@ -51,7 +51,7 @@ class Relaxation:
         did not come to rest, see `problem`.
     to_measured : Distance or None
         From the measured points, compared as in a fit.
-    force, predicted_force : (3,) [N]
+    force, predicted_force : (d,) [N]
         Force of the cable on its end fixture, in the simulator and in our prediction.
     measured_force : (d,) [N] or None
     points, predicted, measured : (K, d) [m]
@@ -78,7 +78,8 @@ class Relaxation:
 def session_of(cable: FittedCable, given: Path | None) -> Config:
     """The session that a cable was fitted to: as given, or found by name near its results and here.
 
-    Raises ConfigError if it cannot be found, or if it is a different session.
+    A session found by name must be the one that was fitted; a given one is taken as it is. Raises
+    ConfigError if it cannot be found.
     """
     name, source = f"{cable.metadata.config}.yaml", cable.metadata.path
     places = [Path(), Path("configs"), *([] if source is None else source.resolve().parents[1:4])]
@@ -104,7 +105,7 @@ def round_trip(
     """Relax a cable in every held-out pose, or in every pose if none was held out.
 
     `poses` limits their number; fitted poses make up for too few held-out ones.
-    Raises DloError if the target is not installed.
+    Raises DloError if the target is not installed, EquilibriumError if no pose can be predicted.
     """
     require(target)
     config, inputs = read_session(config)
@@ -114,6 +115,11 @@ def round_trip(
     order = sorted(range(len(measured)), key=lambda j: not measured[j].held_out)
     held_out = sum(item.held_out for item in measured) or len(measured)
     chosen = [j for j in order if predictions[j] is not None][: poses or held_out]
+    if not chosen:
+        raise EquilibriumError(
+            f"none of {config.name}'s {len(measured)} poses can be predicted with {cable.name!r}."
+            "\n  Try: --check SESSION.yaml, with the session that the cable was fitted to"
+        )
     model = cable.model
     guess = (model.cable.bending_stiffness, model.cable.torsional_stiffness)
     for count, j in enumerate(chosen):
@@ -162,11 +168,10 @@ def _relaxed(
     inside = (rod.s >= 0) & (rod.s <= length)
     gap = np.linalg.norm(points - ours, axis=1)
     out_of_plane = np.abs(at_rest.nodes[inside, d:]).max(initial=0.0)
-    told = measured.has_line or measured.readable
     return replace(
         nothing,
         to_prediction=Distance.of(np.hypot(gap, out_of_plane), length),
-        to_measured=Distance.of(measured.distances(curve), length) if told else None,
+        to_measured=Distance.of(measured.distances(curve), length) if measured.readable else None,
         force=at_rest.end_force[:d],
         points=points,
     )

@@ -128,6 +128,7 @@ def fit_session(
         measured, n, refined = fitting.reweighted(fit), fit.model.n, fit.model.n
     compared = begin(executor, fitting.simpler_fits, config.estimation, declared.model, measured, n)
     fit, error = fitting.fit_declared(config, declared, measured, refined)
+    meshed = fit  # whose mesh error is known
     confirming = begin(executor, fitting.minimum_by_ipopt, fit)
     step("fit the declared model", 1, 1)
 
@@ -154,6 +155,7 @@ def fit_session(
             fit, error = near, mesh_error(near)
             if not config.model.n:
                 fit, error = fine_enough(near, near.model.n)
+            meshed = fit
         fit = as_measured(fit)
     own = own if fit is best else staged(fit)
     nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged, diagnosed=diagnosed)
@@ -165,8 +167,9 @@ def fit_session(
         fit, error, found = close_the_loop(
             config, fit, nearest, stages, measured, reported, center, clock, step, executor
         )
-    elif nearest is not fit:
-        fit, error = nearest, mesh_error(nearest)
+    else:
+        fit = nearest
+        error = error if fit is meshed else mesh_error(fit)
     return judged(
         Outcome(
             config=config,
@@ -265,6 +268,7 @@ def close_the_loop(
         error = mesh_error(fit)
     else:
         fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
+    meshed = fit  # whose mesh error is known
     confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
     next_pose = separating_pose(diagnosis.after, diagnosis.added)
     if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
@@ -285,6 +289,7 @@ def close_the_loop(
             own = fit_stage("closed", best, measured, profile_intervals(best), names)
         fit = best
         stages.append(own)
+    error = error if fit is meshed else mesh_error(fit)
     diagnosis = replace(diagnosis, after=fit)
     validated = diagnosis.validation_after
     told = validated.complete and not diagnosis.added

@@ -17,11 +17,12 @@ def vector(components: Iterable[float], form: str, unit: str) -> str:
 
 def plus_minus(value: float, std: float) -> str:
     """A value rounded to two significant digits of its standard deviation."""
-    if not std > 0:
+    if not 0 < std < math.inf:
         return f"{value:.4g}"
     decimals = 1 - math.floor(math.log10(std))
     if std >= 10 * abs(value) or not 0 <= decimals <= 7:
-        return f"{value:.2g} ± {std:.2g}"
+        digits = decimals + 1 + math.floor(math.log10(abs(value))) if value else 1
+        return f"{value:.{max(digits, 1)}g} ± {std:.2g}"
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 

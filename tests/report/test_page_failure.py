@@ -12,6 +12,7 @@ from dlo_casadi.report import writer
 from dlo_casadi.report.page import GENERATOR, failure_page, hints
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import run_session
+from dlo_casadi.session.outcome import PoseInput
 
 
 @pytest.fixture
@@ -52,6 +53,23 @@ def test_a_run_in_space_that_fails_before_the_poses_are_read_has_its_page(in_roo
 
     assert "The run failed before the poses were read." in page
     assert page.count('<li class="pose"') == 3
+
+
+def test_a_lost_pose_in_space_is_listed(in_room):
+    lost = PoseInput.unread(in_room.config, in_room.poses[0], "no such file")
+    page = failure_page(in_room.config, DloError("wrong"), (lost, *in_room.poses[1:]))
+
+    assert "<strong>Not read.</strong> no such file" in page
+    assert page.count('<li class="pose"') == 3
+
+
+def test_a_pose_given_as_points_needs_no_photograph(photographed):
+    config, poses = photographed.config, photographed.config.experiment.poses
+    points = poses[0].model_copy(update={"file": None, "points": ((0.0, 0.0), (0.1, 0.0))})
+    experiment = config.experiment.model_copy(update={"poses": (points, *poses[1:])})
+    page = failure_page(config.model_copy(update={"experiment": experiment}), DloError("too early"))
+
+    assert page.count("data:image/jpeg;base64,") == 4
 
 
 def test_centre_lines_are_drawn_with_their_declared_fixtures(outcome):

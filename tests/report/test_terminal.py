@@ -211,6 +211,10 @@ def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcom
         (1234.5, 56.0, "1234 ± 56"),
         (1e-9, 2e-10, "1e-09 ± 2e-10"),
         (5.0, 1e5, "5 ± 1e+05"),
+        (2.314e-5, 2.3e-7, "2.314e-05 ± 2.3e-07"),
+        (123456.0, 2000.0, "1.235e+05 ± 2e+03"),
+        (0.0, 3e-12, "0 ± 3e-12"),
+        (0.25, np.inf, "0.25"),
     ],
 )
 def test_digits_follow_the_standard_deviation(value, std, text):
