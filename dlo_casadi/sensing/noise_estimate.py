@@ -329,7 +329,8 @@ def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float
     # Points at the fixtures, where sines vanish, determine no mode.
     count = min(SLOW_MODES, max(1, len(sample.places) - 3))
     modes = smooth_modes(sample.places, cable_length, count, free_end=False)
-    seen = noise.whitening(sample.places, sample.weight, sample.correlation_length) @ modes
+    at = (sample.places, sample.weight, sample.correlation_length, sample.count)
+    seen = noise.whitening(*at) @ modes
     return -float(np.linalg.slogdet(seen.T @ seen)[1]) / count
 
 
