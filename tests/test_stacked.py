@@ -1,5 +1,7 @@
 """Functions of segments over many poses: vectorised ones give the same numbers, bit for bit."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import casadi as ca
@@ -79,3 +81,20 @@ def test_a_function_that_calls_another_stays_scalar(monkeypatch):
     (given,) = arguments(mapped._function, 3, 10)
     (found,) = mapped(given)
     np.testing.assert_allclose(found[..., 0, 0], 2 * (given**2).sum(axis=2))
+
+
+def test_threads_take_turns():
+    """A function is shared by all threads of a process, and so are its buffers."""
+    x = ca.SX.sym("x", 3)
+    mapped = Mapped(ca.Function("segment", [x], [ca.sin(x), ca.sumsqr(x)]))
+    given = [np.random.default_rng(k).uniform(size=(1, 40, 3)) for k in range(200)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(mapped, given))
+    finally:
+        sys.setswitchinterval(interval)
+    for one, (sines, squares) in zip(given, found, strict=True):
+        np.testing.assert_allclose(sines[..., 0], np.sin(one), rtol=1e-14)
+        np.testing.assert_allclose(squares[..., 0, 0], (one**2).sum(axis=2), rtol=1e-14)

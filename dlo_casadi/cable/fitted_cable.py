@@ -404,7 +404,7 @@ class Shape:
             "end": None if pose.end is None else list(pose.end),
             **pose.directions,
             "branch": pose.branch,
-            "status": self.equilibrium.status.name.lower(),
+            "status": "stable" if self.equilibrium.stable else "unstable",
             "stable": self.stable,
             "energy": self.energy,
             "force_on_start": self.start_force.tolist(),

@@ -269,8 +269,10 @@ class Resolved:
 
     def sizes(self, mesh: CableModel, shape: Equilibrium, quantity: str) -> FloatArray:
         """Sizes (K,) of a quantity on a mesh, see `sizes_of`."""
-        given = Inputs.of(self.cable.p, self.rest_on(mesh), self.pose.vector[None])
-        return sizes_of(mesh, shape.shapes, given, _size(quantity))[0]
+        return sizes_of(mesh, shape.shapes, self._given(mesh), _size(quantity))[0]
+
+    def _given(self, mesh: CableModel) -> Inputs:
+        return Inputs.of(self.cable.p, self.rest_on(mesh), self.pose.vector[None])
 
     def uses(self, limits: Limits) -> tuple[LimitUse, ...]:
         """Use of each limit by the shape, in their order."""
@@ -278,7 +280,7 @@ class Resolved:
         for quantity, limit in limits.given.items():
             mesh, shape = self.on(quantity)
             here = self.sizes(mesh, shape, quantity)
-            places, holders = places_of(mesh, self.pose, shape, _size(quantity))
+            places, holders = places_of(mesh, self.pose, shape, self._given(mesh), _size(quantity))
             tight = int(here.argmax())
             value, used = here[tight], here / bounds[_size(quantity)]
             if quantity == "bend_radius":

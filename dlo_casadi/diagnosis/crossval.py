@@ -19,10 +19,8 @@ Vehtari, Gelman and Gabry, Practical Bayesian model evaluation, Statistics and C
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from scipy.special import stdtr
@@ -35,8 +33,6 @@ from dlo_casadi.estimation.fit import explains
 from dlo_casadi.estimation.problem import NO_INFORMATION, Values
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.runtime.executors import InProcess
-from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Number of stretches into which the arc of a single pose is cut.
@@ -56,10 +52,8 @@ class CrossValidation:
         converted by `NoiseModel.units`; infinite if it could not be predicted.
     counts : (folds,)
         Number of points and of wrench components of each fold.
-    complete : bool
-        Whether every fold could be predicted.
     of_points : float [m]
-        Root mean square distance over all points; if not given, that of everything.
+        Root mean square distance over all points of the folds that could be predicted.
     expected : float [m]
         Expected error of everything, to first order: from noise, fixtures, the cable's scatter and
         the parameters' uncertainty given the other folds. Not given for stretches of a single pose.
@@ -71,16 +65,18 @@ class CrossValidation:
 
     squares: FloatArray
     counts: FloatArray
-    complete: bool
-    of_points: float | None = None
+    of_points: float
     expected: float = 0.0
     densities: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
+    def complete(self) -> bool:
+        """Whether every fold could be predicted."""
+        return bool(np.isfinite(self.squares).all())
+
+    @property
     def error(self) -> float:
-        """Root mean square error of everything [m]."""
-        if not self.complete:
-            return float("inf")
+        """Root mean square error of everything [m]; infinite if a fold could not be predicted."""
         return float(np.sqrt(self.squares.sum() / self.counts.sum()))
 
     @property
@@ -96,8 +92,8 @@ class CrossValidation:
 
     @property
     def rmse(self) -> float:
-        """Root mean square distance over all points [m]."""
-        return self.error if self.of_points is None or not self.complete else self.of_points
+        """Root mean square distance over all points [m]; infinite as `error` is."""
+        return self.of_points if self.complete else float("inf")
 
     @property
     def log_density(self) -> float:
@@ -121,11 +117,10 @@ class CrossValidation:
         return float(stdtr(len(gap) - 1, -t))
 
 
-def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidation:
+def cross_validate(fit: Fit) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
-    All folds are solved together, in some 6 ms each; if a state is carried, each is a task of its
-    own. So is each fit without a pose. Tasks run in this process unless an executor is given.
+    All folds are solved together, in some 6 ms each, unless a state is carried.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
@@ -140,8 +135,7 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
         theta, covariance = _without(fit, total.hessian - h_j, total.gradient - g_j)
         thetas.append(theta)
         covariances.append(covariance)
-    run = executor or InProcess()
-    predicted = _predicted(fit, dict(enumerate(thetas)), run)
+    predicted = _predicted(fit, dict(enumerate(thetas)))
     linear = [
         _density(fit, k, _first_order(fit, k, theta), covariances[k])
         for k, theta in enumerate(thetas)
@@ -152,8 +146,8 @@ def cross_validate(fit: Fit, executor: Executor | None = None) -> CrossValidatio
         # Such a fit misses most poses, and fits without each of them would take minutes.
         densities = [linear[k] if k in missed else x for k, x in enumerate(densities)]
         missed = []
-    refitted = zip(missed, map_in_order(run, partial(_fitted_without, fit), missed), strict=True)
-    for k, seen in _predicted(fit, {k: x for k, x in refitted if x is not None}, run).items():
+    refitted = {k: theta for k in missed if (theta := _fitted_without(fit, k)) is not None}
+    for k, seen in _predicted(fit, refitted).items():
         predicted[k], densities[k] = seen, _density_of(fit, k, seen, covariances[k])
     densities = [x if np.isfinite(x) else known for x, known in zip(densities, linear, strict=True)]
     items = [problem.measured[j] for j in problem.used]
@@ -223,13 +217,12 @@ def _log_density(white: FloatArray, ways: FloatArray) -> float:
 def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> CrossValidation:
     """Validation from each fold's errors [m] of points and wrenches; None if not predicted."""
     known = [fold for fold in errors if fold is not None]
-    complete = len(known) == len(errors)
     both = [np.zeros(1) if fold is None else np.concatenate(fold) for fold in errors]
     squares = np.array([float((fold**2).sum()) for fold in both])
     squares[[fold is None for fold in errors]] = np.inf
     points = np.concatenate([fold[0] for fold in known]) if known else np.zeros(1)
     rmse = float(np.sqrt((points**2).mean()))
-    return CrossValidation(squares, np.array([float(len(fold)) for fold in both]), complete, rmse)
+    return CrossValidation(squares, np.array([float(len(fold)) for fold in both]), rmse)
 
 
 def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -242,16 +235,13 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[Float
     return np.clip(fit.point.theta - covariance @ gradient, lower, upper), covariance
 
 
-def _predicted(
-    fit: Fit, thetas: Mapping[int, FloatArray], executor: Executor
-) -> dict[int, Observed | None]:
+def _predicted(fit: Fit, thetas: Mapping[int, FloatArray]) -> dict[int, Observed | None]:
     """Predicted measurements of fitted poses at their own unknowns, from declared ends."""
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
     if not thetas:
         return {}
     if fit.model.has_state:
-        folds = map_in_order(executor, partial(_predict_all, fit), [*thetas.values()])
-        return {k: seen[problem.used[k]] for k, seen in zip(thetas, folds, strict=True)}
+        return {k: _predict_all(fit, theta)[problem.used[k]] for k, theta in thetas.items()}
     p = np.repeat(fit.p[None], equilibria.m, axis=0)
     rest = np.repeat(fit.rest[None], equilibria.m, axis=0)
     for k, theta in thetas.items():

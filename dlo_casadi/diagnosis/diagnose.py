@@ -14,8 +14,8 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
-from dlo_casadi.diagnosis.refits import Confirmed
-from dlo_casadi.diagnosis.screening import Screened, survival
+from dlo_casadi.diagnosis.refits import Confirmed, Tried
+from dlo_casadi.diagnosis.screening import Screened, p_values_of, sidak, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
     Diagnosis,
@@ -26,9 +26,7 @@ from dlo_casadi.diagnosis.selection import (
     closed_by,
     likelier_by,
     p_of_removal,
-    p_values_of,
     ranking,
-    sidak,
 )
 from dlo_casadi.diagnosis.structure import noise_degrees, screening_degrees, structure_of
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
@@ -121,20 +119,15 @@ class Search:
         return cross_validate(self.declared)
 
     @property
-    def error(self) -> float:
-        """Cross-validated error of the declared model [m]; 0 if the validation is incomplete."""
-        return self.validation.error if self.validation.complete else 0.0
-
-    @property
     def several(self) -> bool:
         """Whether an unknown force may have a cause: in one pose a force fits as well as any."""
         return len(self.declared.problem.used) > 1 and self.max_effects > 0
 
     @property
     def doubt(self) -> float | None:
-        """Probability that a gain must beat if only a pose or two were measured repeatedly."""
+        """Probability that a gain must beat if few poses were measured repeatedly."""
         problem = self.declared.problem
-        count = different_poses(problem.history, problem.unknowns.model.cable.length)
+        count = different_poses(problem.history, self.declared.model)
         return self.significance if count < min(DIFFERENT, len(problem.used)) else None
 
     @cached_property
@@ -198,7 +191,7 @@ class Search:
         """
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
-        # In such a fit a first effect absorbs what two explain; others then fit what it leaves.
+        # In such a fit the first effect may stand for two; the next ones then only fit its error.
         first = of_shapes.run() if may_be_far and not explains(self.declared) else None
         if first is not None and not first.unexplained:
             return first
@@ -230,20 +223,20 @@ class Search:
         while len(added) < self.max_effects:
             self.step("search for a missing effect", len(added), self.max_effects)
             first = force if not added else None
-            screened, p_values, tried, far = self._refitted(current, first, len(added))
-            chosen, lost = choose(tried, current, validation, self.doubt)
-            lost |= dict.fromkeys(far, NOT_NEAR)
+            tried = self._tried(current, first, len(added))
+            chosen, lost = choose(tried.refits, current, validation, self.doubt)
+            lost |= dict.fromkeys(tried.far, NOT_NEAR)
             closed, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen
-                closed, p_value = closed_by(winner, current, p_values, self._astray(current))
+                closed, p_value = closed_by(winner, current, tried.p_values, self._astray(current))
                 if p_value > self.significance:
                     names = [item.candidate.name for item in chosen]
                     lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
                     if closed is current:
                         lost |= dict.fromkeys((x.candidate.name for x in winner.each), RAN_AWAY)
             if not ranked:
-                rows = ranking(screened, p_values, tried, current, validation)
+                rows = ranking(tried, current, validation)
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
             if p_value > self.significance:
                 break
@@ -256,24 +249,21 @@ class Search:
         self.step("search for a missing effect", self.max_effects, self.max_effects)
         return self._ended(*self._pruned(current, added), tuple(ranked))
 
-    def _refitted(
-        self, current: Fit, force: UnknownForce | None, added: int
-    ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
-        """Screened candidates, p-values, refits of the likely ones, and names of those far off."""
+    def _tried(self, current: Fit, force: UnknownForce | None, added: int) -> Tried:
+        """Candidates screened and refitted beside those already added."""
         if self._astray(current) and force is None:
-            return self._from_data(current, added)
+            pairs = added + 2 <= self.max_effects
+            return refits.near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:
             known = self.refitted if current is self.declared else {}
-            return screened, p_values, self._leading(current, screened, p_values, known), []
-        tried = self._causes(force, screened)
-        for item in tried:
-            if item is not None:
-                dof = len(item.candidate.frees)
-                single = survival(item.gain, dof, noise_degrees(current))
-                p_values[item.candidate.name] = sidak(single, len(screened))
-        return screened, p_values, tried, []
+            return Tried(screened, p_values, self._leading(current, screened, p_values, known))
+        causes = self._causes(force, screened)
+        for item in causes:
+            single = survival(item.gain, len(item.candidate.frees), noise_degrees(current))
+            p_values[item.candidate.name] = sidak(single, len(screened))
+        return Tried(screened, p_values, causes)
 
     def _astray(self, current: Fit) -> bool:
         """Whether candidates start at the measured shapes because the fit is too far from them."""
@@ -292,7 +282,8 @@ class Search:
         free = {item.candidate.name: len(item.candidate.frees) for item in self.first}
         others = [name for name in scores if free[name] >= len(winner.frees)]
         best = max((scores[name] for name in scores.keys() - others), default=0.0)
-        if best < LARGER_OF_TWO * scores[winner.name]:
+        # An effect that only a larger model could screen has no score here.
+        if best < LARGER_OF_TWO * scores.get(winner.name, np.inf):
             return None
         return replace(self, exclude=[*self.exclude, *others], wider=self).run()
 
@@ -382,7 +373,7 @@ class Search:
         screened: Sequence[Screened],
         p_values: Mapping[str, float],
         known: dict[str, Confirmed | None],
-    ) -> list[Confirmed | None]:
+    ) -> list[Confirmed]:
         """Refits, beside `known` ones, of the significant candidates with the highest scores."""
         # A scatter from pose to pose may hide the effect: test the refit with what is left.
         significant = [
@@ -397,23 +388,10 @@ class Search:
         ceiling = min((refits.ceiling_beside(x.fit) for x in among if x), default=np.inf)
         found = map_in_order(self.executor, partial(refits.confirm, current, ceiling=ceiling), new)
         known.update(zip((item.candidate.name for item in new), found, strict=True))
-        tried = [known[item.candidate.name] for item in worthy]
+        tried = [x for item in worthy if (x := known[item.candidate.name]) is not None]
         return refits.loads_from_best(current, worthy, tried, self.executor)
 
-    def _from_data(
-        self, current: Fit, added: int
-    ) -> tuple[list[Screened], dict[str, float], list[Confirmed | None], list[str]]:
-        """As `_refitted`, but starting at the measured shapes."""
-        pairs = added + 2 <= self.max_effects
-        found = refits.near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
-        p_values = p_values_of(found.screened)
-        for item in found.nearest:
-            single = sidak(item.p_value, len(found.screened))
-            name = item.candidate.name
-            p_values[name] = min(single, p_values.get(name, 1.0))
-        return found.screened, p_values, found.tried, found.far
-
-    def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed | None]:
+    def _causes(self, force: UnknownForce, screened: Sequence[Screened]) -> list[Confirmed]:
         """Refits of all loads at one place that explain the forces, whatever their scores.
 
         A load with the wrong law is less likely than a force in each pose, and is left out.
@@ -444,6 +422,8 @@ class Search:
         times its value without them: what is missing beside them is then small compared with what
         they explain.
         """
+        # If the declared model did not predict every pose, no effect counts as an explanation.
+        known = self.validation.error if self.validation.complete else 0.0
         floor = found.fit.expected_error**2
-        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, self.error))
+        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, known))
         return found if after <= LEFT * before else self._ended(self.declared, [], found.ranked)

@@ -25,7 +25,7 @@ from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from, retry_outlying_poses
-from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
+from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
@@ -97,9 +97,8 @@ def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
 
 def _beside(base: Fit, model: CableModel) -> Problem:
     """The problem of another model, with a base's noise and with priors without any scatter."""
-    unknowns = Unknowns(model, base.free_in(model), base.values_in(model))
     priors = Priors.of(base.problem.priors.tolerances, model)
-    return replace(base.problem, unknowns=unknowns, priors=priors)
+    return replace(base.problem_in(model), priors=priors)
 
 
 def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) -> list[Screened]:

@@ -111,9 +111,11 @@ def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
             # Near a clamp that points up the cable may fall to either side: not a clear test.
             if item is not None and item.equilibrium.other_side is None
         ]
-        gap = curves[0] - curves[1] if len(curves) == 2 else np.zeros((1, 2))
+        gap = curves[0] - curves[1] if len(curves) == 2 else np.full((1, 2), np.nan)
         differences.append(float(np.sqrt((gap**2).sum(axis=1).mean())))
-    best = int(np.argmax(differences))
+    if np.isnan(differences).all():
+        return None, None
+    best = int(np.nanargmax(differences))
     return float(headings[best]), differences[best]
 
 
@@ -125,7 +127,7 @@ class NextReading:
     ----------
     name : str
         Of `ends.REACTIONS`.
-    One of `ends.REACTIONS`.
+    difference : float [N or N m]
         Size of the difference of the two predictions.
     separation : float
         The same in standard deviations of one measurement, including the bias of the sensor.

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import casadi as ca
@@ -34,6 +34,8 @@ from dlo_casadi.diagnosis.screening import (
     Screen,
     Screened,
     in_order,
+    p_values_of,
+    sidak,
     survival,
 )
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
@@ -53,8 +55,8 @@ from dlo_casadi.thresholds import EVIDENCE_APART, REFITTED
 SHARES = (1.0, 0.5, 0.2, 0.05)
 # Share of the gain predicted by the score above which a slowly converging refit is not repeated.
 PROMISED = 0.5
-# Starts whose objectives differ by less count as one minimum: smaller shares would start nearer to
-# the base still. Without this limit the reports of eighteen sessions were the same.
+# Refits whose objectives differ by less have reached the same minimum: no smaller share is tried.
+# Without this limit the reports of eighteen sessions were the same.
 ONE_PLACE = 1.0
 # A refit is given up if its minimum is predicted above that of a known one by more than this (ten
 # times the log likelihood by which a rival may fall short) and by more than the known minimum.
@@ -115,26 +117,25 @@ class Confirmed:
 
 
 @dataclass(frozen=True)
-class NearData:
-    """Candidates tried at the measured shapes.
+class Tried:
+    """Candidates of one step of a search.
 
     Parameters
     ----------
     screened : list of Screened
         All candidates, best first.
-    nearest : list of Screened
-        Those that fit the shapes best, and loads started from the forces of one; of pairs the
-        second candidate.
-    tried : list of Confirmed or None
-        Their fits, and those of contacts.
+    p_values : dict of float
+        Of their scores as the best of all, by name.
+    refits : list of Confirmed
+        Of the likely ones.
     far : list of str
-        Names of likely candidates that stayed far from the shapes.
+        Names of likely candidates that stayed far from the measured shapes.
     """
 
     screened: list[Screened]
-    nearest: list[Screened]
-    tried: list[Confirmed | None]
-    far: list[str]
+    p_values: dict[str, float]
+    refits: list[Confirmed]
+    far: list[str] = field(default_factory=list)
 
 
 def scored(
@@ -223,7 +224,7 @@ def near_data(
     exclude: Sequence[str],
     *,
     pairs: bool,
-) -> NearData:
+) -> Tried:
     """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
 
     In a misfit scores are useless, and a refit follows the declared model's error. If the best
@@ -240,25 +241,30 @@ def near_data(
     least = min(start.left for start in begun) if explained else np.inf
     among, pairs = (executor, center, exclude), pairs and not explained
     kept: list[RelaxedStart] = []
-    tried: list[Confirmed | None] = []
+    tried: list[Confirmed] = []
     for starts in nearest(near, softness, likely, *among, pairs=pairs, least=least):
         kept += starts[:REFITTED]
         tried += _confirmed(base, starts[:REFITTED], executor, rolls=not explained)
-        if any(item is not None and item.fit.noise.source != "misfit" for item in tried):
+        if any(item.fit.noise.source != "misfit" for item in tried):
             break
     tried = loads_from_best(base, screened, tried, executor)
     fitted = {item.name: item.screened for item in touching}
     screened = in_order([fitted.get(x.candidate.name, x) for x in screened])
-    refitted = [x for item in tried if item is not None for x in item.each]
-    names = {x.candidate.name for x in refitted}.union(*(start.names for start in kept))
+    names = {x.candidate.name for item in tried for x in item.each}.union(
+        *(start.names for start in kept)
+    )
     far = [x.candidate.name for x in likely[:REFITTED] if x.candidate.name not in names]
-    best = [*(start.screened for start in kept), *(x.screened for x in tried if x is not None)]
-    return NearData(screened, best, [*touching, *tried], far)
+    p_values = p_values_of(screened)
+    # Those that fit the shapes best, and loads started from the forces of one; of pairs the second.
+    for item in (*(start.screened for start in kept), *(x.screened for x in tried)):
+        single, name = sidak(item.p_value, len(screened)), item.candidate.name
+        p_values[name] = min(single, p_values.get(name, 1.0))
+    return Tried(screened, p_values, [*touching, *tried], far)
 
 
 def _confirmed(
     base: Fit, starts: Sequence[RelaxedStart], executor: Executor, *, rolls: bool
-) -> list[Confirmed | None]:
+) -> list[Confirmed]:
     """Fits from starts; until one explains the shapes, with `rolls` other end rolls are tried."""
     tried = list(map_in_order(executor, partial(confirm_from_data, base), starts))
     for k, start in enumerate(starts) if rolls else ():
@@ -268,7 +274,7 @@ def _confirmed(
             item = tried[k] = confirm_rolled(base, start, item)
         if item is not None and explains(item.fit):
             break
-    return tried
+    return [item for item in tried if item is not None]
 
 
 def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
@@ -379,9 +385,9 @@ def start_from(
 def loads_from_best(
     base: Fit,
     screened: Sequence[Screened],
-    tried: Sequence[Confirmed | None],
+    tried: Sequence[Confirmed],
     executor: Executor,
-) -> list[Confirmed | None]:
+) -> list[Confirmed]:
     """Refits; if the likeliest adds a load at one place, other loads also start from its forces.
 
     `screened`: candidates, of which the loads are tried in place of that load. If a set of effects
@@ -389,7 +395,7 @@ def loads_from_best(
     another noise, the tether of a session in space was lost. From its own start a force was 2.0 mm
     from the left-out poses of a cable with a force, from those of a tether 1.0 mm.
     """
-    best = max(filter(None, tried), key=lambda item: item.fit.log_evidence, default=None)
+    best = max(tried, key=lambda item: item.fit.log_evidence, default=None)
     load = next((x for x in best.beside_others() if _is_load(x.screened)), None) if best else None
     if best is None or load is None:
         return list(tried)

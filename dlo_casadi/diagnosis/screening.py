@@ -34,7 +34,6 @@ from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.problem import NO_INFORMATION, Linearization, Point, Problem, Values
 from dlo_casadi.estimation.relaxation import Relaxation
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
@@ -84,28 +83,31 @@ class _Moving:
     parameters have to be recomputed.
     """
 
+    fit: Fit
     problem: Problem
     shapes: Shapes
     names: tuple[str, ...]
 
     @classmethod
-    def of(cls, fit: Fit, candidates: Sequence[Candidate]) -> _Moving:
-        """Candidates beside a fit."""
-        model = extended(fit, candidates)
-        unknowns = Unknowns(model, fit.free_in(model), fit.values_in(model))
-        problem = replace(fit.problem, unknowns=unknowns)
+    def of(cls, fit: Fit, candidates: Sequence[Candidate], *, relaxed: bool = False) -> _Moving:
+        """Candidates beside a fit, which may be `relaxed`."""
+        problem = fit.problem_in(extended(fit, candidates))
         names = tuple(name for candidate in candidates for name in candidate.screened)
-        return cls(problem, carried_shapes(problem, fit), names)
+        return cls(fit, problem, carried_shapes(problem, fit, relaxed=relaxed), names)
 
-    def by_names(self, fit: Fit, scan: Mapping[str, float]) -> list[FloatArray]:
-        """Whitened derivatives (R_j, names) of each pose's residuals, at one scan."""
-        problem, unknowns = self.problem, self.problem.unknowns
+    def at(self, scan: Mapping[str, float]) -> Values:
+        """The fit's values with the candidates at one scan."""
+        fit, unknowns = self.fit, self.problem.unknowns
         theta = unknowns.pack(fit.values_in(unknowns.model, scan), fit.coefficients)
-        columns = [unknowns.names.index(name) for name in self.names]
         values = Values(theta, self.shapes, fit.point.projections)
-        values = with_springs_in_place(problem, values)
-        slopes = unknowns.slopes(theta)[:, columns]
-        still = np.zeros((len(unknowns.rest(theta)), len(columns)))
+        return with_springs_in_place(self.problem, values)
+
+    def by_names(self, scan: Mapping[str, float]) -> list[FloatArray]:
+        """Whitened derivatives (R_j, names) of each pose's residuals, at one scan."""
+        problem, unknowns, values = self.problem, self.problem.unknowns, self.at(scan)
+        columns = [unknowns.names.index(name) for name in self.names]
+        slopes = unknowns.slopes(values.theta)[:, columns]
+        still = np.zeros((len(unknowns.rest(values.theta)), len(columns)))
         state = problem.state(values)
         along = problem.equilibria.directions(*state, slopes, still, deviations=False)
         moved = problem.residuals(values, along)
@@ -120,7 +122,7 @@ def _scan(active: Sequence[Candidate], k: int) -> dict[str, float]:
 def _derivatives(
     fit: Fit, listed: Sequence[Candidate], scans: Sequence[int]
 ) -> list[dict[tuple[str, ...], list[FloatArray]]]:
-    """For each scan: derivatives by the candidates' parameters, by names; none at the first."""
+    """For each scan: derivatives by the parameters named; none for scan 0, where they are known."""
     moving: dict[tuple[str, ...], _Moving] = {}
     out = []
     for k in scans:
@@ -134,7 +136,7 @@ def _derivatives(
                 continue
             if key not in moving:
                 moving[key] = _Moving.of(fit, active)
-            found[moving[key].names] = moving[key].by_names(fit, _scan(active, k))
+            found[moving[key].names] = moving[key].by_names(_scan(active, k))
         out.append(found)
     return out
 
@@ -191,13 +193,9 @@ class Screen:
     @cached_property
     def _linearized(self) -> tuple[Problem, Point, Linearization]:
         """The fit's model with candidates at their nominal values, linearised at the fit."""
-        problem = self.fit.problem
-        p = self.fit.values_in(self.model, _scan(self.listed, 0))
         # Nuisances that are candidates appear twice: with their prior, and without.
-        free = self.fit.free_in(self.model)
-        unknowns = Unknowns(self.model, free, p)
-        larger = replace(problem, unknowns=unknowns)
-        theta = unknowns.pack(p, self.fit.coefficients)
+        larger = self.fit.problem_in(self.model, _scan(self.listed, 0))
+        theta = larger.unknowns.pack(larger.unknowns.fixed, self.fit.coefficients)
         point = replace(self.fit.point, theta=theta, shapes=carried_shapes(larger, self.fit))
         point = replace(point, shapes=with_springs_in_place(larger, point).shapes)
         return larger, point, larger.linearize(point)
@@ -255,7 +253,7 @@ class Screen:
         step = step / scale
         n_places = max(1.0, len(candidate.scans) / SCANS_PER_TEST)
         single = survival(score, max(dof, 1), noise_dof)
-        p_value = float(min(1.0, -np.expm1(n_places * np.log1p(-min(single, 1 - 1e-16)))))
+        p_value = sidak(single, n_places)
         values = dict(candidate.scans[normal.k])
         for name, change in zip(candidate.screened, step, strict=True):
             i = self.model.names.index(name)
@@ -288,27 +286,21 @@ class RelaxedScreen(Screen):
         Softness of its balance.
     """
 
+    between = False  # The screen only selects the nearest candidates.
+
     def __init__(self, near: Fit, listed: Sequence[Candidate], softness: float) -> None:
         super().__init__(near, listed)
         self.softness = softness
 
-    between = False  # The screen only selects the nearest candidates.
-
     def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
         """Normal equations at scans, with each pose's own unknowns eliminated."""
-        fit, begun = self.fit, dict[tuple[str, ...], tuple[Problem, Shapes]]()
+        begun: dict[tuple[str, ...], _Moving] = {}
         for k in scans:
             active = [c for c in self.listed if k < len(c.scans)]
             names = tuple(candidate.name for candidate in active)
             if names not in begun:
-                model = extended(fit, active)
-                unknowns = Unknowns(model, fit.free_in(model), fit.values_in(model))
-                larger = replace(fit.problem, unknowns=unknowns)
-                begun[names] = larger, carried_shapes(larger, fit, relaxed=True)
-            problem, shapes = begun[names]
-            p = fit.values_in(problem.unknowns.model, _scan(active, k))
-            theta = problem.unknowns.pack(p, fit.coefficients)
-            values = with_springs_in_place(problem, Values(theta, shapes, fit.point.projections))
+                begun[names] = _Moving.of(self.fit, active, relaxed=True)
+            problem, values = begun[names].problem, begun[names].at(_scan(active, k))
             normal = Relaxation(problem, self.softness).normal(values)
             yield AtScan(active, k, normal.hessian, normal.gradient, problem.unknowns.names)
 
@@ -320,6 +312,16 @@ def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, Float
     along = vectors.T @ slope
     step = vectors[:, seen] @ (along[seen] / values[seen])
     return float((along[seen] ** 2 / values[seen]).sum()), step, int(seen.sum())
+
+
+def sidak(p_value: float, tried: float) -> float:
+    """Probability that the best of `tried` independent tests is as good (Sidak)."""
+    return float(-np.expm1(tried * np.log1p(-min(p_value, 1 - 1e-16))))
+
+
+def p_values_of(screened: Sequence[Screened]) -> dict[str, float]:
+    """p-value of each score as the best of all, by name."""
+    return {item.candidate.name: sidak(item.p_value, len(screened)) for item in screened}
 
 
 def survival(score: float, dof: int, noise_dof: float) -> float:

@@ -10,8 +10,8 @@ import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
-from dlo_casadi.diagnosis.refits import Confirmed
-from dlo_casadi.diagnosis.screening import Screened, survival
+from dlo_casadi.diagnosis.refits import Confirmed, Tried
+from dlo_casadi.diagnosis.screening import Screened, sidak, survival
 from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.errors import EstimationError
@@ -214,16 +214,6 @@ def _on_mesh(fit: Fit, n: int) -> Fit:
     return fit
 
 
-def sidak(p_value: float, tried: int) -> float:
-    """Probability that the best of `tried` independent tests is as good (Sidak)."""
-    return float(-np.expm1(tried * np.log1p(-min(p_value, 1 - 1e-16))))
-
-
-def p_values_of(screened: Sequence[Screened]) -> dict[str, float]:
-    """p-value of each score as the best of all, by name."""
-    return {item.candidate.name: sidak(item.p_value, len(screened)) for item in screened}
-
-
 def closed_by(
     winner: Confirmed, current: Fit, p_values: Mapping[str, float], astray: bool
 ) -> tuple[Fit, float]:
@@ -310,7 +300,7 @@ def shortcoming(
 ) -> str:
     """Why a refit is no better than its base; empty if it is better.
 
-    Repeats of one or two poses share any error of their measurement. For these, whole repeats
+    Repeats of few poses share any error of their measurement. For these, whole repeats
     decide: if left-out repeats were predicted no better, a gain as large must have a
     probability below `doubt` (Student's t).
     """
@@ -326,7 +316,7 @@ def shortcoming(
 
 
 def choose(
-    tried: Iterable[Confirmed | None],
+    refits: Sequence[Confirmed],
     base: Fit,
     validation: CrossValidation,
     doubt: float | None,
@@ -335,7 +325,6 @@ def choose(
 
     Both gains have to be positive. Rivals fall short of the best by less than EVIDENCE_APART.
     """
-    refits = [item for item in tried if item is not None]
     why = {item.name: shortcoming(item, base, validation, doubt) for item in refits}
     order = {item.name: support(item, base, validation) for item in refits}
     better = [item for item in refits if not why[item.name]]
@@ -375,15 +364,9 @@ def _names(screened: Iterable[Screened]) -> set[str]:
     return {x.candidate.name for x in screened}
 
 
-def ranking(
-    screened: Sequence[Screened],
-    p_values: Mapping[str, float],
-    tried: Iterable[Confirmed | None],
-    base: Fit,
-    validation: CrossValidation,
-) -> list[Ranked]:
+def ranking(tried: Tried, base: Fit, validation: CrossValidation) -> list[Ranked]:
     """All candidates: the refitted ones by `support`, then the rest by score."""
-    refits = [x for item in tried if item is not None for x in item.beside_others()]
+    refits = [x for item in tried.refits for x in item.beside_others()]
     refits.sort(key=lambda item: support(item, base, validation))
     refitted = {item.candidate.name: item for item in refits}
     order = {name: support(item, base, validation) for name, item in refitted.items()}
@@ -392,9 +375,9 @@ def ranking(
         found = refitted.get(name)
         return found.validation.rmse if found and found.validation.complete else None
 
-    names = [item.candidate.name for item in screened]
+    names = [item.candidate.name for item in tried.screened]
     rows = [
-        Ranked(name, item.score, p_values[name], error(name))
-        for name, item in zip(names, screened, strict=True)
+        Ranked(name, item.score, tried.p_values[name], error(name))
+        for name, item in zip(names, tried.screened, strict=True)
     ]
     return sorted(rows, key=lambda row: (-order.get(row.name, -np.inf), -row.score))

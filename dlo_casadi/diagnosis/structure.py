@@ -5,10 +5,12 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtri
+from scipy.stats import rankdata
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.diagnosis.screening import survival
+from dlo_casadi.diagnosis.screening import sidak, survival
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.repeats import different_poses, repeatability
 from dlo_casadi.estimation.result import Fit
@@ -74,7 +76,7 @@ class Structure:
         That of the less likely of the tests made, corrected for their number (Sidak).
         """
         made = [p for p in (self.p_value, self.p_systematic) if p is not None]
-        return 1 - (1 - min(made)) ** len(made)
+        return sidak(min(made), len(made))
 
 
 def noise_degrees(fit: Fit) -> float:
@@ -195,16 +197,15 @@ def _rank_score(a: FloatArray, b: FloatArray) -> float:
     """Spearman's rank correlation as a normal score."""
     if len(a) < 4 or np.ptp(b) == 0:
         return 0.0
-    ranks = [np.argsort(np.argsort(x)).astype(float) for x in (a, b)]
-    rho = float(np.corrcoef(ranks[0], ranks[1])[0, 1])
+    rho = float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
     return float(np.clip(rho * np.sqrt(len(a) - 1), -LARGEST_SCORE, LARGEST_SCORE))
 
 
 def limiting_spread(fit: Fit) -> float | None:
     """Difference between repeats [m] if it is what limits a prediction, else None."""
-    if different_poses(fit.problem.history, fit.model.cable.length) >= DIFFERENT:
+    if different_poses(fit.problem.history, fit.model) >= DIFFERENT:
         return None
-    spread = repeatability(fit.problem.history, fit.model.cable.length)
+    spread = repeatability(fit.problem.history, fit.model)
     if spread is None or fit.noise.source == "repeats":
         return spread
     floor = noise_distance(fit.problem.history, fit.noise.std)
@@ -218,6 +219,8 @@ def alike(fit: Fit) -> list[tuple[str, ...]]:
     """
     names = fit.problem.unknowns.names
     held = [k for k, name in enumerate(names) if name in fit.model.priors]
+    if not held:
+        return []
     hessian: FloatArray = fit.normal.hessian.copy()
     hessian[np.ix_(held, held)] -= fit.problem.precision[np.ix_(held, held)]
     scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
@@ -225,11 +228,6 @@ def alike(fit: Fit) -> list[tuple[str, ...]]:
     covariance = np.linalg.inv(scaled)[np.ix_(held, held)]
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = np.abs(covariance / np.outer(deviation, deviation))
-    groups: list[set[int]] = []
-    for i in range(len(held)):
-        for j in range(i):
-            if correlation[i, j] > ALIKE:
-                joined = [group for group in groups if group & {i, j}]
-                groups = [group for group in groups if not group & {i, j}]
-                groups.append(set().union({i, j}, *joined))
-    return [tuple(names[held[k]] for k in sorted(group)) for group in groups]
+    count, of = connected_components(correlation > ALIKE, directed=False)
+    groups = [np.flatnonzero(of == group) for group in range(count)]
+    return [tuple(names[held[k]] for k in group) for group in groups if len(group) > 1]

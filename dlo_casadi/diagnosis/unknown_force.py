@@ -36,7 +36,7 @@ class UnknownForce:
 
     Parameters
     ----------
-    force_per_pose : (m_fit, 2) [N]
+    force_per_pose : (m_fit, d) [N]
         Force in each fit pose, in the board frame.
     position : float [m]
     interval : (float, float) [m]
@@ -82,7 +82,7 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
             continue
     if best is None:
         return None
-    columns = [model.deviation_names.index(axis) for axis in effect.per_pose(model.cable)]
+    columns = _columns(model)
     mean = [best.value(f"{effect.label}.f{axis}") for axis in model.node.axes]
     forces = best.point.shapes.deviation[np.ix_(best.problem.used, columns)] + mean
     position = best.value(name)
@@ -91,6 +91,11 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
     gain = 2 * (base.point.objective - best.point.objective)
     names = tuple(best.problem.measured[j].pose.name for j in best.problem.used)
     return UnknownForce(forces, position, interval, gain, best, names)
+
+
+def _columns(model: CableModel) -> list[int]:
+    """Places of the force's components among the deviations of a pose."""
+    return [model.deviation_names.index(axis) for axis in UnknownPull().per_pose(model.cable)]
 
 
 @dataclass(frozen=True)
@@ -148,5 +153,5 @@ class _Search:
         problem, model = self.base.problem, self.model
         scatter, cable = problem.priors.scatter.copy(), model.cable
         bending = cable.bending_stiffness / cable.length**2
-        scatter[-model.node.dimension :] = FORCE_WEIGHTS * max(model.weight, bending)
+        scatter[_columns(model)] = FORCE_WEIGHTS * max(model.weight, bending)
         return replace(problem, unknowns=unknowns, priors=replace(problem.priors, scatter=scatter))

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 from itertools import pairwise
 
 import numpy as np
@@ -23,14 +22,6 @@ END_TOLERANCE = 1e-8
 BALANCE = 1e-12
 # Largest difference of two shapes that count as the same one [rad].
 NEARBY = 0.05
-
-
-class Status(Enum):
-    """Outcome of a solve, one sentence each."""
-
-    STABLE = "stable equilibrium"
-    UNSTABLE = "stationary, but not a minimum of the energy"
-    FAILED = "no equilibrium found"
 
 
 @dataclass(frozen=True)
@@ -64,7 +55,8 @@ class Equilibrium:
         linearly to both ends and to clamped clips. Its error is of second order in the cell length.
     residual : float
         Largest violation of an end condition [m or rad].
-    status : Status
+    stable : bool
+        Whether the energy has a strict minimum here under the end conditions.
     iterations : int
     other_side : Equilibrium or None
         The stable equilibrium of the same pose on its other side, see `CableModel.tipped_by`;
@@ -87,7 +79,7 @@ class Equilibrium:
     twist: FloatArray
     min_bend_radius: float
     residual: float
-    status: Status
+    stable: bool
     iterations: int
     other_side: "Equilibrium | None" = None
     clips: tuple[ClipLoad, ...] = ()
@@ -104,23 +96,13 @@ class Equilibrium:
         return self.x[:, 0]
 
     @property
-    def theta(self) -> FloatArray:
-        """Relative joint angles; the first is the heading of the first link [rad]."""
-        return np.concatenate([self.phi[:1], np.diff(self.phi)])
-
-    @property
     def turn(self) -> float:
         """Last minus first heading [rad], counter-clockwise positive."""
         return float(self.phi[-1] - self.phi[0])
 
-    def turns(self, branch: Branch | None) -> bool:
+    def has_branch(self, branch: Branch | None) -> bool:
         """Whether the cable turns as the branch says; always for None."""
         return branch is None or SIGNS[branch] * self.turn > 0
-
-    @property
-    def stable(self) -> bool:
-        """Whether the energy has a strict minimum here under the end conditions."""
-        return self.status is Status.STABLE
 
 
 def places_along(cells: FloatArray, clamped: Sequence[int] = ()) -> FloatArray:
@@ -192,10 +174,9 @@ def equilibria_of(
     for j in range(len(shapes.x)):
         curvature = chain.curvatures(strains[j]).ravel()
         sizes = curvatures_along(curvature, clipped.cells[j], clipped.clamped_nodes(j))
-        known = dict(zip(model.border_names, shapes.lam[j], strict=True))
         moments = [
-            node.to_world(x, np.array([known.get(f"{side}_{turn}", 0.0) for turn in node.turns]))
-            for side, x in zip(("start", "end"), shapes.x[j][[0, -1]], strict=True)
+            on_fixtures[j, rows[f"{side}_moment"]] * (getattr(model, side) == "clamped")
+            for side in ("start", "end")
         ]
         twisted = "twist" in node.strains
         out.append(
@@ -212,7 +193,7 @@ def equilibria_of(
                 twist=strains[j, : chain.n_cells] if twisted else np.zeros(chain.n_cells),
                 min_bend_radius=1 / max(float(sizes.max()), 1e-300),
                 residual=float(residuals[j]),
-                status=Status.STABLE if stable[j] else Status.UNSTABLE,
+                stable=bool(stable[j]),
                 iterations=int(iterations[j]),
                 clips=on_clips[j],
                 contacts=contacts[j],

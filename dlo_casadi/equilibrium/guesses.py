@@ -207,13 +207,22 @@ def limited(phi: FloatArray) -> FloatArray:
     return phi[0] + np.concatenate([[0.0], np.cumsum(bends)])
 
 
+def downwards(model: CableModel) -> float:
+    """Heading [rad] of gravity in a plane; 0 without gravity."""
+    return float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
+
+
+def fallen(u: FloatArray) -> FloatArray:
+    """Share (k,) of its fall by which a cable with a free end has turned at places u of 0 to 1."""
+    return 1 - np.exp(-4 * u)
+
+
 def _hanging(
     model: CableModel, u: FloatArray, bent: FloatArray, clamp: FloatArray | None
 ) -> list[FloatArray]:
     """Guesses for a cable with a free end."""
-    down = float(np.arctan2(model.gravity[1], model.gravity[0])) if any(model.gravity) else 0.0
+    down, decay = downwards(model), fallen(u)
     first = down if clamp is None else float(clamp[0])
-    decay = 1 - np.exp(-4 * u)
     drop = down - first - 2 * np.pi * np.floor((down - first + np.pi) / (2 * np.pi))
     found = [first + bent, first + drop * decay, np.full_like(u, first)]
     if abs(drop) > FAR or np.ptp(bent) > CURVED:
@@ -318,9 +327,23 @@ def _hanging_frames(
     shapes = [Rotation.concatenate(rest)]
     if np.any(down):
         fall = smallest_turn(first.apply(_FORWARD), down).as_rotvec()
-        shapes.append(Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall) * first)
+        shapes.append(Rotation.from_rotvec(fallen(u)[:, None] * fall) * first)
     shapes.append(Rotation.concatenate([first] * len(u)))
     return [same_sign(shape.as_quat()) for shape in shapes]
+
+
+def bent_into(
+    u: FloatArray, tangents: FloatArray, ends: FloatArray, ways: Sequence[FloatArray | None]
+) -> FloatArray:
+    """Tangents (k, 3), which have directions `ends` (2, 3) at both ends, bent into those of clamps.
+
+    `ways`: directions (3,) of the clamps; None where an end is free to turn.
+    """
+    for own, way, decay in zip(ends, ways, ((1 - u) ** _DECAY, u**_DECAY), strict=True):
+        if way is not None:
+            bend = smallest_turn(own, way).as_rotvec()
+            tangents = Rotation.from_rotvec(decay[:, None] * bend).apply(tangents)
+    return tangents
 
 
 def carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotation, float]:
@@ -328,14 +351,8 @@ def carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotati
 
     The roll is the angle [rad] about the cable's axis from last frame to clamp, in (-pi, pi].
     """
-    bends = [
-        decay[:, None] * smallest_turn(tangents[end], clamp.apply(_FORWARD)).as_rotvec()
-        for clamp, end, decay in zip(clamps, (0, -1), ((1 - u) ** _DECAY, u**_DECAY), strict=True)
-        if clamp is not None
-    ]
-    axes = tangents
-    for bend in bends:
-        axes = Rotation.from_rotvec(bend).apply(axes)
+    ways = [None if clamp is None else clamp.apply(_FORWARD) for clamp in clamps]
+    axes = bent_into(u, tangents, tangents[[0, -1]], ways)
     first = clamps[0] or smallest_turn(_FORWARD, axes[0])
     quaternions = [(smallest_turn(first.apply(_FORWARD), axes[0]) * first).as_quat()]
     x, y, z, w = smallest_turn(axes[:-1], axes[1:]).as_quat().T

@@ -20,7 +20,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, clamped_nodes, node_places, tangents
+from dlo_casadi.model.clips import CLAMPS, tangents
 from dlo_casadi.model.contact import outwards
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
@@ -55,7 +55,7 @@ def fixtures_of(model: CableModel, pose: HeldPose, found: Equilibrium) -> list[F
 
 
 def places_of(
-    model: CableModel, pose: HeldPose, found: Equilibrium, quantity: str
+    model: CableModel, pose: HeldPose, found: Equilibrium, given: Inputs, quantity: str
 ) -> tuple[FloatArray, list[str]]:
     """Arc lengths (K,) [m] at which a quantity has values, and the names of what is there.
 
@@ -66,14 +66,11 @@ def places_of(
         own = [item for item in held if quantity == "force" or item.clamped]
         return np.array([item.at for item in own]), [item.name for item in own]
     if quantity == "clearance":
-        known = [one for one in model.obstacles if not one.touch]
-        points = _along(model, found.points, found.x)
-        nearest = np.argmin([one.near(points).distance for one in known], axis=0)
-        along = np.linspace(0.0, model.cable.length, len(points))
-        return along, [known[k].name for k in nearest]
-    moved = node_places(model.chain, pose.clips)  # to clamped clips
-    cells = np.interp(model.chain.cells, model.chain.places, moved)
-    clamped = clamped_nodes(model.chain, pose.clips)
+        names, deep = _depths(model, found.points[None], found.x[None], given)
+        along = np.linspace(0.0, model.cable.length, deep.shape[2])
+        return along, [names[k] for k in deep[:, 0].argmax(axis=0)]
+    clipped = assembly_of(model).clipped(found.shapes, given)
+    cells, clamped = clipped.cells[0], clipped.clamped_nodes(0)
     places = places_along(cells, clamped) if quantity == "curvature" else cells.mean(axis=1)
     return places, [""] * len(places)
 
@@ -85,14 +82,8 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
     """
     assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
     if quantity == "clearance":
-        points = _along(model, assembly.nodes(shapes, given), shapes.x)
-        offsets = given.p @ outwards(model).T
-        deep = [
-            offsets[:, [k]] - one.near(points).distance
-            for k, one in enumerate(model.obstacles)
-            if not one.touch
-        ]
-        return np.max(deep, axis=0) + model.cable.diameter / 2
+        _, deep = _depths(model, assembly.nodes(shapes, given), shapes.x, given)
+        return np.asarray(deep.max(axis=0))
     if quantity in ("curvature", "twist"):
         strain = assembly.strain(shapes, given)
         if quantity == "twist":
@@ -110,6 +101,16 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
         if kind in known
     ]
     return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
+
+
+def _depths(
+    model: CableModel, points: FloatArray, x: FloatArray, given: Inputs
+) -> tuple[list[str], FloatArray]:
+    """Obstacles to be avoided, and the depth (n, m, K) [m] of cables in each; outside negative."""
+    along, offsets = _along(model, points, x), given.p @ outwards(model).T
+    known = [(k, one) for k, one in enumerate(model.obstacles) if not one.touch]
+    deep = [offsets[:, [k]] - one.near(along).distance for k, one in known]
+    return [one.name for _, one in known], np.array(deep) + model.cable.diameter / 2
 
 
 def _along(model: CableModel, points: FloatArray, x: FloatArray) -> FloatArray:
@@ -175,7 +176,7 @@ class Varied:
     uncertainty: Uncertainty
 
     def exceedances(self, bounds: Mapping[str, float]) -> dict[str, Exceedance]:
-        """Distance to the bound and probability of exceeding it, for each quantity of `sizes_of`.
+        """Probability that each quantity of `sizes_of` exceeds its bound, and the size's std.
 
         The sizes g_k(z) depend on standard normal z: the fitted unknowns, the fixtures, the rest
         curvature of a repeat. To first order g(z) = g + J z. This is taken at all places together,

@@ -54,15 +54,16 @@ FIRST_SHIFT, GROWTH, SHRINKAGE, LEAST_SHIFT = 1e-4, 8.0, 4.0, 1e-7
 # cable's stiffness is then below rounding. Four of 336 descents of very soft cables with a tether
 # returned from beyond 1e6.
 RUNAWAY = 1e16
-# Depths of a cable in soft obstacles, see `contact.DEPTH`, before they become hard. Number of these
-# depths that a given start skips to stay on its side, one more if the pose names it (without it, 16
-# elements in space found the side in none of three poses). Maximum number of steps at each depth.
+# Depths of a cable in soft obstacles, see `contact.DEPTH`, solved in turn before obstacles become
+# hard. A given start skips the first KEEPING_SIDE of them, so that it stays on its side, and one
+# more if the pose names the side (without that, 16 elements in space found it in none of three
+# poses). Maximum number of steps at each depth.
 SOFT, KEEPING_SIDE, STEPS_WHILE_SOFT = (1.0, 0.1, 1e-2, 1e-3, 1e-4), 2, 20
 # Number of times that the change from one depth to the next is halved if contacts alternate. They
 # no longer alternate beyond the depth by which the cable bends between two nodes.
 HALVINGS = 4
-# Alternating contacts give steps of equal size. Of a step longer than SAME_SIZE times the one
-# before, only the share SHORTER is made. The rest of it is the next step, so that SAME_SIZE has to
+# Contacts that alternate give steps of equal size. A step longer than SAME_SIZE times the last one
+# is shortened to the share SHORTER. Its rest comes back as the next step, so that SAME_SIZE must
 # exceed a half.
 SHORTER, SAME_SIZE = 0.5, 0.75
 # Maximum number of halvings of a step that carries a cable through a bar.

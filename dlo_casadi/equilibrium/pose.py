@@ -1,5 +1,7 @@
 """End conditions of one pose as declared."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -100,6 +102,25 @@ class HeldPose:
         held: dict[str, Any] = dict(zip(self._direction_names, values, strict=True))
         end_place = None if self.end is None else tuple(end)
         return replace(self, start=tuple(start), end=end_place, **held)
+
+    def on_the_way(self, before: HeldPose, share: float) -> Self:
+        """The pose at a share of the way from `before`: ends, clips and frames move evenly."""
+
+        def place(a: FloatArray, b: FloatArray) -> FloatArray:
+            return np.asarray(a + share * (b - a))
+
+        def frame(a: FloatArray, b: FloatArray) -> FloatArray:
+            return self.node.interpolated(np.array([share]), np.arange(2.0), np.array([a, b]))[0]
+
+        d, clips = 2 * self.node.dimension, []
+        start, end = place(before.ends[:d], self.ends[:d]).reshape(2, -1)
+        for one, own in zip(before.clips, self.clips, strict=True):
+            held: dict[str, Any] = {"place": tuple(place(np.array(one.place), np.array(own.place)))}
+            if one.frame is not None and own.frame is not None:
+                held[self.node.direction] = self.node.declared(frame(one.frame, own.frame))
+            clips.append(replace(own, **held))
+        frames = [frame(*both) for both in zip(before.frames, self.frames, strict=True)]
+        return replace(self.moved(start, end, frames), clips=tuple(clips))
 
     def joined(self, points: FloatArray) -> FloatArray:
         """Points (K, d) [m] along the cable, with its start before them and its held end after."""

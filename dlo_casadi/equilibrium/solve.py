@@ -194,14 +194,16 @@ def _chosen(
         return no_equilibrium(pose, what, hint)
     if named is not None and (model.start, model.end) == ("pinned", "pinned"):
         for eq in found:
-            if eq.stable and eq.turns(named):
+            if eq.stable and eq.has_branch(named):
                 return eq
     found = sorted(found, key=lambda eq: (not eq.stable, eq.energy))
     lowest = found[0]
     for eq in found:
-        if eq.turns(named) and eq.stable is lowest.stable:
+        if eq.has_branch(named) and eq.stable is lowest.stable:
             return eq
-    there = next((f"branch {branch}" for branch in SIGNS if lowest.turns(branch)), "neither branch")
+    there = next(
+        (f"branch {branch}" for branch in SIGNS if lowest.has_branch(branch)), "neither branch"
+    )
     kind = "stable equilibrium" if lowest.stable else "equilibrium"
     what = (
         f"no {kind} found on the branch {named} from its first guesses with {where}: the lowest "
@@ -225,19 +227,20 @@ class _PoseSearch:
         """Equilibria of each pose, in the order of the first guesses that led to them."""
         found: list[list[Equilibrium]] = [[] for _ in poses]
         free = [j for j, start in enumerate(starts) if start is None]
+        everywhere = np.ones(len(poses), dtype=bool)
         if free and self.model.in_space and self.model.n > self.model.coarse.n:
             of, likely = self._likely([poses[j] for j in free])
             if len(of):
-                found = self._descended(poses, np.array(free)[of], likely, near=True)
+                found = self._descended(poses, np.array(free)[of], likely, everywhere)
         elif free and self.model.surfaces:
             of, beside = self._beside([poses[j] for j in free])
-            found = self._descended(poses, np.array(free)[of], beside, near=True)
+            found = self._descended(poses, np.array(free)[of], beside, everywhere)
         left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
         if left:
             others = [poses[j] for j in left]
-            near = all(starts[j] is not None for j in left)
+            near = np.array([starts[j] is not None for j in left])
             first = self._first(others, [starts[j] for j in left])
-            again = self._descended(others, *first, near=near)
+            again = self._descended(others, *first, near)
             for j, minima in zip(left, again, strict=True):
                 found[j] += minima
         return found
@@ -281,18 +284,21 @@ class _PoseSearch:
         return np.array(rows), Shapes.declared(np.array(nodes), np.array(lam), len(model.clips))
 
     def _descend(
-        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool = False
+        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, near: BoolArray
     ) -> tuple[Inputs, Minima]:
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
         sided = np.array([bool(named_sides(self.model, poses[j])) for j in of])
-        skipped = (KEEPING_SIDE + sided) * near
+        skipped = (KEEPING_SIDE + sided) * near[of]
         return given, descend_to_contact(assembly_of(self.model), shapes, given, skipped)
 
     def _descended(
-        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, *, near: bool
+        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, near: BoolArray
     ) -> list[list[Equilibrium]]:
-        """Equilibria reached by minimising the energy from shapes `of` poses; see `_descend`."""
-        given, minima = self._descend(poses, of, shapes, near=near)
+        """Equilibria reached by minimising the energy from shapes `of` poses.
+
+        `near` (poses,): whether its shapes are to stay on their side of obstacles.
+        """
+        given, minima = self._descend(poses, of, shapes, near)
         kept = minima.balanced
         if not self.model.in_space:
             bends = np.abs(np.diff(minima.shapes.x[..., 0], axis=1))
@@ -322,7 +328,7 @@ class _PoseSearch:
         of, shapes = (
             search._beside(poses) if touching else search._first(poses, [None] * len(poses))
         )
-        given, found = search._descend(poses, of, shapes, near=touching)
+        given, found = search._descend(poses, of, shapes, np.full(len(poses), touching))
         strains = assembly_of(coarse).strain(found.shapes, given)
         twists = _twists(coarse, strains[:, : coarse.chain.n_cells])
         usable = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
@@ -398,8 +404,8 @@ def continued(
 ) -> Equilibrium:
     """Shape of a cable whose ends are moved quasi-statically from another pose.
 
-    Ends and frames move evenly from one pose to the other. If the shape loses its stability on the
-    way, the cable snaps to the equilibrium reached from its last shape.
+    Ends, clips and frames move evenly from one pose to the other. If the shape loses its stability
+    on the way, the cable snaps to the equilibrium reached from its last shape.
 
     Parameters
     ----------
@@ -413,18 +419,18 @@ def continued(
     EquilibriumError
         If no equilibrium is found in the pose.
     """
-    ends = np.array([before.ends, pose.ends])[:, : 2 * model.node.dimension]
-    frames = np.array([before.frames, pose.frames])
+    both, d = (before, pose), model.node.dimension
+    ends = [one.ends[: 2 * d] for one in both]
+    clips = [[x for clip in one.clips for x in clip.place] for one in both]
+    moved = float(np.abs(np.diff(np.hstack([ends, clips]), axis=0)).max()) / model.cable.length
+    frames = [
+        [*one.frames, *(x for clip in one.clips if (x := clip.frame) is not None)] for one in both
+    ]
     # The increment between frames half a turn apart is infinite: limit it.
-    turned = min(float(np.abs(model.node.difference(*frames)).max()), 2 * np.pi)
-    moved = float(np.abs(np.diff(ends, axis=0)).max()) / model.cable.length
+    turned = min(float(np.abs(model.node.difference(*np.array(frames))).max()), 2 * np.pi)
     count = int(np.ceil(max(turned / MOST_TURNED, moved / MOST_MOVED, 1.0)))
     for k in range(1, count):
-        share = np.array([k / count])
-        start, end = (ends[0] + share * (ends[1] - ends[0])).reshape(2, -1)
-        held = [
-            model.node.interpolated(share, np.arange(2.0), way)[0] for way in frames.swapaxes(0, 1)
-        ]
         with suppress(EquilibriumError):  # poses on the way may be out of reach
-            x = solve_equilibrium(model, p, rest, pose.moved(start, end, held), x_init=x).x
+            way = pose.on_the_way(before, k / count)
+            x = solve_equilibrium(model, p, rest, way, x_init=x).x
     return solve_equilibrium(model, p, rest, pose, x_init=x)

@@ -18,6 +18,9 @@ from dlo_casadi.equilibrium.guesses import (
     arc_headings,
     arc_into_clamps,
     arc_tangents,
+    bent_into,
+    downwards,
+    fallen,
     frames_along,
     guessed_frames,
     guesses,
@@ -38,7 +41,7 @@ from dlo_casadi.rod.node import Frame
 _TAUT = 0.3
 # Maximum number of combinations of sides of the spans in a plane.
 MOST_SIDES = 16
-# Shares of the slack between two fixed arc lengths given to the first of two spans.
+# Shares of the slack between two fixed arc lengths that the first of two spans gets.
 _SLACK = (0.5, 0.15, 0.85)
 # Smallest length of a span beside an eyelet, relative to its chord.
 _LEAST = 1.0 + 1e-3
@@ -277,10 +280,10 @@ def _headings(model: CableModel, span: Span, side: int) -> tuple[FloatArray, Flo
     u = np.linspace(0.0, 1.0, max(round(span.length / model.chain.h), 4) + 1)
     inner = span.start + span.length * (1e-9 + (1 - 2e-9) * u)
     if span.chord is None:
-        down = np.arctan2(model.gravity[1], model.gravity[0]) if any(model.gravity) else 0.0
+        down = downwards(model)
         first = down if span.frames[0] is None else float(span.frames[0][0])
         drop = np.angle(np.exp(1j * (down - first)))
-        return inner, first + drop * (1 - np.exp(-4 * u))
+        return inner, first + drop * fallen(u)
     chord = span.chord / span.length
     if span.frames == (None, None):
         return inner, arc_headings(u, 1.0, chord, side)
@@ -337,16 +340,12 @@ def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatAr
         down = down / max(float(np.linalg.norm(down)), 1e-12)
         first = down if ends[0] is None else ends[0]
         fall = smallest_turn(first, down if np.any(down) else first).as_rotvec()
-        return Rotation.from_rotvec((1 - np.exp(-4 * u))[:, None] * fall).apply(first)
+        return Rotation.from_rotvec(fallen(u)[:, None] * fall).apply(first)
     along = span.chord / max(float(np.linalg.norm(span.chord)), 1e-12)
     turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(sagging(along, down))
     axes = arc_tangents(u, span.chord / span.length, turned)
     arc = arc_tangents(np.array([0.0, 1.0]), span.chord / span.length, turned)
-    for end, own, decay in zip(ends, arc, ((1 - u) ** 5, u**5), strict=True):
-        if end is not None:
-            bend = smallest_turn(own, end).as_rotvec()
-            axes = Rotation.from_rotvec(decay[:, None] * bend).apply(axes)
-    return np.asarray(axes)
+    return np.asarray(bent_into(u, axes, arc, ends))
 
 
 # ---- whether a pose is in reach ------------------------------------------------------------------

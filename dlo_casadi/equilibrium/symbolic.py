@@ -284,7 +284,7 @@ def _curvature(model: CableModel) -> ca.Function:
     bends = strains[-len(model.node.curvatures) :, :]
     in_cells = model.node.bend(bends)
     ends = []
-    for outer, inner in ((0, 1), (-1, -2)) if len(widths) > 1 else ():
+    for outer, inner in ((0, 1), (-1, -2)) if len(widths) > 1 else ((0, 0), (-1, -1)):
         share = widths[outer] / (widths[outer] + widths[inner])
         ends.append(in_cells[outer] + share * (in_cells[outer] - in_cells[inner]))
     signed = ca.vertcat(*ends[:1], in_cells.T, *ends[1:])

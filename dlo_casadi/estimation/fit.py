@@ -97,7 +97,7 @@ def fit_model(
     noise = NoiseModel(FIRST_STD)
     if std is not None:
         declared = NoiseModel(std, source="declared")
-        noise = with_repeats(declared, measured, model.cable.length)
+        noise = with_repeats(declared, measured, model)
     noise = replace(noise, readings=readings or first_reading_noise(model))
     priors = Priors.of(tolerances, model)
     if count == 1:
@@ -109,7 +109,7 @@ def fit_model(
     if not refined:
         return fit
     fit = fit_to_misfit(fit) if misfits(fit) else refine(fit, first=True)
-    different = different_poses(measured, model.cable.length)
+    different = different_poses(measured, model)
     doubtful = fit.residual_rms > SearchSettings.of(model).other_minima * model.cable.length
     if different >= DIFFERENT and fit.beyond_noise and doubtful:
         # A fit that trusts each line to its noise distorts rest shape and stiffness to fit whatever
@@ -132,7 +132,7 @@ def as_repeating(fit: Fit) -> Fit:
 
 def at_random(fit: Fit) -> Fit | None:
     """Refit of a misfit with a random effect from pose to pose, if that explains it; else None."""
-    different = different_poses(fit.problem.history, fit.model.cable.length)
+    different = different_poses(fit.problem.history, fit.model)
     if fit.noise.source != "misfit" or different < DIFFERENT:
         return None
     known = fit.noise.before or fit.noise

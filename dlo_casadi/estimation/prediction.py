@@ -11,12 +11,22 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.equilibrium.guesses import line_nodes
 from dlo_casadi.equilibrium.pose import HeldPose, PoseBranch
-from dlo_casadi.equilibrium.solve import continued, solve_equilibria, ways_of, ways_round
+from dlo_casadi.equilibrium.solve import (
+    continued,
+    solve_after,
+    solve_equilibria,
+    ways_of,
+    ways_round,
+)
+from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.problem import Problem, Values
+from dlo_casadi.estimation.repeats import different_poses, repeat_std
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.thresholds import DIFFERENT
 
 
 @dataclass(frozen=True)
@@ -112,10 +122,10 @@ def predict_poses(
     for j, (pose, start) in enumerate(zip(poses, given, strict=True)):
         if j in known:
             found = known[j]
-        elif start is None and last is not None and pose.branch == "previous":
+        elif start is None:
             found = None
             with suppress(EquilibriumError):
-                eq = continued(model, p, rest, pose, *last)
+                eq = solve_after(model, p, rest, pose, last)
                 (found,) = _seen(model, p, rest, [pose], [eq])
         else:
             (found,) = predict_each(model, p, rest, [pose], [start])
@@ -159,7 +169,7 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     """Shapes of a problem's poses as predicted from their ends alone.
 
     Where there is no prediction, or one on the other side (see `CableModel.tipped_by`), the shape
-    of `values` is kept. A prediction takes 3 ms in the plane.
+    of `values` is kept, held as declared. A prediction takes 3 ms in the plane.
     """
     shapes, p, rest = problem.state(values)
     model, history = problem.unknowns.model, [item.pose for item in problem.history]
@@ -214,6 +224,8 @@ def measured_elsewhere(
         [*([fits[line.pose.name]] if line.pose.name in fits else []), *_along_line(model, p, line)]
         for line in lines
     ]
+    if model.has_state:  # each start would leave its mark on the cable
+        starts = [ways[:1] for ways in starts]
     of = [j for j, ways in enumerate(starts) for _ in ways]
     poses = [measured[j].pose for j in of]
     solved = predict_poses(model, p, rest, poses, [x for ways in starts for x in ways])
@@ -340,3 +352,18 @@ def rms_distance(
             return None
         squares.append(item.distances(prediction.curve) ** 2)
     return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
+
+
+def uncertainty_of(fit: Fit) -> Uncertainty:
+    """Causes of uncertainty in predictions from a fit.
+
+    The difference between repeats beyond the noise of their points includes that of the fixtures.
+    If there are many different poses, each repeat's own rest curvature accounts for it instead.
+    """
+    names, covariance = fit.named_covariance
+    used = [fit.model.deviation_names[k] for k in fit.problem.equilibria.used_deviations]
+    scatter = dict(zip(used, map(float, fit.problem.deviation_std), strict=True))
+    history, apart = fit.problem.history, 0.0
+    if different_poses(history, fit.model) < DIFFERENT:
+        apart = repeat_std(history, fit.model, fit.noise.of_points.beside_repeats)
+    return Uncertainty(names, covariance, scatter, fit.problem.priors.pose_scatter, apart)

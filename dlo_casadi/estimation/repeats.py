@@ -1,50 +1,19 @@
-"""Poses taken more than once, and cables that do not come back to the same shape.
-
-Differences between repeats of a pose are pure error: no model can explain them. If there are many
-different poses, each repeat has a random quantity of its own. Most often it is a rest curvature,
-
-    kappa_j(s) = kappa_0(s) + std sum_k sqrt(v_k) c_jk f_k(s),    c_jk ~ N(0, 1)
-    f_0 = 1, f_k = sqrt(2) cos(k pi s / L),    v_k ~ exp(-(k pi l / L)^2 / 2),    sum_k v_k = 1
-
-left by friction between strands and by set. It may also be moments of pins, turns of clamps, places
-of the end, or lengths: the likeliest is chosen. To first order it changes the residuals of pose j
-by std E_j c_j, so their covariance is that of the noise plus std^2 E_j E_j^T.
-
-A model that lacks something leaves residuals, too, but they are alike in poses that are alike. A
-second part, correlated over the poses' shapes, therefore absorbs what is systematic while the size
-of the random part is estimated:
-
-    cov(c_j, c_k) = std^2 delta_jk + systematic^2 exp(-d_jk^2 / (2 range^2))
-
-with d_jk the RMS distance of the two shapes. All sizes maximise the restricted likelihood.
-
-References
-----------
-Patterson and Thompson, Biometrika 58 (1971); Kennedy and O'Hagan, J. R. Statist. Soc. B 63 (2001).
-"""
+"""Poses taken more than once: differences between them are pure error, which no model explains."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.special import chdtrc, chdtri
 
 from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.pose_scatter import REST_CURVATURE, SMOOTHNESS, PoseScatter
-from dlo_casadi.rod.node import Frame, Heading
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.sensing.noise_estimate import (
-    Deviance,
-    NoiseSample,
-    estimate_noise,
-    most_likely,
-    tell_of_noise,
-)
-from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE, SIGNIFICANCE
+from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
+from dlo_casadi.thresholds import DIFFERENT, REPEATS_ARE_NOISE
 
 # Share of the length beside each fixture that is left out: repeats agree where they are held.
 _BESIDE_FIXTURES = 0.02
@@ -53,35 +22,25 @@ _BESIDE_FIXTURES = 0.02
 NEARLY = 1e-3
 # Number of nodes of the mean of repeats, a polyline.
 _NODES = 201
-# Trial ranges of the systematic part, as shares of the RMS distance between the poses' shapes.
-RANGES = (0.25, 1.0)
-# Decrease of -2 log likelihood above which a size counts as nonzero: chance exceeds it in 5 % of
-# cases. Evidence: at 0.5 %, 3 of 17 simulated cables that do not repeat were judged to repeat
-# (decreases 3.5 to 5.9), and the stiffness of one of them was two standard deviations off.
-TELLING = float(chdtri(1, 0.1))
-# Maximum number of poses used, evenly spaced.
-MOST_POSES = 40
-# Smallest and largest size searched, in units of the first guess.
-_LOWEST, _HIGHEST = np.log(1e-4), np.log(1e2)
 
 
-def repeatability(measured: Sequence[MeasuredPose], length: float) -> float | None:
+def repeatability(measured: Sequence[MeasuredPose], model: CableModel) -> float | None:
     """RMS distance [m] of a fit pose from the mean of the others held in the same way.
 
     No prediction of the next pose can be better; None if no pose was repeated.
     """
-    squares = [(gaps**2).sum(axis=2).mean(axis=1) for gaps, _ in _gaps(measured, length)]
+    squares = [(gaps**2).sum(axis=2).mean(axis=1) for gaps, _ in _gaps(measured, model)]
     return float(np.sqrt(np.concatenate(squares).mean())) if squares else None
 
 
-def repeat_std(measured: Sequence[MeasuredPose], length: float, noise: float) -> float:
+def repeat_std(measured: Sequence[MeasuredPose], model: CableModel, noise: float) -> float:
     """RMS difference [m] between repeats of one pose, per coordinate across the cable.
 
     Measured from the mean of the others, as in `repeatability`, less the noise of points [m] in
     both; 0 if no pose was repeated.
     """
     squares = []
-    for gaps, tangents in _gaps(measured, length):
+    for gaps, tangents in _gaps(measured, model):
         across = (gaps**2).sum(axis=2) - (gaps * tangents).sum(axis=2) ** 2
         of_points = noise**2 * len(gaps) / (len(gaps) - 1)
         squares.append(across.mean(axis=1) / (gaps.shape[2] - 1) - of_points)
@@ -89,26 +48,31 @@ def repeat_std(measured: Sequence[MeasuredPose], length: float, noise: float) ->
 
 
 def _gaps(
-    measured: Sequence[MeasuredPose], length: float
+    measured: Sequence[MeasuredPose], model: CableModel
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """For each repeated pose: gaps (m, K, d) from the mean of the others, its tangents (K, d)."""
+    length = model.cable.length
     grid = np.linspace(_BESIDE_FIXTURES, 1 - _BESIDE_FIXTURES, 97) * length
-    for group in _groups(measured, length):
+    for group in _groups(measured, model):
         curves = np.array([_line(item, grid, length) for item in group])
         mean = curves.mean(axis=0)
         # The gap from the mean of the others is m / (m - 1) times that from the mean of all.
         gaps = (curves - mean) * len(group) / (len(group) - 1)
-        # Beyond its last point, a line is constant.
+        # Beyond the last point of a line, where `_line` is constant, `unit` leaves zeros.
         yield gaps, unit(np.gradient(mean, axis=0))
 
 
-def different_poses(measured: Sequence[MeasuredPose], length: float) -> int:
-    """Number of fit poses that are held in different ways, wherever they stand."""
-    return len(_held_alike(measured, length))
+def different_poses(measured: Sequence[MeasuredPose], model: CableModel) -> int:
+    """Number of fit poses that hold the cable in different ways."""
+    return len(_held_alike(measured, model))
 
 
-def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: float) -> NoiseModel:
-    """Noise of one line; with a pose or two, that of repeats if these differ by more than twice it.
+def with_repeats(
+    noise: NoiseModel, measured: Sequence[MeasuredPose], model: CableModel
+) -> NoiseModel:
+    """Noise of one line; of few poses that of their repeats, if it is more than twice as large.
+
+    Few are less than DIFFERENT.
 
     Pure error: the distances of repeats from their mean, with their correlation along the cable,
     times sqrt(m / (m - 1)) because the mean of m takes one degree of freedom. A fit that
@@ -119,12 +83,12 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     ----------
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
-    if different_poses(measured, length) >= DIFFERENT:
+    if different_poses(measured, model) >= DIFFERENT:
         return noise  # differences between repeats are then modelled by `pose_scatter`
-    spread = repeatability(measured, length)
+    spread = repeatability(measured, model)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:
         return noise
-    samples, groups = [], _groups(measured, length)
+    samples, groups, length = [], _groups(measured, model), model.cable.length
     nodes = np.linspace(0.0, length, _NODES)
     for group in groups:
         lines = [_line(other, nodes, length) for other in group]
@@ -152,18 +116,18 @@ def with_repeats(noise: NoiseModel, measured: Sequence[MeasuredPose], length: fl
     return replace(found, source="repeats", slow_dof=free * found.slow_dof)
 
 
-def _groups(measured: Sequence[MeasuredPose], length: float) -> list[list[MeasuredPose]]:
+def _groups(measured: Sequence[MeasuredPose], model: CableModel) -> list[list[MeasuredPose]]:
     """Measured lines of fit poses that were held in the same way, two or more each."""
-    groups = [group for group in _held_alike(measured, length) if len(group) > 1]
+    groups = [group for group in _held_alike(measured, model) if len(group) > 1]
     return [[item.traced for item in group] for group in groups]
 
 
-def _held_alike(measured: Sequence[MeasuredPose], length: float) -> list[list[MeasuredPose]]:
+def _held_alike(measured: Sequence[MeasuredPose], model: CableModel) -> list[list[MeasuredPose]]:
     """Fit poses in groups, each of poses that are held like its first one."""
     groups: list[list[MeasuredPose]] = []
     for item in measured:
         if item.readable and not item.held_out:
-            alike = (group for group in groups if _alike(item.pose, group[0].pose, length))
+            alike = (group for group in groups if _alike(item.pose, group[0].pose, model))
             group = next(alike, None)
             if group is None:
                 groups.append([item])
@@ -172,271 +136,29 @@ def _held_alike(measured: Sequence[MeasuredPose], length: float) -> list[list[Me
     return groups
 
 
-def _alike(pose: HeldPose, other: HeldPose, length: float) -> bool:
-    """Whether two poses hold a cable in the same way, wherever they stand."""
-    chords = [np.subtract(one.end or one.start, one.start) / length for one in (pose, other)]
-    node = Heading if len(pose.start) == 2 else Frame
-    turned = np.abs(node.difference(np.stack(pose.frames), np.stack(other.frames))).max()
-    near = max(np.abs(chords[0] - chords[1]).max(), turned) <= NEARLY
-    return bool(near) and pose.turns == other.turns
+def _alike(pose: HeldPose, other: HeldPose, model: CableModel) -> bool:
+    """Whether two poses hold a cable in the same way; without obstacles, wherever they stand."""
+    both, node = (pose, other), model.node
+
+    def told(one: HeldPose) -> tuple[Any, ...]:
+        clips = [(clip.kind, clip.at is None) for clip in one.clips]
+        return one.turns, one.branch, one.over, clips
+
+    if told(pose) != told(other):
+        return False
+    places, frames = [], []
+    for one in both:
+        away = np.array([one.end or one.start, *(clip.place for clip in one.clips)]) - one.start
+        at = np.array([clip.at or 0.0 for clip in one.clips])
+        stands = np.array(one.start) if model.surfaces else np.zeros(0)
+        places.append(np.concatenate([away.ravel(), at, stands]) / model.cable.length)
+        clamped = (clip.frame for clip in one.clips)
+        frames.append(np.array([*one.frames, *(x for x in clamped if x is not None)]))
+    turned = np.abs(node.difference(*frames)).max()
+    return bool(max(np.abs(places[0] - places[1]).max(), turned) <= NEARLY)
 
 
 def _line(item: MeasuredPose, s: FloatArray, length: float) -> FloatArray:
     """Places (K, d) [m] from the start of a measured line at arc lengths s (K,) [m]."""
     places, away = np.maximum.accumulate(item.places(length)), item.points - item.pose.start
     return np.stack([np.interp(s, places, column) for column in away.T], axis=1)
-
-
-@dataclass(frozen=True)
-class ScatterSample:
-    """Data of one pose: residuals e, and the effects that change them, all whitened by the noise.
-
-    Parameters
-    ----------
-    e : (R,)
-    random : (R, q)
-        Change by a unit of what differs from pose to pose, see `PoseScatter.ways`.
-    own : (R, a)
-        Change by one standard deviation of each other quantity of this pose alone.
-    shared : (R, b)
-        Change by the unknowns that all poses share, in any units.
-    """
-
-    e: FloatArray
-    random: FloatArray
-    own: FloatArray
-    shared: FloatArray
-
-
-@dataclass(frozen=True)
-class Variances:
-    """Most likely sizes of noise, random part and systematic part.
-
-    Parameters
-    ----------
-    noise : float
-        Factor on the standard deviation of the noise. If the noise is known, it stands for errors
-        of points beyond it, which are not a rest curvature either.
-    std, systematic : float [1/m]
-    deviance : float
-        -2 log restricted likelihood, up to a constant.
-    degrees : float
-        Degrees of freedom with which the variance std^2 is known: k degrees give -2 log
-        likelihood the curvature 4 k by log(std).
-    """
-
-    noise: float
-    std: float
-    systematic: float
-    deviance: float
-    degrees: float
-
-
-@dataclass(frozen=True)
-class InformedDeviance(Deviance):
-    """Deviance with the average information by the logarithm of the random part's size."""
-
-    information: float
-
-
-class RestLikelihood:
-    """Restricted likelihood of a session's poses.
-
-    Parameters
-    ----------
-    distances : (m, m) [m]
-        Between the poses' shapes, root mean square.
-    source : str
-        What differs from pose to pose, see `PoseScatter`.
-    """
-
-    def __init__(
-        self,
-        samples: Sequence[ScatterSample],
-        distances: FloatArray,
-        source: str = REST_CURVATURE,
-    ) -> None:
-        self.source = source
-        self.m, self.modes = len(samples), samples[0].random.shape[1]
-        self.count = sum(len(sample.e) for sample in samples)
-        shared = np.concatenate([sample.shared for sample in samples])
-        left, values, _ = np.linalg.svd(
-            shared / np.maximum(np.abs(shared).max(axis=0), 1e-300), full_matrices=False
-        )
-        left = left[:, values > 1e-6 * max(values[:1].max(initial=0.0), 1e-300)]
-        blocks = np.split(left, np.cumsum([len(sample.e) for sample in samples])[:-1])
-        # Products of each pose's columns (Z, X, y), and of U with them; U is rotated so that its
-        # columns are orthogonal, with squares `own`.
-        both = zip(samples, blocks, strict=True)
-        columns = [np.column_stack([one.random, x, one.e]) for one, x in both]
-        self.products = np.array([a.T @ a for a in columns])
-        self.own, turns = np.linalg.eigh(np.array([one.own.T @ one.own for one in samples]))
-        crossed = [one.own.T @ a for one, a in zip(samples, columns, strict=True)]
-        self.crossed = turns.swapaxes(1, 2) @ np.array(crossed)
-        self.distances = distances
-        square = (distances**2).sum() / max(self.m * (self.m - 1), 1)
-        # If all poses are repeats of one, they are alike at any range.
-        self.apart = max(float(np.sqrt(square)), 1e-9)
-
-    def deviance(
-        self, noise: float, std: float, systematic: float, smoothness: float, range_: float
-    ) -> InformedDeviance:
-        """Restricted deviance by the logarithms of the three sizes, see `sensing.restricted`.
-
-            V = V_0 + Z B Z^T,   V_0 = noise^2 1 + U U^T,   P = V^-1 - V^-1 X (...)^-1 X^T V^-1
-
-        by Woodbury's identity, first for the other quantities U of each pose alone, then for the
-        random ones Z: pose by pose, or in one block of all poses if these are correlated.
-        """
-        m, r, variance = self.m, self.modes, noise**2
-        weights = 1 / (variance + self.own)
-        first = self._without_own(weights) / variance  # (Z, X, y)^T V_0^-1 (Z, X, y)
-        twice = weights * (2 - self.own * weights)
-        second = self._without_own(twice) / variance**2  # (Z, X, y)^T V_0^-2 (Z, X, y)
-        sizes = PoseScatter(1.0, smoothness, source=self.source).sizes(r) ** 2
-        joined = systematic > 0 and m > 1
-        alike = np.exp(-((self.distances / range_) ** 2) / 2) if joined else np.eye(m)
-        poses = std**2 * np.eye(m) + systematic**2 * joined * alike  # B = poses x sizes
-        inside, cross, between = first[:, :r, :r], first[:, :r, r:], std**2 * np.diag(sizes)
-        if joined:
-            inside, cross = block_diag(*inside)[None], cross.reshape((1, m * r, -1))
-            between = np.kron(poses, np.diag(sizes))
-        count = len(between)
-        matrix = np.eye(count) + inside @ between
-        solved = np.linalg.solve(matrix, np.concatenate([inside, cross], axis=2))
-        inside, taken = solved[:, :, :count], solved[:, :, count:]  # Z^T V^-1 Z, Z^T V^-1 (X, y)
-        moved = between @ taken
-        gram = first[:, r:, r:].sum(axis=0) - (cross.transpose(0, 2, 1) @ moved).sum(axis=0)
-        x, y = gram[:-1, :-1], gram[:-1, -1]
-        root = np.linalg.cholesky(x + 1e-9 * np.trace(x) / max(len(x), 1) * np.eye(len(x)))
-        half = np.linalg.inv(root)
-        explained = half @ y
-        quadratic = float(gram[-1, -1] - explained @ explained)
-        logdet = 2 * float(np.log(root.diagonal()).sum()) - float(np.log(weights).sum())
-        logdet += (self.count - weights.size) * float(np.log(variance))
-        logdet += float(np.linalg.slogdet(matrix)[1].sum())
-
-        # The noise: trace(P) and |P y|^2, with the diagonal blocks of B - B (Z^T V^-1 Z) B.
-        within = std**4 * inside
-        if joined:
-            apart = np.tensordot(poses, inside.reshape((m, r, m, r)), axes=1)
-            within = (poses[:, None, :, None] * apart).sum(axis=2)
-        within = poses.diagonal()[:, None, None] * np.diag(sizes) - sizes[:, None] * within * sizes
-        unit = np.broadcast_to(np.eye(len(gram)), (m, *gram.shape))
-        rows = np.concatenate([-moved.reshape((m, r, -1)), unit], axis=1)
-        square = (rows.transpose(0, 2, 1) @ second @ rows).sum(axis=0)  # (X, y)^T V^-2 (X, y)
-        fitted = np.append(-(half.T @ explained), 1.0)
-        trace = (self.count - (self.own * weights).sum()) / variance
-        trace -= (within * second[:, :r, :r]).sum() + ((half @ square[:-1, :-1]) * half).sum()
-        by_noise = 2 * variance * float(trace - fitted @ square @ fitted)
-        # The random parts: Z^T P Z and Z^T P y, summed over the modes, by pairs of poses.
-        hidden = half @ taken[:, :, :-1].transpose(0, 2, 1)
-        left = inside - hidden.transpose(0, 2, 1) @ hidden
-        pull = taken[:, :, -1] - (explained @ hidden)
-        each = pull.reshape((m, r))
-        pairs = np.diag(left.diagonal(axis1=1, axis2=2).reshape((m, r)) @ sizes)
-        if joined:
-            pairs = left.reshape((m, r, m, r)).diagonal(axis1=1, axis2=3) @ sizes
-        excess = pairs - (each * sizes) @ each.T
-        by_std = 2 * std**2 * float(np.trace(excess))
-        by_systematic = 2 * systematic**2 * joined * float((alike * excess).sum())
-        # The derivative of V by log(std), times P y, is Z way.
-        way = 2 * std**2 * (each * sizes).reshape(pull.shape)[:, :, None]
-        information = float((way * (inside @ way)).sum() - ((hidden @ way).sum(axis=0) ** 2).sum())
-        gradient = np.array([by_noise, by_std, by_systematic])
-        return InformedDeviance(logdet + quadratic, gradient, information)
-
-    def _without_own(self, weights: FloatArray) -> FloatArray:
-        """Products (m, c, c) of (Z, X, y), minus the weighted part (m, a) that U explains."""
-        return self.products - self.crossed.transpose(0, 2, 1) @ (weights[..., None] * self.crossed)
-
-    def best(
-        self,
-        smoothness: float,
-        range_: float | None,
-        std: bool = True,
-        guess: float = 0.1,
-        weight: float = 0.0,
-    ) -> Variances:
-        """Most likely sizes for a smoothness and a range of the systematic part, or without one.
-
-        Parameters
-        ----------
-        std : bool
-            Whether a random part is allowed.
-        guess : float [1/m]
-            Start value.
-        weight : float
-            Exponent of a prior std^weight of the random part, which keeps it from zero.
-        """
-        sought = np.array([True, std, range_ is not None])
-        start = np.log([1.0, guess if std else guess * np.exp(_LOWEST), guess])
-        prior = 2 * weight * np.array([0.0, 1.0, 0.0])
-
-        def deviance(q: FloatArray) -> InformedDeviance:
-            noise, size, systematic = np.exp(q) * [1, 1, sought[2]]
-            found = self.deviance(noise, size, systematic, smoothness, range_ or 1.0)
-            value = found.value - float(prior @ q)
-            return replace(found, value=value, gradient=found.gradient - prior)
-
-        q, found = most_likely(deviance, start, start + sought * _LOWEST, start + sought * _HIGHEST)
-        noise, size, systematic = (np.exp(q) * [1, 1, sought[2]]).tolist()
-        known = max(found.information / 4, 1.0)
-        return Variances(noise, size, systematic, found.value, known)
-
-
-@dataclass(frozen=True)
-class ScatterEstimate:
-    """Evidence in a session that a cable does not repeat.
-
-    Parameters
-    ----------
-    noise : float
-        Factor on the standard deviation of the noise.
-    p_systematic : float
-        Probability that alike poses share that much if all of it is random.
-    deviance : float
-        -2 log restricted likelihood, up to a constant.
-    """
-
-    scatter: PoseScatter
-    noise: float
-    p_systematic: float
-    deviance: float
-
-
-def estimate_pose_scatter(likelihood: RestLikelihood, *, sparse: bool = False) -> ScatterEstimate:
-    """Sizes of maximal restricted likelihood; what alike poses share does not count as random.
-
-    Parameters
-    ----------
-    sparse : bool
-        Whether a pose has no more points than a rest curvature has modes, which hardly separates
-        noise from scatter. The likeliest scatter may then be zero by chance, with too narrow
-        intervals: a prior proportional to the scatter keeps it off zero by about one std error.
-
-    References
-    ----------
-    Chung et al., Psychometrika 78 (2013).
-    """
-    weight, source = float(sparse), likelihood.source
-    trials = SMOOTHNESS if source == REST_CURVATURE else SMOOTHNESS[:1]
-    alone = {s: likelihood.best(s, None, weight=weight) for s in trials}
-    smoothness = min(alone, key=lambda s: alone[s].deviance)
-    chosen, range_, guess = alone[smoothness], None, alone[smoothness].std
-    ranges = [r * likelihood.apart for r in RANGES] if likelihood.m > 2 else []
-    both = {r: likelihood.best(smoothness, r, guess=guess, weight=weight) for r in ranges}
-    joint = min(both, key=lambda r: both[r].deviance, default=None)
-    gain = 0.0 if joint is None else max(chosen.deviance - both[joint].deviance, 0.0)
-    # Best of all ranges; a size bounded by zero takes half of chi-square's probability.
-    p_systematic = float(min(1.0, 0.5 * len(RANGES) * chdtrc(1, gain)))
-    # What the verdict would not call systematic counts as random: see `Structure.p_noise`.
-    if joint is not None and p_systematic < SIGNIFICANCE / 2:
-        chosen, range_ = both[joint], joint
-    without = likelihood.best(smoothness, range_, std=False, guess=guess)
-    if not sparse and without.deviance - chosen.deviance < TELLING:
-        return ScatterEstimate(PoseScatter(), without.noise, p_systematic, without.deviance)
-    found = PoseScatter(chosen.std, smoothness, chosen.degrees, source)
-    sizes = (chosen.noise, chosen.std, chosen.systematic)
-    deviance = likelihood.deviance(*sizes, smoothness, range_ or 1.0).value
-    return ScatterEstimate(found, chosen.noise, p_systematic, deviance)

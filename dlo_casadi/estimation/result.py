@@ -12,7 +12,6 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.estimation.problem import (
     FIRST_ROUGHNESS,
     NO_INFORMATION,
@@ -22,11 +21,10 @@ from dlo_casadi.estimation.problem import (
     Priors,
     Problem,
 )
-from dlo_casadi.estimation.repeats import different_poses, repeat_std
-from dlo_casadi.estimation.unknowns import REST_TURNS_STD
+from dlo_casadi.estimation.unknowns import REST_TURNS_STD, Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import DIFFERENT, LEAST_NOISE_DEGREES
+from dlo_casadi.thresholds import LEAST_NOISE_DEGREES
 
 # Roughness at which `marginal_covariance` is evaluated: from the smallest estimate to thirty scales
 # of its prior, which is flat below one scale and falls with the square above.
@@ -358,13 +356,15 @@ class Fit:
         """
         problem, size = self.problem, self.problem.unknowns.size
         square, count = problem.n_residuals * self.noise.std**2, self._n_points
-        for k, (j, covariance) in enumerate(zip(problem.used, covariances, strict=True)):
-            by = self.linearization.raw_directions[k][:, :size]
+        directions = (by[:, :size] for by in self.linearization.raw_directions)
+        own = (problem.used, self._by_fixtures, self._by_rest, self._on_points)
+        rows = zip(covariances, directions, *own, strict=True)
+        for covariance, by, j, fixtures, rest, on_points in rows:
             variance = self.inflation**2 * ((by @ covariance) * by).sum(axis=1)
-            variance += self._by_fixtures[k] + self._by_rest[k]
+            variance += fixtures + rest
             units = self.noise.units(problem.measured[j].kinds)
             square += float((units**2 * variance).sum())
-            count += int((~self._on_points[k]).sum())
+            count += int((~on_points).sum())
         return float(np.sqrt(square / count))
 
     @property
@@ -395,6 +395,13 @@ class Fit:
     def value(self, name: str) -> float:
         """Value of a parameter (SI)."""
         return float(self.p[self.model.names.index(name)])
+
+    def problem_in(
+        self, model: CableModel, given: Mapping[str, float] = MappingProxyType({})
+    ) -> Problem:
+        """The problem of a similar model; for its parameters see `free_in` and `values_in`."""
+        unknowns = Unknowns(model, self.free_in(model), self.values_in(model, given))
+        return replace(self.problem, unknowns=unknowns)
 
     def values_in(
         self, model: CableModel, given: Mapping[str, float] = MappingProxyType({})
@@ -432,19 +439,3 @@ class Fit:
             for block, _, _ in self.normal.inner
         )
         return -self.point.objective + (prior - hessian - inner) / 2 + white
-
-
-def uncertainty_of(fit: Fit) -> Uncertainty:
-    """Causes of uncertainty in predictions from a fit.
-
-    The difference between repeats beyond the noise of their points includes that of the fixtures.
-    If there are many different poses, each repeat's own rest curvature accounts for it instead.
-    """
-    names, covariance = fit.named_covariance
-    used = [fit.model.deviation_names[k] for k in fit.problem.equilibria.used_deviations]
-    scatter = dict(zip(used, map(float, fit.problem.deviation_std), strict=True))
-    history, length = fit.problem.history, fit.model.cable.length
-    apart = 0.0
-    if different_poses(history, length) < DIFFERENT:
-        apart = repeat_std(history, length, fit.noise.of_points.beside_repeats)
-    return Uncertainty(names, covariance, scatter, fit.problem.priors.pose_scatter, apart)

@@ -177,8 +177,11 @@ def measured_moment_curve(
         s = chord_lengths(points)
         s *= length / s[-1]  # chords of noisy points add up to more than the cable
     parts = min(MOST_PARTS, len(points) // 2 - DEGREE)
-    knots = np.pad(np.linspace(s[0], s[-1], max(parts, 1) + 1), DEGREE, mode="edge")
-    spline = make_lsq_spline(s, points, knots, DEGREE)
+    order = np.argsort(s, kind="stable")
+    s, points = s[order], points[order]
+    # As many points between two knots everywhere: none of them lies in a hidden stretch.
+    edges = np.quantile(s, np.linspace(0.0, 1.0, max(parts, 1) + 1))
+    spline = make_lsq_spline(s, points, np.pad(edges, DEGREE, mode="edge"), DEGREE)
     fine = np.linspace(s[0], s[-1], FINE)
     curve, velocity, acceleration = (spline(fine, k) for k in range(3))
     speed = np.linalg.norm(velocity, axis=1, keepdims=True)

@@ -174,7 +174,7 @@ class Unknowns:
         return np.concatenate([np.array(width) / np.sqrt(12), np.full(self.n_rest, np.inf)])
 
     def reach(self, theta: FloatArray, farthest: float = FARTHEST) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bounds of theta after one step: logarithms change by FARTHEST at most."""
+        """Lower and upper bounds of theta after a step: logarithms change by `farthest` at most."""
         far = np.where(self._logs, farthest, np.inf)
         lower, upper = self.bounds
         return np.maximum(lower, theta - far), np.minimum(upper, theta + far)
@@ -196,7 +196,7 @@ class Unknowns:
         if k == torsion:
             of_bending = gap[bending] if bending is not None else 0.0
             return float(((gap[k] - of_bending) / STIFFNESS_RATIO_STD) ** 2)
-        return float((gap[k] / self._parameters[k].prior_std) ** 2)
+        return float((gap[k] * self.scales[k] / self._parameters[k].prior_std) ** 2)
 
     def prior(self, roughness_std: float) -> tuple[FloatArray, FloatArray]:
         """Mean (size,) and precision matrix (size, size) of the Gaussian prior of theta.
@@ -272,5 +272,4 @@ IN_PLANE = SearchSettings(20, 0.0, 0.01, 0.001, 3, predicts=True, converged_firs
 # misfit: searches left 0.0025 to 0.0083 in four sessions in which an effect is missing, 0.0008 to
 # 0.0013 in three with little or nothing missing. Either stiffness of such a fit may be far off (a
 # taper's torsion 0.0005 of 0.005 N m^2): the missing effect is searched from the measured shapes.
-# shapes.
 IN_SPACE = SearchSettings(10, 0.004, 0.002, np.inf, 1, predicts=False, converged_first=True)

@@ -8,16 +8,15 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.repeats import (
-    MOST_POSES,
-    RestLikelihood,
-    ScatterEstimate,
-    ScatterSample,
-    different_poses,
-    estimate_pose_scatter,
-    with_repeats,
-)
+from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.scatter_likelihood import (
+    MOST_POSES,
+    ScatterEstimate,
+    ScatterLikelihood,
+    ScatterSample,
+    estimate_pose_scatter,
+)
 from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
@@ -131,7 +130,9 @@ def errors_of(
         for count in range(modes, -1, -1):
             samples = _noise_samples(fit, count)
             if tell_of_noise(samples):
-                noise = with_repeats(estimate_noise(samples, length), fit.problem.history, length)
+                noise = with_repeats(
+                    estimate_noise(samples, length), fit.problem.history, fit.model
+                )
                 break
         else:
             noise, together = _white_noise(fit), True
@@ -187,7 +188,7 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
 
 def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
     """Likeliest random quantity of each repeat and its size; see `estimate_pose_scatter`."""
-    if different_poses(fit.problem.history, fit.model.cable.length) < DIFFERENT:
+    if different_poses(fit.problem.history, fit.model) < DIFFERENT:
         return ScatterEstimate(PoseScatter(), 1.0, 1.0, 0.0)
     (found,) = _scatters_of(fit, noise, [PoseScatter()])
     if found.scatter.std == 0 and not (fit.beyond_noise or _beyond_tolerances(fit)):
@@ -233,7 +234,7 @@ def _scatters_of(
             ScatterSample(e, white @ moved[k], own, shared)
             for k, (white, e, own, shared) in zip(kept, poses, strict=True)
         ]
-        likelihood = RestLikelihood(samples, distances, scatter.source)
+        likelihood = ScatterLikelihood(samples, distances, scatter.source)
         found.append(estimate_pose_scatter(likelihood, sparse=sparse))
     return found
 

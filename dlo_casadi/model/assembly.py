@@ -246,7 +246,7 @@ class Assembly:
     def slipped(
         self, given: Inputs, along: Tangents
     ) -> Iterator[tuple[FloatArray, tuple[Inputs, Inputs]]]:
-        """Pairs of inputs whose difference, times factors (m, q), is the change by clip slips."""
+        """Central differences by slips of clips: the rate (m, q) of each, and both inputs."""
         step = _SLIP * self.chain.length
         for k in np.flatnonzero(functions_of(self.model).slips.any(axis=0)):
             unit = step * np.eye(given.p.shape[1])[k]

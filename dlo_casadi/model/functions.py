@@ -169,16 +169,11 @@ class Functions:
 
         The forces (dimension, 2) [N] and moments (increment, 2) [N m] are those of `Equilibrium`.
         """
-        node, rows = self.node, reaction_rows(self.node)
-        forces = [self._reactions[rows[f"{side}_force"]] for side in ("start", "end")]
-        lam = (self.terms.lam[k] for k in range(self.model.n_lam))
-        known = dict(zip(self.model.border_names, lam, strict=False))
-        frames = zip(("start", "end"), ca.vertsplit(self.terms.x, node.coordinates), strict=True)
+        rows, sides = reaction_rows(self.node), ("start", "end")
+        forces = [self._reactions[rows[f"{side}_force"]] for side in sides]
         moments = [
-            node.to_world(
-                x, ca.vertcat(*(known.get(f"{side}_{turn}", ca.SX(0)) for turn in node.turns))
-            )
-            for side, x in frames
+            self._reactions[rows[f"{side}_moment"]] * (getattr(self.model, side) == "clamped")
+            for side in sides
         ]
         value = self.terms.ends_lagrangian
         return self._of_ends("end_shape", value, ca.horzcat(*forces), ca.horzcat(*moments))
@@ -334,7 +329,7 @@ class Functions:
 
     @cached_property
     def _readings(self) -> ca.SX:
-        """The same as measured by sensors."""
+        """`_reactions` as the sensors measure them."""
         rows, of = self._reactions, reaction_rows(self.node, len(self.model.clips))
         for effect, local in self.terms.effects_of(MeasurementEffect):
             parts = effect.feel({name: rows[at] for name, at in of.items()}, local)

@@ -149,21 +149,19 @@ class InnerProblem:
 
         min V(theta, alpha) + beta r_p(theta)   s.t.   r(L) = end,   |theta_i| <= pi/2 for i >= 2
 
+    with beta = WEIGHT n.
+
     Parameters
     ----------
     gravity : (float, float) [m/s^2]
     n : int
         Number of links.
-    c : float [J/m^2]
-        beta = c n.
     """
 
-    def __init__(
-        self, cable: CableData, gravity: tuple[float, ...], n: int, c: float = WEIGHT
-    ) -> None:
+    def __init__(self, cable: CableData, gravity: tuple[float, ...], n: int) -> None:
         self.chain = Chain(cable.length, n, "link")
         self.weight = cable.mass / n * np.array(gravity)
-        self.beta = c * n
+        self.beta = WEIGHT * n
         # One solver for all poses and iterations: alpha, end and points are its parameters.
         phi, k_theta = ca.SX.sym("phi", n), ca.SX.sym("k_theta")
         theta_0, seen = ca.SX.sym("theta_0", n - 1), ca.SX.sym("seen", n - 1)

@@ -22,7 +22,8 @@ from dlo_casadi.config.values import AXES
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import DloError, well_formed
-from dlo_casadi.estimation.result import Fit, uncertainty_of
+from dlo_casadi.estimation.prediction import uncertainty_of
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.report.words import ALWAYS, all_warnings

@@ -52,15 +52,9 @@ class Vector:
         inner = np.abs(self.x).max(axis=(1, 2))
         return np.maximum(inner, np.abs(self.y).max(axis=1, initial=0.0))
 
-    @classmethod
-    def of(cls, rows: FloatArray, n: int, b: int) -> Vector:
-        """From rows (m, n b + k, q): those of the nodes, then those of the border."""
-        m, _, q = rows.shape
-        return cls(rows[:, : n * b].reshape((m, n, b, q)), rows[:, n * b :])
-
     @property
     def rows(self) -> FloatArray:
-        """All rows (m, n b + k, q), in the order of `of`."""
+        """All rows (m, n b + k, q): those of the nodes, then those of the border."""
         m, n, b, q = self.x.shape
         return np.concatenate([self.x.reshape((m, n * b, q)), self.y], axis=1)
 

@@ -372,10 +372,10 @@ class Outcome:
     @cached_property
     def repeatability(self) -> Repeatability:
         """How well the cable returns to the same shape."""
-        history, length = self.fit.problem.history, self.fit.model.cable.length
-        if different_poses(history, length) >= DIFFERENT:
+        history, model = self.fit.problem.history, self.fit.model
+        if different_poses(history, model) >= DIFFERENT:
             return Repeatability(float(np.sqrt(2) * self.fit.repeat_error), "poses")
-        spread = repeatability(history, length)
+        spread = repeatability(history, model)
         return Repeatability(spread or 0.0, None if spread is None else "repeats")
 
     def stage(self, name: StageName) -> Stage | None:

@@ -12,7 +12,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.config import Config, Pose, load_config
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.errors import ConfigError, EquilibriumError
+from dlo_casadi.errors import ConfigError, EquilibriumError, counted
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.export.rod import ROUND, Rod
 from dlo_casadi.export.targets import Target, require
@@ -117,8 +117,8 @@ def round_trip(
     chosen = [j for j in order if predictions[j] is not None][: poses or held_out]
     if not chosen:
         raise EquilibriumError(
-            f"none of {config.name}'s {len(measured)} poses can be predicted with {cable.name!r}."
-            "\n  Try: --check SESSION.yaml, with the session that the cable was fitted to"
+            f"no pose of {config.name} ({counted(len(measured), 'pose')}) can be predicted with "
+            f"{cable.name!r}.\n  Try: --check SESSION.yaml, with the session it was fitted to"
         )
     model = cable.model
     guess = (model.cable.bending_stiffness, model.cable.torsional_stiffness)

@@ -30,8 +30,9 @@ from dlo_casadi.estimation.prediction import (
     predict_other_side,
     predict_poses,
     rms_distance,
+    uncertainty_of,
 )
-from dlo_casadi.estimation.result import Fit, uncertainty_of
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
 from dlo_casadi.model.clips import clip_rows

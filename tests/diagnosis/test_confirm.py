@@ -15,6 +15,7 @@ from dlo_casadi.effects import CableData, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.problem import Priors
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
@@ -83,6 +84,22 @@ def test_a_fixed_effect_stays_on_another_mesh_and_beside_an_unknown_pull(base):
     )
     assert kept(found) == FIXED
     assert not unknowns.free[1:3].any()
+
+
+def test_an_unknown_force_has_its_prior_beside_clips(base):
+    clipped = replace(PLAIN, clips=("pinned",))
+    problem = replace(
+        base.problem,
+        unknowns=replace(base.problem.unknowns, model=clipped),
+        priors=Priors.of(Tolerances(), clipped.with_effect(UnknownPull())),
+    )
+    model = clipped.with_effect(UnknownPull())
+    search = _Search(SimpleNamespace(problem=problem), model, "unknown_pull.position")
+    std = search._problem(base.problem.unknowns).priors.scatter
+    stds = dict(zip(model.deviation_names, std, strict=True))
+    assert np.isfinite(std).all()
+    assert stds["unknown_force_x"] == stds["unknown_force_y"] > 0.1  # of its weight of 0.3 N
+    assert stds["clip_0_x"] == Tolerances().clip
 
 
 def test_a_fit_that_loses_its_poses_starts_again_from_the_declared_model(base, monkeypatch):

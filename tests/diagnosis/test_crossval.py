@@ -37,10 +37,10 @@ def test_where_a_step_leads_too_far_the_other_poses_are_fitted_again(effects, mo
     expected, densities = cross_validate(fit).squares, cross_validate(fit).densities
     predicted = crossval._predicted
 
-    def astray(fit, thetas, executor):  # a bending stiffness 2.7 times as large
+    def astray(fit, thetas):  # a bending stiffness 2.7 times as large
         monkeypatch.setattr(crossval, "_predicted", predicted)
         further = {k: theta + np.eye(len(theta))[0] for k, theta in thetas.items()}
-        return predicted(fit, further, executor)
+        return predicted(fit, further)
 
     monkeypatch.setattr(crossval, "_predicted", astray)
     found = cross_validate(fit)
@@ -61,8 +61,8 @@ def test_a_fit_that_does_not_explain_its_points_is_not_repeated_without_each_pos
     expected = cross_validate(fit).densities
     predicted = crossval._predicted
 
-    def astray(fit, thetas, executor):
-        return predicted(fit, {k: x + np.eye(len(x))[0] for k, x in thetas.items()}, executor)
+    def astray(fit, thetas):
+        return predicted(fit, {k: x + np.eye(len(x))[0] for k, x in thetas.items()})
 
     monkeypatch.setattr(crossval, "_predicted", astray)
     monkeypatch.setattr(crossval, "_fitted_without", lambda *_: pytest.fail("fitted again"))

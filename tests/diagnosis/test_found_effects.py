@@ -151,11 +151,11 @@ def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one(monkeypatch):
     assert same == [tether, gradient]
     assert found.name == "point_force"
     assert found.fit.point.objective < force.fit.point.objective - 1000
-    *_, nowhere = loads_from_best(base, screened, [None, tether, gradient], InProcess())
+    *_, nowhere = loads_from_best(base, screened, [tether, gradient], InProcess())
     assert nowhere.fit.point.objective == found.fit.point.objective
     # It stays beside the other effect of a pair, whose data are as sure of it as of the tether.
     pair = replace(tether, beside=(gradient.screened,))
-    other = loads_from_best(base, screened, [None, pair, None], InProcess())[1]
+    other = loads_from_best(base, screened, [pair], InProcess())[1]
     assert other.name == "stiffness_gradient and point_force"
     # A load that the pair already has is not added once more.
     loads = replace(tether, beside=(screened[0],))
@@ -172,7 +172,7 @@ def test_left_out_poses_that_no_fit_predicts_count_to_first_order(monkeypatch):
     fit = confirm(base, Screened(listed["tether"], 1.0, 0.0, start)).fit
     whole = cross_validate(fit)
     assert whole.complete
-    monkeypatch.setattr(crossval, "_predicted", lambda fit, thetas, _: dict.fromkeys(thetas))
+    monkeypatch.setattr(crossval, "_predicted", lambda fit, thetas: dict.fromkeys(thetas))
     lost = cross_validate(fit)
     assert lost.densities == pytest.approx(whole.densities, abs=1.0)
     assert lost.error == np.inf

@@ -53,9 +53,9 @@ def test_hangings_that_differ_by_more_than_the_noise_limit_every_prediction(scat
 def test_only_a_clear_gain_counts_where_poses_do_not_repeat(gains, doubt, kept):
     """Gains in log density of each left-out repeat."""
     counts = np.full(5, 40.0)
-    before = CrossValidation(counts, counts, True, densities=np.zeros(5))
+    before = CrossValidation(counts, counts, 1.0, densities=np.zeros(5))
     added = SimpleNamespace(candidate=SimpleNamespace(name="effect"))
-    after = CrossValidation(counts, counts, True, densities=np.array(gains))
+    after = CrossValidation(counts, counts, 1.0, densities=np.array(gains))
     tried = Confirmed(added, SimpleNamespace(log_evidence=100.0), after, 100.0)
     chosen, _ = choose([tried], SimpleNamespace(log_evidence=0.0), before, doubt)
     assert chosen == ([tried] if kept else [])

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
-from dlo_casadi.diagnosis.structure import structure_of
+from dlo_casadi.diagnosis.structure import _rank_score, structure_of
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
@@ -44,6 +45,14 @@ def test_waves_along_two_normals_are_long_runs(structure):
     """Six runs a component, of 60 points 30 are expected: opposite signs side by side are none."""
     # sqrt(10) components of 24.5 runs less than expected each, 3.8 their standard deviation.
     assert structure.runs_z == pytest.approx(-10 * 25 / np.sqrt(10 * 14.7), rel=0.15)
+
+
+def test_ties_share_their_rank():
+    """Repeats of two poses: the order in which they were taken does not matter."""
+    energies, spans = np.arange(9.0), np.repeat([1.0, 2.0], [8, 1])
+    there, back = _rank_score(energies, spans), _rank_score(energies[::-1], spans[::-1])
+    assert there == pytest.approx(back)
+    assert there == pytest.approx(spearmanr(energies, spans).statistic * np.sqrt(8))
 
 
 def test_the_distance_of_the_ends_is_that_in_space(structure):

@@ -18,7 +18,7 @@ SHARES = np.array([0.9, 1.1, 1.0, 0.95, 1.05, 1.0]) / 6
 
 def validation(log_density):
     """Of poses left out, with so much log density in all."""
-    return CrossValidation(COUNTS * 1e-6, COUNTS, True, densities=log_density * SHARES)
+    return CrossValidation(COUNTS * 1e-6, COUNTS, 1e-3, densities=log_density * SHARES)
 
 
 DECLARED = validation(90.0)
@@ -49,7 +49,6 @@ TRIED = [
     refit("worse", 50.0, -40.0),
     lost([2], "edge", 49.0, 55.0),
     lost([0, 1, 2, 3], "lost", 49.0, 55.0),
-    None,
 ]
 
 
@@ -79,7 +78,7 @@ def test_hangings_that_are_no_better_by_more_than_chance():
     one = Confirmed(
         TRIED[0].screened,
         SimpleNamespace(log_evidence=150.0),
-        CrossValidation(COUNTS, COUNTS, True, densities=told),
+        CrossValidation(COUNTS, COUNTS, 1.0, densities=told),
         60.0,
     )
     assert choose([one], BASE, DECLARED, None) == ([one], {})

@@ -268,7 +268,7 @@ def test_limits_end_the_loop_with_a_message():
 def test_parameters_are_those_of_the_model():
     """k_theta = EI / h and theta_0 = kappa_0 h give the energy of Eq. 6 in `CableModel`."""
     result = run_algorithm1(CABLE, measured(0.3, ENDS), GRAVITY, n=6, max_iterations=1)
-    problem = InnerProblem(CABLE, GRAVITY, 6, c=0.0)
+    problem = InnerProblem(CABLE, GRAVITY, 6)
     shape = solve_equilibrium(result.model, result.p, result.rest, HeldPose((0.0, 0.0), ENDS[0]))
     line = MeasuredPose.of_points(HeldPose((0.0, 0.0), ENDS[0]), shape.points[1:-1])
     by_paper = problem.objective(

@@ -48,3 +48,13 @@ def test_the_law_is_read_off_a_hanging_strip(torsion, gravity, level, softness, 
 def test_too_few_points():
     with pytest.raises(EstimationError, match="at least 10 points, got 4"):
         measured_moment_curve(np.zeros((4, 2)), 1.0, 1.0, (0.0, -9.81))
+
+
+def test_a_hidden_stretch_leaves_no_gap_in_the_curve():
+    """Points in two stretches, and not in their order: a curve through all, without nan."""
+    s = np.r_[np.linspace(0.0, 0.05, 18), np.linspace(0.22, 0.25, 4)]
+    points = np.stack([s, -2.0 * s**2], axis=1)
+    found = measured_moment_curve(points, 0.26, WEIGHT, (0.0, -9.81), s)
+    assert np.isfinite(found.curvature).all()
+    turned = measured_moment_curve(points[::-1], 0.26, WEIGHT, (0.0, -9.81), s[::-1])
+    np.testing.assert_array_equal(found.curvature, turned.curvature)

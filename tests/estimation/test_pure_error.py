@@ -7,17 +7,25 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import displacements, spread_across
-from dlo_casadi.estimation.prediction import measured_branches, predict_poses, rms_distance
+from dlo_casadi.estimation.prediction import (
+    measured_branches,
+    predict_poses,
+    rms_distance,
+    uncertainty_of,
+)
 from dlo_casadi.estimation.repeats import (
     different_poses,
     repeat_std,
     repeatability,
     with_repeats,
 )
-from dlo_casadi.estimation.result import uncertainty_of
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.report.documents import fit_dict
+from dlo_casadi.rod.obstacles import Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.fitting import declared_model, fit_declared
@@ -25,6 +33,7 @@ from dlo_casadi.session.measure import measured_poses, read_inputs
 
 ROOT = Path(__file__).resolve().parents[2]
 LENGTH, STD = 1.0, 5e-4
+MODEL = CableModel(CableData(LENGTH, 0.1, 0.01, 0.05), 20)
 DECLARED = NoiseModel(STD, source="declared")
 
 
@@ -43,17 +52,17 @@ def test_repeats_tell_size_and_correlation():
     """Sixteen lines; the distances from their mean lose one degree of freedom."""
     truth = NoiseModel(3e-3, share=0.9, length=0.05, kernel="gaussian")
     measured = lines(truth, 16, HeldPose((0.0, 0.0), (LENGTH, 0.0)))
-    found = with_repeats(DECLARED, measured, LENGTH)
+    found = with_repeats(DECLARED, measured, MODEL)
     assert found.source == "repeats"
     assert found.known
     # 16 lines of some 8 correlation lengths: 10 % of a standard deviation, three of them.
     assert found.std == pytest.approx(truth.std, rel=0.3)
     assert found.length == pytest.approx(truth.length, rel=0.3)
     # From the mean of the others: sqrt(1 + 1 / 15).
-    assert repeatability(measured, LENGTH) == pytest.approx(truth.std * 1.033, rel=0.3)
+    assert repeatability(measured, MODEL) == pytest.approx(truth.std * 1.033, rel=0.3)
     # Nothing differs along the line, nor beyond the noise.
-    assert repeat_std(measured, LENGTH, 0.0) == pytest.approx(truth.std * 1.033, rel=0.3)
-    assert repeat_std(measured, LENGTH, truth.std) < truth.std / 2
+    assert repeat_std(measured, MODEL, 0.0) == pytest.approx(truth.std * 1.033, rel=0.3)
+    assert repeat_std(measured, MODEL, truth.std) < truth.std / 2
 
     # The same elsewhere, and nearly the same: ends 0.5 mm apart, of a cable of 1 m.
     moved = []
@@ -62,21 +71,45 @@ def test_repeats_tell_size_and_correlation():
         end = item.pose.end + away + [0.0, 5e-4 * (k % 2)]
         pose = replace(item.pose, start=tuple(away), end=tuple(end))
         moved.append(MeasuredPose.of_points(pose, item.points + away))
-    assert different_poses(moved, LENGTH) == 1
-    again = with_repeats(DECLARED, moved, LENGTH)
+    assert different_poses(moved, MODEL) == 1
+    again = with_repeats(DECLARED, moved, MODEL)
     assert again.std == pytest.approx(found.std, rel=0.01)
     turned = replace(moved[0], pose=replace(moved[0].pose, start_heading=0.002))
-    assert different_poses([turned, *moved], LENGTH) == 2
+    assert different_poses([turned, *moved], MODEL) == 2
+
+
+def test_poses_that_hold_a_cable_in_different_ways_are_no_repeats():
+    pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
+    item = lines(DECLARED, 1, pose)[0]
+    clip = HeldClip("pinned", (0.5, 0.1), 0.5)
+    others = [
+        replace(pose, branch="ccw"),
+        replace(pose, branch="cw"),
+        replace(pose, over=True),
+        replace(pose, clips=(clip,)),
+        replace(pose, clips=(replace(clip, place=(0.5, 0.2)),)),
+        replace(pose, clips=(replace(clip, at=0.6),)),
+        replace(pose, clips=(replace(clip, kind="clamped", heading=0.1),)),
+        replace(pose, clips=(replace(clip, kind="clamped", heading=0.2),)),
+    ]
+    held = [replace(item, pose=one) for one in (pose, *others, *others)]
+    assert different_poses(held, MODEL) == 1 + len(others)
+    # Beside a table it matters where they stand.
+    raised = replace(pose, start=(0.0, 0.1), end=(LENGTH, 0.1))
+    two = [item, replace(item, pose=raised)]
+    assert different_poses(two, MODEL) == 1
+    table = Plane((0.0, -0.3), (0.0, 1.0), name="table")
+    assert different_poses(two, replace(MODEL, obstacles=(table,))) == 2
 
 
 def test_poses_that_repeat_to_the_noise_or_are_taken_once_leave_it_as_declared():
     pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
-    assert with_repeats(DECLARED, lines(DECLARED, 5, pose), LENGTH) is DECLARED
+    assert with_repeats(DECLARED, lines(DECLARED, 5, pose), MODEL) is DECLARED
     far_off = lines(NoiseModel(3e-3), 2, pose)
     once = [far_off[0], replace(far_off[1], pose=replace(pose, end=(LENGTH, 0.01)))]
-    assert with_repeats(DECLARED, once, LENGTH) is DECLARED
+    assert with_repeats(DECLARED, once, MODEL) is DECLARED
     held_out = [far_off[0], replace(far_off[1], held_out=True)]
-    assert with_repeats(DECLARED, held_out, LENGTH) is DECLARED
+    assert with_repeats(DECLARED, held_out, MODEL) is DECLARED
 
 
 @pytest.mark.parametrize("left_out", [0, 1])
@@ -97,7 +130,7 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     predictions = predict_poses(fit.model, fit.p, fit.rest, poses)
     others = measured_branches(fit.model, fit.p, fit.rest, measured, predictions)
     assert others == [None] * 5
-    floor = repeatability([replace(item, held_out=False) for item in measured], 1.5)
+    floor = repeatability([replace(item, held_out=False) for item in measured], fit.model)
     assert rms_distance(predictions, measured, held_out=True) < 1.5 * floor
     # The band is as wide as repeats differ, of which a distance in a plane has up to two parts.
     uncertainty = uncertainty_of(fit)
@@ -115,4 +148,4 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
 def test_repeats_of_a_point_each_tell_of_no_noise():
     pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
     points = [MeasuredPose.of_points(pose, np.array([[0.5, y]])) for y in (-0.01, 0.01)]
-    assert with_repeats(DECLARED, points, LENGTH) is DECLARED
+    assert with_repeats(DECLARED, points, MODEL) is DECLARED

@@ -7,7 +7,11 @@ import pytest
 from scipy.optimize import minimize
 
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.repeats import RestLikelihood, ScatterSample, estimate_pose_scatter
+from dlo_casadi.estimation.scatter_likelihood import (
+    ScatterLikelihood,
+    ScatterSample,
+    estimate_pose_scatter,
+)
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, modes_of
 from dlo_casadi.sensing.noise_estimate import Deviance
 
@@ -39,7 +43,7 @@ def test_deviance_against_the_full_covariance(systematic):
     # Repeats of a pose share what they determine, which couples them whatever the scatter.
     samples[1] = replace(samples[1], shared=samples[0].shared)
     noise, std, smoothness, range_ = 1.3, 0.15, 0.25, 0.3
-    likelihood = RestLikelihood(samples, distances)
+    likelihood = ScatterLikelihood(samples, distances)
     found = likelihood.deviance(noise, std, systematic, smoothness, range_)
     sizes = PoseScatter(1.0, smoothness).sizes(MODES)
     alike = np.exp(-((distances / range_) ** 2) / 2)
@@ -67,7 +71,7 @@ def test_deviance_against_the_full_covariance(systematic):
 
 @pytest.mark.parametrize("systematic", [0.0, 0.2])
 def test_gradient_of_the_deviance_against_differences(systematic):
-    likelihood = RestLikelihood(*session(0.1))
+    likelihood = ScatterLikelihood(*session(0.1))
 
     def at(logs: np.ndarray) -> Deviance:
         return likelihood.deviance(*np.array([1.3, 0.15, systematic]) * np.exp(logs), 0.25, 0.3)
@@ -79,7 +83,7 @@ def test_gradient_of_the_deviance_against_differences(systematic):
 
 def test_a_single_pose_has_no_systematic_part():
     samples, distances = session(0.1, rows=30)
-    alone = RestLikelihood(samples[:1], distances[:1, :1]).deviance(1.3, 0.15, 0.2, 0.25, 0.3)
+    alone = ScatterLikelihood(samples[:1], distances[:1, :1]).deviance(1.3, 0.15, 0.2, 0.25, 0.3)
     assert alone.gradient[2] == 0.0
     assert alone.gradient[1] != 0.0
 
@@ -88,11 +92,11 @@ def test_sizes_are_those_of_a_search_without_derivatives():
     """Nelder and Mead's, from the same start, far below what a likelihood tells."""
     for systematic in (0.0, 0.5):
         samples, distances = session(0.2, systematic, seed=1)
-        likelihood = RestLikelihood(samples, distances)
+        likelihood = ScatterLikelihood(samples, distances)
         found = likelihood.best(0.5, 0.3)
         at = np.log([found.noise, found.std, found.systematic])
 
-        def deviance(q: np.ndarray, likelihood: RestLikelihood = likelihood) -> float:
+        def deviance(q: np.ndarray, likelihood: ScatterLikelihood = likelihood) -> float:
             return likelihood.deviance(*np.exp(q), 0.5, 0.3).value
 
         options = {"xatol": 1e-4, "fatol": 1e-4}
@@ -103,14 +107,14 @@ def test_sizes_are_those_of_a_search_without_derivatives():
 def test_degrees_of_freedom_of_a_variance_that_noise_does_not_hide():
     """All rows less two unknowns."""
     samples, distances = session(50.0, seed=2)
-    found = RestLikelihood(samples, distances).best(0.12, None, guess=50.0)
+    found = ScatterLikelihood(samples, distances).best(0.12, None, guess=50.0)
     assert found.degrees == pytest.approx(M * ROWS - 2, rel=0.01)
 
 
 def test_a_random_rest_curvature_is_found_beside_unknown_noise():
     """Nine poses of six numbers: within a third, on average over twenty sessions."""
     found = [
-        estimate_pose_scatter(RestLikelihood(*session(0.2, seed=k, rows=12))) for k in range(20)
+        estimate_pose_scatter(ScatterLikelihood(*session(0.2, seed=k, rows=12))) for k in range(20)
     ]
     assert np.mean([x.scatter.std for x in found]) == pytest.approx(0.2, rel=0.15)
     assert np.mean([x.noise for x in found]) == pytest.approx(1.0, rel=0.15)
@@ -120,7 +124,8 @@ def test_a_random_rest_curvature_is_found_beside_unknown_noise():
 def test_a_cable_that_repeats_has_none():
     """A threshold of five percent for the best of three smoothnesses: three of twenty at most."""
     found = [
-        estimate_pose_scatter(RestLikelihood(*session(0.0, seed=k))).scatter.std for k in range(20)
+        estimate_pose_scatter(ScatterLikelihood(*session(0.0, seed=k))).scatter.std
+        for k in range(20)
     ]
     assert np.count_nonzero(found) <= 3
     assert np.median(found) == 0
@@ -130,7 +135,7 @@ def test_what_poses_that_are_alike_have_in_common_is_not_random():
     """A function of the pose, as a missing effect leaves it."""
     for seed in range(5):
         samples, distances = session(0.0, 0.5, seed)
-        found = estimate_pose_scatter(RestLikelihood(samples, distances))
+        found = estimate_pose_scatter(ScatterLikelihood(samples, distances))
         assert found.p_systematic < 1e-6
         assert found.scatter.std < 0.1
 
@@ -149,4 +154,4 @@ def test_a_covariance_that_cannot_be_factorised_is_told():
     samples, distances = session(0.1)
     lost = [ScatterSample(x.e, 1e20 * x.random, x.own, x.shared) for x in samples]
     with pytest.raises(EstimationError, match="rounding leaves no"):
-        RestLikelihood(lost, distances).best(0.5, None)
+        ScatterLikelihood(lost, distances).best(0.5, None)

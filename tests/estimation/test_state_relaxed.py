@@ -7,8 +7,9 @@ import pytest
 
 from dlo_casadi.effects import CableData, RestCurvatureDrift
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation import prediction
 from dlo_casadi.estimation.continuation import relaxed, with_unseen_predicted
-from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem, Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.start import begin
@@ -86,3 +87,20 @@ def test_a_drift_is_found_from_a_stiffness_four_times_off(problem):
     assert found[f"{EFFECT.label}.rate"] == pytest.approx(RATE, rel=0.05)
     predicted = with_unseen_predicted(problem, values)
     np.testing.assert_allclose(values.shapes.x[UNSEEN], predicted.shapes.x[UNSEEN], atol=0.02)
+
+
+def test_measured_branches_are_sought_with_the_state_of_one_start_a_pose(problem):
+    """Two starts, from the fit and from the line, would let the cable drift twice."""
+    p = MODEL.nominal.copy()
+    p[MODEL.names.index(f"{EFFECT.label}.rate")] = RATE
+    rest = MODEL.rest_basis @ np.array([0.5, -0.4])
+    shapes = predict_poses(MODEL, p, rest, [item.pose for item in problem.history])
+    nodes = {
+        item.pose.name: one.equilibrium.x for item, one in zip(problem.history, shapes, strict=True)
+    }
+    given = MODEL, p, rest, problem.history, shapes
+    with pytest.MonkeyPatch.context() as patch:
+        sought = []
+        patch.setattr(prediction, "predict_poses", lambda *args: sought.extend(args[3]) or shapes)
+        assert measured_elsewhere(*given, nodes) == [None] * len(shapes)
+    assert sought == [item.pose for item in problem.history]

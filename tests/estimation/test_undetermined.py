@@ -7,8 +7,7 @@ from dlo_casadi.effects import CableData, LumpedMass
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.result import uncertainty_of
+from dlo_casadi.estimation.prediction import predict_poses, uncertainty_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.report.documents import finite
 from dlo_casadi.report.tables import describe

@@ -1,13 +1,10 @@
 """Folds, candidates and pulls of one session give the same digits in other processes."""
 
-import numpy as np
 import pytest
 from tiny_sessions import write_session
 
 from dlo_casadi.config import load_config
-from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.effects import EFFECTS, RestCurvatureDrift
-from dlo_casadi.estimation.descent import refit
+from dlo_casadi.effects import EFFECTS
 from dlo_casadi.report.documents import report_dict
 from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session
@@ -54,11 +51,3 @@ def test_a_whole_session(tmp_path, pool, name, tried, verdict):
     assert tried in {row["name"] for row in both[0]["candidates"]}
     assert any(row["rmse_cross_validated"] for row in both[0]["candidates"]), "some were refitted"
     assert (verdict == "unexplained") == bool(both[0]["unexplained"])
-
-
-def test_folds_where_a_state_is_carried(fit, pool):
-    model = fit.model.with_effect(RestCurvatureDrift())
-    drifting = refit(fit, model)
-    here, there = cross_validate(drifting), cross_validate(drifting, pool)
-    assert here.complete
-    assert np.array_equal(here.squares, there.squares)

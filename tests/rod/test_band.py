@@ -37,6 +37,12 @@ def floating(n: int, b: int, k: int) -> BandMatrix:
     return BandMatrix(diagonal, upper, rng.normal(size=(POSES, n, b, k)), np.zeros((POSES, k, k)))
 
 
+def vector_of(rows: np.ndarray, n: int, b: int) -> Vector:
+    """From rows (m, n b + k, q): those of the nodes, then those of the border."""
+    m, _, q = rows.shape
+    return Vector(rows[:, : n * b].reshape((m, n, b, q)), rows[:, n * b :])
+
+
 def right_side(matrix: BandMatrix) -> np.ndarray:
     rows = matrix.dense().shape[1]
     return np.random.default_rng(1).normal(size=(POSES, rows, COLUMNS))
@@ -50,7 +56,7 @@ def assert_solves(matrix: BandMatrix) -> None:
     """As LAPACK does: an error of the condition number times rounding, a few dozen times."""
     dense, f = matrix.dense(), right_side(matrix)
     _, n, b, _ = matrix.diagonal.shape
-    found = matrix.factor().solve(Vector.of(f, n, b)).rows
+    found = matrix.factor().solve(vector_of(f, n, b)).rows
     exact = np.linalg.solve(dense, f)
     tolerance = 30 * EPS * np.linalg.cond(dense) * np.abs(exact).max(axis=(1, 2))
     assert np.all(np.abs(found - exact).max(axis=(1, 2)) < tolerance)
@@ -63,7 +69,7 @@ def test_the_dense_matrix_is_the_same_map(n, b):
     matrix = indefinite(n, b, 2)
     dense, f = matrix.dense(), right_side(matrix)
     np.testing.assert_array_equal(dense, np.swapaxes(dense, 1, 2))
-    vector = Vector.of(f, n, b)
+    vector = vector_of(f, n, b)
     np.testing.assert_array_equal(vector.rows, f)
     # Rounding of at most 3 b + 2 products of normal numbers.
     np.testing.assert_allclose(matrix.apply(vector).rows, dense @ f, atol=1e-13)
@@ -115,11 +121,11 @@ def test_conditions_that_depend_on_each_other(b, copied):
     np.testing.assert_array_equal(matrix.negative(), -1)
     f = right_side(alone)
     twice = f[:, n * b] if copied else np.zeros((POSES, COLUMNS))
-    found = matrix.factor().solve(Vector.of(np.concatenate([f, twice[:, None]], axis=1), n, b))
+    found = matrix.factor().solve(vector_of(np.concatenate([f, twice[:, None]], axis=1), n, b))
     exact = np.linalg.solve(alone.dense(), f)
     # As in `assert_solves`, for a matrix of condition 1e3 at most; half of the digits are
     # refined away where the inside is singular, too.
-    np.testing.assert_allclose(found.x, Vector.of(exact, n, b).x, atol=1e-10)
+    np.testing.assert_allclose(found.x, vector_of(exact, n, b).x, atol=1e-10)
     share = found.y[:, [k]] if copied else 0.0
     np.testing.assert_allclose(found.y[:, :1] + share, exact[:, [n * b]], atol=1e-9)
     assert copied or not found.y[:, k].any()
@@ -141,12 +147,12 @@ def test_more_conditions_in_the_border(b):
 def test_poses_do_not_touch_each_other():
     """A subset is solved as it is among others, one pose of other units beside it."""
     matrix, f = indefinite(9, 1, 2), right_side(indefinite(9, 1, 2))
-    alone = matrix.subset(np.array([1])).factor().solve(Vector.of(f[[1]], 9, 1)).rows
+    alone = matrix.subset(np.array([1])).factor().solve(vector_of(f[[1]], 9, 1)).rows
     matrix.diagonal[0] *= 1e9
     matrix.upper[0] *= 1e9
     factor = matrix.factor()
-    together = factor.solve(Vector.of(f, 9, 1)).rows[[1]]
-    picked = factor.subset(np.array([1])).solve(Vector.of(f[[1]], 9, 1)).rows
+    together = factor.solve(vector_of(f, 9, 1)).rows[[1]]
+    picked = factor.subset(np.array([1])).solve(vector_of(f[[1]], 9, 1)).rows
     # Refinement may take one step more for the others' sake: rounding, times the condition.
     size = np.linalg.cond(matrix.dense()[1]) * np.abs(alone).max()
     for found in (together, picked):

@@ -8,8 +8,7 @@ import pytest
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.result import uncertainty_of
+from dlo_casadi.estimation.prediction import predict_poses, uncertainty_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.stages import fit_stage

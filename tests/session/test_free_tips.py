@@ -7,14 +7,16 @@ import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium import solve as solve_module
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
+from dlo_casadi.equilibrium.solve import MOST_MOVED, continued, solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, tipping, tipping_of
-from dlo_casadi.errors import ConfigError
+from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import PoseInput
@@ -78,6 +80,29 @@ def test_a_cable_is_followed_over_the_top_until_it_snaps():
     assert snapped.phi == pytest.approx(fallen(held(-1.3)).phi, abs=1e-6)
     back = continued(MODEL, MODEL.nominal, STRAIGHT, held(0.9), held(-1.3), snapped.x)
     assert back.energy == pytest.approx(stays.energy, rel=1e-9)
+
+
+def test_clips_move_with_the_ends_while_a_cable_is_followed(monkeypatch):
+    """A clip is raised by half the cable's length, in steps of a twentieth."""
+    clips = [(HeldClip("clamped", (0.3, y), 0.4, heading=a),) for y, a in ((-0.2, 0.2), (0.3, 0.4))]
+    before, after = (HeldPose((0.0, 0.0), start_heading=0.0, clips=x) for x in clips)
+    way = after.on_the_way(before, 0.4)
+    assert way.clips[0].place == pytest.approx((0.3, 0.0))
+    assert way.clips[0].heading == pytest.approx(0.28)
+    assert way.clips[0].at == 0.4
+    assert after.on_the_way(before, 1.0).clips == after.clips
+    solved = []
+
+    def solve(model, p, rest, pose, x_init=None):
+        solved.append(pose.clips[0].place[1])
+        raise EquilibriumError("counted only", pose.name, None)
+
+    x = fallen(held(1.0)).x
+    monkeypatch.setattr(solve_module, "solve_equilibrium", solve)
+    with pytest.raises(EquilibriumError):
+        continued(MODEL, MODEL.nominal, STRAIGHT, after, before, x)
+    assert solved == pytest.approx(np.linspace(-0.2, 0.3, len(solved) + 1)[1:])
+    assert len(solved) == np.ceil(0.5 / MODEL.cable.length / MOST_MOVED)
 
 
 def judged(measured):
