@@ -16,6 +16,7 @@ from recorded.takes import HOLD, MOVE, led, write_grippers, write_mcap
 
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
+from dlo_casadi.errors import VisionError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.vision import KnownCable, line_in_cloud, of_color
 
@@ -55,17 +56,17 @@ def test_the_line_is_on_the_axis_and_leaves_out_what_is_hidden(clouds):
     cable = KnownCable(pose.start, pose.end, CONFIG.cable.diameter, CONFIG.cable.length)
     sight = (PLACE - SHAPES[pose.name].mean(axis=0)) / 1.2
 
-    line = line_in_cloud(seen, cable, PLACE)
-    off = errors(line.points, pose.name)
+    line, messages = line_in_cloud(seen, cable, PLACE)
+    off = errors(line, pose.name)
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.5e-3
     assert abs((off @ sight).mean()) < 0.15e-3
-    assert len(line.points) * 0.01 == pytest.approx((1 - HIDDEN) * CONFIG.cable.length, abs=0.04)
-    assert "hidden" in line.messages[0]
+    assert len(line) * 0.01 == pytest.approx((1 - HIDDEN) * CONFIG.cable.length, abs=0.04)
+    assert "hidden" in messages[0]
 
-    bare = line_in_cloud(seen, cable, None)
+    bare, messages = line_in_cloud(seen, cable, None)
     before = np.pi / 8 * CONFIG.cable.diameter
-    assert (errors(bare.points, pose.name) @ sight).mean() == pytest.approx(before, rel=0.2)
-    assert "before the axis" in bare.messages[-1]
+    assert (errors(bare, pose.name) @ sight).mean() == pytest.approx(before, rel=0.2)
+    assert "before the axis" in messages[-1]
 
 
 def write(kind, clouds, take, folder):
@@ -185,3 +186,15 @@ def test_files_of_few_points_that_are_broken(clouds, take, tmp_path, capsys):
         assert "Try: " in told, (kind, how)
         assert "Traceback" not in told
         assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize(("length", "diameter"), [(0.9, 0.007), (2.0, 0.02)])
+def test_a_cloud_of_too_few_points(length, diameter):
+    """Fewer than five per centimetre give no mean: of 150 points at most one centimetre did."""
+    random = np.random.default_rng(0)
+    points = np.zeros((150, 3))
+    points[:, 0] = np.linspace(0.0, length, 150)
+    points[:, 1:] = 0.1 * diameter * random.standard_normal((150, 2))
+    cable = KnownCable(np.zeros(3), np.array([length, 0.0, 0.0]), diameter, length)
+    with pytest.raises(VisionError, match=r"have the 5 points per cm .* Try: "):
+        line_in_cloud(points, cable, None)

@@ -259,9 +259,10 @@ def _cloud_lines(
             wishes.known["diameter"],
             wishes.known["length"],
         )
-        found = vision.line_in_cloud(np.vstack([c.points for c in shown]), cable, shown[0].camera)
-        lines.append(found.points)
-        told.append("; ".join([still.told, *found.messages]))
+        points = np.vstack([c.points for c in shown])
+        line, messages = vision.line_in_cloud(points, cable, shown[0].camera)
+        lines.append(line)
+        told.append("; ".join([still.told, *messages]))
     if shown[0].camera is not None:
         remarks.append("clouds: points moved from the surface to the axis, along the line of sight")
     return lines, told
