@@ -14,7 +14,7 @@ from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.recordings.recording import Recording
+from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.stills import (
     Gripper,
     Still,
@@ -55,6 +55,12 @@ class Wishes:
     """One in this many poses is held out; 0 for none."""
     known: Mapping[str, float] = field(default_factory=dict)
     """Keys and values of the section `cable`."""
+
+    @property
+    def holders(self) -> dict[str, list[str]]:
+        """Names of the body, or of the three markers, at each fixture."""
+        sides = {"start": self.start} | ({} if self.end == FREE else {"end": self.end})
+        return {side: list(map(str.strip, name.split(","))) for side, name in sides.items()}
 
 
 @dataclass(frozen=True)
@@ -102,8 +108,8 @@ class Imported:
 def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     """Make a session from a recording: align clocks, find poses, name markers, orient grippers.
 
-    `name`: of the cable. Raises MeasurementError if the recording lacks something that a session
-    needs; the message says what to try.
+    Called `name`. Raises MeasurementError if the recording lacks something that a session needs;
+    the message says what to try.
     """
     recording, offsets = align_clocks(recording)
     stills = find_stills(recording, wishes.hold)
@@ -112,12 +118,18 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     if wishes.end != FREE:
         end = find_gripper(wishes.end, wishes.end_offset, "end", stills, recording)
     remarks = [*recording.assumptions, *(offset.told for offset in offsets)]
-    files = {stream.clock.partition(" (")[0] for stream in recording.streams}
-    files |= {cloud.clock.partition(" (")[0] or cloud.name for cloud in recording.clouds}
-    if len(files) > 1 and start is not None:
+    holders = wishes.holders.values()
+    used: list[Stream | Cloud] = list(recording.clouds)
+    used += [s for s in recording.streams if s.kind == "marker" or [s.name] in holders]
+    frames = {(item.file, item.frame) for item in used}
+    if start is not None and len(frames) > 1:
+        files = {item.file for item in used}
+        origin = (
+            "files" if len(files) > 1 else f"frames ({', '.join(sorted(x for _, x in frames))})"
+        )
         remarks.append(
             "world frame: cable and grippers are taken to have the same origin and axes, though "
-            "they come from several files, and nothing here registers them. If theirs differ, "
+            f"they come from several {origin}, and nothing here registers them. If theirs differ, "
             "calibrate both systems to one frame and export again, or record a bag whose TF joins "
             "the frames"
         )
@@ -199,14 +211,11 @@ def _readings(
         if wishes.end == FREE and side == "end":
             continue
         for still, row in zip(stills, found, strict=True):
-            wrench, body = still.values.get(f"wrench {name}"), f"body {stream.frame}"
-            if wrench is None or (
-                stream.frame in recording.of("body") and body not in still.values
-            ):
+            wrench = still.values.get(("wrench", name))
+            body = still.values.get(("body", stream.frame))
+            if wrench is None or (stream.frame in recording.of("body") and body is None):
                 continue
-            turn = Rotation.identity()
-            if body in still.values:
-                turn = Rotation.from_quat(still.values[body][3:])
+            turn = Rotation.identity() if body is None else Rotation.from_quat(body[3:])
             row[f"{side}_force"] = _row(turn.apply(wrench[:3]))
             row[f"{side}_moment"] = _row(turn.apply(wrench[3:]))
         axes = stream.frame if stream.frame in recording.of("body") else "the world"
@@ -250,8 +259,8 @@ def _cloud_lines(
         shown = [c for c in clouds if still.begin <= c.t <= still.end] if timed else [clouds[k]]
         if not shown:
             raise MeasurementError(
-                f"no cloud was seen in pose {k + 1} ({still.begin:.2f} to {still.end:.2f} s).\n"
-                "  Try: hold it longer; clouds and grippers with clocks that agree."
+                f"no cloud was seen in pose {k + 1} ({still.span}).\n  Try: hold it longer; "
+                "clouds and grippers with clocks that agree."
             )
         cable = vision.KnownCable(
             start.places[k],
@@ -275,7 +284,7 @@ def _cable_markers(
     recording: Recording, stills: Sequence[Still], wishes: Wishes
 ) -> dict[str, FloatArray]:
     """Positions (P, 3) [m] of each of the cable's markers; nan in poses where it is not seen."""
-    of_grippers = {part.strip() for name in (wishes.start, wishes.end) for part in name.split(",")}
+    of_grippers = {part for parts in wishes.holders.values() for part in parts}
     on_bodies = tuple(f"{body}:" for body in recording.of("body"))  # naming of Motive and Vicon
     names = [
         name
@@ -284,7 +293,7 @@ def _cable_markers(
     ]
     nowhere = np.full(3, np.nan)
     found = {
-        name: np.array([still.values.get(f"marker {name}", nowhere) for still in stills])
+        name: np.array([still.values.get(("marker", name), nowhere) for still in stills])
         for name in names
     }
     found = {name: places for name, places in found.items() if np.isfinite(places).any()}
