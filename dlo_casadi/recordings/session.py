@@ -150,6 +150,12 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
         names, places = [list(markers)[k] for k in order], np.array([*markers.values()])[order]
         seen = np.isfinite(places).all(axis=2)
         lines = [places[here, k] for k, here in enumerate(seen.T)]
+        for k, (line, still) in enumerate(zip(lines, stills, strict=True), start=1):
+            if len(line) < 2:
+                raise MeasurementError(
+                    f"pose {k} ({still.span}) shows {counted(len(line), 'marker')} of the cable, "
+                    "but it takes two.\n  Try: fill their gaps, or cut the recording there."
+                )
         start, end = along_cable(start, end, lines, remarks)
         s, length = _along(start, places, end, names, wishes, remarks)
         points = [
@@ -205,25 +211,47 @@ def _readings(
 ) -> list[dict[str, str]]:
     """Forces and moments of each pose in the world's axes, by their configuration keys."""
     found: list[dict[str, str]] = [{} for _ in stills]
+    sensors: dict[str, str] = {}  # of each side
     for name, stream in recording.of("wrench").items():
-        named = (stream.frame, name)
-        side = "start" if any(wishes.start in text for text in named) else "end"
-        if wishes.end == FREE and side == "end":
-            continue
+        side = _side(stream, wishes)
+        if side in sensors:
+            raise MeasurementError(
+                f"two force sensors are at the {side}: {sensors[side]} and {name}.\n  Try: leave "
+                "the topic of one of them out."
+            )
+        sensors[side] = name
+        if stream.frame and stream.frame not in recording.of("body"):
+            raise MeasurementError(
+                f"the axes of the force sensor {name} are unknown: no TF and no body has its frame "
+                f"{stream.frame!r}.\n  Try: record /tf and /tf_static, too, or leave its topic out."
+            )
         for still, row in zip(stills, found, strict=True):
             wrench = still.values.get(("wrench", name))
             body = still.values.get(("body", stream.frame))
-            if wrench is None or (stream.frame in recording.of("body") and body is None):
-                continue
-            turn = Rotation.identity() if body is None else Rotation.from_quat(body[3:])
-            row[f"{side}_force"] = _row(turn.apply(wrench[:3]))
-            row[f"{side}_moment"] = _row(turn.apply(wrench[3:]))
-        axes = stream.frame if stream.frame in recording.of("body") else "the world"
+            if wrench is not None and (body is not None or not stream.frame):
+                turn = Rotation.from_quat([0.0, 0.0, 0.0, 1.0] if body is None else body[3:])
+                row[f"{side}_force"] = _row(turn.apply(wrench[:3]))
+                row[f"{side}_moment"] = _row(turn.apply(wrench[3:]))
         remarks.append(
-            f"{side}_force, {side}_moment: means of {name}, in axes of {axes}; taken as those of "
-            "the cable on its fixture, about its place, with the gripper's weight taken off"
+            f"{side}_force, {side}_moment: means of {name}, in axes of "
+            f"{stream.frame or 'the world'}; taken as those of the cable on its fixture, about its "
+            "place, with the gripper's weight taken off"
         )
     return found
+
+
+def _side(sensor: Stream, wishes: Wishes) -> str:
+    """The fixture, start or end, that a force sensor's frame or topic is called after."""
+    for names in ([sensor.frame], [sensor.name, *sensor.name.split("/")]):
+        sides = [side for side, parts in wishes.holders.items() if {*parts} & {*names}]
+        if len(sides) == 1:
+            return sides[0]
+    raise MeasurementError(
+        f"the force sensor {sensor.name} (frame {sensor.frame!r}) is called after "
+        f"{'both' if sides else 'none'} of the fixtures {wishes.start!r} and {wishes.end!r}.\n  "
+        f"Try: --start or --end with its frame; a topic such as /{wishes.start.split(',')[0]}/"
+        "wrench; or leave its topic out."
+    )
 
 
 # ---- clouds -------------------------------------------------------------------------------------
@@ -318,7 +346,7 @@ def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> l
         return float(np.nanmax(np.linalg.norm(a - b, axis=1), initial=0.0))
 
     apart = np.array([[away(a, b) for b in places] for a in places])
-    tree = minimum_spanning_tree(apart)
+    tree = minimum_spanning_tree(apart)  # without edges between markers never seen together
     neighbours = np.bincount(np.concatenate(tree.nonzero()), minlength=len(places))
     if neighbours.max() > 2:
         branch = list(markers)[int(np.argmax(neighbours))]
@@ -326,10 +354,15 @@ def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> l
             f"the markers are no chain: three lead to {branch!r}.\n  Try: --cable with a part of "
             "the names of the cable's own markers."
         )
-    tips = np.flatnonzero(neighbours == 1).tolist()
+    tips = np.flatnonzero(neighbours <= 1).tolist()
     if starts is not None:
         tips = sorted(tips, key=lambda k: away(places[k], starts))
     order, _ = depth_first_order(tree, tips[0], directed=False)
+    if len(order) < len(places):
+        raise MeasurementError(
+            f"no pose shows one of the markers {', '.join(np.array([*markers])[order])} and one of "
+            "the others.\n  Try: fill their gaps, or leave some out: --cable"
+        )
     return [int(k) for k in order]
 
 
