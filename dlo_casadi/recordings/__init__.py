@@ -64,7 +64,8 @@ def read_recording(
         except Exception as error:  # what readers of damaged files raise is not documented
             raise MeasurementError(
                 f"cannot be read as a {path.suffix or 'bag'} recording: {type(error).__name__}: "
-                f"{error}.\n  Try: export it again, whole; `ros2 bag reindex` for a bag.",
+                f"{str(error).rstrip('.')}.\n  Try: export it again, whole; `ros2 bag reindex` "
+                "for a bag.",
                 pose=label,
             ) from error
     return together(found)
