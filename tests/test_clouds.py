@@ -16,7 +16,9 @@ from recorded.takes import HOLD, MOVE, led, write_grippers, write_mcap
 
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
+from dlo_casadi.errors import MeasurementError, VisionError
 from dlo_casadi.io.points import read_points
+from dlo_casadi.recordings import CloudView, read_recording
 from dlo_casadi.vision import KnownCable, line_in_cloud, of_color
 
 DATA = Path(__file__).parent / "data"
@@ -55,17 +57,17 @@ def test_the_line_is_on_the_axis_and_leaves_out_what_is_hidden(clouds):
     cable = KnownCable(pose.start, pose.end, CONFIG.cable.diameter, CONFIG.cable.length)
     sight = (PLACE - SHAPES[pose.name].mean(axis=0)) / 1.2
 
-    line = line_in_cloud(seen, cable, PLACE)
-    off = errors(line.points, pose.name)
+    line, messages = line_in_cloud(seen, cable, PLACE)
+    off = errors(line, pose.name)
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.5e-3
     assert abs((off @ sight).mean()) < 0.15e-3
-    assert len(line.points) * 0.01 == pytest.approx((1 - HIDDEN) * CONFIG.cable.length, abs=0.04)
-    assert "hidden" in line.messages[0]
+    assert len(line) * 0.01 == pytest.approx((1 - HIDDEN) * CONFIG.cable.length, abs=0.04)
+    assert "hidden" in messages[0]
 
-    bare = line_in_cloud(seen, cable, None)
+    bare, messages = line_in_cloud(seen, cable, None)
     before = np.pi / 8 * CONFIG.cable.diameter
-    assert (errors(bare.points, pose.name) @ sight).mean() == pytest.approx(before, rel=0.2)
-    assert "before the axis" in bare.messages[-1]
+    assert (errors(bare, pose.name) @ sight).mean() == pytest.approx(before, rel=0.2)
+    assert "before the axis" in messages[-1]
 
 
 def write(kind, clouds, take, folder):
@@ -147,13 +149,13 @@ def test_files_of_few_points_that_are_broken(clouds, take, tmp_path, capsys):
     """PCD and NPY: a message with a remedy for each, and nothing written."""
     for kind, how, said in (
         ("pcd", "truncated", "ends after"),
-        ("pcd", "empty", "is no PCD file of points"),
+        ("pcd", "empty", "cannot be read as a .pcd recording"),
         ("pcd", "nan", "finite"),
-        ("pcd", "no z", "is no PCD file of points: 'z'"),
-        ("npy", "truncated", "is no NPY file of points"),
-        ("npy", "empty", "is no NPY file of points"),
+        ("pcd", "no z", "the fields x, y, h, rgb"),
+        ("npy", "truncated", "cannot be read as a .npy recording"),
+        ("npy", "empty", "cannot be read as a .npy recording"),
         ("npy", "nan", "finite"),
-        ("npy", "four columns", "(K, 3) or (K, 6) belongs there"),
+        ("npy", "four columns", "Try: (K, 3), or (K, 6)"),
         ("npy", "no points", "holds no points"),
         ("npy", "y and z exchanged", "one frame"),
     ):
@@ -185,3 +187,75 @@ def test_files_of_few_points_that_are_broken(clouds, take, tmp_path, capsys):
         assert "Try: " in told, (kind, how)
         assert "Traceback" not in told
         assert sorted(folder.iterdir()) == before
+
+
+THREE = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
+RED = [230.0, 110.0, 20.0]
+
+
+def padded_pcd(path, style):
+    """A file as PCL writes a struct: padding between the fields, of any length."""
+    fields = [("x", "<f4"), ("_", "u1"), ("y", "<f4"), ("z", "<f4"), ("_", "u1"), ("rgb", "<u4")]
+    counts = (1, 4, 1, 1, 8, 1)
+    kind = [
+        (f"{k}", form, (n,)) for k, ((_, form), n) in enumerate(zip(fields, counts, strict=True))
+    ]
+    table = np.ones(3, kind)
+    for k, column in zip("023", THREE.T, strict=True):
+        table[k] = column[:, None]
+    table["5"] = RED @ np.array([65536, 256, 1])
+    head = [
+        f"FIELDS {' '.join(name for name, _ in fields)}",
+        f"SIZE {' '.join(form[-1] for _, form in fields)}",
+        f"TYPE {' '.join(form[-2].upper() for _, form in fields)}",
+        f"COUNT {' '.join(map(str, counts))}",
+        "VIEWPOINT 100 200 300 1 0 0 0",
+        f"POINTS 3\nDATA {style}\n",
+    ]
+    rows = [" ".join(str(x) for value in row for x in np.ravel(value)) for row in table.tolist()]
+    body = table.tobytes() if style == "binary" else "\n".join(rows).encode()
+    path.write_bytes("\n".join(head).encode() + body)
+
+
+@pytest.mark.parametrize("style", ["ascii", "binary"])
+def test_padding_between_the_fields_of_a_pcd_file_is_skipped(style, tmp_path):
+    padded_pcd(tmp_path / "a.pcd", style)
+    (cloud,) = read_recording([tmp_path / "a.pcd"], view=CloudView(color=RED)).clouds
+    assert cloud.points == pytest.approx(THREE)
+
+
+def test_units_scale_the_camera_of_a_file_and_not_the_one_given_in_metres(tmp_path):
+    padded_pcd(tmp_path / "a.pcd", "binary")
+    (own,) = read_recording([tmp_path / "a.pcd"], view=CloudView(units="mm")).clouds
+    assert own.points == pytest.approx(1e-3 * THREE)
+    assert own.camera == pytest.approx([0.1, 0.2, 0.3])
+    given = CloudView(units="mm", camera=(1.0, 2.0, 3.0))
+    assert read_recording([tmp_path / "a.pcd"], view=given).clouds[0].camera.tolist() == [1, 2, 3]
+
+
+PLY = ["ply", "format ascii 1.0", "element vertex 1", *(f"property float {a}" for a in "xyz")]
+
+
+def test_lines_of_a_ply_file_may_end_as_on_windows(tmp_path):
+    (tmp_path / "a.ply").write_bytes("\r\n".join([*PLY, "end_header", "1 2 3", ""]).encode())
+    assert read_recording([tmp_path / "a.ply"]).clouds[0].points.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize("missing", ["format", "element", "property float z"])
+def test_a_ply_file_that_lacks_a_line_of_its_header(missing, tmp_path):
+    lines = [line for line in PLY if not line.startswith(missing)]
+    (tmp_path / "a.ply").write_text("\n".join([*lines, "end_header\n1 2 3\n"]))
+    with pytest.raises(MeasurementError, match=r"^a\.ply: [^:]+.*\n  Try: "):
+        read_recording([tmp_path / "a.ply"])
+
+
+@pytest.mark.parametrize(("length", "diameter"), [(0.9, 0.007), (2.0, 0.02)])
+def test_a_cloud_of_too_few_points(length, diameter):
+    """Fewer than five per centimetre give no mean: of 150 points at most one centimetre did."""
+    random = np.random.default_rng(0)
+    points = np.zeros((150, 3))
+    points[:, 0] = np.linspace(0.0, length, 150)
+    points[:, 1:] = 0.1 * diameter * random.standard_normal((150, 2))
+    cable = KnownCable(np.zeros(3), np.array([length, 0.0, 0.0]), diameter, length)
+    with pytest.raises(VisionError, match=r"have the 5 points per cm .* Try: "):
+        line_in_cloud(points, cable, None)

@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
-from recorded.takes import WRITERS, rendered
+from recorded.takes import HOLD, WRITERS, rendered
 
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
+from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import read_points
+from dlo_casadi.recordings import FORMATS, Recording, Stream, Wishes, make_session, read_recording
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
 CABLE = ("--mass", "0.03", "--diameter", "0.004")
@@ -210,3 +212,109 @@ def test_a_library_that_is_not_installed(take, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     assert imported(files, tmp_path / "loom", *options) == 2
     assert "pip install 'dlo-casadi[recordings]'" in capsys.readouterr().err
+
+
+def test_files_of_one_name_have_their_own_clocks(take, tmp_path):
+    """The grippers' file is 80 ms ahead; a number in brackets is part of a name."""
+    (cable, grippers), _ = WRITERS["vicon"](take, tmp_path)
+    pairs = [("one/take.csv", "two/take.csv"), ("take (1).csv", "take (2).csv")]
+    for pair in pairs:
+        files = [tmp_path / name for name in pair]
+        for file, source in zip(files, (cable, grippers), strict=True):
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(source.read_bytes())
+        session = make_session("loom", read_recording(files), Wishes())
+        told = " ".join(session.remarks)
+        assert int(re.search(r"is (\d+) ms ahead of", told)[1]) == pytest.approx(80, abs=5)
+        assert "come from several files" in told
+
+
+def test_a_blank_line_above_a_motive_file_does_not_hide_its_units(take, tmp_path):
+    (cable, _), _ = WRITERS["motive"](take, tmp_path)
+    before = read_recording([cable]).of("marker")
+    cable.write_text("\n" + cable.read_text())
+    for name, stream in read_recording([cable]).of("marker").items():
+        assert stream.values == pytest.approx(before[name].values)
+
+
+VICON = "Segments\n100\n,,hand,,\nFrame,Sub Frame,TX,TY,TZ\n,,mm,mm,mm\n1,0,1,2,3\n\n"
+
+
+@pytest.mark.parametrize("program", ["motive", "vicon"])
+def test_columns_that_are_absent(program, take, tmp_path):
+    """Motive's row of types is shorter than the table; Vicon's segment has no rotation."""
+    (cable, _), _ = WRITERS["motive"](take, tmp_path)
+    lines = cable.read_text().splitlines()
+    lines[2] = ",".join(lines[2].split(",")[:5])
+    cable.write_text(VICON if program == "vicon" else "\n".join(lines))
+    with pytest.raises(MeasurementError, match=r"cable\.csv: cannot be read .*\n  Try: ") as told:
+        read_recording([cable])
+    assert isinstance(told.value.__cause__, IndexError)
+
+
+def test_a_mistake_in_a_reader_stays_recognisable(tmp_path, monkeypatch):
+    (tmp_path / "a.csv").write_text("")
+    monkeypatch.setitem(FORMATS, ".csv", lambda path: {}["nothing"])
+    with pytest.raises(MeasurementError, match="KeyError: 'nothing'") as told:
+        read_recording([tmp_path / "a.csv"])
+    assert isinstance(told.value.__cause__, KeyError)
+
+
+def recorded(take, sensors=(), bodies=("start", "end")):
+    """The recording of a take, with force sensors: names, frames and forces."""
+    clock = {"clock": "take", "file": "take"}
+    values = dict(zip(bodies, take.bodies.values(), strict=True))
+    streams = [Stream(name, "marker", take.t, x, **clock) for name, x in take.markers.items()]
+    streams += [Stream(name, "body", take.t, x, **clock) for name, x in values.items()]
+    for name, frame, force in sensors:
+        wrench = np.tile([force, 0.0, 0.0, 0.0, 0.0, 0.0], (len(take.t), 1))
+        streams.append(Stream(name, "wrench", take.t, wrench, **clock, frame=frame))
+    return Recording(tuple(streams))
+
+
+def test_forces_go_to_the_fixture_of_their_whole_name(take):
+    """By the frame, else by a part of the topic; "hand" is not a part of "hand2"."""
+    sensors = (("ft", "hand2", 2.0), ("hand/wrench", "", 1.0))
+    wishes = Wishes(start="hand", end="hand2")
+    session = make_session("loom", recorded(take, sensors, ("hand", "hand2")), wishes)
+    for pose in session.poses:
+        assert pose["start_force"] == "[1.000000, 0.000000, 0.000000]"
+        force = [float(x) for x in pose["end_force"].strip("[]").split(",")]
+        assert np.linalg.norm(force) == pytest.approx(2.0, abs=1e-5)
+    assert any("means of ft, in axes of hand2;" in text for text in session.remarks)
+    assert any("means of hand/wrench, in axes of the world;" in text for text in session.remarks)
+
+
+@pytest.mark.parametrize(
+    ("sensors", "said"),
+    [
+        ([("left_ft", "left_ft", 1.0)], "left_ft .* after none .*--start or --end .*/start/wrench"),
+        ([("start/end/wrench", "", 1.0)], "after both of the fixtures"),
+        ([("a", "end", 1.0), ("b", "end", 1.0)], "two force sensors are at the end: a and b"),
+        ([("end/wrench", "ft_sensor", 1.0)], "no body has its frame 'ft_sensor'"),
+    ],
+    ids=["neither", "both", "two", "unknown axes"],
+)
+def test_forces_that_belong_nowhere(sensors, said, take):
+    with pytest.raises(MeasurementError, match=f"(?s){said}") as told:
+        make_session("loom", recorded(take, sensors), Wishes())
+    assert "Try: " in told.value.message
+
+
+def test_a_pose_without_the_cables_markers_is_named(take):
+    """The grippers alone are still in the last one: five markers are fewer than half of all."""
+    last = (take.t > take.t[-1] - HOLD - 0.5)[:, None]
+    few = {name: np.where(last, np.nan, x) for name, x in [*take.markers.items()][:5]}
+    with pytest.raises(MeasurementError, match=r"pose 4 \(.* s\) shows 0 markers .*two\.\n  Try"):
+        make_session("loom", recorded(replace(take, markers=few)), Wishes())
+
+
+def test_markers_that_are_never_seen_together(take):
+    early = (take.t < 0.5 * take.t[-1])[:, None]
+    first = [*take.markers][:6]
+    markers = {
+        name: np.where(early if name in first else ~early, x, np.nan)
+        for name, x in take.markers.items()
+    }
+    with pytest.raises(MeasurementError, match=r"no pose shows one of the markers .*\n  Try: fill"):
+        make_session("loom", recorded(replace(take, markers=markers)), Wishes())

@@ -3,14 +3,16 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
-from dlo_casadi.errors import MeasurementError
+from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.recordings.bags import read_bag
 from dlo_casadi.recordings.clouds import CloudView, read_cloud
 from dlo_casadi.recordings.mocap import read_c3d, read_mocap_csv
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream, together
 from dlo_casadi.recordings.session import FREE, Imported, Wishes, make_session
 
+Record = TypeVar("Record", Stream, Cloud)
 WHOLE = CloudView()  # all points of clouds, in metres
 
 # File extension -> reader.
@@ -39,24 +41,48 @@ def read_recording(
     up : "x", "y", "z" or None
         The axis that points up; by default the usual one of each format.
     view : CloudView
-        How clouds were seen, in the axes of their files.
+        How clouds were seen, in the axes of their files, or of the root of a bag's TF.
 
     Raises
     ------
     MeasurementError
-        If one of them cannot be read.
+        If one of them cannot be read. An exception that no reader expects is its `__cause__`.
     """
+    names = [path.absolute().name for path in paths]
     found = []
-    for path in paths:
-        reader = FORMATS.get("" if path.is_dir() else path.suffix.lower())
-        if reader is None:
+    for path, name in zip(paths, names, strict=True):
+        label = name if names.count(name) == 1 else str(path)
+        try:
+            read = _read(path)
+            streams = tuple(_of_file(stream, label) for stream in read.streams)
+            clouds = tuple(_of_file(view.of(cloud), label) for cloud in read.clouds)
+            found.append(replace(read, streams=streams, clouds=clouds).with_z_up(up))
+        except MeasurementError as error:
+            raise MeasurementError(error.message, pose=label) from error
+        except DloError:  # a library that is not installed
+            raise
+        except Exception as error:  # what readers of damaged files raise is not documented
             raise MeasurementError(
-                f"files of this kind are not read.\n  Try: {', '.join(filter(None, FORMATS))}",
-                pose=path.name,
-            )
-        if not path.exists():
-            raise MeasurementError("there is no such file", pose=str(path))
-        read = reader(path)
-        clouds = tuple(view.of(cloud) for cloud in read.clouds)
-        found.append(replace(read, clouds=clouds).with_z_up(up))
+                f"cannot be read as a {path.suffix or 'bag'} recording: {type(error).__name__}: "
+                f"{str(error).rstrip('.')}.\n  Try: export it again, whole; `ros2 bag reindex` "
+                "for a bag.",
+                pose=label,
+            ) from error
     return together(found)
+
+
+def _read(path: Path) -> Recording:
+    """What the reader of a file's format finds in it."""
+    reader = FORMATS.get("" if path.is_dir() else path.suffix.lower())
+    if reader is None:
+        kinds = ", ".join(filter(None, FORMATS))
+        raise MeasurementError(f"files of this kind are not read.\n  Try: {kinds}")
+    if not path.exists():
+        raise MeasurementError(f"there is no {path}.\n  Try: another name or folder.")
+    return reader(path)
+
+
+def _of_file(record: Record, file: str) -> Record:
+    """The same with the name of its file, and clocks that no other file has."""
+    clock = f"{file} ({record.clock})" if record.clock else file
+    return replace(record, file=file, clock=clock)

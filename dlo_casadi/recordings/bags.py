@@ -1,7 +1,7 @@
 """ROS bags (rosbag2 with SQLite or MCAP, and rosbag1), read by rosbags."""
 
-from collections import defaultdict
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, library
+from dlo_casadi.recordings.clouds import cloud_of
 from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream
 
 _NANO = 1e-9
@@ -19,6 +20,7 @@ _WANTED = (
     "marker arrays (visualization_msgs/MarkerArray, geometry_msgs/PoseArray, or any message with "
     "`markers`), PoseStamped, TransformStamped, Odometry or TF, WrenchStamped, PointCloud2"
 )
+_ORIGIN = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 Rows = list[tuple[float, list[float]]]  # times [s] and values
 Links = dict[str, tuple[str, Rows]]  # frame -> its parent in TF, and its poses there
 
@@ -27,72 +29,63 @@ def read_bag(path: Path) -> Recording:
     """Read a bag: markers, poses and TF of grippers, wrenches, and clouds of points.
 
     Times are those of the messages' headers. Markers and clouds share one clock, grippers and force
-    sensors another. A body is named after its topic or, in TF, its frame, and given in the root of
-    its tree. Clouds are also transformed to the root where TF contains the camera's pose. Raises
-    MeasurementError if the bag is damaged, or holds none of these.
+    sensors another. A body is named after its topic or, in TF, its frame. Markers, bodies and
+    clouds are transformed from the frames of their headers to the roots of these in TF; a wrench
+    stays in the axes of its sensor. Raises MeasurementError if the bag holds none of these.
     """
-    anyreader = library("rosbags.highlevel", "recordings", "reading this file")
+    highlevel = library("rosbags.highlevel", "recordings", "reading this file")
     typesys = library("rosbags.typesys", "recordings", "reading this file")
-    rows: dict[tuple[Kind, str], Rows] = defaultdict(list)
-    frames: dict[tuple[Kind, str], str] = {}
+    rows: dict[tuple[Kind, str, str, str], Rows] = {}  # of kind, name, topic, frame
     links: Links = {}
-    clouds: list[tuple[str, float, Any]] = []
-    topics: dict[str, str] = {}
-    try:
-        store = typesys.get_typestore(typesys.Stores.LATEST)
-        with anyreader.AnyReader([path], default_typestore=store) as reader:
-            topics = {item.topic: item.msgtype for item in reader.connections}
-            for connection, _, raw in reader.messages():
-                name = connection.topic.strip("/")
-                kind = connection.msgtype.rsplit("/", 1)[-1]
-                if kind not in _HANDLED and "arker" not in kind:
-                    continue
-                message = reader.deserialize(raw, connection.msgtype)
-                if kind == "TFMessage":
-                    for link in message.transforms:
-                        child = link.child_frame_id.strip("/")
-                        parent = link.header.frame_id.strip("/")
-                        pose = _pose(link.transform.translation, link.transform.rotation)
-                        if np.isfinite(pose).all():
-                            links.setdefault(child, (parent, []))[1].append((_time(link), pose))
-                elif kind == "PointCloud2":
-                    clouds.append((name, _time(message), message))
-                elif kind in _BODIES:
-                    key: tuple[Kind, str] = _BODIES[kind][0], name
-                    rows[key].append((_time(message), _BODIES[kind][1](message)))
-                    frames[key] = message.header.frame_id.strip("/")
-                else:
-                    for marker, t, place in _markers(message, kind):
-                        rows["marker", marker].append((t, place))
-    except MeasurementError:
-        raise
-    except Exception as error:  # storages raise various errors: sqlite3, struct, YAML, zstd
-        raise MeasurementError(
-            f"cannot be read: {str(error) or type(error).__name__}.\n  Try: `ros2 bag info`, "
-            "`ros2 bag reindex`, or a bag that was closed.",
-            pose=path.name,
-        ) from None
-    for child in links:
-        rows["body", child] = _to_root(child, links)
-    streams = []
-    for (kind, name), items in rows.items():
-        times, values = (np.array(column) for column in zip(*items, strict=True))
-        order = np.unique(times, return_index=True)[1]
-        clock = f"{path.name} ({'markers' if kind == 'marker' else 'grippers'})"
-        frame = frames.get((kind, name), "") if kind == "wrench" else ""
-        streams.append(Stream(name, kind, times[order], values[order], clock, frame))
-    if not streams and not clouds:
+    clouds: list[Any] = []
+    store = typesys.get_typestore(typesys.Stores.LATEST)
+    with highlevel.AnyReader([path], default_typestore=store) as reader:
+        topics = {item.topic: item.msgtype for item in reader.connections}
+        for connection, _, raw in reader.messages():
+            topic = connection.topic.strip("/")
+            kind = connection.msgtype.rsplit("/", 1)[-1]
+            if kind not in _HANDLED and "arker" not in kind:
+                continue
+            message = reader.deserialize(raw, connection.msgtype)
+            if kind == "TFMessage":
+                for link in message.transforms:
+                    _add(link, links, topic.endswith("tf_static"))
+            elif kind == "PointCloud2":
+                clouds.append(message)
+            elif kind in _BODIES:
+                of, row = _BODIES[kind]
+                key = of, topic, topic, _frame(message)
+                rows.setdefault(key, []).append((_time(message), row(message)))
+            else:
+                for name, sent, place in _markers(message, kind, topic):
+                    key = "marker", name, topic, _frame(sent)
+                    rows.setdefault(key, []).append((_time(sent), place))
+    if not rows and not links and not clouds:
         held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "no topics"
-        raise MeasurementError(
-            f"holds {held}.\n  Try: record one or more of {_WANTED}.", pose=path.name
-        )
-    seen = tuple(_cloud(item, links, f"{path.name} (markers)") for item in clouds)
-    return Recording(tuple(streams), seen, up_by="as ROS has it (REP 103)")
+        raise MeasurementError(f"holds {held}.\n  Try: record one or more of {_WANTED}.")
+    rows = {key: items for key, items in rows.items() if key[0] != "body" or key[1] not in links}
+    for name in links:  # a frame is a body at its own origin, as often as what moves it most often
+        times = max((links[below][1] for below in _chain(name, links)[:-1]), key=len)
+        rows["body", name, "tf", name] = [(t, _ORIGIN) for t, _ in times]
+    streams = [
+        _stream(kind, name, frame, items, links) for (kind, name, _, frame), items in rows.items()
+    ]
+    seen = tuple(_cloud(message, links) for message in clouds)
+    roots = {x.frame for x in streams if x.kind != "wrench"} | {x.frame for x in seen}
+    roots -= {x.name for x in streams if x.kind == "body"}
+    told = tuple(
+        replace(x, frame="") if x.kind == "wrench" and x.frame in roots else x for x in streams
+    )
+    return Recording(told, seen, up_by="as ROS has it (REP 103)")
 
 
 def _time(message: Any) -> float:
     stamp = message.header.stamp
     return float(stamp.sec + _NANO * stamp.nanosec)
+
+
+def _frame(message: Any) -> str:
+    return str(message.header.frame_id.strip("/"))
 
 
 def _vector(v: Any) -> list[float]:
@@ -117,36 +110,48 @@ _BODIES: dict[str, tuple[Kind, Callable[[Any], list[float]]]] = {
 _HANDLED = {"TFMessage", "PointCloud2", "PoseArray", *_BODIES}
 
 
-def _markers(message: Any, kind: str) -> Iterator[tuple[str, float, list[float]]]:
-    """Name, time and position of each marker in a message."""
-    if kind == "PoseArray":
-        for k, pose in enumerate(message.poses):
-            yield f"{k:02d}", _time(message), _vector(pose.position)
-        return
-    items = getattr(message, "markers", [message])
+def _markers(message: Any, kind: str, topic: str) -> Iterator[tuple[str, Any, list[float]]]:
+    """Name of each marker in a message, what holds its header, and its position."""
+    items = message.poses if kind == "PoseArray" else getattr(message, "markers", [message])
     for k, item in enumerate(items):
-        pose = getattr(item, "pose", None)
-        place = pose.position if pose is not None else getattr(item, "translation", None)
+        pose = getattr(item, "pose", item)
+        place = getattr(pose, "position", None) or getattr(item, "translation", None)
         if place is None:
             continue
-        named = [getattr(item, key, "") for key in ("ns", "marker_name", "name", "id")]
-        name = "_".join(str(part) for part in named if part != "") or f"{k:02d}"
-        yield name, _time(item if hasattr(item, "header") else message), _vector(place)
+        texts = [getattr(item, key, "") for key in ("ns", "marker_name", "name")]
+        named = [text for text in texts if text]
+        number = getattr(item, "id", "" if named else f"{k:02d}")
+        name = "_".join(str(part) for part in (*(named or [topic]), number) if part != "")
+        yield name, item if hasattr(item, "header") else message, _vector(place)
 
 
-def _to_root(child: str, links: Links) -> Rows:
-    """Poses of a frame in the root of its tree, at the times of its most frequent link."""
-    chain, parent = [child], links[child][0]
-    while parent in links and parent not in chain:
-        chain.append(parent)
-        parent = links[parent][0]
-    t = max((np.array([time for time, _ in links[name][1]]) for name in chain), key=len)
-    place, turn = np.zeros((len(t), 3)), Rotation.from_quat(np.tile([0.0, 0, 0, 1], (len(t), 1)))
-    for name in chain:
+def _add(link: Any, links: Links, static: bool) -> None:
+    """Add a TransformStamped to TF; of a static one only the last pose is valid."""
+    pose = _pose(link.transform.translation, link.transform.rotation)
+    if not np.isfinite(pose).all() or not any(pose[3:]):
+        return
+    _, poses = links.setdefault(link.child_frame_id.strip("/"), (_frame(link), []))
+    if static:
+        poses.clear()
+    poses.append((_time(link), pose))
+
+
+def _chain(frame: str, links: Links) -> list[str]:
+    """A frame and its parents in TF, up to the root."""
+    chain = [frame]
+    while chain[-1] in links and links[chain[-1]][0] not in chain:
+        chain.append(links[chain[-1]][0])
+    return chain
+
+
+def _in_root(frame: str, links: Links, t: FloatArray) -> tuple[str, FloatArray, Rotation]:
+    """Root of a frame's tree in TF, and the frame's places (n, 3) and rotations there."""
+    *below, root = _chain(frame, links)
+    place, turn = np.zeros((len(t), 3)), Rotation.identity(len(t))
+    for name in below:
         offset, own = _at(links[name][1], t)
         place, turn = offset + own.apply(place), own * turn
-    values = np.hstack([place, turn.as_quat()])
-    return [(float(time), row.tolist()) for time, row in zip(t, values, strict=True)]
+    return root, place, turn
 
 
 def _at(items: Rows, t: FloatArray) -> tuple[FloatArray, Rotation]:
@@ -154,34 +159,43 @@ def _at(items: Rows, t: FloatArray) -> tuple[FloatArray, Rotation]:
     times, first = np.unique([time for time, _ in items], return_index=True)
     poses = np.array([items[k][1] for k in first])
     if len(times) == 1:
-        return np.tile(poses[0, :3], (len(t), 1)), Rotation.from_quat(
-            np.tile(poses[0, 3:], (len(t), 1))
-        )
+        poses = np.tile(poses, (len(t), 1))
+        return poses[:, :3], Rotation.from_quat(poses[:, 3:])
     inside = np.clip(t, times[0], times[-1])
     place = np.column_stack([np.interp(inside, times, column) for column in poses[:, :3].T])
     return place, Slerp(times, Rotation.from_quat(poses[:, 3:]))(inside)
 
 
-def _cloud(item: tuple[str, float, Any], links: Links, clock: str) -> Cloud:
-    """Read a sensor_msgs/PointCloud2 into the root of its frame's tree."""
-    name, t, message = item
-    layout = {
+def _stream(kind: Kind, name: str, frame: str, items: Rows, links: Links) -> Stream:
+    """The record of a topic's marker, body or sensor; all but sensors in the root of its frame."""
+    t, values = (np.array(column) for column in zip(*items, strict=True))
+    t, first = np.unique(t, return_index=True)
+    clock = "markers" if kind == "marker" else "grippers"
+    stream = Stream(name, kind, t, values[first], clock, frame)
+    if kind == "wrench":
+        return stream
+    root, place, turn = _in_root(frame, links, t)
+    return replace(stream.moved(turn, place), frame=root)
+
+
+def _cloud(message: Any, links: Links) -> Cloud:
+    """Read a sensor_msgs/PointCloud2."""
+    order = ">" if message.is_bigendian else "<"
+    kind: Any = {
         "names": [f.name for f in message.fields],
-        "formats": [_FIELDS[f.datatype] for f in message.fields],
+        "formats": [order + _FIELDS[f.datatype] for f in message.fields],
         "offsets": [f.offset for f in message.fields],
         "itemsize": message.point_step,
     }
-    data: Any = np.frombuffer(bytes(message.data), np.dtype(layout))  # type: ignore[call-overload]
-    points = np.column_stack([data[axis].astype(float) for axis in "xyz"])
-    colors = None
-    if "rgb" in layout["names"]:
-        packed = np.ascontiguousarray(data["rgb"]).view("u4")
-        colors = np.column_stack([(packed >> shift) & 255 for shift in (16, 8, 0)]).astype(float)
-    frame = message.header.frame_id.strip("/")
-    camera = None
-    if frame in links:
-        stamps, poses = zip(*_to_root(frame, links), strict=True)
-        pose = np.array(poses[int(np.argmin(np.abs(np.array(stamps) - t)))])
-        points = Rotation.from_quat(pose[3:]).apply(points) + pose[:3]
-        camera = pose[:3]
-    return Cloud(name, points, colors, camera, t, clock)
+    shape, steps = (message.height, message.width), (message.row_step, message.point_step)
+    cloud = cloud_of(np.ndarray(shape, np.dtype(kind), bytes(message.data), 0, steps).ravel())
+    t, frame = _time(message), _frame(message)
+    root, place, turn = _in_root(frame, links, np.array([t]))
+    return Cloud(
+        turn[0].apply(cloud.points) + place,
+        cloud.colors,
+        place[0] if frame in links else None,
+        t,
+        "markers",
+        root,
+    )

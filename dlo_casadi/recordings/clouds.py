@@ -1,14 +1,15 @@
 """Read files of point clouds: PLY, PCD and NPY."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from dlo_casadi import vision
-from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.recording import METRES, Cloud, Recording
 
@@ -23,7 +24,7 @@ class CloudView:
     """How clouds were seen, and which of their points belong to the cable."""
 
     camera: Sequence[float] = ()
-    """Place of the camera [m], in the frame of the file."""
+    """Place of the camera [m], in the frame of the file, or the root of a bag's TF."""
     color: Sequence[float] = ()
     """Colour of the cable: red, green, blue, 0 to 255; all points when empty."""
     box: Sequence[float] = ()
@@ -36,12 +37,13 @@ class CloudView:
 
         Raises MeasurementError if no points are left, or if they have no colour.
         """
-        points = cloud.points * METRES[self.units]
+        scale = METRES[self.units]
+        points = scale * cloud.points
         kept = np.isfinite(points).all(axis=1)
         if self.color:
             if cloud.colors is None:
                 raise MeasurementError(
-                    "its points have no colour.\n  Try: --box instead of --color", pose=cloud.name
+                    "its points have no colour.\n  Try: --box instead of --color"
                 )
             kept &= vision.of_color(cloud.colors, self.color)
         if self.box:
@@ -49,58 +51,65 @@ class CloudView:
             kept &= ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
         if not kept.any():
             raise MeasurementError(
-                f"none of its {counted(len(points), 'point')} is finite, and in --box and of "
-                "--color.\n  Try: other corners or another colour; --units.",
-                pose=cloud.name,
+                f"none of its {counted(len(points), 'point')} is finite, inside --box and of "
+                "--color.\n  Try: other corners or another colour; --units."
             )
-        camera = np.array(self.camera) if self.camera else cloud.camera
+        camera = None if cloud.camera is None else scale * cloud.camera
+        if self.camera:
+            camera = np.array(self.camera)
         return replace(cloud, points=points[kept], colors=None, camera=camera)
 
 
 def read_cloud(path: Path) -> Recording:
     """Read a cloud: PLY or PCD (text or binary), or NPY, an array (K, 3), or (K, 6) with colours.
 
-    Raises MeasurementError if the file is damaged.
+    Raises MeasurementError if it holds fewer points than it says, or none.
     """
-    reader = {".ply": _ply, ".pcd": _pcd, ".npy": _npy}[path.suffix.lower()]
-    try:
-        cloud = reader(path)
-    except MeasurementError:
-        raise
-    except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError) as error:
-        raise MeasurementError(
-            f"is no {path.suffix[1:].upper()} file of points: {error}.\n  {_AGAIN}", pose=path.name
-        ) from None
+    cloud = {".ply": _ply, ".pcd": _pcd, ".npy": _npy}[path.suffix.lower()](path)
     if not len(cloud.points):
-        raise MeasurementError(f"holds no points.\n  {_AGAIN}", pose=path.name)
+        raise MeasurementError(f"holds no points.\n  {_AGAIN}")
     return Recording(clouds=(cloud,), up_by=f"as in most {path.suffix} files")
+
+
+def cloud_of(table: Any) -> Cloud:
+    """Cloud of a structured array: x, y, z, and red, green, blue or PCL's packed `rgb` if any."""
+    names = table.dtype.names
+    if not {"x", "y", "z"} <= set(names):
+        raise MeasurementError(
+            f"its points have the fields {', '.join(names)}.\n  Try: an export with x, y and z."
+        )
+    points = np.column_stack([table[axis].astype(float) for axis in "xyz"])
+    colors = None
+    if {"red", "green", "blue"} <= set(names):
+        colors = np.column_stack([table[name].astype(float) for name in ("red", "green", "blue")])
+    elif "rgb" in names:
+        packed = table["rgb"].astype("f4" if table["rgb"].dtype.kind == "f" else "u4").view("u4")
+        colors = np.column_stack([(packed >> shift) & 255 for shift in (16, 8, 0)]).astype(float)
+    return Cloud(points, colors)
 
 
 def _npy(path: Path) -> Cloud:
     array = np.load(path, allow_pickle=False)
+    if array.shape[-1:] not in ((3,), (6,)):
+        raise MeasurementError(
+            f"is an array {array.shape}.\n  Try: (K, 3), or (K, 6) with red, green and blue."
+        )
     array = array.reshape(-1, array.shape[-1]).astype(float)
-    if array.shape[1] not in (3, 6):
-        raise ValueError(f"an array (K, 3) or (K, 6) belongs there, found {array.shape}")
-    return Cloud(path.name, array[:, :3], array[:, 3:] if array.shape[1] == 6 else None)
+    return Cloud(array[:, :3], array[:, 3:] if array.shape[1] == 6 else None)
 
 
 def _ply(path: Path) -> Cloud:
-    head, mark, body = path.read_bytes().partition(b"end_header\n")
-    lines = head.decode("ascii", "replace").split("\n")
-    if not mark or lines[0].strip() != "ply":
-        raise ValueError("it has no header")
-    style = next(line.split()[1] for line in lines if line.startswith("format"))
-    first = next(k for k, line in enumerate(lines) if line.startswith("element"))
-    if lines[first].split()[1] != "vertex":
-        raise ValueError("its first element is not vertex")
-    count, fields = int(lines[first].split()[2]), []
-    for line in lines[first + 1 :]:
-        if line.startswith("element"):
-            break
-        if line.startswith("property"):
-            _, kind, name = line.split()
-            fields.append((name, _PLY[kind]))
-    return _cloud(path, fields, body, count, style)
+    head, *body = re.split(rb"end_header\r?\n", path.read_bytes(), maxsplit=1)
+    if not body or not head.startswith(b"ply"):
+        raise MeasurementError(f"has no header.\n  {_AGAIN}")
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines() if line.strip()]
+    style = next(line[1] for line in lines if line[0] == "format")
+    first, *others = (k for k, line in enumerate(lines) if line[0] == "element")
+    if lines[first][1] != "vertex":
+        raise MeasurementError(f"its first element is not vertex.\n  {_AGAIN}")
+    lines = lines[first : min(others, default=None)]
+    fields = [(line[-1], _PLY[line[1]], 1) for line in lines if line[0] == "property"]
+    return cloud_of(_table(fields, body[0], int(lines[0][2]), style))
 
 
 def _pcd(path: Path) -> Cloud:
@@ -111,43 +120,28 @@ def _pcd(path: Path) -> Cloud:
         head[key], at = values, end + 1
     style = head["DATA"][0]
     if style == "binary_compressed":
-        raise ValueError("it is compressed; save it as binary")
+        raise MeasurementError("is compressed.\n  Try: save it as binary.")
+    names = [f"_{k}" if name == "_" else name for k, name in enumerate(head["FIELDS"])]  # padding
+    counts = map(int, head.get("COUNT", "1" * len(names)))
     kinds = [f"{kind.lower()}{size}" for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
-    fields = list(zip(head["FIELDS"], kinds, strict=True))
+    fields = list(zip(names, kinds, counts, strict=True))
     style = "ascii" if style == "ascii" else "binary_little_endian"
-    cloud = _cloud(path, fields, content[at:], int(head["POINTS"][0]), style)
+    cloud = cloud_of(_table(fields, content[at:], int(head["POINTS"][0]), style))
     seen_from = np.array([float(x) for x in head.get("VIEWPOINT", [])][:3])
     return replace(cloud, camera=seen_from if seen_from.any() else None)
 
 
-def _cloud(path: Path, fields: list[tuple[str, str]], body: bytes, count: int, style: str) -> Cloud:
-    """Points and colours of a table, stored as text or binary."""
-    names = [name for name, _ in fields]
+def _table(fields: Sequence[tuple[str, str, int]], body: bytes, count: int, style: str) -> Any:
+    """Structured array of points; of each field the name, NumPy's type and how many values."""
+    order = ">" if style == "binary_big_endian" else "<"
+    kind = np.dtype([(name, order + form, (number,)) for name, form, number in fields])
     if style == "ascii":
-        lines = [line.split()[: len(names)] for line in body.decode().splitlines()[:count]]
-        rows = [line for line in lines if len(line) == len(names)]
-        held = len(rows)
-        columns = zip(fields, np.array(rows, float).reshape(held, -1).T, strict=False)
-        table = {name: column.astype(kind) for (name, kind), column in columns}
+        width = sum(number for *_, number in fields)
+        lines = [line.split()[:width] for line in body.decode().splitlines()[:count]]
+        rows = [line for line in lines if len(line) == width]
+        table = unstructured_to_structured(np.array(rows, float).reshape(-1, width), kind)
     else:
-        order = ">" if style == "binary_big_endian" else "<"
-        kind = np.dtype([(name, order + form) for name, form in fields])
-        held = len(body) // kind.itemsize
-        data: Any = np.frombuffer(body, kind, min(count, held))
-        table = {name: data[name] for name in names}
-    if held < count:
-        raise MeasurementError(
-            f"ends after {held} of {counted(count, 'point')}.\n  {_AGAIN}", pose=path.name
-        )
-    points = np.column_stack([table[axis].astype(float) for axis in "xyz"])
-    return Cloud(path.name, points, _colors(table))
-
-
-def _colors(table: dict[str, Any]) -> FloatArray | None:
-    """Red, green and blue from separate columns, or from PCL's packed `rgb`."""
-    if {"red", "green", "blue"} <= table.keys():
-        return np.column_stack([table[name].astype(float) for name in ("red", "green", "blue")])
-    if "rgb" not in table:
-        return None
-    packed = table["rgb"].astype("f4" if table["rgb"].dtype.kind == "f" else "u4").view("u4")
-    return np.column_stack([(packed >> shift) & 255 for shift in (16, 8, 0)]).astype(float)
+        table = np.frombuffer(body, kind, min(count, len(body) // kind.itemsize))
+    if len(table) < count:
+        raise MeasurementError(f"ends after {len(table)} of {counted(count, 'point')}.\n  {_AGAIN}")
+    return table

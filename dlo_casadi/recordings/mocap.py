@@ -41,54 +41,45 @@ def read_mocap_csv(path: Path) -> Recording:
     OptiTrack, "Data Export: CSV". Vicon Nexus, "ASCII file format"; its rotations of segments
     with three components are rotation vectors (angle-axis).
     """
-    try:
-        rows = list(csv.reader(path.read_text("utf-8-sig").splitlines()))
-    except UnicodeDecodeError:
-        raise MeasurementError(f"is not a text file.\n  {_AGAIN}", pose=path.name) from None
-    except (OSError, csv.Error) as error:
-        raise MeasurementError(f"cannot be read: {error}", pose=path.name) from None
-    first = next((row[0].strip() for row in rows if row and row[0].strip()), "")
+    rows = list(csv.reader(path.read_text("utf-8-sig").splitlines()))
+    head = next((row for row in rows if row and row[0].strip()), [""])
+    first = head[0].strip()
     if first == "Format Version":
-        streams, own, program = list(_motive(rows, path)), "y", "Motive"
+        streams, own, program = list(_motive(rows, head)), "y", "Motive"
     elif first in (*_SECTIONS, "Devices", "Model Outputs", "Joints"):
-        streams, own, program = list(_vicon(rows, path)), "z", "Vicon"
+        streams, own, program = list(_vicon(rows)), "z", "Vicon"
     else:
         found = f"it begins with {show(first)}" if first else "it is empty"
         raise MeasurementError(
             f"is no CSV file of Motive or Vicon: {found}; Format Version or Trajectories belongs "
-            f"there.\n  {_AGAIN}",
-            pose=path.name,
+            f"there.\n  {_AGAIN}"
         )
     if not streams:
         raise MeasurementError(
-            "holds no labelled marker and no rigid body.\n  Try: label them before the export.",
-            pose=path.name,
+            "holds no labelled marker and no rigid body.\n  Try: label them before the export."
         )
     return Recording(tuple(streams), up=own, up_by=f"as {program} exports it")
 
 
-def _motive(rows: Rows, path: Path) -> Iterator[Stream]:
-    meta = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
+def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
+    meta = dict(zip(settings[::2], settings[1::2], strict=False))
     heads = [k for k, row in enumerate(rows) if row[:1] == ["Frame"]]
     named = {row[1]: row for row in rows[: heads[0]] if len(row) > 2} if heads else {}
     if not heads or not {"Type", "Name"} <= named.keys():
-        raise MeasurementError(
-            f"has no rows Type, Name and Frame above its numbers.\n  {_AGAIN}", pose=path.name
-        )
+        raise MeasurementError(f"has no rows Type, Name and Frame above its numbers.\n  {_AGAIN}")
     if meta.get("Coordinate Space", "Global") != "Global":
         raise MeasurementError(
             f"is in the space {meta['Coordinate Space']!r}.\n  Try: an export with Coordinate "
-            "Space: Global",
-            pose=path.name,
+            "Space: Global"
         )
     head, quantities = heads[0], rows[heads[0] - 1]
-    table = _table(rows[head + 1 :], len(rows[head]), path, head + 2)
+    table = _table(rows[head + 1 :], len(rows[head]), head + 2)
     said = meta.get("Total Exported Frames", "")
     if said.isdigit() and int(said) != len(table):
         raise MeasurementError(
-            f"ends after {len(table)} of {counted(int(said), 'frame')}.\n  {_AGAIN}", pose=path.name
+            f"ends after {len(table)} of {counted(int(said), 'frame')}.\n  {_AGAIN}"
         )
-    scale = factor(meta.get("Length Units", "m"), path.name)
+    scale = factor(meta.get("Length Units", "m"))
     columns: dict[tuple[str, str], dict[str, int]] = {}
     for c in range(2, len(rows[head])):
         columns.setdefault((named["Type"][c], named["Name"][c]), {})[
@@ -104,42 +95,33 @@ def _motive(rows: Rows, path: Path) -> Iterator[Stream]:
             if min(turns) < 0:
                 raise MeasurementError(
                     f"rotations of {name!r} are not quaternions ({meta.get('Rotation Type', '?')})."
-                    "\n  Try: an export with Rotation Type: Quaternion",
-                    pose=path.name,
+                    "\n  Try: an export with Rotation Type: Quaternion"
                 )
             values = np.hstack([values, table[:, turns]])
         if label in _KINDS:
-            yield Stream(name, _KINDS[label], table[:, 1], values, path.name)
+            yield Stream(name, _KINDS[label], table[:, 1], values)
 
 
-def _vicon(rows: Rows, path: Path) -> Iterator[Stream]:
+def _vicon(rows: Rows) -> Iterator[Stream]:
     starts = [k for k, row in enumerate(rows) if row and row[0].strip() in _SECTIONS]
     for k in starts:
         kind = _SECTIONS[rows[k][0].strip()]
-        try:
-            (rate, *_), names, axes, units = rows[k + 1 : k + 5]
-            period = 1.0 / float(rate)
-        except (ValueError, ZeroDivisionError):
-            raise MeasurementError(
-                f"line {k + 2}: a rate [Hz], names, axes and units belong below {rows[k][0]!r}.\n"
-                f"  {_AGAIN}",
-                pose=path.name,
-            ) from None
+        (rate, *_), names, axes, units = rows[k + 1 : k + 5]
         body = rows[k + 5 :]
         stop = next((i for i, row in enumerate(body) if not any(row)), len(body))
-        table = _table(body[:stop], len(axes), path, k + 6)
-        t = table[:, 0] * period
+        table = _table(body[:stop], len(axes), k + 6)
+        t = table[:, 0] / float(rate)
         heads = [c for c in range(2, len(names)) if names[c].strip()]
         for c, following in zip(heads, [*heads[1:], len(axes)], strict=True):
             at = {axes[i].strip(): i for i in range(c, following)}
             places = [at.get(a, at.get(f"T{a}", -1)) for a in "XYZ"]
             if min(places) < 0 or names[c].strip().startswith("*"):
                 continue
-            values = factor(units[places[0]], path.name) * table[:, places]
+            values = factor(units[places[0]]) * table[:, places]
             if kind == "body":
                 turns = [at[f"R{a}"] for a in "XYZW" if f"R{a}" in at]
                 values = np.hstack([values, _quaternions(table[:, turns], units[turns[0]])])
-            yield Stream(names[c].strip(), kind, t, values, path.name)
+            yield Stream(names[c].strip(), kind, t, values)
 
 
 def _quaternions(turns: FloatArray, unit: str) -> FloatArray:
@@ -153,24 +135,21 @@ def _quaternions(turns: FloatArray, unit: str) -> FloatArray:
     return found
 
 
-def _table(rows: Sequence[list[str]], width: int, path: Path, first: int) -> FloatArray:
+def _table(rows: Sequence[list[str]], width: int, first: int) -> FloatArray:
     """Numbers (n, width); nan in empty cells."""
     table = np.full((len(rows), width), np.nan)
     for k, row in enumerate(rows):
         if len(row) < width:
             raise MeasurementError(
                 f"line {first + k} has {len(row)} of {counted(width, 'cell')}: the file is "
-                f"truncated.\n  {_AGAIN}",
-                pose=path.name,
+                f"truncated.\n  {_AGAIN}"
             )
         try:
             table[k] = [float(cell) if cell.strip() else np.nan for cell in row[:width]]
         except ValueError as error:
-            raise MeasurementError(
-                f"line {first + k}: {error}.\n  {_AGAIN}", pose=path.name
-            ) from None
+            raise MeasurementError(f"line {first + k}: {error}.\n  {_AGAIN}") from None
     if not len(rows):
-        raise MeasurementError(f"holds no frames.\n  {_AGAIN}", pose=path.name)
+        raise MeasurementError(f"holds no frames.\n  {_AGAIN}")
     return table
 
 
@@ -192,11 +171,7 @@ def read_c3d(path: Path) -> Recording:
     The C3D file format, www.c3d.org: POINT:Y_SCREEN is the axis that points up on a screen.
     """
     ezc3d = library("ezc3d", "recordings", "reading this file")
-    try:
-        content = ezc3d.c3d(str(path))
-    except (OSError, RuntimeError, ValueError) as error:
-        said = str(error).split(":")[0]
-        raise MeasurementError(f"is no C3D file: {said}.\n  {_WHOLE}", pose=path.name) from None
+    content = ezc3d.c3d(str(path))
     group = content["parameters"]["POINT"].items()
     point = {key: item["value"] for key, item in group if key != "__METADATA__"}
     places = content["data"]["points"][:3]
@@ -204,22 +179,20 @@ def read_c3d(path: Path) -> Recording:
     declared = last - first + 1 if last < 65535 else 0
     if places.shape[2] < declared:
         raise MeasurementError(
-            f"ends after {places.shape[2]} of {counted(declared, 'frame')}.\n  {_WHOLE}",
-            pose=path.name,
+            f"ends after {places.shape[2]} of {counted(declared, 'frame')}.\n  {_WHOLE}"
         )
     labels = [label.strip() for label in point["LABELS"]]
     named = [k for k, label in enumerate(labels) if label and not label.startswith("*")]
     if not named or not places.size:
         raise MeasurementError(
-            "holds no labelled points.\n  Try: label the markers before the export.",
-            pose=path.name,
+            "holds no labelled points.\n  Try: label the markers before the export."
         )
     rate = float(np.ravel(point.get("RATE", [0.0]))[0])
     if rate <= 0.0:
-        raise MeasurementError(f"POINT:RATE is {rate:g} Hz.\n  {_WHOLE}", pose=path.name)
+        raise MeasurementError(f"POINT:RATE is {rate:g} Hz.\n  {_WHOLE}")
     t = np.arange(places.shape[2]) / rate
-    scale = factor("".join(point.get("UNITS", [])[:1]) or "mm", path.name)  # mm by the standard
-    streams = [Stream(labels[k], "marker", t, scale * places[:, k].T, path.name) for k in named]
+    scale = factor("".join(point.get("UNITS", [])[:1]) or "mm")  # mm by the standard
+    streams = [Stream(labels[k], "marker", t, scale * places[:, k].T) for k in named]
     screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
     own = screen.lstrip("+") if screen.lstrip("+") in ("x", "y", "z") else "z"
     said = "as POINT:Y_SCREEN tells" if screen else "in most C3D files; POINT:Y_SCREEN is absent"

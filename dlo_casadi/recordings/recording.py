@@ -25,7 +25,10 @@ METRES |= {"mm": 1e-3, "millimeters": 1e-3, "millimetres": 1e-3}
 
 @dataclass(frozen=True)
 class Stream:
-    """The record of one marker, rigid body or force sensor."""
+    """The record of one marker, rigid body or force sensor.
+
+    A marker or body of one row does not move: a static transform, or a pose that was sent once.
+    """
 
     name: str
     kind: Kind
@@ -34,17 +37,38 @@ class Stream:
     values: FloatArray
     """(n, 3) [m] of a marker; (n, 7) position [m] and quaternion (x, y, z, w) of a body; (n, 6)
     force [N] and moment [N m]. nan where it was not seen."""
-    clock: str
-    """Streams with the same clock share their origin of time."""
+    clock: str = ""
+    """Streams with the same clock share their origin of time. Readers name the clocks in a file if
+    it has several."""
     frame: str = ""
-    """Axes of a wrench: of the world, or the name of what carries the sensor."""
+    """The axes: of what the file calls its world, or those of a frame of this name."""
+    file: str = ""
+
+    @property
+    def moves(self) -> bool:
+        """Whether it is a marker or body that may move."""
+        return self.kind != "wrench" and len(self.t) > 1
+
+    def moved(self, turn: Rotation, place: FloatArray | float = 0.0) -> "Stream":
+        """The stream in other axes, in which its own have the rotation `turn` and the `place`."""
+        values = self.values.copy()
+        values[:, :3] = turn.apply(values[:, :3])
+        if self.kind == "wrench":
+            values[:, 3:] = turn.apply(values[:, 3:])
+            return replace(self, values=values)
+        values[:, :3] += place
+        if self.kind == "body":
+            lost = ~(np.linalg.norm(values[:, 3:], axis=1) > 0.5)  # zero where tracking was lost
+            values[lost, 3:] = [0.0, 0.0, 0.0, 1.0]
+            values[:, 3:] = (turn * Rotation.from_quat(values[:, 3:])).as_quat()
+            values[lost] = np.nan
+        return replace(self, values=values)
 
 
 @dataclass(frozen=True)
 class Cloud:
     """Points that a depth camera has seen at one time."""
 
-    name: str
     points: FloatArray
     """(K, 3) [m]."""
     colors: FloatArray | None = None
@@ -54,6 +78,8 @@ class Cloud:
     t: float = np.nan
     """[s]; nan in a file without a time."""
     clock: str = ""
+    frame: str = ""
+    file: str = ""
 
 
 @dataclass(frozen=True)
@@ -66,7 +92,7 @@ class Recording:
     up: str = "z"
     """The axis, x, y or z, that points up."""
     up_by: str = ""
-    """Why it is taken for the one."""
+    """Why this axis is assumed to point up."""
 
     def of(self, kind: Kind) -> dict[str, Stream]:
         """Streams of one kind, by name."""
@@ -74,31 +100,20 @@ class Recording:
 
     def with_z_up(self, up: str | None) -> "Recording":
         """The recording rotated to z up, from axes in which `up` points up, or as it was read."""
-        turn = _UP[up or self.up]
+        turn = Rotation.from_matrix(_UP[up or self.up])
         assumed = () if up else (f"{self.up} is up, {self.up_by}; or --up",)
-
-        def turned(stream: Stream) -> Stream:
-            values = stream.values.copy()
-            if stream.kind != "wrench":
-                values[:, :3] = values[:, :3] @ turn.T
-            if stream.kind == "body":
-                seen = np.linalg.norm(values[:, 3:], axis=1) > 0.5  # zero where tracking was lost
-                values[~seen] = np.nan
-                turns = Rotation.from_matrix(turn) * Rotation.from_quat(values[seen, 3:])
-                values[seen, 3:] = turns.as_quat()
-            if stream.kind == "wrench" and not stream.frame:
-                values = np.hstack([values[:, :3] @ turn.T, values[:, 3:] @ turn.T])
-            return replace(stream, values=values)
-
+        streams = tuple(
+            stream if stream.kind == "wrench" and stream.frame else stream.moved(turn)
+            for stream in self.streams
+        )
         clouds = tuple(
             replace(
                 cloud,
-                points=cloud.points @ turn.T,
-                camera=None if cloud.camera is None else turn @ cloud.camera,
+                points=turn.apply(cloud.points),
+                camera=None if cloud.camera is None else turn.apply(cloud.camera),
             )
             for cloud in self.clouds
         )
-        streams = tuple(map(turned, self.streams))
         return Recording(streams, clouds, (*self.assumptions, *assumed))
 
 
@@ -113,7 +128,7 @@ def together(recordings: Sequence[Recording]) -> Recording:
         if names.count((kind, name)) > 1:
             raise MeasurementError(
                 f"two streams ({kind}) are called {name!r}: of {stream.clock} and another.\n"
-                "  Try: one file for each cable, or other names in the export."
+                "  Try: one file or topic for each cable, or other names in the export."
             )
         places = stream.values[:, :3]
         far = float(np.abs(places[np.isfinite(places)]).max(initial=0.0))
@@ -129,9 +144,10 @@ def together(recordings: Sequence[Recording]) -> Recording:
     )
 
 
-def factor(unit: str, name: str) -> float:
+def factor(unit: str) -> float:
     """Convert a unit of length named in a file to metres."""
     if unit.strip().lower() not in METRES:
-        known = ", ".join(METRES)
-        raise MeasurementError(f"the unit of length {unit!r} is none of {known}", pose=name)
+        raise MeasurementError(
+            f"the unit of length is {unit!r}.\n  Try: an export in one of {', '.join(METRES)}."
+        )
     return METRES[unit.strip().lower()]

@@ -14,7 +14,7 @@ from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.recordings.recording import Recording
+from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.stills import (
     Gripper,
     Still,
@@ -55,6 +55,12 @@ class Wishes:
     """One in this many poses is held out; 0 for none."""
     known: Mapping[str, float] = field(default_factory=dict)
     """Keys and values of the section `cable`."""
+
+    @property
+    def holders(self) -> dict[str, list[str]]:
+        """Names of the body, or of the three markers, at each fixture."""
+        sides = {"start": self.start} | ({} if self.end == FREE else {"end": self.end})
+        return {side: list(map(str.strip, name.split(","))) for side, name in sides.items()}
 
 
 @dataclass(frozen=True)
@@ -102,8 +108,8 @@ class Imported:
 def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     """Make a session from a recording: align clocks, find poses, name markers, orient grippers.
 
-    `name`: of the cable. Raises MeasurementError if the recording lacks something that a session
-    needs; the message says what to try.
+    Called `name`. Raises MeasurementError if the recording lacks something that a session needs;
+    the message says what to try.
     """
     recording, offsets = align_clocks(recording)
     stills = find_stills(recording, wishes.hold)
@@ -112,12 +118,18 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     if wishes.end != FREE:
         end = find_gripper(wishes.end, wishes.end_offset, "end", stills, recording)
     remarks = [*recording.assumptions, *(offset.told for offset in offsets)]
-    files = {stream.clock.partition(" (")[0] for stream in recording.streams}
-    files |= {cloud.clock.partition(" (")[0] or cloud.name for cloud in recording.clouds}
-    if len(files) > 1 and start is not None:
+    holders = wishes.holders.values()
+    used: list[Stream | Cloud] = list(recording.clouds)
+    used += [s for s in recording.streams if s.kind == "marker" or [s.name] in holders]
+    frames = {(item.file, item.frame) for item in used}
+    if start is not None and len(frames) > 1:
+        files = {item.file for item in used}
+        origin = (
+            "files" if len(files) > 1 else f"frames ({', '.join(sorted(x for _, x in frames))})"
+        )
         remarks.append(
             "world frame: cable and grippers are taken to have the same origin and axes, though "
-            "they come from several files, and nothing here registers them. If theirs differ, "
+            f"they come from several {origin}, and nothing here registers them. If theirs differ, "
             "calibrate both systems to one frame and export again, or record a bag whose TF joins "
             "the frames"
         )
@@ -138,6 +150,12 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
         names, places = [list(markers)[k] for k in order], np.array([*markers.values()])[order]
         seen = np.isfinite(places).all(axis=2)
         lines = [places[here, k] for k, here in enumerate(seen.T)]
+        for k, (line, still) in enumerate(zip(lines, stills, strict=True), start=1):
+            if len(line) < 2:
+                raise MeasurementError(
+                    f"pose {k} ({still.span}) shows {counted(len(line), 'marker')} of the cable, "
+                    "but it takes two.\n  Try: fill their gaps, or cut the recording there."
+                )
         start, end = along_cable(start, end, lines, remarks)
         s, length = _along(start, places, end, names, wishes, remarks)
         points = [
@@ -193,28 +211,47 @@ def _readings(
 ) -> list[dict[str, str]]:
     """Forces and moments of each pose in the world's axes, by their configuration keys."""
     found: list[dict[str, str]] = [{} for _ in stills]
+    sensors: dict[str, str] = {}  # of each side
     for name, stream in recording.of("wrench").items():
-        named = (stream.frame, name)
-        side = "start" if any(wishes.start in text for text in named) else "end"
-        if wishes.end == FREE and side == "end":
-            continue
+        side = _side(stream, wishes)
+        if side in sensors:
+            raise MeasurementError(
+                f"two force sensors are at the {side}: {sensors[side]} and {name}.\n  Try: leave "
+                "the topic of one of them out."
+            )
+        sensors[side] = name
+        if stream.frame and stream.frame not in recording.of("body"):
+            raise MeasurementError(
+                f"the axes of the force sensor {name} are unknown: no TF and no body has its frame "
+                f"{stream.frame!r}.\n  Try: record /tf and /tf_static, too, or leave its topic out."
+            )
         for still, row in zip(stills, found, strict=True):
-            wrench, body = still.values.get(f"wrench {name}"), f"body {stream.frame}"
-            if wrench is None or (
-                stream.frame in recording.of("body") and body not in still.values
-            ):
-                continue
-            turn = Rotation.identity()
-            if body in still.values:
-                turn = Rotation.from_quat(still.values[body][3:])
-            row[f"{side}_force"] = _row(turn.apply(wrench[:3]))
-            row[f"{side}_moment"] = _row(turn.apply(wrench[3:]))
-        axes = stream.frame if stream.frame in recording.of("body") else "the world"
+            wrench = still.values.get(("wrench", name))
+            body = still.values.get(("body", stream.frame))
+            if wrench is not None and (body is not None or not stream.frame):
+                turn = Rotation.from_quat([0.0, 0.0, 0.0, 1.0] if body is None else body[3:])
+                row[f"{side}_force"] = _row(turn.apply(wrench[:3]))
+                row[f"{side}_moment"] = _row(turn.apply(wrench[3:]))
         remarks.append(
-            f"{side}_force, {side}_moment: means of {name}, in axes of {axes}; taken as those of "
-            "the cable on its fixture, about its place, with the gripper's weight taken off"
+            f"{side}_force, {side}_moment: means of {name}, in axes of "
+            f"{stream.frame or 'the world'}; taken as those of the cable on its fixture, about its "
+            "place, with the gripper's weight taken off"
         )
     return found
+
+
+def _side(sensor: Stream, wishes: Wishes) -> str:
+    """The fixture, start or end, that a force sensor's frame or topic is called after."""
+    for names in ([sensor.frame], [sensor.name, *sensor.name.split("/")]):
+        sides = [side for side, parts in wishes.holders.items() if {*parts} & {*names}]
+        if len(sides) == 1:
+            return sides[0]
+    raise MeasurementError(
+        f"the force sensor {sensor.name} (frame {sensor.frame!r}) is called after "
+        f"{'both' if sides else 'none'} of the fixtures {wishes.start!r} and {wishes.end!r}.\n  "
+        f"Try: --start or --end with its frame; a topic such as /{wishes.start.split(',')[0]}/"
+        "wrench; or leave its topic out."
+    )
 
 
 # ---- clouds -------------------------------------------------------------------------------------
@@ -250,8 +287,8 @@ def _cloud_lines(
         shown = [c for c in clouds if still.begin <= c.t <= still.end] if timed else [clouds[k]]
         if not shown:
             raise MeasurementError(
-                f"no cloud was seen in pose {k + 1} ({still.begin:.2f} to {still.end:.2f} s).\n"
-                "  Try: hold it longer; clouds and grippers with clocks that agree."
+                f"no cloud was seen in pose {k + 1} ({still.span}).\n  Try: hold it longer; "
+                "clouds and grippers with clocks that agree."
             )
         cable = vision.KnownCable(
             start.places[k],
@@ -259,9 +296,10 @@ def _cloud_lines(
             wishes.known["diameter"],
             wishes.known["length"],
         )
-        found = vision.line_in_cloud(np.vstack([c.points for c in shown]), cable, shown[0].camera)
-        lines.append(found.points)
-        told.append("; ".join([still.told, *found.messages]))
+        points = np.vstack([c.points for c in shown])
+        line, messages = vision.line_in_cloud(points, cable, shown[0].camera)
+        lines.append(line)
+        told.append("; ".join([still.told, *messages]))
     if shown[0].camera is not None:
         remarks.append("clouds: points moved from the surface to the axis, along the line of sight")
     return lines, told
@@ -274,7 +312,7 @@ def _cable_markers(
     recording: Recording, stills: Sequence[Still], wishes: Wishes
 ) -> dict[str, FloatArray]:
     """Positions (P, 3) [m] of each of the cable's markers; nan in poses where it is not seen."""
-    of_grippers = {part.strip() for name in (wishes.start, wishes.end) for part in name.split(",")}
+    of_grippers = {part for parts in wishes.holders.values() for part in parts}
     on_bodies = tuple(f"{body}:" for body in recording.of("body"))  # naming of Motive and Vicon
     names = [
         name
@@ -283,7 +321,7 @@ def _cable_markers(
     ]
     nowhere = np.full(3, np.nan)
     found = {
-        name: np.array([still.values.get(f"marker {name}", nowhere) for still in stills])
+        name: np.array([still.values.get(("marker", name), nowhere) for still in stills])
         for name in names
     }
     found = {name: places for name, places in found.items() if np.isfinite(places).any()}
@@ -308,7 +346,7 @@ def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> l
         return float(np.nanmax(np.linalg.norm(a - b, axis=1), initial=0.0))
 
     apart = np.array([[away(a, b) for b in places] for a in places])
-    tree = minimum_spanning_tree(apart)
+    tree = minimum_spanning_tree(apart)  # without edges between markers never seen together
     neighbours = np.bincount(np.concatenate(tree.nonzero()), minlength=len(places))
     if neighbours.max() > 2:
         branch = list(markers)[int(np.argmax(neighbours))]
@@ -316,10 +354,15 @@ def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> l
             f"the markers are no chain: three lead to {branch!r}.\n  Try: --cable with a part of "
             "the names of the cable's own markers."
         )
-    tips = np.flatnonzero(neighbours == 1).tolist()
+    tips = np.flatnonzero(neighbours <= 1).tolist()
     if starts is not None:
         tips = sorted(tips, key=lambda k: away(places[k], starts))
     order, _ = depth_first_order(tree, tips[0], directed=False)
+    if len(order) < len(places):
+        raise MeasurementError(
+            f"no pose shows one of the markers {', '.join(np.array([*markers])[order])} and one of "
+            "the others.\n  Try: fill their gaps, or leave some out: --cable"
+        )
     return [int(k) for k in order]
 
 

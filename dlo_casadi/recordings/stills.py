@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import BoolArray, FloatArray, unit
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.recordings.recording import Recording, Stream
+from dlo_casadi.recordings.recording import Kind, Recording, Stream
 
 _LEVER = 0.1  # m, distance from a body of the points that show its rotation
 _SMOOTH = 0.05  # s, window in which speeds are smoothed before clocks are compared
@@ -65,17 +65,22 @@ class Still:
 
     begin: float  # [s]
     end: float  # [s]
-    values: dict[str, FloatArray]
-    """Mean of each stream that was seen, by kind and name: `marker m1`."""
+    values: dict[tuple[Kind, str], FloatArray]
+    """Mean of each stream that was seen, by kind and name."""
     scatter: float  # [m], standard deviation of a coordinate of a marker or body
     drift: float  # [m], largest distance between the means of its two halves
+
+    @property
+    def span(self) -> str:
+        """When it was."""
+        return f"{self.begin:.2f} to {self.end:.2f} s"
 
     @property
     def told(self) -> str:
         """Describe how still it was."""
         return (
-            f"still from {self.begin:.2f} to {self.end:.2f} s: scatter {1e3 * self.scatter:.2f} "
-            f"mm, drift {1e3 * self.drift:.2f} mm"
+            f"still from {self.span}: scatter {1e3 * self.scatter:.2f} mm, drift "
+            f"{1e3 * self.drift:.2f} mm"
         )
 
 
@@ -84,14 +89,15 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
 
     The offset of two clocks is the lag at which the mean speeds of their markers and bodies
     correlate best, to a fraction of a frame by a parabola through the maximum. A clock without
-    moving streams, such as that of a force sensor, keeps its times. Raises MeasurementError if the
-    motions in two recordings do not match.
+    moving streams, such as that of a force sensor, is taken to agree with the first one. Raises
+    MeasurementError if the motions in two recordings do not match.
     """
-    clocks = tuple(dict.fromkeys(s.clock for s in recording.streams if s.kind != "wrench"))
+    clocks = tuple(dict.fromkeys(s.clock for s in recording.streams if s.moves))
     if not clocks:
         return recording, ()
     dt = _period(recording.streams)
-    speeds = [_speed([s for s in recording.streams if s.clock == c], dt) for c in clocks]
+    moving = [stream for stream in recording.streams if stream.moves]
+    speeds = [_speed([s for s in moving if s.clock == c], dt) for c in clocks]
     first, reference = speeds[0]
     offsets = []
     for clock, (begin, speed) in zip(clocks[1:], speeds[1:], strict=True):
@@ -123,7 +129,7 @@ def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
     slowest steady drift that this detects is 6 noises a second. Raises MeasurementError if nothing
     was seen, or if the recording never stands still.
     """
-    shown = [stream for stream in recording.streams if stream.kind != "wrench"]
+    shown = [stream for stream in recording.streams if stream.moves]
     tracks = [track for stream in shown for track in _tracks(stream)]
     tracks = [(t, x) for t, x in tracks if len(t) > 3]
     if not tracks:
@@ -172,9 +178,12 @@ def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
 
 def _still(streams: Sequence[Stream], begin: float, end: float) -> Still:
     """Robust means between two times, with their scatter and drift."""
-    values, scatters, drifts = {}, [], [0.0]
+    values: dict[tuple[Kind, str], FloatArray] = {}
+    scatters, drifts = [], [0.0]
     for stream in streams:
-        seen = (stream.t >= begin) & (stream.t <= end) & np.isfinite(stream.values).all(axis=1)
+        seen = np.isfinite(stream.values).all(axis=1)
+        if stream.moves or stream.kind == "wrench":
+            seen &= (stream.t >= begin) & (stream.t <= end)
         if not seen.any():
             continue
         x = stream.values[seen]
@@ -183,8 +192,8 @@ def _still(streams: Sequence[Stream], begin: float, end: float) -> Still:
         mean = x[kept].mean(axis=0)
         if stream.kind == "body":
             mean[3:] = Rotation.from_quat(x[kept, 3:]).mean().as_quat()
-        values[f"{stream.kind} {stream.name}"] = mean
-        if stream.kind != "wrench":
+        values[stream.kind, stream.name] = mean
+        if stream.moves:
             scatters.append(x[kept, :3].var(axis=0).mean())
             halves = np.array_split(x[kept, :3], 2)
             if len(halves[1]):
@@ -197,7 +206,7 @@ def _same(one: Still, other: Still) -> bool:
     away = [
         float(np.linalg.norm(one.values[key][:3] - other.values[key][:3]))
         for key in one.values.keys() & other.values.keys()
-        if not key.startswith("wrench")
+        if key[0] != "wrench"
     ]
     return bool(away) and max(away) < 3.0 * max(one.scatter, other.scatter, _FLOOR)
 
@@ -282,7 +291,7 @@ def find_gripper(
 ) -> Gripper | None:
     """The body, or the three markers, holding an end; None if the recording has no body."""
     if name.count(",") == 2:
-        o, x, y = (_means(stills, f"marker {part.strip()}", recording) for part in name.split(","))
+        o, x, y = (_means(stills, "marker", part.strip(), recording) for part in name.split(","))
         first = unit(x - o)
         third = unit(np.cross(first, y - o))
         frames = np.stack([first, np.cross(third, first), third], axis=2)
@@ -296,24 +305,26 @@ def find_gripper(
             f"{', '.join(bodies) or 'none'}.\n  Try: --{side} NAME of one of them, or --{side} "
             "O,X,Y of three markers on it: its place, along its x axis, on the side of y."
         )
-    values = _means(stills, f"body {name}", recording)
+    values = _means(stills, "body", name, recording)
     frames = Rotation.from_quat(values[:, 3:]).as_matrix()
     return Gripper(values[:, :3] + frames @ np.array(offset or np.zeros(3)), frames)
 
 
-def _means(stills: Sequence[Still], key: str, recording: Recording) -> FloatArray:
+def _means(stills: Sequence[Still], kind: Kind, name: str, recording: Recording) -> FloatArray:
     """Means (P, k) of a stream in all poses."""
-    kind, name = key.split(" ", 1)
-    if not any(key in still.values for still in stills):
-        known = ", ".join(stream.name for stream in recording.streams if stream.kind == kind)
-        raise MeasurementError(f"no {kind} {name!r} was seen in any pose; found: {known}")
+    if not any((kind, name) in still.values for still in stills):
+        known = ", ".join(recording.of(kind)) or "none"
+        raise MeasurementError(
+            f"no {kind} {name!r} was seen in any pose; found: {known}.\n  Try: --start or --end "
+            "with one of these names."
+        )
     for k, still in enumerate(stills, start=1):
-        if key not in still.values:
+        if (kind, name) not in still.values:
             raise MeasurementError(
-                f"{key} is not seen in pose {k} ({still.begin:.2f} to {still.end:.2f} s).\n"
+                f"{kind} {name} is not seen in pose {k} ({still.span}).\n"
                 "  Try: fill its gaps, or cut the recording there."
             )
-    return np.array([still.values[key] for still in stills])
+    return np.array([still.values[kind, name] for still in stills])
 
 
 def along_cable(

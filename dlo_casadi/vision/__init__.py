@@ -11,7 +11,7 @@ from dlo_casadi.vision.camera import (
 )
 from dlo_casadi.vision.centerline import ExtractedCenterline, extract_centerline
 from dlo_casadi.vision.chain import Workings
-from dlo_casadi.vision.cloud import CloudLine, line_in_cloud, of_color
+from dlo_casadi.vision.cloud import line_in_cloud, of_color
 from dlo_casadi.vision.image import draw_steps, encoded, read_image
 from dlo_casadi.vision.image_curve import ImageCurve, nearest_in_order, see_cable
 from dlo_casadi.vision.space_line import SpaceLine, Views, measure_views

@@ -1,7 +1,6 @@
 """Find the line of a cable in a depth camera's cloud of points on its surface."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -19,7 +18,7 @@ from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
 
 _ALIKE = 40.0  # distance in CIE Lab within which a colour counts as the cable's
 _REACH = 2.0  # diameters: distance of neighbouring points, and of points from the line
-_LONELY = 0.2  # share of the usual number of neighbours: a point with fewer is not on the cable
+_LONELY = 0.2  # share of the median number of neighbours; a point with fewer is left out
 _SHORTEST = 2.0  # diameters: shorter strands are left out
 _KNOT, _SMOOTH = 5.0, 2.0  # diameters, of the spline
 _ROUNDS = 4  # rounds of assigning points to the spline and refitting it; it converges in three
@@ -27,18 +26,6 @@ SPACING = 0.01  # m, distance between points of the line
 _FEWEST = 5  # points of the cloud needed for one point of the line
 _LEAST = 0.25  # smallest share of the length that must be seen
 _TOLD = 0.05  # share of the length: a longer hidden part is reported
-
-
-@dataclass(frozen=True)
-class CloudLine:
-    """A line in space from a cloud of points."""
-
-    points: Array
-    """(K, 3) [m], ordered from start to end; hidden stretches are left out."""
-    std: Array
-    """(K,) [m], standard deviation of a coordinate of each point."""
-    messages: tuple[str, ...]
-    """What a user should know."""
 
 
 def of_color(colors: FloatArray, wanted: Sequence[float]) -> Flags:
@@ -52,7 +39,9 @@ def of_color(colors: FloatArray, wanted: Sequence[float]) -> Flags:
     return np.asarray(away < _ALIKE)
 
 
-def line_in_cloud(points: FloatArray, cable: KnownCable, camera: FloatArray | None) -> CloudLine:
+def line_in_cloud(
+    points: FloatArray, cable: KnownCable, camera: FloatArray | None
+) -> tuple[Array, tuple[str, ...]]:
     """Find the line of a cable in a cloud of its surface.
 
     Neighbouring points form strands, which are ordered like those in a photograph; a spline
@@ -70,10 +59,17 @@ def line_in_cloud(points: FloatArray, cable: KnownCable, camera: FloatArray | No
     camera : (3,) [m] or None
         Place of the camera. Without it the line lies pi r / 4 before the axis.
 
+    Returns
+    -------
+    (M, 3) [m]
+        Points of the line, ordered from start to end; hidden stretches are left out.
+    tuple of str
+        What a user should know.
+
     Raises
     ------
     VisionError
-        If too little of a cable is found.
+        If too little of a cable is found, or its points are too few.
     """
     diameter = cable.diameter
     surface = np.asarray(points[np.isfinite(points).all(axis=1)], float)
@@ -92,17 +88,23 @@ def line_in_cloud(points: FloatArray, cable: KnownCable, camera: FloatArray | No
     curve = fit_curve(t[kept], line[kept], np.ones(int(kept.sum())), _KNOT * diameter, diameter)
     for _ in range(_ROUNDS):
         curve, at, near = _refitted(curve, surface, diameter, camera)
-    found, std = _means(curve, at, near)
+    found = _means(curve, at, near)
     steps = np.linalg.norm(np.diff(found, axis=0), axis=1)
     seen = float(steps[steps < 2.5 * SPACING].sum())
+    if seen < _LEAST * cable.length:
+        raise VisionError(
+            f"only {seen:.3f} m of {cable.length:g} m of the cable have the {_FEWEST} points per "
+            f"cm that are needed; the mean is {len(near) / (100.0 * cable.length):.1f}. Try: the "
+            "cloud before it was thinned out; a camera that is nearer."
+        )
     messages = []
     if seen < (1.0 - _TOLD) * cable.length:
         hidden = 100 * (1.0 - seen / cable.length)
-        messages.append(f"{hidden:.0f} % of the cable are hidden or cannot be told")
+        messages.append(f"{hidden:.0f} % of the cable is hidden, or has too few points")
     if camera is None:
         before = 1e3 * np.pi * diameter / 8
         messages.append(f"the line is {before:.1f} mm before the axis (no place of the camera)")
-    return CloudLine(found, std, tuple(messages))
+    return found, tuple(messages)
 
 
 def _strands(points: Array, diameter: float) -> list[Strand]:
@@ -162,16 +164,13 @@ def _refitted(
     return fit_curve(t, points, np.ones(len(t)), _KNOT * diameter, _SMOOTH * diameter), t, points
 
 
-def _means(curve: BSpline, t: Array, points: Array) -> tuple[Array, Array]:
-    """Points (K, 3) of the curve, each moved by the mean of the cloud beside it, and their std."""
+def _means(curve: BSpline, t: Array, points: Array) -> Array:
+    """Points (K, 3) of the curve, each moved by the mean of the cloud beside it."""
     bins = np.floor((t - t[0]) / SPACING).astype(int)
-    found, std = [], []
+    found = []
     for b in np.unique(bins):
         inside = bins == b
-        if inside.sum() < _FEWEST:
-            continue
-        residual = points[inside] - curve(t[inside])
-        at = t[inside].mean()
-        found.append(curve(at) + residual.mean(axis=0))
-        std.append(np.sqrt(residual.var(axis=0).mean() / inside.sum()))
-    return np.array(found), np.array(std)
+        if inside.sum() >= _FEWEST:
+            residual = points[inside] - curve(t[inside])
+            found.append(curve(t[inside].mean()) + residual.mean(axis=0))
+    return np.reshape(found, (-1, 3))

@@ -1,0 +1,144 @@
+"""Bags whose frames, forces and clouds are given in other ways than the rendered takes do it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.recordings import Wishes, make_session, read_recording
+from dlo_casadi.recordings.stills import align_clocks, find_stills
+
+rosbag2 = pytest.importorskip("rosbags.rosbag2")
+typesys = pytest.importorskip("rosbags.typesys")
+STORE = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+MSG = {name.rsplit("/", 1)[-1]: kind for name, kind in STORE.types.items()}
+T = np.arange(0.0, 8.0, 0.05)  # s
+STEP = np.clip(T - 3.5, 0.0, 1.0)[:, None] * [0.0, 0.1, 0.0]  # m: two poses
+POINTS = np.array([[0.1, 0.0, 0.0], [0.2, 0.02, 0.0], [0.3, 0.0, 0.0]])  # m
+STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+MOUNT = np.array([1.0, 2.0, 3.0, *Rotation.from_euler("z", 90, degrees=True).as_quat()])
+
+
+def header(t, frame):
+    stamp = STORE.types["builtin_interfaces/msg/Time"](int(t), round((t - int(t)) * 1e9))
+    return MSG["Header"](stamp, frame)
+
+
+def pose(x):
+    return MSG["Pose"](MSG["Point"](*x[:3]), MSG["Quaternion"](*x[3:]))
+
+
+def tf(t, parent, child, x):
+    moved = MSG["Transform"](MSG["Vector3"](*x[:3]), MSG["Quaternion"](*x[3:]))
+    return MSG["TFMessage"]([MSG["TransformStamped"](header(t, parent), child, moved)])
+
+
+def markers(t, frame, places):
+    poses = [pose([*x, 0.0, 0.0, 0.0, 1.0]) for x in places]
+    return MSG["PoseArray"](header(t, frame), poses)
+
+
+def wrench(t, frame):
+    force = MSG["Wrench"](MSG["Vector3"](1.0, 2.0, 3.0), MSG["Vector3"](0.0, 0.0, 0.0))
+    return MSG["WrenchStamped"](header(t, frame), force)
+
+
+def written(folder, *messages):
+    """A bag of (topic, message)."""
+    topics = {}
+    with rosbag2.Writer(folder / "take", version=9) as writer:
+        for topic, message in messages:
+            kind = message.__msgtype__
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(topics[topic], 1, STORE.serialize_cdr(message, kind))
+    return [folder / "take"]
+
+
+def cable(frame="world"):
+    return [("/a", markers(t, frame, POINTS + x)) for t, x in zip(T, STEP, strict=True)]
+
+
+def test_markers_and_bodies_go_to_the_root_of_tf(tmp_path):
+    hands = [
+        ("/hand", MSG["PoseStamped"](header(t, "mocap"), pose([*x, *STILL[3:]])))
+        for t, x in zip(T, STEP, strict=True)
+    ]
+    mount = ("/tf_static", tf(0.0, "world", "mocap", MOUNT))
+    recording = read_recording(written(tmp_path, mount, *cable("mocap"), *hands))
+    turn = Rotation.from_quat(MOUNT[3:])
+    for k, stream in enumerate(recording.of("marker").values()):
+        assert stream.values == pytest.approx(turn.apply(POINTS[k] + STEP) + MOUNT[:3])
+    hand = recording.of("body")["hand"]
+    assert hand.values[:, :3] == pytest.approx(turn.apply(STEP) + MOUNT[:3])
+    assert hand.values[:, 3:] == pytest.approx(np.tile(MOUNT[3:], (len(T), 1)))
+    assert {stream.frame for stream in recording.streams} == {"world"}
+
+
+def test_markers_of_two_topics_are_not_mixed(tmp_path):
+    other = [("/b", markers(t, "world", 2.0 + POINTS)) for t in T]
+    found = read_recording(written(tmp_path, *cable(), *other)).of("marker")
+    assert [*found] == [f"{topic}_{k:02d}" for topic in "ab" for k in range(3)]
+    assert found["b_01"].values == pytest.approx(np.tile(2.0 + POINTS[1], (len(T), 1)))
+
+
+def test_fixtures_that_never_move_hold_every_pose(tmp_path):
+    """Static frames are sent before the first pose; that nothing joins two roots is told."""
+    far = np.array([0.4, *STILL[1:]])
+    fixed = [
+        ("/tf_static", tf(0.0, "base", "start", STILL)),
+        ("/tf_static", tf(2.0, "start", "end", 2.0 * far)),
+        ("/tf_static", tf(3.0, "start", "end", far)),
+    ]
+    recording = read_recording(written(tmp_path, *fixed, *cable()))
+    aligned, offsets = align_clocks(recording)
+    assert not offsets
+    stills = find_stills(aligned, 0.5)
+    assert len(stills) == 2
+    for still in stills:
+        assert still.values["body", "start"] == pytest.approx(STILL)
+        assert still.values["body", "end"] == pytest.approx(far)
+    session = make_session("loom", recording, Wishes())
+    assert any("come from several frames (base, world)" in text for text in session.remarks)
+
+
+def test_a_wrench_in_axes_of_the_world_is_turned_with_it(tmp_path):
+    """With y up in the bag, y becomes z. One in the axes of a sensor keeps them."""
+    sent = [("/end/wrench", wrench(t, "world")) for t in T]
+    sent += [("/start/wrench", wrench(t, "hand")) for t in T]
+    sent += [("/tf", tf(t, "world", "hand", STILL)) for t in T]
+    found = read_recording(written(tmp_path, *cable(), *sent), up="y").of("wrench")
+    assert found["end/wrench"].values[0, :3] == pytest.approx([1.0, -3.0, 2.0])
+    assert found["start/wrench"].values[0, :3] == pytest.approx([1.0, 2.0, 3.0])
+
+
+def cloud(order="<", names="xyz", lost=0):
+    """A PointCloud2 of two rows with two points and four bytes of padding each."""
+    table = np.zeros((2, 2), [(name, f"{order}f4") for name in names])
+    for k, name in enumerate(names):
+        table[name] = [[k, 3 + k], [6 + k, 9 + k]]
+    fields = [MSG["PointField"](name, 4 * k, 7, 1) for k, name in enumerate(names)]
+    data = b"".join(row.tobytes() + b"\xff" * 4 for row in table)
+    raw = np.frombuffer(data[: len(data) - lost], np.uint8)
+    width = table.dtype.itemsize
+    return MSG["PointCloud2"](
+        header(1.0, "camera"), 2, 2, fields, order == ">", width, 2 * width + 4, raw, True
+    )
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_rows_of_a_cloud_may_be_padded_and_of_either_byte_order(order, tmp_path):
+    (found,) = read_recording(written(tmp_path, ("/depth", cloud(order)))).clouds
+    assert found.points == pytest.approx(np.arange(12.0).reshape(4, 3))
+
+
+@pytest.mark.parametrize("broken", [cloud(names="xyh"), cloud(lost=8)], ids=["no z", "truncated"])
+def test_broken_clouds_of_a_bag(broken, tmp_path):
+    with pytest.raises(MeasurementError, match=r"^take: .*\n  Try: "):
+        read_recording(written(tmp_path, ("/depth", broken)))
+
+
+def test_a_transform_without_a_rotation_is_left_out(tmp_path):
+    sent = [("/tf", tf(t, "world", "hand", STILL * (k > 0))) for k, t in enumerate(T)]
+    hand = read_recording(written(tmp_path, *sent)).of("body")["hand"]
+    assert hand.values == pytest.approx(np.tile(STILL, (len(T) - 1, 1)))
