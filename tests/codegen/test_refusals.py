@@ -51,7 +51,9 @@ def test_a_failed_shape_has_no_clearance_and_no_limits(solver, failed):
 def test_a_failed_shape_is_no_start(solver, failed):
     assert solver.solve(POSE, warm=failed, throw=False).status == "bad_argument"
     assert solver.step(failed, POSE).status == "bad_argument"
-    assert solver.path([POSE], warm=failed).shapes[0].status == "bad_argument"
+    path = solver.path([POSE, POSE], warm=failed)
+    assert [shape.status for shape in path.shapes] == ["bad_argument", "ok"]
+    assert path.first_jump == 0
     with pytest.raises(EquilibriumError, match="bad_argument"):
         solver.sensitivity(failed, POSE)
     with pytest.raises(EquilibriumError, match="a warm start whose status is ok"):
