@@ -368,19 +368,19 @@ class CompiledSolver:
         """Obstacles in the layout of dlo_obstacle."""
         if not isinstance(obstacles, Sequence):
             raise DloError(f"obstacles is a list, found {obstacles!r}\n  Try: [obstacle]")
+        d = self.model.node.dimension
         for obstacle in obstacles:
             if not isinstance(obstacle, Obstacle):
                 raise DloError(
                     f"a Capsule or a Plane belongs here, found {obstacle!r}\n"
                     "  Try: dlo_casadi.codegen.Plane(point, normal)"
                 )
-            row, d = row_of(obstacle), self.model.node.dimension
-            if any(np.shape(place) != (d,) for place in (row.a, row.b)):
+            if any(np.shape(place) != (d,) for place in row_of(obstacle)[1:3]):
                 raise DloError(
                     f"places of an obstacle must have {counted(d, 'number')}, found {obstacle!r}\n"
-                    f"  Try: {counted(d, 'number')}, as the cable's gravity has"
+                    "  Try: as many as the cable's gravity has"
                 )
-        return np.array([row_of(obstacle) for obstacle in obstacles], self._records.obstacle)
+        return np.array(list(map(row_of, obstacles)), self._records.obstacle)
 
     def _along(self, slope: Slope | None) -> Any:
         return None if slope is None else _filled(self._records.slope, slope)

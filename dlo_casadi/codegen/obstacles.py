@@ -1,7 +1,6 @@
 """Obstacles in the generated solver: their maximum number, and those of the model."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -84,25 +83,16 @@ _SAID = """\
 """
 
 
-class ObstacleRow(NamedTuple):
-    """An obstacle in the layout of dlo_obstacle."""
-
-    kind: int
-    a: tuple[float, ...]
-    b: tuple[float, ...]
-    radius: float
-
-
-def row_of(obstacle: Obstacle) -> ObstacleRow:
-    """An obstacle in the layout of dlo_obstacle."""
+def row_of(obstacle: Obstacle) -> tuple[int, tuple[float, ...], tuple[float, ...], float]:
+    """Kind, places a and b, and radius of an obstacle: the layout of dlo_obstacle."""
     if isinstance(obstacle, Plane):
-        return ObstacleRow(1, obstacle.point, obstacle.normal, 0.0)
-    return ObstacleRow(0, obstacle.a, obstacle.b, obstacle.radius)
+        return 1, obstacle.point, obstacle.normal, 0.0
+    return 0, obstacle.a, obstacle.b, obstacle.radius
 
 
 def _initializer(obstacle: Obstacle) -> str:
     """An obstacle as an initialiser of dlo_obstacle."""
-    row = row_of(obstacle)
-    a, b = (", ".join(c_number(float(x)) for x in place) for place in (row.a, row.b))
-    kind = ("DLO_CAPSULE", "DLO_HALF_SPACE")[row.kind]
-    return f"{{{kind}, {{{a}}}, {{{b}}}, {c_number(row.radius)}}}"
+    kind, *places, radius = row_of(obstacle)
+    a, b = (", ".join(c_number(float(x)) for x in place) for place in places)
+    name = ("DLO_CAPSULE", "DLO_HALF_SPACE")[kind]
+    return f"{{{name}, {{{a}}}, {{{b}}}, {c_number(radius)}}}"
