@@ -382,12 +382,17 @@ def test_a_declared_effect_lies_within_its_own_bounds(tmp_path, effect, paramete
     assert f"{effect}.{parameter.split(':')[0]}: {message}" in str(caught.value)
 
 
-def load_for_all(folder: Path, options: str) -> Config:
-    """Load a session in which every effect can act: clamps, a calibrated camera."""
-    return load(
-        folder,
+def load_for_all(folder: Path, options: str, *, clamped: bool) -> Config:
+    """Load a session in which every effect of pins, or of clamps, can act."""
+    clamps = (
         ("{start: pinned, end: pinned}", "{start: clamped, end: clamped}"),
         ("start: [0, 0]", "start: [0, 0], start_heading: 0, end_heading: 0"),
+    )
+    return load(
+        folder,
+        *clamps * clamped,
+        ("role:", "clips: [{kind: pinned, at: 0.4, place: [0.2, -0.1]}], role:"),
+        ("  poses:", "  obstacles:\n    - {kind: plane, point: [0, -1], normal: [0, 1]}\n  poses:"),
         ("{kind: centerlines, std: 3e-4}", f"{{kind: images, {CAMERA}, {BOARD}}}"),
         (".csv", ".jpg"),
         text=GOOD + options,
@@ -399,7 +404,7 @@ def test_no_parameter_of_an_effect_takes_any_number(tmp_path, name):
     for q in EFFECTS[name]().parameters(CableData(0.8, 0.23, 0.0128, 0.6)):
         options = f"model: {{effects: [{{name: {name}, parameters: {{{q.name}: 1e300}}}}]}}\n"
         with pytest.raises(ConfigError, match=rf"{name}.{q.name}: 1e\+300.* is possible"):
-            load_for_all(tmp_path, options)
+            load_for_all(tmp_path, options, clamped=not name.endswith("_spring"))
 
 
 @pytest.mark.parametrize(
@@ -444,8 +449,11 @@ def test_names_that_no_file_system_takes(tmp_path):
 
 def test_every_effect_can_be_declared(tmp_path):
     in_plane = [name for name, kind in EFFECTS.items() if 2 in kind.dimensions]
-    config = load_for_all(tmp_path, f"model: {{effects: [{', '.join(in_plane)}]}}\n")
-    assert [item.name for item in config.model.effects] == in_plane
+    for clamped, other in ((True, "_spring"), (False, "clamp_")):
+        names = [name for name in in_plane if other not in name]
+        options = f"model: {{effects: [{', '.join(names)}]}}\n"
+        config = load_for_all(tmp_path, options, clamped=clamped)
+        assert [item.name for item in config.model.effects] == names
 
 
 @pytest.mark.parametrize(

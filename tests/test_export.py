@@ -11,7 +11,7 @@ from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.export.mujoco import principal
-from dlo_casadi.export.rod import Held, Rod
+from dlo_casadi.export.rod import Rod, SolvedCable
 from dlo_casadi.export.targets import TARGETS, losses, samples_of, target_of, write_rods
 from dlo_casadi.model.cable_model import CableModel
 
@@ -33,14 +33,14 @@ def in_space(*effects, **values):
     pose = HeldPose(
         (0.1, 0.2, 0.3), (0.45, 0.3, 0.35), start_orientation=(0, 0, 0, 1), end_orientation=turned
     )
-    return Held.solved(model, p, rest, pose)
+    return SolvedCable.of(model, p, rest, pose)
 
 
 def in_plane(start="pinned", end="pinned"):
     model = CableModel(PLANE, 20, "quadratic", start, end, n_rest=4)
     rest = model.rest_basis @ np.array([0.5, 2.0, 1.0, 0.2])
     pose = HeldPose((0.1, 0.2), (0.6, 0.1) if end != "free" else None, start_heading=0.3)
-    return Held.solved(model, model.nominal, rest, pose)
+    return SolvedCable.of(model, model.nominal, rest, pose)
 
 
 def off(held, rod, nodes):
@@ -152,7 +152,7 @@ def test_one_bending_stiffness_costs_what_it_moves():
     mean = in_space()
     p = mean.p.copy()
     p[mean.model.names.index("bending_stiffness")] = (1 + RATIO) / 2 * 0.015
-    mean = Held.solved(mean.model, p, mean.rest, mean.pose)
+    mean = SolvedCable.of(mean.model, p, mean.rest, mean.pose)
     s = np.linspace(0, 0.6, 101)
     moved = 100 * np.linalg.norm(held.curve.at(s) - mean.curve.at(s), axis=1).max() / 0.6
     assert list(found) == ["anisotropy"]
@@ -186,7 +186,7 @@ def test_a_file_says_what_it_holds(target, tmp_path):
     assert f"written by dlo-casadi for {kind.title}" in text
     assert "EI 0.015 N m^2, GJ 0.011 N m^2, mass 0.05 kg" in text
     assert "compact mass of 0.02 kg at 0.25 m" in text
-    assert re.search(r"Not carried:\n\W+nothing", text)
+    assert re.search(r"Not represented:\n\W+nothing", text)
 
 
 def test_what_is_not_carried_is_named_with_its_size():

@@ -114,7 +114,8 @@ def test_dead_load_is_all_that_hangs_on_the_cable(element):
     model = CableModel(CABLE, n=5, element=element, effects=effects)
     p = np.array([0.02, 0.1, 0.5, 0.3, -0.4, 0.7, 0.25, 0.2])
     gravity = 9.81 * np.array([np.sin(0.2), -np.cos(0.2)])
-    exact = (CABLE.mass + 0.1) * gravity + [0.3, -0.4] + 0.25 * np.array([CABLE.length, 0.0])
+    across = np.array([np.cos(0.2), np.sin(0.2)])
+    exact = (CABLE.mass + 0.1) * gravity + [0.3, -0.4] + 0.25 * CABLE.length * across
     np.testing.assert_allclose(
         np.array(functions_of(model).dead_load(p)).ravel(), exact, rtol=1e-13
     )

@@ -30,7 +30,7 @@ from dlo_casadi.equilibrium.spread import (
     tipping_of,
 )
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.export.rod import Held
+from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.export.targets import samples_of, target_of, write_rods
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.model.contact import Contact, surfaces_at
@@ -181,8 +181,17 @@ class FittedCable(EstimatedCable):
         Raises
         ------
         DloError
-            If there is no such target, if a file cannot be written, or as in `solve`.
+            If there is no such target, if a number is too small, if a file cannot be written, or as
+            in `solve`.
         """
+        for name, value, least in (
+            ("segments", 4 if segments is None else segments, 4),
+            ("samples", samples, 0),
+            ("seed", seed, 0),
+        ):
+            if not isinstance(value, int | np.integer) or value < least:
+                text = f"{name}: a whole number, {least} or more, found {value!r}"
+                raise DloError(f"{text}\n  Try: {name}={least}")
         to, known, first = target_of(target), self.metadata, self.solve(**held).held
         fitted = (known.coefficients, known.covariance.names, known.covariance.values)
         others = samples_of(first, *fitted, samples, seed)
@@ -267,10 +276,10 @@ class Shape:
         return self.curve.frames(self.s, places, self.equilibrium.x)
 
     @property
-    def held(self) -> Held:
+    def held(self) -> SolvedCable:
         """The state from which an export is made."""
         model, p = without_camera(self.cable.model, self.cable.p)
-        return Held(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
+        return SolvedCable(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
 
     @property
     def start_force(self) -> FloatArray:

@@ -56,10 +56,6 @@ def export(chosen: argparse.Namespace) -> None:
         raise DloError(f"--figure {chosen.figure}: the name must end in {', '.join(DRAWN)}")
     if chosen.figure is not None and chosen.check is None:
         raise DloError("--figure draws the check.\n  Try: with --check")
-    for name, least in (("samples", 0), ("seed", 0), ("segments", 4)):
-        value = getattr(chosen, name)
-        if value is not None and value < least:
-            raise DloError(f"--{name} {value}: {least} or more belongs here")
     config = None
     if chosen.check is not None:
         require(target)
@@ -79,7 +75,7 @@ def export(chosen: argparse.Namespace) -> None:
     lost = losses(shape.held, target, rod)
     page = Page(chosen)
     for feature, cost in lost.items():
-        page.warn(f"{target.title} cannot carry {feature}: {cost}")
+        page.warn(f"{target.title} cannot represent {feature}: {cost}")
     others = f" and {len(files) - 1} more, seed {chosen.seed}" if chosen.samples else ""
     page.say(f"{path}{others}: {len(rod.masses)} links")
     told = {"files": [str(file) for file in files], "links": len(rod.masses), "not_carried": lost}

@@ -1,7 +1,7 @@
 """Differences between the solvers of a cable in a plane and in space."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.kernels import Held, Kernels, kernels_of
+from dlo_casadi.codegen.kernels import Holding, Kernels, kernels_of
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.equilibrium.solve import coarse_rest
@@ -65,8 +65,8 @@ class Case:
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
-        if self.obstacles and bare.end == "free":
-            bare = replace(bare, end="pinned")  # forces on obstacles are those at an end
+        if bare.end == "free" and (self.obstacles or self.holds):
+            bare = replace(bare, end="pinned")  # segments before a clip or a contact carry a force
         if not self.holds:
             return kernels_of(bare, p, rest, self.inline)
         if not bare.chain.kind.smooth:
@@ -74,10 +74,8 @@ class Case:
                 "no solver can be generated for a cable of links with a tether\n"
                 "  Try: another element, --element quadratic"
             )
-        # Before a clip the cable carries a force even if its end is free.
-        bare = replace(bare, end="pinned") if bare.end == "free" else bare
         slides = bool(self.model.sliding)
-        return kernels_of(bare, p, rest, self.inline, Held(moved, slides))
+        return kernels_of(bare, p, rest, self.inline, Holding(moved, slides))
 
     @property
     def holds(self) -> int:
@@ -114,19 +112,14 @@ class Case:
     @property
     def example_clips(self) -> str:
         """Clips for the pose in example.c, evenly spaced along its chord."""
-        model, shares = self.model, np.linspace(0.0, 1.0, len(self.model.clips) + 2)[1:-1]
-        rows = [
-            [s, *(s * np.array([0.6, 0.1, 0.1]))[: model.node.dimension]]
-            for s in shares * self.length
-        ]
-        frame = model.node.identity if model.clamped_between else ()
+        node, chord = self.model.node, (0.6, 0.1, 0.1)[: self.model.node.dimension]
+        frame = [f"{x:g}" for x in node.identity] if self.model.clamped_between else []
+        direction = [_braces(frame)] if len(frame) > 1 else frame
         clips = [
-            f"{{{row[0]:.4g}, {{{', '.join(f'{x:.4g}' for x in row[1:])}}}"
-            + _initializer(frame)
-            + "}"
-            for row in rows
+            _braces([f"{s:.4g}", _braces(f"{s * x:.4g}" for x in chord), *direction])
+            for s in np.linspace(0.0, self.length, len(self.model.clips) + 2)[1:-1]
         ]
-        return f",\n                           {{{', '.join(clips)}}}" if clips else ""
+        return f",\n                           {_braces(clips)}" if clips else ""
 
     @property
     def compliances(self) -> list[float]:
@@ -197,11 +190,8 @@ class Case:
         return np.array(functions_of(self.model).dead_load(self.p)).ravel()
 
 
-def _initializer(frame: Sequence[float]) -> str:
-    """C text after the place of a clip: its direction, if it has one."""
-    if not len(frame):
-        return ""
-    return f", {frame[0]:g}" if len(frame) == 1 else f", {{{', '.join(f'{x:g}' for x in frame)}}}"
+def _braces(parts: Iterable[str]) -> str:
+    return f"{{{', '.join(parts)}}}"
 
 
 class _PlaneCase(Case):

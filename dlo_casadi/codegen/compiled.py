@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.generate import Solver, generate
-from dlo_casadi.codegen.obstacles import Obstacles
+from dlo_casadi.codegen.obstacles import row_of
 from dlo_casadi.codegen.shapes import (
     QUANTITIES,
     STATUSES,
@@ -32,7 +33,7 @@ from dlo_casadi.codegen.shapes import (
 from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.rod.obstacles import Obstacle, Plane
+from dlo_casadi.rod.obstacles import Obstacle
 
 # Poses, or rows of numbers in the layout of dlo_pose in the C header.
 Poses = Sequence[AnyPose] | FloatArray
@@ -119,9 +120,8 @@ class CompiledSolver:
     ) -> None:
         self.model = model
         self.source = generate(model, p, rest, obstacles=obstacles)
-        known = Obstacles.of(model, np.asarray(p, float), obstacles)
-        self.most_obstacles = known.most
-        self.obstacles = known.declared
+        self.most_obstacles = self.source.obstacles.most
+        self.obstacles = self.source.obstacles.declared
         folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         self._c = ctypes.CDLL(str(compile_library(self.source, folder, flags)))
@@ -299,14 +299,18 @@ class CompiledSolver:
         Raises
         ------
         DloError
-            If there is no obstacle or another object, or a number is not finite.
+            If there is no obstacle or another object, a number is not finite, or the shape is empty
+            because its pose has no equilibrium.
         """
         given, along = self._table_of(obstacles), self._along(slope)
         kept, out = self._record_of(shape), np.zeros(1, self._records.gap)
         status = self._call("dlo_clearance", kept, given, len(given), along, out)
         if status:
-            count = counted(len(obstacles), "obstacle")
-            raise DloError(f"no clearance ({STATUSES[status]}): {count} given")
+            count = counted(len(given), "obstacle")
+            raise DloError(
+                f"no clearance ({STATUSES[status]}): the shape is {shape.status!r}, {count} given\n"
+                "  Try: a shape whose status is ok, one obstacle or more, finite numbers"
+            )
         if slope is None:
             out["gradient"] = np.nan
         return Gap(**_values(out[0]))
@@ -332,21 +336,28 @@ class CompiledSolver:
         Raises
         ------
         DloError
-            If a limit has an unknown name or is not positive, the shape is empty, or a number is
-            not finite.
+            If a limit has an unknown name or is not a positive finite number, the shape is empty,
+            or a number is not finite.
         """
         if unknown := [name for name in limits if name not in QUANTITIES]:
             text = f"a shape has no limit {unknown[0]!r}"
             raise DloError(f"{text}\n  Try: {', '.join(QUANTITIES)}")
-        if wrong := [name for name, limit in limits.items() if not limit > 0]:
-            raise DloError(f"a limit must be positive, found {wrong[0]} {limits[wrong[0]]!r}")
+        for name, limit in limits.items():
+            if not (isinstance(limit, Real) and 0 < limit < np.inf):
+                raise DloError(
+                    f"a limit must be positive and finite, found {name} {limit!r}\n"
+                    f"  Try: a number; without {name} there is no limit"
+                )
         bounds = np.array([limits.get(name, 0.0) for name in QUANTITIES], float)
         given, along = self._table_of(obstacles), self._along(slope)
         kept, out = self._record_of(shape), np.zeros(len(QUANTITIES), self._records.usage)
         tightest = np.zeros(1, np.intc)
         status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
         if status:
-            raise DloError(f"no limits ({STATUSES[status]}): the shape is {shape.status!r}")
+            raise DloError(
+                f"no limits ({STATUSES[status]}): the shape is {shape.status!r}\n"
+                "  Try: a shape whose status is ok, and finite numbers"
+            )
         if slope is None:
             out["gradient"] = np.nan
         found = {name: Usage(**_values(row)) for name, row in zip(QUANTITIES, out, strict=True)}
@@ -355,20 +366,21 @@ class CompiledSolver:
 
     def _table_of(self, obstacles: Sequence[Obstacle]) -> NDArray[Any]:
         """Obstacles in the layout of dlo_obstacle."""
-        given = np.zeros(len(obstacles), self._records.obstacle)
-        for row, obstacle in zip(given, obstacles, strict=True):
+        if not isinstance(obstacles, Sequence):
+            raise DloError(f"obstacles is a list, found {obstacles!r}\n  Try: [obstacle]")
+        d = self.model.node.dimension
+        for obstacle in obstacles:
             if not isinstance(obstacle, Obstacle):
-                raise DloError(f"a Capsule or a Plane belongs here, found {obstacle!r}")
-            if isinstance(obstacle, Plane):
-                first, second, radius = obstacle.point, obstacle.normal, 0.0
-            else:
-                first, second, radius = obstacle.a, obstacle.b, obstacle.radius
-            if any(np.shape(place) != row["a"].shape for place in (first, second)):
-                count = counted(self.model.node.dimension, "number")
-                raise DloError(f"places of an obstacle must have {count}, found {obstacle!r}")
-            row["kind"], row["radius"] = isinstance(obstacle, Plane), radius
-            row["a"], row["b"] = first, second
-        return given
+                raise DloError(
+                    f"a Capsule or a Plane belongs here, found {obstacle!r}\n"
+                    "  Try: dlo_casadi.codegen.Plane(point, normal)"
+                )
+            if any(np.shape(place) != (d,) for place in row_of(obstacle)[1:3]):
+                raise DloError(
+                    f"places of an obstacle must have {counted(d, 'number')}, found {obstacle!r}\n"
+                    "  Try: as many as the cable's gravity has"
+                )
+        return np.array(list(map(row_of, obstacles)), self._records.obstacle)
 
     def _along(self, slope: Slope | None) -> Any:
         return None if slope is None else _filled(self._records.slope, slope)
@@ -383,16 +395,17 @@ class CompiledSolver:
 
     def _call(self, name: str, *arguments: Any, obstacles: Sequence[Obstacle] | None = None) -> int:
         """Call the library and return its status; functions that solve get a workspace."""
-        work, among = np.empty(self.workspace), self.obstacles if obstacles is None else obstacles
+        work = np.empty(self.workspace)
         given = [*arguments, work, work.size][: len(_ARGUMENTS[name])]
-        if len(among) > self.most_obstacles:
-            raise DloError(
-                f"{counted(len(among), 'obstacle')}, the solver knows at most "
-                f"{self.most_obstacles}\n  Try: CompiledSolver(..., obstacles={len(among)})"
-            )
-        if self.most_obstacles and name in _AMONG:
-            listed = self._table_of(among)
-            given[_AMONG[name] : _AMONG[name]] = [listed, len(listed)]
+        if name in _AMONG:
+            among = self._table_of(self.obstacles if obstacles is None else obstacles)
+            if len(among) > self.most_obstacles:
+                raise DloError(
+                    f"{counted(len(among), 'obstacle')}, the solver knows at most "
+                    f"{self.most_obstacles}\n  Try: CompiledSolver(..., obstacles={len(among)})"
+                )
+            if self.most_obstacles:
+                given[_AMONG[name] : _AMONG[name]] = [among, len(among)]
         places = (a.ctypes.data if isinstance(a, np.ndarray) else a for a in given)
         return getattr(self._c, name)(*places)
 

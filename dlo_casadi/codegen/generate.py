@@ -52,12 +52,15 @@ class Solver:
         File name -> text.
     workspace : int
         Size of a workspace in doubles.
+    obstacles : Obstacles
+        Maximum number of obstacles of a call, and those of the model.
     """
 
     prefix: str
     hash: str
     files: dict[str, str]
     workspace: int
+    obstacles: Obstacles
 
     def write(self, folder: Path | str) -> list[Path]:
         """Write all files into the folder, or none; the folder is made if it does not exist.
@@ -88,7 +91,7 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
     left_out = [e for e in model.effects if isinstance(e, MeasurementEffect | StateEffect)]
     prefixes = tuple(f"{effect.label}." for effect in left_out)
     content = {
-        "cable": [model.cable.length, model.cable.mass],
+        "cable": [model.cable.length, model.cable.mass, model.cable.diameter],
         "mesh": [model.n, model.element],
         "boundary": [model.start, model.end, *model.clips],
         "gravity": list(map(float, model.gravity)),
@@ -175,7 +178,7 @@ def table_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
 
 def check_prefix(prefix: str) -> None:
     """Raise DloError unless the prefix is a valid beginning of C names."""
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix, flags=re.ASCII):
+    if not isinstance(prefix, str) or not re.fullmatch(r"[A-Za-z]\w*", prefix, flags=re.ASCII):
         raise DloError(
             f"the prefix {prefix!r} is not a C identifier: use letters, digits and underscores, "
             "a letter first, e.g. --prefix harness"
@@ -270,4 +273,4 @@ def generate(
     }
     words = case.words | among.words
     filled = {name: fill(marked(text, words), values, prefix) for name, text in found.items()}
-    return Solver(prefix, digest, filled, int(values["WORKSPACE"]))
+    return Solver(prefix, digest, filled, int(values["WORKSPACE"]), among)

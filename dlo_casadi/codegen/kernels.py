@@ -191,7 +191,7 @@ def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
 
 
 @dataclass(frozen=True)
-class Held:
+class Holding:
     """How something holds a cable inside a segment.
 
     `moved`: whether nodes move along the cable; `slides`: whether the cable may slide through.
@@ -206,7 +206,7 @@ def kernels_of(
     p: FloatArray,
     rest: FloatArray,
     inline: bool = True,
-    held: Held | None = None,
+    held: Holding | None = None,
 ) -> Kernels:
     """Kernels of a model without clips and tethers; `inline` as in `generate`."""
     bare, moved = model, held is not None and held.moved
@@ -220,10 +220,10 @@ def kernels_of(
     whole = (0, len(own))
     holder = None
     if held is not None:
-        inside = partial(_told, model, parameters, rows.shape[1], held)
+        inside = partial(_segment_from_row, model, parameters, rows.shape[1], held)
         holder = Kernel(whole, rows, inside, moved)
     if moved:
-        plain = partial(_told, model, parameters, rows.shape[1])
+        plain = partial(_segment_from_row, model, parameters, rows.shape[1])
         return Kernels(
             (Kernel(whole, own[:, :0], plain, moved),), _ends(bare, parameters), shared, holder
         )
@@ -243,15 +243,20 @@ def kernels_of(
     return Kernels(segments, _ends(bare, parameters), shared, holder)
 
 
-def _told(model: CableModel, p: ca.SX, width: int, held: Held | None = None) -> ca.Function:
-    """(x, lam, row, p) -> `_in_order` of a segment of a cable with one clip.
+def _segment_from_row(
+    model: CableModel, p: ca.SX, width: int, held: Holding | None = None
+) -> ca.Function:
+    """(x, lam, row, p) -> results of a segment whose numbers are in a row, see `_in_order`.
 
-    The row (width,) has its start and length [m] and rest strains inside. `held`: the clip holds it
-    at the share `row[width]`, and lam are the force beyond and that of the clip. Then there are,
-    after the other results, the derivatives by the force inside, first, then with the first node,
-    the last node, the force beyond and itself; and derivatives by the place on the cable [1/m]: of
-    the Lagrangian and, if it slides, of its gradient by the first node, the last node, the force
-    beyond and that inside; and the second one of the Lagrangian.
+    `row` has the arc length of its start, its length [m] and rest strains (width,), and with `held`
+    the share of the segment before the held place. `lam` has the force beyond the segment, and with
+    `held` that on the clip. With `held` these derivatives follow:
+
+    - by the clip's force: first ones, mixed ones with the first node, the last node and the force
+      beyond, second ones;
+    - by the arc length of the held place [1/m]: of the Lagrangian; if the cable slides also of its
+      gradient by the first node, the last node, the force beyond and that on the clip, and the
+      second one.
     """
     d, terms, inside = model.node.dimension, lagrangian_of(model), held is not None
     row, lam, own = (ca.SX.sym("i", size) for size in (width + inside, d, d))

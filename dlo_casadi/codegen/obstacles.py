@@ -9,8 +9,7 @@ from dlo_casadi.codegen.kernels import c_number
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import gap_per_force, surfaces_at
-from dlo_casadi.rod import obstacles as rod
-from dlo_casadi.rod.obstacles import Plane
+from dlo_casadi.rod.obstacles import Obstacle, Plane
 
 
 @dataclass(frozen=True)
@@ -18,7 +17,7 @@ class Obstacles:
     """Obstacles of a solver: at most `most` per call, and those of the model if a fit has them."""
 
     most: int
-    declared: tuple[rod.Obstacle, ...]
+    declared: tuple[Obstacle, ...]
 
     @classmethod
     def of(cls, model: CableModel, p: FloatArray, most: int) -> "Obstacles":
@@ -29,8 +28,9 @@ class Obstacles:
         DloError
             If `most` is not a valid number, or the cable is one of links.
         """
-        if not isinstance(most, int | np.integer) or not 0 <= most <= 1000:
-            raise DloError(f"obstacles: a whole number, 0 to 1000, found {most!r}")
+        whole = isinstance(most, int | np.integer) and not isinstance(most, bool)
+        if not whole or not 0 <= most <= 1000:
+            raise DloError(f"obstacles: a whole number, 0 to 1000, found {most!r}\n  Try: 1")
         if most and not model.chain.kind.smooth:
             raise DloError(
                 "a cable of links cannot lie on obstacles\n"
@@ -58,29 +58,21 @@ class Obstacles:
 
     @property
     def words(self) -> dict[str, str]:
-        """Text parts of the templates, by mark."""
-        if not self.most:
-            return dict.fromkeys(_MARKS, "")
-        among = "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     "
-        own = "DECLARED_OBSTACLES, DLO_DECLARED, " if self.declared else "0, 0, "
-        member = "    std::vector<dlo_obstacle> obstacles; /* on which the cable may lie */\n\n"
-        given = ("obstacles, n_obstacles, ", own, "NULL, 0, ", _SAID)
-        hpp = (member, "obstacles.data(), obstacles.size(), ")
-        declared = ", ".join(map(_initializer, self.declared))
-        return dict(zip(_MARKS, (among, *given, *hpp, declared), strict=True))
+        """Text parts of the templates, by mark; empty for a solver without obstacles."""
+        found = {
+            "AMONG": "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     ",
+            "GIVEN": "obstacles, n_obstacles, ",
+            "DECLARED_GIVEN": "DECLARED_OBSTACLES, DLO_DECLARED, " if self.declared else "0, 0, ",
+            "NO_OBSTACLES": "NULL, 0, ",
+            "OBSTACLES_ARE": _SAID,
+            "HPP_OBSTACLES": "    std::vector<dlo_obstacle> obstacles; "
+            "/* on which the cable may lie */\n\n",
+            "HPP_GIVEN": "obstacles.data(), obstacles.size(), ",
+            "DECLARED_OBSTACLES": ", ".join(map(_initializer, self.declared)),
+        }
+        return found if self.most else dict.fromkeys(found, "")
 
 
-# Marks of obstacles in the templates.
-_MARKS = (
-    "AMONG",
-    "GIVEN",
-    "DECLARED_GIVEN",
-    "NO_OBSTACLES",
-    "OBSTACLES_ARE",
-    "HPP_OBSTACLES",
-    "HPP_GIVEN",
-    "DECLARED_OBSTACLES",
-)
 # Text about obstacles in the header.
 _SAID = """\
  *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie. Where
@@ -91,11 +83,16 @@ _SAID = """\
 """
 
 
-def _initializer(surface: rod.Obstacle) -> str:
-    """A surface as an initialiser of dlo_obstacle."""
-    if isinstance(surface, Plane):
-        kind, places, radius = "DLO_HALF_SPACE", (surface.point, surface.normal), 0.0
-    else:
-        kind, places, radius = "DLO_CAPSULE", (surface.a, surface.b), surface.radius
+def row_of(obstacle: Obstacle) -> tuple[int, tuple[float, ...], tuple[float, ...], float]:
+    """Kind, places a and b, and radius of an obstacle: the layout of dlo_obstacle."""
+    if isinstance(obstacle, Plane):
+        return 1, obstacle.point, obstacle.normal, 0.0
+    return 0, obstacle.a, obstacle.b, obstacle.radius
+
+
+def _initializer(obstacle: Obstacle) -> str:
+    """An obstacle as an initialiser of dlo_obstacle."""
+    kind, *places, radius = row_of(obstacle)
     a, b = (", ".join(c_number(float(x)) for x in place) for place in places)
-    return f"{{{kind}, {{{a}}}, {{{b}}}, {c_number(radius)}}}"
+    name = ("DLO_CAPSULE", "DLO_HALF_SPACE")[kind]
+    return f"{{{name}, {{{a}}}, {{{b}}}, {c_number(radius)}}}"

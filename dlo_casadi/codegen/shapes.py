@@ -36,7 +36,7 @@ _HINTS = {
     "not_finite": "finite numbers for start, end and directions.",
     "unstable": "another branch, or a pose nearby.",
     "bad_argument": "in space a pose without a branch, orientations that are not zero, clips in "
-    "their order and not two in one element.",
+    "their order and not two in one element, a warm start whose status is ok.",
     "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
     "turns_shed": "fewer turns, or the end farther from the start.",
     "no_room": "the obstacles' places: a fixture is inside of one.",
@@ -183,7 +183,7 @@ class Gap:
         Arc length over length.
     point, normal : (dimension,)
         Point on the cable's axis [m], and direction away from the obstacle.
-    gradient : (4,) or (12,)
+    gradient : (k,)
         Of the distance, by the slope's columns; NaN without a slope.
     obstacle : int
         Index of the nearest obstacle.
@@ -232,8 +232,7 @@ class Usage:
 class Records(NamedTuple):
     """Layouts of dlo_shape, dlo_slope, dlo_obstacle, dlo_gap and dlo_usage of a solver's C.
 
-    `columns`: numbers of a pose by which dlo_slope has derivatives; in a plane without the place of
-    the start.
+    `columns`: k, the number of numbers of a pose by which dlo_slope has derivatives, see `Slope`.
     """
 
     shape: np.dtype[Any]
@@ -314,6 +313,8 @@ def pose_table(
         return np.ascontiguousarray(poses, float), _branch_number(branch)
     if branch is not None:
         raise DloError(f"branch {branch!r} is for poses in an array; a Pose names its own")
+    if not isinstance(poses, Sequence):
+        raise DloError(f"a list of poses or an array belongs here, found {poses!r}\n  Try: [pose]")
     table = np.array([_row(model, pose) for pose in poses]).reshape(-1, pose_size(model))
     numbers = {_branch_number(pose.branch) for pose in poses} or {0}
     if len(numbers) > 1:
@@ -337,9 +338,14 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     if pose.end is None and model.end != "free":
         raise DloError(f"{said}the end of the cable is {model.end}: where is it?\n  Try: end")
     d = model.node.dimension
-    for name, place in (("start", pose.start), ("end", pose.end)):
+    places = {"start": pose.start, "end": pose.end}
+    places |= {f"the place of clip {k}": clip.place for k, clip in enumerate(pose.clips, 1)}
+    for name, place in places.items():
         if place is not None and np.shape(place) != (d,):
-            raise DloError(f"{said}{name} must have {counted(d, 'number')}, found {place!r}")
+            raise DloError(
+                f"{said}{name} must have {counted(d, 'number')}, found {place!r}\n"
+                "  Try: as many as the cable's gravity has"
+            )
     try:
         numbers = np.asarray([*pose.ends, pose.turns], float)
     except (TypeError, ValueError):

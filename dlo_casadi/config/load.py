@@ -391,6 +391,8 @@ def declared_setup(config: Config) -> Setup:
         gravity=experiment.gravity,
         curved=cable.rest_shape != "straight",
         n_poses=sum(pose.role == "fit" for pose in experiment.poses),
+        # Only the photographs tell where their middle is.
+        center=(0.0, 0.0) if measurement.kind == "images" else None,
         camera=measurement.kind == "images" and None not in (measurement.board, measurement.camera),
         readings=tuple({name for pose in experiment.poses for name in pose.readings}),
         tolerances=experiment.tolerances.model_dump(),

@@ -43,8 +43,9 @@ class SideLoad(LoadAcrossGravity):
 
         V = - int (q . r(s)) ds,   q = sum_i force_per_length_i e_i     [J]
 
-    In a plane e is +x. In space e_x, e_y are the unit vectors across gravity nearest to the world's
-    axes x and y, if gravity is mostly along z; otherwise they are named in the same way.
+    In a plane e is the direction of gravity turned counter-clockwise by pi/2: +x for gravity along
+    -y, and without gravity. In space e_x, e_y are the unit vectors across gravity nearest to the
+    world's axes x and y, if gravity is mostly along z; otherwise they are named in the same way.
 
     Parameters
     ----------
@@ -65,7 +66,9 @@ class SideLoad(LoadAcrossGravity):
         """Force on the part beyond s."""
         names = self.components("force_per_length", cable)
         if len(names) == 1:
-            return params[names[0]] * (cable.length - s) * ca.vertcat(1, 0)
+            across = ca.vertcat(-gravity[1], gravity[0]) / ca.norm_2(gravity)
+            across = ca.SX([1, 0]) if gravity.is_zero() else across
+            return params[names[0]] * (cable.length - s) * across
         # Without gravity these are the world's axes themselves.
         down = gravity / ca.sqrt(ca.sumsqr(gravity) + 1e-12)
         total = ca.SX.zeros(3)

@@ -1,6 +1,5 @@
 """Clamps that hold the cable in another direction than declared, or that give way."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -30,23 +29,19 @@ class ClampEffect(BoundaryEffect):
         return [side for side in ("start", "end") if getattr(self, side)]
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if an end is clamped."""
-        return super().applies(setup) and "clamped" in (setup.start, setup.end)
+    def impossible(cls, setup: Setup) -> str:
+        """It needs a clamp."""
+        if "clamped" in (setup.start, setup.end):
+            return super().impossible(setup)
+        return (
+            "it turns a clamp, and no end is clamped. "
+            "Try: experiment.boundary, with start or end clamped"
+        )
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
         """The effect with errors of the clamped ends."""
         return cls(start=setup.start == "clamped", end=setup.end == "clamped")
-
-    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
-        """Without a clamp the effect has no parameters."""
-        if self.start or self.end:
-            return super().refusal(setup, values)
-        return (
-            "it turns a clamp, and no end is clamped. "
-            "Try: experiment.boundary, with start or end clamped"
-        )
 
     def may_be(self, found: Fitted) -> bool:
         """A local effect next to a clamp may be caused by the clamp."""

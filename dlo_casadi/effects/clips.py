@@ -13,12 +13,8 @@ from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vec
 class _OfOneClip(BoundaryEffect):
     """An effect of one clip, the same in all poses; `clip` is its index, 0 for the first."""
 
+    index = "clip"
     clip: int = 0
-
-    def __post_init__(self) -> None:
-        if not self.label and self.clip:
-            object.__setattr__(self, "label", f"{self.name}_{self.clip + 1}")
-        super().__post_init__()
 
     @classmethod
     def numbers(cls, setup: Setup) -> list[int]:
@@ -26,9 +22,12 @@ class _OfOneClip(BoundaryEffect):
         return list(range(len(setup.clips)))
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if there is such a clip."""
-        return super().applies(setup) and bool(cls.numbers(setup))
+    def impossible(cls, setup: Setup) -> str:
+        """It needs such a clip."""
+        if cls.numbers(setup):
+            return super().impossible(setup)
+        listed = ", ".join(setup.clips) or "none"
+        return f"it is of a clip, and the poses have {listed}. Try: clips of the poses"
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:

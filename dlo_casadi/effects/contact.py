@@ -26,21 +26,19 @@ class ObstacleOffset(ContactEffect):
     """
 
     name = "obstacle_offset"
+    index = "obstacle"
     tolerances: ClassVar = {"offset": "obstacle"}
-
-    def __post_init__(self) -> None:
-        if not self.label and self.obstacle:
-            object.__setattr__(self, "label", f"{self.name}_{self.obstacle + 1}")
-        super().__post_init__()
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the offset."""
         return Parameter.symmetric(["offset"], "m", 0.002 * cable.length, 0.1 * cable.length)
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if there are obstacles."""
-        return super().applies(setup) and setup.obstacles > 0
+    def impossible(cls, setup: Setup) -> str:
+        """It needs a declared obstacle."""
+        if setup.obstacles:
+            return super().impossible(setup)
+        return "it moves an obstacle, and none is declared. Try: experiment.obstacles"
 
     @classmethod
     def each_for(cls, setup: Setup) -> tuple[Self, ...]:
@@ -74,9 +72,14 @@ class ContactPlane(ContactEffect):
         return (Parameter("height", "m", lowest, 0.01 * cable.length, lowest, 0.0),)
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if there is a vertical."""
-        return super().applies(setup) and any(setup.gravity)
+    def impossible(cls, setup: Setup) -> str:
+        """It needs a vertical."""
+        if any(setup.gravity):
+            return super().impossible(setup)
+        return (
+            "it is a level plane, and without gravity no plane is level. "
+            "Try: experiment.gravity, or experiment.obstacles"
+        )
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:

@@ -90,7 +90,7 @@ class Effect:
     Parameters
     ----------
     label : str, optional
-        Prefix of the parameters' names: the effect's name unless a model has two of that kind.
+        Prefix of the parameters' names: the effect's name, for the second clip or obstacle with _2.
     """
 
     name: ClassVar[str]
@@ -110,6 +110,9 @@ class Effect:
     # Whether derivatives taken where the effect vanishes reveal it.
     gradual: ClassVar[bool] = True
 
+    # Name of its field, if it has one, with the index of the clip or obstacle that it is of.
+    index: ClassVar[str] = ""
+
     # Parameters that do not depend on the cable, see `parameters`.
     declared: ClassVar[tuple[Parameter, ...]] = ()
 
@@ -117,7 +120,8 @@ class Effect:
 
     def __post_init__(self) -> None:
         if not self.label:
-            object.__setattr__(self, "label", self.name)
+            index = getattr(self, self.index) if self.index else 0
+            object.__setattr__(self, "label", self.name + (f"_{index + 1}" if index else ""))
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Parameters with units, bounds and the nominal value at which the effect vanishes."""
@@ -130,9 +134,21 @@ class Effect:
         return ()
 
     @classmethod
+    def impossible(cls, setup: Setup) -> str:
+        """Why a setup has no such effect, and what to try; empty if it may have one."""
+        count, where = len(setup.gravity), {2: "a plane", 3: "space"}
+        if count in cls.dimensions:
+            return ""
+        return (
+            f"it is of cables in {where[cls.dimensions[0]]}, and gravity has "
+            f"{counted(count, 'number')}: the cable is in {where[count]}. "
+            "Try: without it, or experiment.gravity"
+        )
+
+    @classmethod
     def applies(cls, setup: Setup) -> bool:
         """Whether the effect is possible in a setup and visible in its measurements."""
-        return len(setup.gravity) in cls.dimensions
+        return not cls.impossible(setup)
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
@@ -146,14 +162,7 @@ class Effect:
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
         """Why it cannot be declared with these values, and what to try; empty if it can be."""
-        count, where = len(setup.gravity), {2: "a plane", 3: "space"}
-        if count in self.dimensions:
-            return ""
-        return (
-            f"it is of cables in {where[self.dimensions[0]]}, and gravity has "
-            f"{counted(count, 'number')}: the cable is in {where[count]}. "
-            "Try: without it, or experiment.gravity"
-        )
+        return self.impossible(setup)
 
     def prior(self, setup: Setup) -> dict[str, float]:
         """Standard deviations of the prior on its parameters; empty without a prior."""

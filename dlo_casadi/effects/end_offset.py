@@ -28,9 +28,14 @@ class EndOffset(BoundaryEffect):
         return Parameter.symmetric(names, "m", 0.002 * cable.length, 0.3 * cable.length)
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if the end is held."""
-        return super().applies(setup) and setup.end != "free"
+    def impossible(cls, setup: Setup) -> str:
+        """It needs a fixture at the end."""
+        if setup.end != "free":
+            return super().impossible(setup)
+        return (
+            "it moves the end fixture, and the end is free. "
+            "Try: experiment.boundary, with the end pinned or clamped"
+        )
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Move the end fixture."""

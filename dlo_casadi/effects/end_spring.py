@@ -38,9 +38,16 @@ class _PinSpring(BoundaryEffect):
         )
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if that end is a pin."""
-        return super().applies(setup) and getattr(setup, cls.side) == "pinned"
+    def impossible(cls, setup: Setup) -> str:
+        """It needs a pin at that end."""
+        held = getattr(setup, cls.side)
+        if held == "pinned":
+            return super().impossible(setup)
+        return (
+            f"it is a spring at a pin, and the {cls.side} is {held}. "
+            f"Try: experiment.boundary, with the {cls.side} pinned"
+            + (", or clamp_compliance" if held == "clamped" else "")
+        )
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
         """Try headings around the cable's mean heading at that end."""

@@ -19,11 +19,8 @@ class ImageDistortion(MeasurementEffect):
     ----------
     coefficient : scalar k [1/m^2]
         Vanishes at 0.
-
-    Fields
-    ------
     center : (float, float) [m]
-        The image centre c in the board frame.
+        The image centre c in the board frame: an option of the effect, never fitted.
 
     References
     ----------
@@ -40,9 +37,14 @@ class ImageDistortion(MeasurementEffect):
         return (Parameter("coefficient", "1/m^2", scale=0.005 / cable.length**2),)
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if there are photographs."""
-        return super().applies(setup) and setup.center is not None
+    def impossible(cls, setup: Setup) -> str:
+        """It needs photographs."""
+        if setup.center is not None:
+            return super().impossible(setup)
+        return (
+            "it is of the lens of a camera, and there are no photographs. "
+            "Try: measurement.kind images, or image_scale"
+        )
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:

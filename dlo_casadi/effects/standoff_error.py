@@ -1,7 +1,5 @@
 """A cable that is not as far in front of the board as declared."""
 
-from collections.abc import Mapping
-
 import casadi as ca
 
 from dlo_casadi.effects.cable import Parameter, Setup
@@ -36,14 +34,10 @@ class StandoffError(MeasurementEffect):
     declared = (Parameter("distance", "m", scale=1e-3),)
 
     @classmethod
-    def applies(cls, setup: Setup) -> bool:
-        """True if the position of the camera is known."""
-        return super().applies(setup) and setup.camera
-
-    def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
+    def impossible(cls, setup: Setup) -> str:
         """Without a camera there are no rays."""
         if setup.camera:
-            return super().refusal(setup, values)
+            return super().impossible(setup)
         return (
             "it is a shift along the rays of a calibrated camera, and none is declared. "
             "Try: measurement.camera, or image_scale"

@@ -46,13 +46,10 @@ class Relaxed:
         Positions of the `Rod`'s nodes at rest.
     end_force : (3,) [N]
         Force of the cable on its end fixture, world axes; zero at a free end.
-    seconds : float
-        Simulated time.
     """
 
     nodes: FloatArray
     end_force: FloatArray
-    seconds: float
 
 
 def relax(
@@ -62,8 +59,8 @@ def relax(
     step: float,
     name: str,
     speed: float = REST_SPEED,
-) -> tuple[FloatArray, float]:
-    """Relax a cable; return its nodes (n + 1, 3) [m] at rest, and the simulated time [s].
+) -> FloatArray:
+    """Relax a cable; return its nodes (n + 1, 3) [m] at rest.
 
     Kinetic damping: whenever the kinetic energy has passed a maximum, all velocities are set to
     zero (Barnes, Comput. Struct. 19 (1984)). Damping and inertia do not change the shape at rest.
@@ -102,4 +99,4 @@ def relax(
             halt()
             moving = 0.0
         last = moving
-    return nodes, time
+    return nodes

@@ -204,6 +204,6 @@ def settle(text: str, rod: Rod) -> Relaxed:
     def halt() -> None:
         data.qvel[:] = 0.0
 
-    nodes, seconds = relax(advance, energy, halt, model.opt.timestep, "MuJoCo")
+    nodes = relax(advance, energy, halt, model.opt.timestep, "MuJoCo")
     on_cable = data.efc_force[data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY][:3]
-    return Relaxed(nodes, -on_cable if len(on_cable) else np.zeros(3), seconds)
+    return Relaxed(nodes, -on_cable if len(on_cable) else np.zeros(3))

@@ -160,11 +160,11 @@ def settled(model: Any, rod: Rod, name: str) -> Relaxed:
         return float((states[0].body_qd.numpy()[:, :3] ** 2).sum())
 
     halt = states[0].body_qd.zero_
-    nodes, seconds = relax(advance, energy, halt, step, name, _REST_SPEED)
+    nodes = relax(advance, energy, halt, step, name, _REST_SPEED)
     x = states[0].body_q.numpy()[count - 2 : count].astype(float)
     along = Rotation.from_quat(x[:, 3:]).apply([0.0, 0.0, 1.0])
     gap = x[1, :3] - x[0, :3] - rod.h / 2 * along.sum(axis=0)
     stretch = gap @ along[0] * along[0]
     pull = (stiff * (gap - stretch) + min(rod.axial, stiff) * stretch) / rod.h
     weight = rod.link_masses[-1] * rod.gravity
-    return Relaxed(nodes, (weight - pull) * (rod.end.kind != "free"), seconds)
+    return Relaxed(nodes, (weight - pull) * (rod.end.kind != "free"))

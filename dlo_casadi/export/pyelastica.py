@@ -88,7 +88,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
         ("GA", f"{stiff:.9g}", "[N], so stiff that shear does not matter"),
         ("INERTIA", f"{inertia:.9g}", "of an element [kg m^2], raised until STEP is stable"),
         ("STEP", f"{step:.6g}", "time step [s]"),
-        ("DAMPING", "10.0", "[1/s], which nobody has measured"),
+        ("DAMPING", "10.0", "[1/s]: chosen, not measured"),
         ("HELD_NODES", str(sum((nodes for nodes, _ in held), ())), ""),
         ("HELD_ELEMENTS", str(sum((elements for _, elements in held), ())), ""),
         ("NODES", array(rod.nodes), "[m]"),
@@ -133,7 +133,7 @@ def settle(text: str, rod: Rod) -> Relaxed:
     def halt() -> None:
         cable.velocity_collection[:] = cable.omega_collection[:] = 0.0
 
-    nodes, seconds = relax(advance, energy, halt, step, "PyElastica")
+    nodes = relax(advance, energy, halt, step, "PyElastica")
     at_end = [k for k in made["HELD_NODES"] if k < 0]
     weight = np.outer(made["GRAVITY"], cable.mass[at_end])
-    return Relaxed(nodes, (cable.internal_forces[:, at_end] + weight).sum(axis=1), seconds)
+    return Relaxed(nodes, (cable.internal_forces[:, at_end] + weight).sum(axis=1))

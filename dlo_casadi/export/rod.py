@@ -59,7 +59,7 @@ _CLOSING = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class SolvedCable:
     """A cable in an equilibrium of one pose, from which a `Rod` is cut.
 
     Parameters
@@ -82,7 +82,7 @@ class Held:
     x: FloatArray
 
     @classmethod
-    def solved(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> "Held":
+    def of(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> Self:
         """The cable in its predicted shape."""
         eq = solve_equilibrium(model, p, rest, pose)
         rows = assembly_of(model).curve(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
@@ -159,7 +159,7 @@ class Rod:
     features: dict[Feature, tuple[str, ...]]
 
     @classmethod
-    def of(cls, held: Held, segments: int | None = None) -> Self:
+    def of(cls, held: SolvedCable, segments: int | None = None) -> Self:
         """Cut a cable into segments, by default as many as keep each joint's turn below `TURN`."""
         model, p, pose, curve = held.model, held.p, held.pose, held.curve
         terms, length = lagrangian_of(model), model.cable.length
@@ -301,7 +301,7 @@ def _features(
         total = effect.resultant(ca.SX(0), gravity, cable, local)
         load, down = _numbers(terms, p, pose, total + 0 * gravity, gravity)
         across = load - down * float(load @ down) / max(float(down @ down), 1e-12)
-        if np.linalg.norm(across) > 0:
+        if np.linalg.norm(across) > 1e-9 * np.linalg.norm(load):  # more than rounding
             found.append("load across gravity")
         if effect.forces(gravity, local):
             found.append("lumped mass" if effect.carried else "point force")
@@ -359,7 +359,7 @@ def _fixtures(
 
 
 def _segments(
-    cable: Held, fixtures: tuple[Fixture, Fixture], s: FloatArray, h: float
+    cable: SolvedCable, fixtures: tuple[Fixture, Fixture], s: FloatArray, h: float
 ) -> tuple[FloatArray, Rotation]:
     """Nodes and frames of equal segments along the curve, closed between the fixtures."""
     start, end = fixtures

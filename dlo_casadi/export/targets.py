@@ -12,7 +12,7 @@ from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.errors import DloError, EquilibriumError, OutputError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
 from dlo_casadi.export.common import Relaxed
-from dlo_casadi.export.rod import Feature, Held, Rod
+from dlo_casadi.export.rod import Feature, Rod, SolvedCable
 from dlo_casadi.io.files import is_marked, write_file
 
 # Text that identifies a written file.
@@ -205,10 +205,10 @@ def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence
         "",
         *known,
         "",
-        "Where it stands:",
+        "Meaning of the numbers:",
         *(f"  {line}" for line in target.places),
         "",
-        "Not carried:",
+        "Not represented:",
         *(f"  {line}" for line in costs or ["nothing"]),
     ]
 
@@ -225,7 +225,7 @@ _DRAWS = 200
 def write_rods(
     target: Target,
     path: Path,
-    cables: Sequence[Held],
+    cables: Sequence[SolvedCable],
     origin: str,
     segments: int | None,
     seed: int,
@@ -255,12 +255,12 @@ def write_rods(
     return names
 
 
-def losses(cable: Held, target: Target, rod: Rod) -> dict[Feature, str]:
+def losses(cable: SolvedCable, target: Target, rod: Rod) -> dict[Feature, str]:
     """Features that a target does not support: their effects, and the shape's change without."""
     return {item: _cost(cable, rod, item) for item in target.dropped(rod)}
 
 
-def _cost(cable: Held, rod: Rod, feature: Feature) -> str:
+def _cost(cable: SolvedCable, rod: Rod, feature: Feature) -> str:
     labels = rod.features[feature]
     model, pose, rest = cable.model, cable.pose, cable.rest
     length, known = model.cable.length, dict(zip(model.names, cable.p, strict=True))
@@ -278,7 +278,7 @@ def _cost(cable: Held, rod: Rod, feature: Feature) -> str:
     p = np.array([known[name] for name in model.names])
     named = f"{', '.join(labels)} left out; " if labels else ""
     try:
-        plain = Held.solved(model, p, rest, pose)
+        plain = SolvedCable.of(model, p, rest, pose)
     except EquilibriumError:
         return f"{named}without it this pose has no equilibrium"
     s = np.linspace(0.0, length, 101)
@@ -287,13 +287,13 @@ def _cost(cable: Held, rod: Rod, feature: Feature) -> str:
 
 
 def samples_of(
-    cable: Held,
+    cable: SolvedCable,
     coefficients: FloatArray,
     names: Sequence[str],
     covariance: FloatArray,
     count: int,
     seed: int,
-) -> list[Held]:
+) -> list[SolvedCable]:
     """Draw cables in the same pose from a covariance: positive and within all physical bounds.
 
     A value estimated as a logarithm is drawn as one. Values outside their bounds, and cables
@@ -331,7 +331,7 @@ def samples_of(
     # The covariance of log(v) is the covariance of v divided by v.
     scale = np.where(log, mean, 1.0)
     root = root_of(covariance[np.ix_(kept, kept)] / np.outer(scale, scale))
-    generator, out = np.random.default_rng(seed), list[Held]()
+    generator, out = np.random.default_rng(seed), list[SolvedCable]()
     for _ in range(_DRAWS * count):
         if len(out) == count:
             break
@@ -349,7 +349,7 @@ def samples_of(
     return out
 
 
-def _cable(cable: Held, values: Mapping[str, float], count: int) -> Held | None:
+def _cable(cable: SolvedCable, values: Mapping[str, float], count: int) -> SolvedCable | None:
     """The cable with other values; None if they are outside their bounds, or if it has no shape."""
     model = cable.model
     if not all(q.lower <= values[q.name] <= q.upper for q in model.parameters):
@@ -357,6 +357,6 @@ def _cable(cable: Held, values: Mapping[str, float], count: int) -> Held | None:
     p = np.array([values[name] for name in model.names])
     rest = model.rest_basis @ np.array([values[f"rest_curvature[{k}]"] for k in range(count)])
     try:
-        return Held.solved(model, p, rest, cable.pose)
+        return SolvedCable.of(model, p, rest, cable.pose)
     except EquilibriumError:
         return None

@@ -32,7 +32,7 @@ int dlo_bare(const dlo_pose *pose, int which, const dlo_shape *warm, dlo_shape *
     solver_t w;
     int steps;
     lay_out(&w, TABLE, work);
-    if ((warm && !load(&w, warm)) || take(&w, pose) != DLO_OK || which >= GUESSES)
+    if ((warm && load(&w, warm) != DLO_OK) || take(&w, pose) != DLO_OK || which >= GUESSES)
         return 0;
     if (warm)
         clamp(&w);

@@ -15,14 +15,15 @@ from dlo_casadi.effects import AxialStretch, BendingSoftening, CableData, Lumped
 from dlo_casadi.model.cable_model import CableModel
 
 HERE = Path(__file__).parent
-# Element, ends, and gravity, whose three numbers put a cable in space.
+# Element, ends, gravity, whose three numbers put a cable in space, and obstacles; memory.c has two.
 PLANE, SPACE = (0.0, -9.81), (0.0, 0.0, -9.81)
 KINDS = (
-    ("link", "pinned", "pinned", PLANE),
-    ("arc", "clamped", "clamped", PLANE),
-    ("link", "clamped", "free", PLANE),
-    ("quadratic", "clamped", "clamped", SPACE),
-    ("arc", "clamped", "free", SPACE),
+    ("link", "pinned", "pinned", PLANE, 0),
+    ("arc", "clamped", "clamped", PLANE, 0),
+    ("link", "clamped", "free", PLANE, 0),
+    ("arc", "pinned", "pinned", PLANE, 2),
+    ("quadratic", "clamped", "clamped", SPACE, 0),
+    ("arc", "clamped", "free", SPACE, 0),
 )
 THREADS = 8
 STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
@@ -33,7 +34,7 @@ RACES = ("-g", "-O1", "-fsanitize=thread")
 def run(problems: int = 100) -> dict[str, Any]:
     """Counted statuses (ok, unreachable, ...), and the output of the tools or "silent"."""
     out: dict[str, Any] = {}
-    for element, start, end, gravity in KINDS:
+    for element, start, end, gravity, obstacles in KINDS:
         # A law of the section inside quadratic elements in space takes minutes to compile.
         law = () if gravity is SPACE else (BendingSoftening(),)
         for effects in ((), (AxialStretch(), LumpedMass(), *law)):
@@ -44,10 +45,11 @@ def run(problems: int = 100) -> dict[str, Any]:
             p[1:] += 1e-3
             rest = model.rest_basis @ np.random.default_rng(0).normal(size=model.n_coefficients)
             folder = Path(tempfile.mkdtemp(prefix="dlo_memory_"))
-            generate(model, p, rest).write(folder)
+            generate(model, p, rest, obstacles=obstacles).write(folder)
             shutil.copy(HERE / "memory.c", folder)
             where = "in space" if model.in_space else "in the plane"
-            name = f"{element} {start} {end} {where}" + (" with effects" if effects else "")
+            name = f"{element} {start} {end} {where}" + " on obstacles" * (obstacles > 0)
+            name += " with effects" if effects else ""
             few = max(1, problems // 20)
             out[name] = {
                 "sanitizers": build_and_run(folder, SANITIZE, [], problems),

@@ -286,6 +286,7 @@ class AnyCable:
         warm = np.zeros(len(poses), self.record)
         if starts is not None:
             warm["x"][..., 0] = starts
+            warm["min_bend_radius"] = 1.0  # zero is that of a pose without a shape
         shapes = np.zeros(len(poses), self.record)
         statuses = np.zeros(len(poses), np.intc)
         begin = perf_counter()

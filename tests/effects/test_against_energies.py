@@ -157,13 +157,11 @@ def _tethered(own: Physics, v: dict[str, float]) -> Physics:
 
 
 def _blown(own: Physics, v: dict[str, float]) -> Physics:
-    if "force_per_length" in v:
-        return replace(own, force_per_length=np.array([v["force_per_length"], 0.0, 0.0]))
     down = own.gravity / np.linalg.norm(own.gravity)
     across = np.eye(3)[:2] - np.outer(down[:2], down)
     across /= np.linalg.norm(across, axis=1)[:, None]
-    force = v["force_per_length_x"] * across[0] + v["force_per_length_y"] * across[1]
-    return replace(own, force_per_length=force)
+    x, y = v.get("force_per_length", v.get("force_per_length_x")), v.get("force_per_length_y", 0.0)
+    return replace(own, force_per_length=x * across[0] + y * across[1])
 
 
 def _tilted(own: Physics, v: dict[str, float]) -> Physics:
