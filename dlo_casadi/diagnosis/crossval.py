@@ -146,7 +146,8 @@ def cross_validate(fit: Fit) -> CrossValidation:
         # Such a fit misses most poses, and fits without each of them would take minutes.
         densities = [linear[k] if k in missed else x for k, x in enumerate(densities)]
         missed = []
-    refitted = {k: theta for k in missed if (theta := _fitted_without(fit, k)) is not None}
+    anew = {k: _fitted_without(fit, k) for k in missed}
+    refitted = {k: theta for k, theta in anew.items() if theta is not None}
     for k, seen in _predicted(fit, refitted).items():
         predicted[k], densities[k] = seen, _density_of(fit, k, seen, covariances[k])
     densities = [x if np.isfinite(x) else known for x, known in zip(densities, linear, strict=True)]

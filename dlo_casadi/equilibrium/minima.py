@@ -299,6 +299,9 @@ def ipopt(name: str, problem: dict[str, ca.SX], tolerance: float, iterations: in
     """A silent IPOPT solver."""
     options: dict[str, Any] = {
         "print_time": False,
+        # Multipliers of p are not needed; without an equilibrium they gave a warning of CasADi.
+        "no_nlp_grad": True,
+        "calc_lam_p": False,
         "ipopt.print_level": 0,
         "ipopt.sb": "yes",
         "ipopt.tol": tolerance,

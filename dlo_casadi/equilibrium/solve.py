@@ -423,11 +423,10 @@ def continued(
     ends = [one.ends[: 2 * d] for one in both]
     clips = [[x for clip in one.clips for x in clip.place] for one in both]
     moved = float(np.abs(np.diff(np.hstack([ends, clips]), axis=0)).max()) / model.cable.length
-    frames = [
-        [*one.frames, *(x for clip in one.clips if (x := clip.frame) is not None)] for one in both
-    ]
+    held = [[*one.frames, *(clip.frame for clip in one.clips)] for one in both]
+    frames = np.array([[x for x in each if x is not None] for each in held])
     # The increment between frames half a turn apart is infinite: limit it.
-    turned = min(float(np.abs(model.node.difference(*np.array(frames))).max()), 2 * np.pi)
+    turned = min(float(np.abs(model.node.difference(*frames)).max()), 2 * np.pi)
     count = int(np.ceil(max(turned / MOST_TURNED, moved / MOST_MOVED, 1.0)))
     for k in range(1, count):
         with suppress(EquilibriumError):  # poses on the way may be out of reach
