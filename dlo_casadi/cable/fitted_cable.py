@@ -35,7 +35,7 @@ from dlo_casadi.export.targets import samples_of, target_of, write_rods
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.rod.node import Heading
-from dlo_casadi.show.text import html_table, millimetres
+from dlo_casadi.show.text import bend_radius, html_table
 
 # Number of points of a shape.
 _POINTS = 101
@@ -352,7 +352,7 @@ class Shape:
         """Draw the shape with the forces of the cable on its supports; in a plane also its band."""
         other, forces = self.other_side, {"start": self.start_force}
         state = "stable" if self.stable else "NOT stable"
-        radius = millimetres(self.min_bend_radius)
+        radius = bend_radius(self.min_bend_radius)
         if self.pose.end is not None:
             forces["end"] = self.end_force
         surfaces, length = surfaces_at(self.cable.model, self.cable.p), self.curve.length
@@ -377,7 +377,7 @@ class Shape:
         """Quantities of the shape, and their values as text."""
         rows = reaction_texts(self.cable.model, self.pose, self.equilibrium, self.points)
         rows.append(("energy", f"{self.energy:.6g} J"))
-        rows.append(("smallest bend radius", millimetres(self.min_bend_radius)))
+        rows.append(("smallest bend radius", bend_radius(self.min_bend_radius)))
         rows.append(("stable", "yes" if self.stable else "NO: the cable would not stay there"))
         other, near = self.other_side, self.tipping
         if other is not None and near is not None:

@@ -196,7 +196,7 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
     Columns are end_x_m, end_y_m and, where they differ from pose to pose, start_x_m, start_y_m,
     start_heading_rad, end_heading_rad; in space also end_z_m, start_z_m, start_qx to start_qw,
     end_qx to end_qw and turns; and name, by default the line's number. Raises DloError if the file
-    is missing, has other columns, or has cells that are not numbers.
+    is missing, has other columns, has cells that are not numbers, or has a name twice.
     """
     node, sides = model.node, ("start", "end")
     keys = {side: [f"{side}_{axis}_m" for axis in node.axes] for side in sides}
@@ -211,11 +211,22 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
         raise DloError(
             f"{path} cannot be read: {reason}.\n  Try: a CSV with the columns {', '.join(known)}"
         ) from None
-    if not rows or (strange := [x for x in rows[0] if x not in known]):
+    if not rows or (strange := [x for x in rows[0] if x and x not in known]):
         said = f"unknown columns {strange}" if rows else "no poses"
         raise DloError(f"{path}: {said}.\n  Try: {', '.join(known)}; the first line names them")
     out: dict[str, dict[str, Any]] = {}
     for k, row in enumerate(rows, start=1):
+        name = row.get("name") or f"pose_{k:02d}"
+        if None in row:
+            raise DloError(
+                f"{path}, pose {k}: more cells than the first line has columns.\n"
+                "  Try: numbers with a decimal point, 0.3 and not 0,3"
+            )
+        if name in out:
+            raise DloError(
+                f"{path}, pose {k}: an earlier pose is called {name!r}, too.\n"
+                "  Try: a name for each pose, or no column `name`"
+            )
         given: dict[str, Any] = {}
         for key, columns in keys.items():
             if set(columns) & row.keys():
@@ -224,8 +235,9 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
                 except (KeyError, TypeError, ValueError):
                     cells = ", ".join(f"{x}={row.get(x)!r}" for x in columns)
                     raise DloError(
-                        f"{path}, pose {k}: numbers belong here, found {cells}"
+                        f"{path}, pose {k}: numbers belong here, found {cells}.\n"
+                        "  Try: one number in each cell"
                     ) from None
                 given[key] = numbers if len(columns) > 1 else numbers[0]
-        out[row.get("name") or f"pose_{k:02d}"] = given
+        out[name] = given
     return out

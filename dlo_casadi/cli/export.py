@@ -15,15 +15,17 @@ from dlo_casadi.export.targets import TARGETS, losses, require, target_of
 
 # `--check` without a session.
 _NEAR = Path()
+_SAMPLES = "further cables drawn from the fit's covariance"
+_SEGMENTS = "number of links; by default as many as the bends need"
 
 
 @command(
     PARAMETERS,
     option("--to", required=True, metavar="SIMULATOR", help=f"one of {', '.join(TARGETS)}"),
     option("--output", type=Path, metavar="FILE", help="by default named after the session"),
-    option("--samples", type=int, default=0, metavar="N", help="cables more, from the covariance"),
-    option("--seed", type=int, default=0, metavar="N", help="of the samples (0)"),
-    option("--segments", type=int, metavar="N", help="links of the chain, instead of enough"),
+    option("--samples", type=int, default=0, metavar="N", help=_SAMPLES),
+    option("--seed", type=int, default=0, metavar="N", help="random seed of --samples (0)"),
+    option("--segments", type=int, metavar="N", help=_SEGMENTS),
     option(
         "--check",
         type=Path,
@@ -102,12 +104,14 @@ def _held(cable: FittedCable, chosen: argparse.Namespace) -> dict[str, Any]:
     from dlo_casadi.session.round_trip import session_of
 
     held = {name: getattr(chosen, name) for name in HELD}
-    if any(value not in (None, 0.0) for value in held.values()):
+    if any(value is not None for value in held.values()):
         return held
     try:
-        config = session_of(cable, None if chosen.check in (None, _NEAR) else chosen.check)
+        given = session_of(cable, None if chosen.check in (None, _NEAR) else chosen.check)
     except DloError:
         return held
-    first = config.experiment.poses[0].held
-    branch = first.branch if first.branch != "previous" else None
-    return {**{name: getattr(first, name) for name in HELD}, "branch": branch}
+    first, ends = given.experiment.poses[0], ("start", "end")
+    turning = tuple(f"{side}_" for side in ends if getattr(cable.model, side) != "clamped")
+    held = {name: getattr(first, name) for name in HELD if not name.startswith(turning)}
+    held |= {"clips": first.clips, "over": first.over, "obstacles": given.experiment.obstacles}
+    return held | {"branch": first.branch if first.branch != "previous" else None}

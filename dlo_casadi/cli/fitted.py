@@ -72,7 +72,7 @@ POSE = (
         )
         for side in ("start", "end")
     ),
-    option("--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"),
+    option("--turns", type=float, metavar="N", help="extra turns of twist in space"),
     BRANCH,
 )
 
@@ -128,7 +128,8 @@ def predict(chosen: argparse.Namespace) -> None:
             "than forces and energy"
         )
     page, found = Page(chosen), shape.as_dict()
-    checks = None if chosen.limits is None else _checked(shape, chosen)
+    asked_for = (chosen.limits, chosen.tolerances) != (None, None)
+    checks = _checked(shape, chosen) if asked_for else None
     if checks is not None:
         found["limits"] = [check.as_dict() for check in checks]
     page.data(found)
@@ -268,25 +269,21 @@ def shape_table(chosen: argparse.Namespace) -> None:
     cable = cable.with_mesh(chosen.elements, chosen.element)
     metadata = cable.metadata
     poses = _poses(cable, chosen)
-    output = chosen.output.resolve()
-    plan = Plan(
-        cable.model, cable.p, cable.rest, chosen.branch, output.with_name(f"{output.name}.parts")
-    )
+    plan = Plan(cable.model, cable.p, cable.rest, chosen.branch, chosen.output.resolve())
     counter = Counter(quiet=chosen.quiet, noun="pose", size=plan.chunk, count=poses.count)
     with counter, open_executor(chosen.jobs, chosen.scheduler) as executor:
         counts = tables.shape_table(
             plan,
             poses,
-            output,
             executor,
             metadata={"parameters_model_hash": metadata.model_hash, "config": metadata.config},
             restart=chosen.restart,
             progress=counter.show,
         )
     page = Page(chosen)
-    page.data({"output": str(output), "solver_hash": plan.digest, "poses": counts})
+    page.data({"output": str(plan.output), "solver_hash": plan.digest, "poses": counts})
     said = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.items())
-    page.say(f"{output}: {said or 'complete already'}")
+    page.say(f"{plan.output}: {said or 'complete already'}")
 
 
 def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:

@@ -131,9 +131,11 @@ class Page(Console):
         self.as_json: bool = chosen.json
 
     def data(self, data: Any) -> None:
-        """Print plain data as JSON, if requested."""
+        """Print plain data as JSON, if requested; numbers that are not finite as null."""
         if self.as_json:
-            print(json.dumps(data, indent=1, allow_nan=False))
+            from dlo_casadi.report.documents import finite
+
+            print(json.dumps(finite(data), indent=1, allow_nan=False))
 
     def say(self, text: object, mark: str = "") -> None:
         """Print a line unchanged, however long, after a mark with markup."""

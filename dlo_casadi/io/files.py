@@ -18,6 +18,8 @@ from dlo_casadi.errors import OutputError, well_formed
 
 # Prefix of the names of all drafts.
 _DRAFT = ".dlo-draft-"
+# Name of the file by which a run locks its folder.
+LOCK = ".lock"
 
 
 def write_file(
@@ -196,7 +198,7 @@ def only_run(folder: Path) -> Iterator[None]:
     make_folder(folder)
     with _explained(folder):
         try:
-            held = FileLock(folder / ".lock", timeout=0).acquire()
+            held = FileLock(folder / LOCK, timeout=0).acquire()
         except Timeout:
             raise OutputError(
                 f"another run is writing to {folder}; wait for its end", folder
