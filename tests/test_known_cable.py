@@ -159,6 +159,7 @@ STRAIGHT = dlo.Cable(
             {"gravity": (0, 0, -9.81), "boundary": ("pinned", "free")},
             "may be turned about gravity",
         ),
+        (WIRE, IN_SPACE | {"model": {"element": "link"}}, "link is of a cable in a plane. Try: qu"),
         (UNWEIGHED, {}, "cable.mass is not given, and no fit tells it. Try: the mass"),
         (3, {}, "cable: a mapping of keys and values belongs here, found 3"),
         (ROPE, {"model": {"effects": ["lumped_mas"]}}, "did you mean 'lumped_mass'?"),
@@ -200,6 +201,11 @@ def test_all_that_is_missing_is_told_at_once():
 
 
 def test_what_needs_a_fit_says_so(rope, tmp_path):
+    with pytest.raises(dlo.DloError, match="path: a file name belongs here, found 5"):
+        rope.export("mujoco", 5, end=(0.5, 0.1))
+    wire = dlo.known_cable(WIRE, **IN_SPACE)
+    with pytest.raises(dlo.DloError, match="element: one of quadratic, arc belongs here"):
+        wire.with_mesh(element="link")
     with pytest.raises(dlo.DloError, match="'rope' is known exactly: all samples would be the sam"):
         rope.export("mujoco", tmp_path / "rope.xml", end=(0.5, 0.1), samples=2)
     with pytest.raises(dlo.DloError, match="'bending_stiffness' was not fitted; fitted are none"):

@@ -319,6 +319,8 @@ def test_from_python_limits_are_a_mapping(fitted):
     shape = load(fitted).solve((0.3, -0.1))
     with pytest.raises(DloError, match="a mapping belongs here"):
         shape.check(0.05)
+    with pytest.raises(ConfigError, match="unknown key '1'"):
+        shape.check({1: 2})
     with pytest.raises(ConfigError, match="bend"):
         shape.check({"bend": 0.05})
     assert [str(x).partition(":")[0] for x in shape.check({"force": 1e3})] == ["pass"]

@@ -203,6 +203,7 @@ def test_pool_and_process_give_the_same(pool):
 
 def test_any_executor_of_the_standard_library_serves():
     with ThreadPoolExecutor(2) as executor:
+        assert begin(executor, threading.get_ident)() != threading.get_ident()
         assert map_in_order(executor, square, range(5)) == [0, 1, 4, 9, 16]
 
 

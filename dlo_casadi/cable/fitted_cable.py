@@ -183,6 +183,8 @@ class FittedCable(EstimatedCable):
         DloError
             If there is no such target, if a file cannot be written, or as in `solve`.
         """
+        if not isinstance(path, str | PathLike):
+            raise DloError(f"path: a file name belongs here, found {path!r}")
         to, known, first = target_of(target), self.metadata, self.solve(**held).held
         fitted = (known.coefficients, known.covariance.names, known.covariance.values)
         others = samples_of(first, *fitted, samples, seed)
@@ -201,7 +203,7 @@ class FittedCable(EstimatedCable):
         """
         if n is None and element is None:
             return self
-        check_mesh(n, element)
+        check_mesh(n, element, self.model.in_space)
         if self.model.has_state:
             raise DloError(
                 f"{self.name!r} has a rest shape that changed from pose to pose, which is known on "

@@ -20,9 +20,14 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
 from dlo_casadi.model.contact import Contact, outwards
-from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.show.text import millimetres, vector
 
+# Arguments of `FittedCable.solve` that say how the ends are held.
+HELD = (
+    *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
+    *("turns", "branch"),
+)
 # Smallest distance [m] between a fixture and the cable that a table reports.
 _SHOWN = 5e-6
 
@@ -61,12 +66,13 @@ def side_texts(
     return [("this side", f"`{own}`"), ("also stable", said)]
 
 
-def check_mesh(n: object, element: object) -> None:
+def check_mesh(n: object, element: object, in_space: bool) -> None:
     """Raise DloError if a mesh of `n` such elements is impossible; None is the fit's mesh."""
+    known = ELEMENTS_IN_SPACE if in_space else ELEMENTS
     if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
         raise DloError(f"n: a whole number, {MESH}, found {n!r}")
-    if element not in (None, *ELEMENTS):
-        raise DloError(f"element: one of {', '.join(ELEMENTS)} belongs here, found {element!r}")
+    if element not in (None, *known):
+        raise DloError(f"element: one of {', '.join(known)} belongs here, found {element!r}")
 
 
 def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:

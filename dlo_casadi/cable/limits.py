@@ -216,7 +216,7 @@ def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
         return given
     if not isinstance(given, Mapping):
         raise DloError(f"a mapping belongs here, found {given!r}\n  Try: {example}")
-    return kind(**given)
+    return kind(**{str(key): value for key, value in given.items()})
 
 
 def bounds_of(limits: Limits) -> dict[str, float]:

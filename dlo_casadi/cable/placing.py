@@ -24,7 +24,7 @@ from scipy.optimize import linprog, minimize
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Metadata
-from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.held import HELD, held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
@@ -57,6 +57,7 @@ SCATTER = 0.05
 PENALTY = 10.0
 # Rounds end when the resolved use of bends changes by less than this relative amount.
 SETTLED = 5e-3
+_POSES = "poses: [{'end': (0.3, -0.1)}, ...] belongs here, as `solve` takes them"
 _TRY = "within=((0.1, 0.0), (0.3, 0.2)) [m]: the lowest and the highest coordinates of the clips"
 
 
@@ -116,8 +117,13 @@ def placed(
         raise DloError(f"aim: one of {', '.join(get_args(Aim))} belongs here, found {aim!r}")
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise DloError(f"count: a number of clips, 1 or more, belongs here, found {count!r}")
-    if isinstance(poses, Mapping) or not len(poses):
-        raise DloError("poses: [{'end': (0.3, -0.1)}, ...] belongs here, as `solve` takes them")
+    if not isinstance(poses, list | tuple) or not poses:
+        raise DloError(_POSES)
+    if wrong := [pose for pose in poses if not isinstance(pose, Mapping)]:
+        raise DloError(f"{_POSES}, found {wrong[0]!r}")
+    if strange := [key for pose in poses for key in pose if key not in HELD]:
+        text = f"poses: {strange[0]!r} is not about the ends of a pose without clips"
+        raise DloError(f"{text}.\n  Try: {', '.join(HELD)}")
     try:
         region = np.array(within, dtype=float)
     except (TypeError, ValueError):

@@ -6,7 +6,8 @@ from typing import Any
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable
-from dlo_casadi.cli.fitted import DRAWN, HELD, POSE
+from dlo_casadi.cable.held import HELD
+from dlo_casadi.cli.fitted import DRAWN, POSE
 from dlo_casadi.cli.options import PARAMETERS, Page, command, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.errors import DloError

@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
-from dlo_casadi.cable.held import listed_poses
+from dlo_casadi.cable.held import HELD, listed_poses
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
 from dlo_casadi.cli.watch import Counter
@@ -43,11 +43,6 @@ LIMITS = (
         metavar="NAME=VALUE",
         help="of other fixtures than the session's: end, length [m], heading, rotation, roll [rad]",
     ),
-)
-# Options that are arguments of `FittedCable.solve`.
-HELD = (
-    *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
-    *("turns", "branch"),
 )
 POSE = (
     *(

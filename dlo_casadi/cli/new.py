@@ -90,7 +90,7 @@ def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list
         raise DloError(f"{folder} holds no {what} ({', '.join(endings)})")
 
     def parts(path: Path) -> list[int | str]:
-        return [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", path.name)]
+        return [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", path.name)]
 
     return [Path(os.path.relpath(path, base)).as_posix() for path in sorted(found, key=parts)]
 

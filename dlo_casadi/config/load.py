@@ -4,7 +4,7 @@ import difflib
 import math
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,7 +23,7 @@ from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.effects.cable import height_of
 from dlo_casadi.errors import ConfigError, counted
-from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 
 Kind = TypeVar("Kind", bound=Config)
 
@@ -120,10 +120,13 @@ _RELATIVE = "files are found relative to the YAML, from Python relative to the w
 
 
 def any_photographs(poses: object) -> bool:
-    """Whether any file of the poses has a picture's name."""
-    listed = poses if isinstance(poses, list | tuple) else ()
-    paths = [path for pose in listed if isinstance(pose, Pose) for path in pose.paths]
-    return any(path.suffix.lower() in _IMAGE_ENDINGS for path in paths)
+    """Whether any file of the poses has a picture's name; a pose is a `Pose` or a mapping."""
+    paths: list[object] = []
+    for pose in poses if isinstance(poses, list | tuple) else ():
+        given = vars(pose) if isinstance(pose, Pose) else pose if isinstance(pose, Mapping) else {}
+        several = given.get("files")
+        paths += [given.get("file"), *(several if isinstance(several, list | tuple) else ())]
+    return any(Path(str(path)).suffix.lower() in _IMAGE_ENDINGS for path in paths)
 
 
 # Names of results add up to forty characters to a pose's name; file systems allow 255 bytes.
@@ -290,8 +293,9 @@ def _absent(file: Path) -> str:
         near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
         meant = f"did you mean {near[0]}?" if near else _RELATIVE
         return f"{file} does not exist; {meant}"
-    except OSError as error:
-        return f"{show(str(file))} cannot be read: {error.strerror}"
+    except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
+        reason = getattr(error, "strerror", None) or error
+        return f"{show(str(file))} cannot be read: {reason}"
 
 
 def _oddities(config: Config) -> Iterator[str]:
@@ -401,9 +405,13 @@ def declared_setup(config: Config) -> Setup:
 
 
 def wrong_effects(config: Config) -> list[ConfigProblem]:
-    """Find effects, and parameters of effects, that do not exist or are impossible as declared."""
-    setup = declared_setup(config)
+    """Find elements, effects and their parameters that do not exist or are impossible here."""
+    setup, element = declared_setup(config), config.model.element
     found: list[ConfigProblem] = []
+    if config.experiment.in_space and element not in ELEMENTS_IN_SPACE:
+        known = " or ".join(ELEMENTS_IN_SPACE)
+        text = f"model.element: {element} is of a cable in a plane. Try: {known}"
+        found.append(ConfigProblem(("model", "element"), text))
     for i, item in enumerate(config.model.effects):
         found += _wrong(item, ("model", "effects", i), setup)
     for i, name in enumerate(config.diagnosis.exclude):

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 from urllib.parse import quote
@@ -292,10 +293,10 @@ def robust_z(values: Sequence[float | None]) -> list[float | None]:
     return [None if np.isnan(score) else float(score) for score in scores]
 
 
-def overview_html(rows: Sequence[Row], output: Path) -> str:
+def overview_html(rows: Sequence[Row], output: Path | None) -> str:
     """The page of a fleet as text: one row per session; self-contained, without a script.
 
-    `output`: folder of the page; sessions with results in it are linked.
+    `output`: folder of the page; sessions with results in it are linked. None: nothing is linked.
     """
     judged = judge(rows)
     verdicts = Counter(item.verdict for item in judged)
@@ -304,7 +305,7 @@ def overview_html(rows: Sequence[Row], output: Path) -> str:
     return _template().render(
         title=counted(len(rows), "session"),
         summary=f"{counts or 'nothing is finished yet'}. {odd} to look at first.",
-        judged=[(item, _link(item.row, output)) for item in judged],
+        judged=[(item, None if output is None else _link(item.row, output)) for item in judged],
         outlying=OUTLYING,
         version=__version__,
     )
@@ -313,16 +314,11 @@ def overview_html(rows: Sequence[Row], output: Path) -> str:
 @cache
 def _template() -> Template:
     # Imported late: workers import this module but write no page.
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from jinja2 import StrictUndefined, Template
 
-    environment = Environment(
-        loader=PackageLoader("dlo_casadi.fleet"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template("overview.html")
+    text = (files("dlo_casadi.fleet") / "templates" / "overview.html").read_text("utf-8")
+    kept = {"trim_blocks": True, "keep_trailing_newline": True}
+    return Template(text, autoescape=True, undefined=StrictUndefined, **kept)
 
 
 def _link(row: Row, output: Path) -> str | None:

@@ -101,7 +101,10 @@ class FolderDraft:
                 with suppress(FileNotFoundError):
                     self.path.stat()  # a name that no folder can have
                 for parent in [p for p in self.path.parents if not os.path.exists(p)][::-1]:
-                    parent.mkdir()
+                    try:
+                        parent.mkdir()
+                    except FileExistsError:  # another run has made it meanwhile
+                        continue
                     self._made.insert(0, parent)
                 self.folder.mkdir(parents=True)
         except BaseException:
