@@ -157,7 +157,7 @@ STRAIGHT = dlo.Cable(
         (
             WIRE,
             {"gravity": (0, 0, -9.81), "boundary": ("pinned", "free")},
-            "may be turned about gravity",
+            "turn freely about the direction of gravity",
         ),
         (WIRE, IN_SPACE | {"model": {"element": "link"}}, "link is of a cable in a plane. Try: qu"),
         (UNWEIGHED, {}, "cable.mass is not given, and no fit tells it. Try: the mass"),

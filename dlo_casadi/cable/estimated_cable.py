@@ -138,7 +138,7 @@ class CableCurve(NodeCurve):
     def at_rest(
         cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
     ) -> Self:
-        """The curve of a model in an equilibrium, as its camera sees it."""
+        """The curve of a model in an equilibrium, as its camera sees it if it has such effects."""
         given = Inputs.of(p, rest, pose.vector[None])
         return cls.of(model.cable.length, assembly_of(model).curve(eq.shapes, given)[0])
 

@@ -329,13 +329,13 @@ def limit_checks(
             LimitCheck(
                 **vars(use),
                 **(vars(chance) | {"std": std}),
-                decided_by=_said(cable.model, uncertainty, chance),
+                decided_by=_main_cause(cable.model, uncertainty, chance),
             )
         )
     return tuple(out)
 
 
-def _said(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:
+def _main_cause(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:
     """The largest cause of uncertainty as text: "2 mm at the end (81 %)"."""
     if not chance.std > 0:
         return "nothing is uncertain"

@@ -7,8 +7,8 @@ from typing import Any
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cable.held import HELD
-from dlo_casadi.cli.fitted import DRAWN, POSE
-from dlo_casadi.cli.options import PARAMETERS, Page, command, option
+from dlo_casadi.cli.fitted import POSE
+from dlo_casadi.cli.options import PARAMETERS, Page, command, figure, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.errors import DloError
 from dlo_casadi.export.rod import Rod
@@ -35,7 +35,7 @@ _SEGMENTS = "number of links; by default as many as the bends need"
         metavar="SESSION",
         help="relax it in the simulator in every held-out pose; SESSION is found if it is near",
     ),
-    option("--figure", type=Path, metavar="FILE", help=f"draw the check: {', '.join(DRAWN)}"),
+    figure("draw the check"),
     *POSE,
     json="print files, losses and errors as JSON",
 )
@@ -55,8 +55,6 @@ def export(chosen: argparse.Namespace) -> None:
     from dlo_casadi.show.style import save_figure
 
     target, cable = target_of(chosen.to), load(chosen.parameters)
-    if chosen.figure is not None and chosen.figure.suffix.lower() not in DRAWN:
-        raise DloError(f"--figure {chosen.figure}: the name must end in {', '.join(DRAWN)}")
     if chosen.figure is not None and chosen.check is None:
         raise DloError("--figure draws the check.\n  Try: with --check")
     for name, least in (("samples", 0), ("seed", 0), ("segments", 4)):

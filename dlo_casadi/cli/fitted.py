@@ -9,7 +9,16 @@ from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.cable.held import HELD, listed_poses
 from dlo_casadi.cable.limits import LimitCheck
-from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
+from dlo_casadi.cli.options import (
+    PARAMETERS,
+    SCHEDULER,
+    Page,
+    command,
+    figure,
+    jobs,
+    one_of,
+    option,
+)
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
@@ -21,7 +30,6 @@ from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 
-DRAWN = (".png", ".pdf", ".svg", ".jpg")
 BRANCH = option("--branch", choices=("ccw", "cw"), help="which way the cable turns")
 MESH = (
     option("--elements", type=int, help="number of elements, instead of the fit's"),
@@ -41,7 +49,8 @@ LIMITS = (
         "--tolerances",
         nargs="+",
         metavar="NAME=VALUE",
-        help="of other fixtures than the session's: end, length [m], heading, rotation, roll [rad]",
+        help="of other fixtures than the session's: end, length, clip, slip [m], heading, "
+        "rotation, roll [rad]",
     ),
 )
 POSE = (
@@ -84,7 +93,7 @@ POSE = (
         help="over or under bars: true or false of all, or NAME=true ... of some",
     ),
     *LIMITS,
-    option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
+    figure("draw it"),
     codes="2 is also a pose without an equilibrium",
 )
 def predict(chosen: argparse.Namespace) -> None:
@@ -100,14 +109,11 @@ def predict(chosen: argparse.Namespace) -> None:
     from dlo_casadi.report.terminal import limits_table, prediction_table
     from dlo_casadi.show.style import save_figure
 
-    figure = chosen.figure
-    if figure is not None and figure.suffix.lower() not in DRAWN:
-        raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
     asked = {name: getattr(chosen, name) for name in HELD}
     asked |= {name: _listed(chosen, name) for name in ("clips", "obstacles")}
     shape = load(chosen.parameters).solve(**asked, over=_sides(chosen.over))
-    if figure is not None:
-        save_figure(figure, shape.plot())
+    if chosen.figure is not None:
+        save_figure(chosen.figure, shape.plot())
     # What a reader of the prediction should know about the file it came from.
     notes = []
     if shape.cable.metadata.edited:
@@ -131,8 +137,8 @@ def predict(chosen: argparse.Namespace) -> None:
     page.print(prediction_table(shape, notes))
     if checks is not None:
         page.print(limits_table(shape.cable.name, checks))
-    if figure is not None:
-        page.say(f"Figure: {figure}")
+    if chosen.figure is not None:
+        page.say(f"Figure: {chosen.figure}")
 
 
 def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:
@@ -325,7 +331,7 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
         type=int,
         default=0,
         metavar="N",
-        help="most obstacles on which the cable may lie, handed over with each pose",
+        help="maximum number of obstacles; they are given with each pose",
     ),
     *MESH,
     json="print files and hash as JSON",
@@ -346,5 +352,5 @@ def generate_solver(chosen: argparse.Namespace) -> None:
     written = solver.write(chosen.output)
     page = Page(chosen)
     page.data({"files": [str(path) for path in written], "solver_hash": solver.hash})
-    for text in (*written, f"model hash {solver.hash}"):
+    for text in (*written, f"solver hash {solver.hash}"):
         page.say(text)

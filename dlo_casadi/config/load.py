@@ -168,7 +168,8 @@ def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
             text = "results are named after the file without its ending, give each its own"
             wrong.append((f"pose {first + 1} is called {pose.name!r} too; {text}", None))
         if pose.branch == "previous" and i == 0:
-            wrong.append(("the first pose continues none; branch: ccw or cw?", "branch"))
+            text = "branch: previous needs a pose before this one; use ccw or cw"
+            wrong.append((text, "branch"))
         for message, key in wrong:
             at: Place = ("experiment", "poses", i)
             yield ConfigProblem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
@@ -216,12 +217,13 @@ def _weightless(config: Config) -> Iterator[ConfigProblem]:
     if not any(experiment.gravity):
         yield ConfigProblem(at, "mass: null: without gravity nothing depends on it; declare any")
     elif not any(pose.readings for pose in experiment.poses if pose.role == "fit"):
-        text = "mass: null: shapes tell stiffness over weight alone. Try: the mass in kg, or "
-        yield ConfigProblem(at, f"{text}end_force of a fit pose, which tells both")
+        text = "mass: null: shapes determine only the ratio of stiffness to weight. Try: the mass "
+        yield ConfigProblem(at, f"{text}in kg, or end_force of a fit pose")
     elif any(item.name == UNKNOWN_MASS.name for item in config.model.effects):
-        yield ConfigProblem(
-            at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two"
+        text = (
+            f"{UNKNOWN_MASS.name} corrects a declared mass: declare the mass, or leave the effect"
         )
+        yield ConfigProblem(at, f"mass: null: {text} out")
 
 
 def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
@@ -307,8 +309,8 @@ def _oddities(config: Config) -> Iterator[str]:
         yield f"youngs_modulus {young:g} Pa is softer than any cable: in pascal?"
     if cable.mass is None:
         yield (
-            f"cable.mass is not declared: stages before the batch take {cable.prior_mass:.3g} kg, "
-            "that of a solid cable of this diameter; the readings tell it from there on"
+            f"cable.mass is not declared: the first stages assume {cable.prior_mass:.3g} kg (a "
+            "solid cable of this diameter); the batch fit then estimates it from the force readings"
         )
     spans = [math.dist(pose.start, pose.end) for pose in experiment.poses if pose.end is not None]
     if spans and 0.0 < 50.0 * max(spans) < cable.length:

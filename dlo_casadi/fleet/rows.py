@@ -317,8 +317,7 @@ def _template() -> Template:
     from jinja2 import StrictUndefined, Template
 
     text = (files("dlo_casadi.fleet") / "templates" / "overview.html").read_text("utf-8")
-    kept = {"trim_blocks": True, "keep_trailing_newline": True}
-    return Template(text, autoescape=True, undefined=StrictUndefined, **kept)
+    return Template(text, trim_blocks=True, autoescape=True, undefined=StrictUndefined)
 
 
 def _link(row: Row, output: Path) -> str | None:
