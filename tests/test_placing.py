@@ -123,7 +123,7 @@ def test_no_place_near_a_clip_in_space_is_better():
         ({"aim": "beauty"}, "one of margin, force"),
         ({"poses": []}, "as `solve` takes them"),
         ({"poses": 5}, "as `solve` takes them"),
-        ({"poses": [(0.3, -0.1)]}, r"as `solve` takes them, found \(0.3, -0.1\)"),
+        ({"poses": [(0.3, -0.1)]}, r"as `solve` takes them, found \[\(0.3, -0.1\)"),
         ({"poses": [{"end": (0.5, 0.0), "over": True}]}, "'over' is not about.* Try: end, start"),
         ({"poses": [{"end": (0.5, 0.0), "start_heading": 0.1}]}, "start_heading has no meaning"),
         ({"poses": [{"end": (5.0, 0.0)}]}, "5.0000 m from the start"),

@@ -12,12 +12,13 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable, without_camera
-from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
+from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable
+from dlo_casadi.cable.held import among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Clip, Obstacle
+from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -32,6 +33,8 @@ from dlo_casadi.equilibrium.spread import (
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.rod import Held
 from dlo_casadi.export.targets import samples_of, target_of, write_rods
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.rod.node import Heading
@@ -192,31 +195,15 @@ class FittedCable(EstimatedCable):
         origin = f"{kind} cable {known.model_hash[:16]} of {known.config}"
         return write_rods(to, Path(path), [first, *others], origin, segments, seed)
 
-    def with_mesh(self, n: int | None = None, element: str | None = None) -> Self:
-        """The same cable on another mesh.
-
-        Raises
-        ------
-        DloError
-            If there is no such mesh, or if the rest shape has changed from pose to pose: it is
-            known on the fit's mesh only.
-        """
-        if n is None and element is None:
-            return self
-        check_mesh(n, element, self.model.in_space)
-        if self.model.has_state:
-            raise DloError(
-                f"{self.name!r} has a rest shape that changed from pose to pose, which is known on "
-                "the fit's elements alone: leave out the number and the kind of elements"
-            )
-        model = self.model.with_mesh(self.model.n if n is None else int(n), element)
-        return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
-
     def shape_in(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
         """The shape in an equilibrium."""
-        models = without_camera(self.model, self.p), (self.model, self.p)
-        true, seen = (CableCurve.at_rest(*one, self.rest, pose, eq) for one in models)
-        return Shape(self, pose, eq, true, seen)
+
+        def curve(model: CableModel, p: FloatArray) -> CableCurve:
+            given = Inputs.of(p, self.rest, pose.vector[None])
+            return CableCurve.of(self.length, assembly_of(model).curve(eq.shapes, given)[0])
+
+        true = curve(*self.model.without_kind(MeasurementEffect, self.p))
+        return Shape(self, pose, eq, true, curve(self.model, self.p))
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,7 +258,7 @@ class Shape:
     @property
     def held(self) -> Held:
         """The state from which an export is made."""
-        model, p = without_camera(self.cable.model, self.cable.p)
+        model, p = self.cable.model.without_kind(MeasurementEffect, self.cable.p)
         return Held(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.config.supports import Obstacle, Sides, clip_problems, obstacle_problems
-from dlo_casadi.config.values import AXES, MESH, ConfigSection
+from dlo_casadi.config.values import AXES, ConfigSection
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
@@ -20,7 +20,6 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
 from dlo_casadi.model.contact import Contact, outwards
-from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.show.text import millimetres, vector
 
 # Arguments of `FittedCable.solve` that say how the ends are held.
@@ -30,28 +29,6 @@ HELD = (
 )
 # Smallest distance [m] between a fixture and the cable that a table reports.
 _SHOWN = 5e-6
-
-
-def fixture_texts(
-    side: str,
-    kind: str,
-    at: Sequence[float] | None,
-    reached: FloatArray,
-    force: FloatArray,
-    moment: FloatArray,
-) -> list[tuple[str, str]]:
-    """How an end is held, the cable's true end, and its reactions, as text."""
-    if at is None:
-        return [(side, "free")]
-    rows = [(side, vector(at, "g", "m"))]
-    if math.dist(at, reached) > _SHOWN:
-        place = vector(reached, ".5f", "m")
-        rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-    rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
-    if kind == "clamped":
-        said = vector(moment, ".4g", "N m") if moment.ndim else f"{moment:.4g} N m"
-        rows.append((f"moment of the cable on its {side}", said))
-    return rows
 
 
 def side_texts(
@@ -64,15 +41,6 @@ def side_texts(
         f"turned by {near.angle:.2g} rad (known to {near.std:.2g} rad)"
     )
     return [("this side", f"`{own}`"), ("also stable", said)]
-
-
-def check_mesh(n: object, element: object, in_space: bool) -> None:
-    """Raise DloError if a mesh of `n` such elements is impossible; None is the fit's mesh."""
-    known = ELEMENTS_IN_SPACE if in_space else ELEMENTS
-    if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
-        raise DloError(f"n: a whole number, {MESH}, found {n!r}")
-    if element not in (None, *known):
-        raise DloError(f"element: one of {', '.join(known)} belongs here, found {element!r}")
 
 
 def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:
@@ -104,12 +72,22 @@ def reaction_texts(
     model: CableModel, pose: HeldPose, found: Equilibrium, points: FloatArray
 ) -> list[tuple[str, str]]:
     """All supports of a cable whose points (K, d) [m] start and end there, and its reactions."""
-    rows = []
+    rows: list[tuple[str, str]] = []
     ends = (("start", pose.start, points[0]), ("end", pose.end, points[-1]))
     forces = (found.start_force, found.end_force)
     for (side, at, reached), force, moment in zip(ends, forces, found.moments, strict=True):
-        kind = getattr(model, side)
-        rows += fixture_texts(side, kind, at, reached, force, np.asarray(moment))
+        if at is None:
+            rows.append((side, "free"))
+            continue
+        rows.append((side, vector(at, "g", "m")))
+        if math.dist(at, reached) > _SHOWN:
+            place = vector(reached, ".5f", "m")
+            rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
+        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
+        if getattr(model, side) == "clamped":
+            flat = not np.ndim(moment)
+            said = f"{moment:.4g} N m" if flat else vector(moment, ".4g", "N m")
+            rows.append((f"moment of the cable on its {side}", said))
     return rows + clip_texts(pose.clips, found.clips) + contact_texts(found.contacts)
 
 

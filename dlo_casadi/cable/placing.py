@@ -60,7 +60,6 @@ SCATTER = 0.05
 PENALTY = 10.0
 # Rounds end when the resolved use of bends changes by less than this relative amount.
 SETTLED = 5e-3
-_POSES = "poses: [{'end': (0.3, -0.1)}, ...] belongs here, as `solve` takes them"
 _TRY = "within=((0.1, 0.0), (0.3, 0.2)) [m]: the lowest and the highest coordinates of the clips"
 
 
@@ -120,10 +119,10 @@ def placed(
         raise DloError(f"aim: one of {', '.join(get_args(Aim))} belongs here, found {aim!r}")
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise DloError(f"count: a number of clips, 1 or more, belongs here, found {count!r}")
-    if not isinstance(poses, list | tuple) or not poses:
-        raise DloError(_POSES)
-    if wrong := [pose for pose in poses if not isinstance(pose, Mapping)]:
-        raise DloError(f"{_POSES}, found {wrong[0]!r}")
+    listed = poses if isinstance(poses, list | tuple) else ()
+    if not listed or not all(isinstance(pose, Mapping) for pose in listed):
+        belongs = "poses: [{'end': (0.3, -0.1)}, ...] belongs here, as `solve` takes them"
+        raise DloError(f"{belongs}, found {poses!r}")
     if strange := [key for pose in poses for key in pose if key not in HELD]:
         text = f"poses: {strange[0]!r} is not about the ends of a pose without clips"
         raise DloError(f"{text}.\n  Try: {', '.join(HELD)}")

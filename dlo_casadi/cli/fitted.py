@@ -157,16 +157,14 @@ def _sides(words: list[str] | None) -> bool | dict[str, bool] | None:
     said = {"true": True, "false": False}
     if len(words) == 1 and words[0] in said:
         return said[words[0]]
-    pairs = [word.rpartition("=") for word in words]
-    if wrong := [
-        word
-        for word, (name, _, side) in zip(words, pairs, strict=True)
-        if not (name and side in said)
-    ]:
-        raise DloError(
-            f"--over {wrong[0]}: true, false or NAME=true belongs here, such as bar=true"
-        )
-    return {name: said[side] for name, _, side in pairs}
+    sides = {}
+    for word in words:
+        name, _, side = word.rpartition("=")
+        if not name or side not in said:
+            text = f"--over {word}: true, false or NAME=true belongs here, such as bar=true"
+            raise DloError(text)
+        sides[name] = said[side]
+    return sides
 
 
 def _checked(shape: Shape, chosen: argparse.Namespace) -> tuple[LimitCheck, ...]:

@@ -114,8 +114,6 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
 
 
 _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
-
-
 _RELATIVE = "files are found relative to the YAML, from Python relative to the working directory"
 
 

@@ -73,12 +73,10 @@ class Clip(ConfigSection):
 class _Clipped(Protocol):
     """A pose with clips."""
 
-    @property
-    def start(self) -> Sequence[float]: ...
-    @property
-    def end(self) -> Sequence[float] | None: ...
-    @property
-    def clips(self) -> Sequence[Clip]: ...
+    start: Place
+    end: Place | None
+    clips: tuple[Clip, ...]
+
     @property
     def held(self) -> Any: ...
 

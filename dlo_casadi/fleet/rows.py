@@ -7,7 +7,6 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -198,9 +197,6 @@ def arrow_schema() -> pyarrow.Schema:
 
 # ---- the page ------------------------------------------------------------------------------------
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
 # Modified z-score beyond which a value is an outlier (Iglewicz and Hoaglin, 1993).
 OUTLYING = 3.5
 # Fewest sessions for a search for outliers.
@@ -298,26 +294,22 @@ def overview_html(rows: Sequence[Row], output: Path | None) -> str:
 
     `output`: folder of the page; sessions with results in it are linked. None: nothing is linked.
     """
+    # Imported late: workers import this module but write no page.
+    from jinja2 import StrictUndefined, Template
+
+    text = (files("dlo_casadi.fleet") / "templates" / "overview.html").read_text("utf-8")
+    page = Template(text, trim_blocks=True, autoescape=True, undefined=StrictUndefined)
     judged = judge(rows)
     verdicts = Counter(item.verdict for item in judged)
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in verdicts.most_common())
     odd = sum(bool(item.reasons) for item in judged)
-    return _template().render(
+    return page.render(
         title=counted(len(rows), "session"),
         summary=f"{counts or 'nothing is finished yet'}. {odd} to look at first.",
         judged=[(item, None if output is None else _link(item.row, output)) for item in judged],
         outlying=OUTLYING,
         version=__version__,
     )
-
-
-@cache
-def _template() -> Template:
-    # Imported late: workers import this module but write no page.
-    from jinja2 import StrictUndefined, Template
-
-    text = (files("dlo_casadi.fleet") / "templates" / "overview.html").read_text("utf-8")
-    return Template(text, trim_blocks=True, autoescape=True, undefined=StrictUndefined)
 
 
 def _link(row: Row, output: Path) -> str | None:
