@@ -41,7 +41,8 @@ _SEGMENTS = "number of links; by default as many as the bends need"
 )
 def export(chosen: argparse.Namespace) -> None:
     """Write a fitted cable for a simulator: rest shape, stiffness and weight, in the pose that it
-    starts in, by default the session's first. The file's head says which number stands where.
+    starts in, by default the session's first with its clips and obstacles. The file's head says
+    which number stands where.
 
     dlo export results/cable --to mujoco                        cable.xml
     dlo export results/cable --to mujoco --end 0.3 -0.1 --output rope.xml
