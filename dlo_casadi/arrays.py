@@ -27,7 +27,7 @@ def chord_lengths(points: FloatArray) -> NDArray[np.float64]:
 
 def length_of(points: FloatArray) -> float:
     """Length of a polyline through points (K, d)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    return float(chord_lengths(points)[-1])
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

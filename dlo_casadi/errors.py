@@ -104,17 +104,6 @@ class EquilibriumError(DloError):
         self.p_des = p_des
 
 
-def library(name: str, extra: str, user: str) -> Any:
-    """Import an optional library; without it a DloError names its `user` and the extra to use."""
-    try:
-        return import_module(name)
-    except ImportError:
-        raise DloError(
-            f"{user}: {name.partition('.')[0]} is not installed.\n"
-            f"  Try: pip install 'dlo-casadi[{extra}]'"
-        ) from None
-
-
 class EstimationError(DloError):
     """An estimate that the available poses do not allow."""
 
@@ -139,3 +128,14 @@ class OutputError(DloError):
         self.message = self.message.replace(draft, place)
         self.args = (self.message,)
         self.path = None if self.path is None else Path(str(self.path).replace(draft, place))
+
+
+def library(name: str, extra: str, user: str) -> Any:
+    """Import an optional library; without it a DloError names its `user` and the extra to use."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise DloError(
+            f"{user}: {name.partition('.')[0]} is not installed.\n"
+            f"  Try: pip install 'dlo-casadi[{extra}]'"
+        ) from None

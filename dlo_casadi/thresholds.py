@@ -15,10 +15,10 @@ COLLINEAR = 1e-7
 # Number of scanned places that count as one independent test: neighbouring places, a few
 # hundredths of the length apart, are correlated.
 SCANS_PER_TEST = 3
-# Spacing of the places that are scanned first. Those between are scanned next to a candidate's best
-# place if its p-value, over its places, is below IN_QUESTION, ten times the significance: a score
-# higher by a fifth than 7.4 lowers it from 0.05 to 0.02. In two sessions in space, with 23 places
-# each, this gave the leading candidates the same scores as all places.
+# Step of the coarse scan, in places. Places between are scanned around a candidate's best place if
+# its p-value there is below IN_QUESTION. Ten times the significance: a score higher by a fifth than
+# 7.4 lowers p from 0.05 to 0.02. In two sessions in space, with 23 places each, this gave the
+# leading candidates the same scores as all places.
 SCANS_APART, IN_QUESTION = 2, 0.05
 # Fewest degrees of freedom assumed for an estimated noise: with 4 or fewer F has no variance. The
 # 95 % quantile of Student's t is then 2.8; intervals are too short if the noise is known worse.

@@ -510,7 +510,7 @@ def test_a_ball_joint_and_a_free_end_hold_no_shape_in_space(tmp_path):
     ]
     assert load(tmp_path, *free).experiment.boundary.end == "free"
     space = [("[0, -9.81]", "[0, 0, -9.81]"), ("start: [0, 0]", "start: [0, 0, 0]")]
-    with pytest.raises(ConfigError, match=r"may be turned about gravity.* Try: start: clamped"):
+    with pytest.raises(ConfigError, match=r"can turn freely about.* Try: start: clamped"):
         load(tmp_path, *free, *space)
 
 
@@ -753,7 +753,9 @@ def test_readings_that_cannot_be(tmp_path, readings, said):
 
 def test_a_mass_that_is_not_declared_takes_a_reading(tmp_path):
     unknown = ("mass: 0.23", "mass: null")
-    with pytest.raises(ConfigError, match="end_force of a fit pose, which tells both"):
+    with pytest.raises(
+        ConfigError, match=r"stiffness to weight. Try: the mass in kg, or end_force"
+    ):
         load(tmp_path, unknown)
     config = read_at(tmp_path, "end_force: [1, -2]", unknown)
     solid = DENSITY * math.pi / 4 * config.cable.diameter**2 * config.cable.length

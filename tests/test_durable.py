@@ -262,6 +262,14 @@ def test_a_file_in_place_of_a_folder_stays(tmp_path):
     assert tree(tmp_path) == {"file": b"mine"}
 
 
+def test_another_run_may_make_the_same_parents(tmp_path, monkeypatch):
+    (tmp_path / "results").mkdir()
+    monkeypatch.setattr(os.path, "exists", lambda path: False)  # as of before it did
+    with FolderDraft(tmp_path / "results" / "new" / "cable"):
+        assert (tmp_path / "results" / "new").is_dir()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "results"]
+
+
 def test_names_from_elsewhere_are_refused(tmp_path):
     refuse_foreign(tmp_path, [])
     with pytest.raises(OutputError, match=r"holds a, b from elsewhere.*\n  Try: another folder"):

@@ -1,5 +1,6 @@
 """A cable of which everything is known, beside closed forms; and it is what a fit returns."""
 
+import json
 import pickle
 import shutil
 
@@ -9,6 +10,7 @@ from scipy.optimize import brentq
 from scipy.special import fresnel
 
 import dlo_casadi as dlo
+from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml
 
 ROPE = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, name="rope")
@@ -155,8 +157,9 @@ STRAIGHT = dlo.Cable(
         (
             WIRE,
             {"gravity": (0, 0, -9.81), "boundary": ("pinned", "free")},
-            "may be turned about gravity",
+            "turn freely about the direction of gravity",
         ),
+        (WIRE, IN_SPACE | {"model": {"element": "link"}}, "link is of a cable in a plane. Try: qu"),
         (UNWEIGHED, {}, "cable.mass is not given, and no fit tells it. Try: the mass"),
         (3, {}, "cable: a mapping of keys and values belongs here, found 3"),
         (ROPE, {"model": {"effects": ["lumped_mas"]}}, "did you mean 'lumped_mass'?"),
@@ -198,12 +201,66 @@ def test_all_that_is_missing_is_told_at_once():
 
 
 def test_what_needs_a_fit_says_so(rope, tmp_path):
+    with pytest.raises(dlo.DloError, match="path: a file name belongs here, found 5"):
+        rope.export("mujoco", 5, end=(0.5, 0.1))
+    wire = dlo.known_cable(WIRE, **IN_SPACE)
+    with pytest.raises(dlo.DloError, match="element: one of quadratic, arc belongs here"):
+        wire.with_mesh(element="link")
     with pytest.raises(dlo.DloError, match="'rope' is known exactly: all samples would be the sam"):
         rope.export("mujoco", tmp_path / "rope.xml", end=(0.5, 0.1), samples=2)
     with pytest.raises(dlo.DloError, match="'bending_stiffness' was not fitted; fitted are none"):
         _ = rope.covariance["bending_stiffness", "bending_stiffness"]
     with pytest.raises(dlo.DloError, match="no limit is given, and none was declared"):
         rope.solve(end=(0.5, 0.1)).check()
+
+
+def test_a_straight_cable_keeps_every_bend_radius():
+    """Without gravity nothing bends it, and nothing pulls at its clamp: sizes of exactly 0."""
+    shape = dlo.known_cable(ROPE, **WEIGHTLESS).solve(start_heading=0.0)
+    tolerances = {"heading": 0.01}
+    for stds in (None, tolerances):
+        bend, force = shape.check({"bend_radius": 0.05, "force": 1.0}, tolerances=stds)
+        assert (bend.verdict, bend.probability, force.verdict, force.value) == (
+            "pass",
+            0,
+            "pass",
+            0,
+        )
+        assert bend.std == 0 or stds
+        assert "pass: bend radius straight at" in str(bend)
+    assert "smallest bend radius: straight" in str(shape)
+    assert "bend radius straight" in shape.plot().axes[0].get_title()
+
+
+def test_a_straight_cable_can_be_checked_from_the_command_line(tmp_path, capsys):
+    known = dlo.known_cable(ROPE, **WEIGHTLESS, limits={"bend_radius": 0.05})
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(known.metadata.document))
+    words = ["--start-heading", "0", "--tolerances", "heading=0.01", "--json"]
+    assert main(["predict", str(tmp_path), *words]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["limits"]
+    assert (row["verdict"], row["std"]) == ("pass", 0.0)
+
+
+@pytest.mark.parametrize("words", [["--start-heading", "0"], []])
+def test_an_export_starts_as_it_is_told_or_in_the_first_pose(tmp_path, monkeypatch, capsys, words):
+    """A heading of 0 is one. A session's clips count; its headings of pinned ends only warn."""
+    held = FREE if words else PINNED
+    clip = {"kind": "pinned", "at": 0.4, "place": (0.3, -0.1)}
+    line = [(0.0, 0.0), (0.3, -0.1), (0.5, 0.1)]
+    pose = dlo.Pose((0, 0), None if words else (0.5, 0.1), start_heading=1.0, points=line)
+    pose = pose.changed(clips=() if words else (dlo.Clip(**clip),))
+    session = dlo.Session(ROPE, [pose], **held)
+    monkeypatch.setattr("dlo_casadi.session.round_trip.session_of", lambda *_: session)
+    document = dlo.known_cable(ROPE, **held).metadata.document
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(document))
+    file = tmp_path / "rope.xml"
+    words = [str(tmp_path), "--to", "mujoco", "--output", str(file), *words, "--json"]
+    assert main(["export", *words]) == 0
+    assert ("clips" in json.loads(capsys.readouterr().out)["not_carried"]) == (held is PINNED)
+    if held is FREE:
+        expected = tmp_path / "expected.xml"
+        dlo.load(tmp_path).export("mujoco", expected, start_heading=0.0)
+        assert file.read_text() == expected.read_text()
 
 
 def test_declared_limits_are_checked():

@@ -274,6 +274,9 @@ def test_what_cannot_be_checked_says_what_to_try(fitted, capsys, words, said):
         ("x,y\n1,2\n", "unknown columns"),
         ("end_x_m\n0.3\n", "numbers belong here"),
         ("end_x_m,end_y_m\n0.3,high\n", "pose 1: numbers"),
+        ("end_x_m,end_y_m\n0,3,-0,1\n", "pose 1: more cells"),
+        ("end_x_m,end_y_m\n0.3,-0.1\n0.3,-0,1\n", "pose 2: more cells"),
+        ("name,end_x_m,end_y_m\na,0.3,0\na,0.2,0\n", "pose 2: an earlier pose is called 'a'"),
     ],
 )
 def test_a_list_that_cannot_be_read_is_named(fitted, tmp_path, capsys, text, said):
@@ -316,6 +319,8 @@ def test_from_python_limits_are_a_mapping(fitted):
     shape = load(fitted).solve((0.3, -0.1))
     with pytest.raises(DloError, match="a mapping belongs here"):
         shape.check(0.05)
+    with pytest.raises(ConfigError, match="unknown key '1'"):
+        shape.check({1: 2})
     with pytest.raises(ConfigError, match="bend"):
         shape.check({"bend": 0.05})
     assert [str(x).partition(":")[0] for x in shape.check({"force": 1e3})] == ["pass"]

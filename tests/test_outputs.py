@@ -75,7 +75,16 @@ def test_a_name_that_cannot_be_printed_is_escaped(session, monkeypatch, capsys):
 
 
 def test_a_new_configuration_finds_the_files_of_any_name(tmp_path):
-    names = [CAFE, "line\nbreak", "quote'\"", "back\\slash", "#: {x}", "\u202e", "\U0001f600"]
+    names = [
+        CAFE,
+        "line\nbreak",
+        "quote'\"",
+        "back\\slash",
+        "#: {x}",
+        "\u202e",
+        "\U0001f600",
+        "1²2",
+    ]
     for name in names:
         (tmp_path / f"{name}.csv").write_text("x_m,y_m\n0,0\n1,0\n")
     config = tmp_path / "it's.yaml"

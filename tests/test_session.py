@@ -329,6 +329,8 @@ def words_of(message: str) -> set[str]:
         ([3], "pose 1: a mapping of keys and values belongs here, found 3"),
         (3, "poses: a list belongs here, found 3"),
         ([], "no pose has role: fit"),
+        ([{"file": "a.jpg", "start": (0, 0), "end": (0.3, 0)}], "needs either a board or a refer"),
+        ([dlo.Pose((0, 0), (0.3, 0), file="a\0.csv")], "cannot be read: embedded null byte"),
     ],
 )
 def test_poses_are_a_list_of_poses(poses, message):

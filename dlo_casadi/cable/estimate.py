@@ -142,7 +142,6 @@ class Metadata:
         Whether the model has changed since the file was written.
     config : str
         Name of the configuration.
-    versions : dict
     document : dict
         The whole file.
     """
@@ -158,5 +157,4 @@ class Metadata:
     model_hash: str
     edited: bool
     config: str
-    versions: dict[str, str]
     document: dict[str, Any]

@@ -1,7 +1,7 @@
 """A fitted cable without its shapes: values, their uncertainty, and its curve in a pose."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -12,14 +12,11 @@ from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata, Named
 from dlo_casadi.cable.limits import Asked
 from dlo_casadi.cable.placing import Aim, Placing, placed
-from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.config.values import MESH
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, counted
-from dlo_casadi.model.assembly import Inputs, assembly_of
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.node import Frame
 
 
@@ -64,6 +61,30 @@ class EstimatedCable(CasadiCable):
     def length(self) -> float:
         """Length [m] as declared."""
         return self.model.cable.length
+
+    def with_mesh(self, n: int | None = None, element: str | None = None) -> Self:
+        """The same cable on another mesh.
+
+        Raises
+        ------
+        DloError
+            If there is no such mesh, or if the rest shape has changed from pose to pose: it is
+            known on the fit's mesh only.
+        """
+        if n is None and element is None:
+            return self
+        if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
+            raise DloError(f"n: a whole number, {MESH}, found {n!r}")
+        known = ELEMENTS_IN_SPACE if self.model.in_space else ELEMENTS
+        if element not in (None, *known):
+            raise DloError(f"element: one of {', '.join(known)} belongs here, found {element!r}")
+        if self.model.has_state:
+            raise DloError(
+                f"{self.name!r} has a rest shape that changed from pose to pose, which is known on "
+                "the fit's elements alone: leave out the number and the kind of elements"
+            )
+        model = self.model.with_mesh(self.model.n if n is None else int(n), element)
+        return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
 
     def place(
         self,
@@ -134,14 +155,6 @@ class CableCurve(NodeCurve):
             )
         return super().at(np.clip(places, 0.0, self.length), derivative)
 
-    @classmethod
-    def at_rest(
-        cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, eq: Equilibrium
-    ) -> Self:
-        """The curve of a model in an equilibrium, as its camera sees it."""
-        given = Inputs.of(p, rest, pose.vector[None])
-        return cls.of(model.cable.length, assembly_of(model).curve(eq.shapes, given)[0])
-
     def frames(self, s: FloatArray, places: FloatArray, x: FloatArray) -> FloatArray:
         """Material frames (K, d, d) at s [m]: columns are the tangent and the section's axes.
 
@@ -154,8 +167,3 @@ class CableCurve(NodeCurve):
         y = Rotation.from_quat(Frame.interpolated(s, places, x)).apply([0.0, 1.0, 0.0])
         y = unit(y - (y * tangents).sum(axis=1, keepdims=True) * tangents)
         return np.stack([tangents, y, np.cross(tangents, y)], axis=2)
-
-
-def without_camera(model: CableModel, p: FloatArray) -> tuple[CableModel, FloatArray]:
-    """The model without effects of the camera, and its part of `p`."""
-    return model.without_kind(MeasurementEffect, p)

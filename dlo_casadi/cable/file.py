@@ -50,6 +50,9 @@ from dlo_casadi.rod.node import Frame
 
 FILE = "parameters.yaml"
 SCHEMA = "dlo-parameters/1"
+# Largest file [bytes]: the covariance of 250 estimates, among them 128 rest coefficients in space,
+# has 250^2 numbers of 25 bytes; all else has less than a fifth of that.
+_LARGEST = 2_000_000
 # Keys on which a prediction depends, besides the values of the parameters.
 _MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
 # Tolerance of a value at its bound, relative to the bound or the parameter's scale: for rounding in
@@ -204,7 +207,6 @@ class ParametersFile(OpenSection):
     explains: bool | None = None
     model_hash: Name
     config: Name = "unnamed"
-    versions: dict[str, Any] | None = None
 
 
 def load(path: str | Path) -> FittedCable:
@@ -232,7 +234,7 @@ def load(path: str | Path) -> FittedCable:
             raise ConfigError(f"no {FILE} in this folder.{_results_near(source)}", source.parent)
     elif not os.path.exists(source):
         raise ConfigError(f"no such file or folder of results.{_results_near(source)}", source)
-    document = Document.read(source)
+    document = Document.read(source, _LARGEST)
     data = document.data
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         found = data.get("schema") if isinstance(data, dict) else type(data).__name__
@@ -251,7 +253,8 @@ def load(path: str | Path) -> FittedCable:
     if problems := [*_unlike(file, model)]:
         raise document.error(problems, _DAMAGED, _REMEDY)
     p = np.array([file.parameters[name].value for name in model.names])
-    return FittedCable(model, p, np.array(file.state.rest_curvature), metadata_of(data, source))
+    metadata = metadata_of(data, source, file)
+    return FittedCable(model, p, np.array(file.state.rest_curvature), metadata)
 
 
 def _results_near(path: Path) -> str:
@@ -332,9 +335,11 @@ def _beyond(q: Parameter, row: _Value) -> str:
     return f"{row.value:.12g} {q.unit} lies outside of its bounds {bounds}"
 
 
-def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
-    """Contents of a document besides the model."""
-    file = ParametersFile.model_validate(document)
+def metadata_of(
+    document: dict[str, Any], source: Path | None, file: ParametersFile | None = None
+) -> Metadata:
+    """Contents of a document besides the model; `file`: the same, if it is checked already."""
+    file = file or ParametersFile.model_validate(document)
     names = file.covariance.names
     covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
     scatter = file.scatter or _Scatter()
@@ -354,7 +359,6 @@ def metadata_of(document: dict[str, Any], source: Path | None) -> Metadata:
         model_hash=file.model_hash,
         edited=parameters_hash(document) != file.model_hash,
         config=file.config,
-        versions=file.versions or {},
         document=document,
     )
 

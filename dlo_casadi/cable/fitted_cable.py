@@ -12,12 +12,13 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable, without_camera
-from dlo_casadi.cable.held import among, check_mesh, held_pose, reaction_texts, side_texts
+from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable
+from dlo_casadi.cable.held import among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Clip, Obstacle
+from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -32,10 +33,12 @@ from dlo_casadi.equilibrium.spread import (
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.export.targets import samples_of, target_of, write_rods
+from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.rod.node import Heading
-from dlo_casadi.show.text import html_table, millimetres
+from dlo_casadi.show.text import bend_radius, html_table
 
 # Number of points of a shape.
 _POINTS = 101
@@ -184,6 +187,8 @@ class FittedCable(EstimatedCable):
             If there is no such target, if a number is too small, if a file cannot be written, or as
             in `solve`.
         """
+        if not isinstance(path, str | PathLike):
+            raise DloError(f"path: a file name belongs here, found {path!r}")
         for name, value, least in (
             ("segments", 4 if segments is None else segments, 4),
             ("samples", samples, 0),
@@ -199,31 +204,15 @@ class FittedCable(EstimatedCable):
         origin = f"{kind} cable {known.model_hash[:16]} of {known.config}"
         return write_rods(to, Path(path), [first, *others], origin, segments, seed)
 
-    def with_mesh(self, n: int | None = None, element: str | None = None) -> Self:
-        """The same cable on another mesh.
-
-        Raises
-        ------
-        DloError
-            If there is no such mesh, or if the rest shape has changed from pose to pose: it is
-            known on the fit's mesh only.
-        """
-        if n is None and element is None:
-            return self
-        check_mesh(n, element)
-        if self.model.has_state:
-            raise DloError(
-                f"{self.name!r} has a rest shape that changed from pose to pose, which is known on "
-                "the fit's elements alone: leave out the number and the kind of elements"
-            )
-        model = self.model.with_mesh(self.model.n if n is None else int(n), element)
-        return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
-
     def shape_in(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
         """The shape in an equilibrium."""
-        models = without_camera(self.model, self.p), (self.model, self.p)
-        true, seen = (CableCurve.at_rest(*one, self.rest, pose, eq) for one in models)
-        return Shape(self, pose, eq, true, seen)
+
+        def curve(model: CableModel, p: FloatArray) -> CableCurve:
+            given = Inputs.of(p, self.rest, pose.vector[None])
+            return CableCurve.of(self.length, assembly_of(model).curve(eq.shapes, given)[0])
+
+        true = curve(*self.model.without_kind(MeasurementEffect, self.p))
+        return Shape(self, pose, eq, true, curve(self.model, self.p))
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +267,7 @@ class Shape:
     @property
     def held(self) -> SolvedCable:
         """The state from which an export is made."""
-        model, p = without_camera(self.cable.model, self.cable.p)
+        model, p = self.cable.model.without_kind(MeasurementEffect, self.cable.p)
         return SolvedCable(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
 
     @property
@@ -361,7 +350,7 @@ class Shape:
         """Draw the shape with the forces of the cable on its supports; in a plane also its band."""
         other, forces = self.other_side, {"start": self.start_force}
         state = "stable" if self.stable else "NOT stable"
-        radius = millimetres(self.min_bend_radius)
+        radius = bend_radius(self.min_bend_radius)
         if self.pose.end is not None:
             forces["end"] = self.end_force
         surfaces, length = surfaces_at(self.cable.model, self.cable.p), self.curve.length
@@ -386,7 +375,7 @@ class Shape:
         """Quantities of the shape, and their values as text."""
         rows = reaction_texts(self.cable.model, self.pose, self.equilibrium, self.points)
         rows.append(("energy", f"{self.energy:.6g} J"))
-        rows.append(("smallest bend radius", millimetres(self.min_bend_radius)))
+        rows.append(("smallest bend radius", bend_radius(self.min_bend_radius)))
         rows.append(("stable", "yes" if self.stable else "NO: the cable would not stay there"))
         other, near = self.other_side, self.tipping
         if other is not None and near is not None:

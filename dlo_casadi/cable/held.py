@@ -12,7 +12,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.config.supports import Obstacle, Sides, clip_problems, obstacle_problems
-from dlo_casadi.config.values import AXES, MESH, ConfigSection
+from dlo_casadi.config.values import AXES, ConfigSection
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
@@ -20,33 +20,15 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
 from dlo_casadi.model.contact import Contact, outwards
-from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.show.text import millimetres, vector
 
+# Arguments of `FittedCable.solve` that say how the ends are held.
+HELD = (
+    *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
+    *("turns", "branch"),
+)
 # Smallest distance [m] between a fixture and the cable that a table reports.
 _SHOWN = 5e-6
-
-
-def fixture_texts(
-    side: str,
-    kind: str,
-    at: Sequence[float] | None,
-    reached: FloatArray,
-    force: FloatArray,
-    moment: FloatArray,
-) -> list[tuple[str, str]]:
-    """How an end is held, the cable's true end, and its reactions, as text."""
-    if at is None:
-        return [(side, "free")]
-    rows = [(side, vector(at, "g", "m"))]
-    if math.dist(at, reached) > _SHOWN:
-        place = vector(reached, ".5f", "m")
-        rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-    rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
-    if kind == "clamped":
-        said = vector(moment, ".4g", "N m") if moment.ndim else f"{moment:.4g} N m"
-        rows.append((f"moment of the cable on its {side}", said))
-    return rows
 
 
 def side_texts(
@@ -59,14 +41,6 @@ def side_texts(
         f"turned by {near.angle:.2g} rad (known to {near.std:.2g} rad)"
     )
     return [("this side", f"`{own}`"), ("also stable", said)]
-
-
-def check_mesh(n: object, element: object) -> None:
-    """Raise DloError if a mesh of `n` such elements is impossible; None is the fit's mesh."""
-    if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
-        raise DloError(f"n: a whole number, {MESH}, found {n!r}")
-    if element not in (None, *ELEMENTS):
-        raise DloError(f"element: one of {', '.join(ELEMENTS)} belongs here, found {element!r}")
 
 
 def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:
@@ -98,12 +72,22 @@ def reaction_texts(
     model: CableModel, pose: HeldPose, found: Equilibrium, points: FloatArray
 ) -> list[tuple[str, str]]:
     """All supports of a cable whose points (K, d) [m] start and end there, and its reactions."""
-    rows = []
+    rows: list[tuple[str, str]] = []
     ends = (("start", pose.start, points[0]), ("end", pose.end, points[-1]))
     forces = (found.start_force, found.end_force)
     for (side, at, reached), force, moment in zip(ends, forces, found.moments, strict=True):
-        kind = getattr(model, side)
-        rows += fixture_texts(side, kind, at, reached, force, np.asarray(moment))
+        if at is None:
+            rows.append((side, "free"))
+            continue
+        rows.append((side, vector(at, "g", "m")))
+        if math.dist(at, reached) > _SHOWN:
+            place = vector(reached, ".5f", "m")
+            rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
+        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
+        if getattr(model, side) == "clamped":
+            flat = not np.ndim(moment)
+            said = f"{moment:.4g} N m" if flat else vector(moment, ".4g", "N m")
+            rows.append((f"moment of the cable on its {side}", said))
     return rows + clip_texts(pose.clips, found.clips) + contact_texts(found.contacts)
 
 
@@ -196,7 +180,7 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
     Columns are end_x_m, end_y_m and, where they differ from pose to pose, start_x_m, start_y_m,
     start_heading_rad, end_heading_rad; in space also end_z_m, start_z_m, start_qx to start_qw,
     end_qx to end_qw and turns; and name, by default the line's number. Raises DloError if the file
-    is missing, has other columns, or has cells that are not numbers.
+    is missing, has other columns, has cells that are not numbers, or has a name twice.
     """
     node, sides = model.node, ("start", "end")
     keys = {side: [f"{side}_{axis}_m" for axis in node.axes] for side in sides}
@@ -211,11 +195,22 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
         raise DloError(
             f"{path} cannot be read: {reason}.\n  Try: a CSV with the columns {', '.join(known)}"
         ) from None
-    if not rows or (strange := [x for x in rows[0] if x not in known]):
+    if not rows or (strange := [x for x in rows[0] if x and x not in known]):
         said = f"unknown columns {strange}" if rows else "no poses"
         raise DloError(f"{path}: {said}.\n  Try: {', '.join(known)}; the first line names them")
     out: dict[str, dict[str, Any]] = {}
     for k, row in enumerate(rows, start=1):
+        name = row.get("name") or f"pose_{k:02d}"
+        if None in row:
+            raise DloError(
+                f"{path}, pose {k}: more cells than the first line has columns.\n"
+                "  Try: numbers with a decimal point, 0.3 and not 0,3"
+            )
+        if name in out:
+            raise DloError(
+                f"{path}, pose {k}: an earlier pose is called {name!r}, too.\n"
+                "  Try: a name for each pose, or no column `name`"
+            )
         given: dict[str, Any] = {}
         for key, columns in keys.items():
             if set(columns) & row.keys():
@@ -224,8 +219,9 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
                 except (KeyError, TypeError, ValueError):
                     cells = ", ".join(f"{x}={row.get(x)!r}" for x in columns)
                     raise DloError(
-                        f"{path}, pose {k}: numbers belong here, found {cells}"
+                        f"{path}, pose {k}: numbers belong here, found {cells}.\n"
+                        "  Try: one number in each cell"
                     ) from None
                 given[key] = numbers if len(columns) > 1 else numbers[0]
-        out[row.get("name") or f"pose_{k:02d}"] = given
+        out[name] = given
     return out

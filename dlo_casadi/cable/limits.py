@@ -22,7 +22,7 @@ from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.assembly import Inputs
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.show.text import millimetres
+from dlo_casadi.show.text import STRAIGHT, millimetres
 from dlo_casadi.thresholds import SAFE
 
 Kind = TypeVar("Kind", bound=ConfigSection)
@@ -76,6 +76,8 @@ class LimitUse:
     def text(self, *values: float) -> str:
         """A value of the quantity with its unit, and its standard deviation if there is one."""
         values = values if any(values[1:]) else values[:1]
+        if self.quantity == "bend_radius" and values[0] > STRAIGHT:
+            return "straight"
         unit = UNITS[self.quantity]
         unit, size = ("mm", 1e3) if unit == "m" else (unit, 1.0)
         forms = zip(values, (".4g", ".2g"), strict=False)
@@ -214,7 +216,7 @@ def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
         return given
     if not isinstance(given, Mapping):
         raise DloError(f"a mapping belongs here, found {given!r}\n  Try: {example}")
-    return kind(**given)
+    return kind(**{str(key): value for key, value in given.items()})
 
 
 def bounds_of(limits: Limits) -> dict[str, float]:
@@ -284,7 +286,7 @@ class Resolved:
             tight = int(here.argmax())
             value, used = here[tight], here / bounds[_size(quantity)]
             if quantity == "bend_radius":
-                value = 1 / value
+                value = 1 / max(value, 1e-300)
             elif quantity == "clearance":
                 value, used = -value, 2 - used
             where = float(places[tight]), holders[tight], places
@@ -310,9 +312,10 @@ def limit_checks(
     drawn, near = shape.meshes[-1]
     # Ratio of a size on the mesh of the draws to its resolved value.
     ratio = {
-        _size(x): shape.sizes(drawn, near, x).max() / shape.sizes(*shape.on(x), x).max()
+        _size(x): shape.sizes(drawn, near, x).max() / size if size else 1.0
         for x in limits.given
-        if x != "clearance"  # a clearance hardly depends on the mesh, and may be zero
+        if x != "clearance"  # a clearance hardly depends on the mesh
+        for size in [shape.sizes(*shape.on(x), x).max()]
     } | {"clearance": 1.0}
     own = uncertainty.pose_scatter
     with_own = own.within(drawn), own.values(cable.p, drawn)
@@ -321,19 +324,20 @@ def limit_checks(
     out = []
     for use in shape.uses(limits):
         name = _size(use.quantity)
-        chance, std = likely[name], likely[name].std / ratio[name]
-        std *= use.value**2 if use.quantity == "bend_radius" else 1.0
+        chance, std = likely[name], float(likely[name].std / ratio[name])
+        if use.quantity == "bend_radius":
+            std = std * use.value * use.value  # infinite, or 0, of a straight cable
         out.append(
             LimitCheck(
                 **vars(use),
-                **(vars(chance) | {"std": float(std)}),
-                decided_by=_said(cable.model, uncertainty, chance),
+                **(vars(chance) | {"std": std}),
+                decided_by=_main_cause(cable.model, uncertainty, chance),
             )
         )
     return tuple(out)
 
 
-def _said(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:
+def _main_cause(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:
     """The largest cause of uncertainty as text: "2 mm at the end (81 %)"."""
     if not chance.std > 0:
         return "nothing is uncertain"

@@ -24,7 +24,7 @@ from scipy.optimize import linprog, minimize
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Metadata
-from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.held import HELD, held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
@@ -48,9 +48,12 @@ Sizes = Mapping[str, FloatArray]
 ROOM, ROOMY = 0.95, (0.8, 0.9, 0.95)
 # First, largest and last radius of the trust region, in lengths of the cable.
 FIRST, LARGEST, LAST = 0.05, 0.2, 1e-4
-# Number of first guesses and of steps from each; number of the best that continue, and their
-# maximum number of steps; maximum number of rounds, after each of which bends are resolved.
-GUESSES, TRIED, STARTS, STEPS, ROUNDS = 16, 6, 3, 60, 4
+# Number of first guesses, and of steps from each.
+GUESSES, TRIED = 16, 6
+# Number of the best guesses that continue, and their maximum number of steps.
+STARTS, STEPS = 3, 60
+# Maximum number of rounds, after each of which bends are resolved.
+ROUNDS = 4
 # Scatter of first guesses [lengths].
 SCATTER = 0.05
 # Weight of a share beyond a limit relative to the minimized force.
@@ -116,8 +119,13 @@ def placed(
         raise DloError(f"aim: one of {', '.join(get_args(Aim))} belongs here, found {aim!r}")
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise DloError(f"count: a number of clips, 1 or more, belongs here, found {count!r}")
-    if isinstance(poses, Mapping) or not len(poses):
-        raise DloError("poses: [{'end': (0.3, -0.1)}, ...] belongs here, as `solve` takes them")
+    listed = poses if isinstance(poses, list | tuple) else ()
+    if not listed or not all(isinstance(pose, Mapping) for pose in listed):
+        belongs = "poses: [{'end': (0.3, -0.1)}, ...] belongs here, as `solve` takes them"
+        raise DloError(f"{belongs}, found {poses!r}")
+    if strange := [key for pose in poses for key in pose if key not in HELD]:
+        text = f"poses: {strange[0]!r} is not about the ends of a pose without clips"
+        raise DloError(f"{text}.\n  Try: {', '.join(HELD)}")
     try:
         region = np.array(within, dtype=float)
     except (TypeError, ValueError):
@@ -141,7 +149,7 @@ def placed(
 
 
 @dataclass(frozen=True)
-class _Hung:
+class _Trial:
     """The lowest shapes of all poses with the clips at z.
 
     `sizes`: of each pose by name; `aims` (R,) are minimized, `others` (S,) kept below 1.
@@ -195,7 +203,7 @@ class _Search:
         return CasadiCable(model, p, self.cable.rest)
 
     @cached_property
-    def ways(self) -> Uncertainty:
+    def clip_moves(self) -> Uncertainty:
         """Slips and moves of clips by 1 m, as uncertain quantities."""
         slips = tuple(f"{ALONG_CABLE(clip=k).label}.ds" for k in range(self.count))
         moves = [
@@ -205,8 +213,8 @@ class _Search:
 
     @cached_property
     def columns(self) -> list[int]:
-        """Columns of the derivatives by `ways`, in the order of z."""
-        causes = self.ways.causes_in(self.slipping.model)
+        """Columns of the derivatives by `clip_moves`, in the order of z."""
+        causes = self.clip_moves.causes_in(self.slipping.model)
         moves = [np.flatnonzero([x == f"clip_{k}" for x in causes]) for k in range(self.count)]
         return [int(column) for k, own in enumerate(moves) for column in (k, *own)]
 
@@ -241,7 +249,7 @@ class _Search:
         spare, slopes = (np.array(part) for part in zip(*found, strict=True))
         return spare, slopes
 
-    def hung(self, z: FloatArray, scales: FloatArray) -> _Hung:
+    def solved_at(self, z: FloatArray, scales: FloatArray) -> _Trial:
         """The lowest shapes at z; raises EquilibriumError if there are none."""
         known, poses = self.slipping, self.held(z)
         shapes, sizes = [], []
@@ -253,7 +261,7 @@ class _Search:
             given = Inputs.of(known.p, known.rest, pose.vector[None])
             names = (*self.bounded, "force")
             sizes.append({x: sizes_of(known.model, eq.shapes, given, x)[0] for x in names})
-        return _Hung(z, tuple(shapes), tuple(sizes), *self._split(sizes, scales))
+        return _Trial(z, tuple(shapes), tuple(sizes), *self._split(sizes, scales))
 
     @cached_property
     def bounded(self) -> dict[str, float]:
@@ -271,37 +279,33 @@ class _Search:
             for scale, (name, bound) in zip(row, self.bounded.items(), strict=True)
         ]
         forces = np.concatenate([one["force"] for one in sizes]) / self.cable.model.force_scale
-        none = forces[:0]
-        return (
-            (np.concatenate(shares), none)
-            if self.aim == "margin"
-            else (forces, np.concatenate([none, *shares]))
-        )
+        bounded = np.concatenate([forces[:0], *shares])
+        return (bounded, forces[:0]) if self.aim == "margin" else (forces, bounded)
 
-    def slopes(self, now: _Hung, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def slopes(self, now: _Trial, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (R, size of z), (S, size of z) of `aims` and `others`."""
         known, names, sizes = self.slipping, (*self.bounded, "force"), []
         for pose, eq in zip(self.held(now.z), now.shapes, strict=True):
-            varied = Varied(known.model, known.p, known.rest, pose, eq, self.ways)
-            by_ways = varied.linear(tuple(dict.fromkeys(names)))[1]
-            sizes.append({k: self.length * x[:, self.columns] for k, x in by_ways.items()})
+            varied = Varied(known.model, known.p, known.rest, pose, eq, self.clip_moves)
+            by_moves = varied.linear(tuple(dict.fromkeys(names)))[1]
+            sizes.append({k: self.length * x[:, self.columns] for k, x in by_moves.items()})
         return self._split(sizes, scales)
 
     def best(self) -> Placing:
         """The best result of all first guesses; raises an error if none keeps the limits."""
         scales, lost = np.ones((len(self.poses), len(self.bounded))), EquilibriumError("")
-        hung: list[_Hung] = []
+        trials: list[_Trial] = []
         for z in self._guesses():
             try:
-                hung.append(self._descended(self.hung(z, scales), scales, TRIED))
+                trials.append(self._descended(self.solved_at(z, scales), scales, TRIED))
             except EquilibriumError as error:
                 lost = error
         clips = counted(self.count, "pinned clip")
-        if not hung:
+        if not trials:
             happened = lost.message.partition("\n  Try:")[0]
             what = f"no shapes were found with {clips} in the region: {happened}"
             raise DloError(f"{what}.\n  Try: another region, ends nearer to the start.")
-        firsts = sorted(hung, key=lambda one: one.merit)[:STARTS]
+        firsts = sorted(trials, key=lambda one: one.merit)[:STARTS]
         best = min((self._improved(one, scales) for one in firsts), key=self._order)
         if best.margin < 0:
             raise DloError(
@@ -361,7 +365,7 @@ class _Search:
         )
         return np.clip(found.x, *self.bounds)
 
-    def _improved(self, now: _Hung, scales: FloatArray) -> Placing:
+    def _improved(self, now: _Trial, scales: FloatArray) -> Placing:
         """The placing reached from a first guess; rounds end when its bends are resolved."""
         found: list[Placing] = []
         for _ in range(ROUNDS):
@@ -372,7 +376,7 @@ class _Search:
                 )
                 for pose, eq in zip(self.held(now.z), now.shapes, strict=True)
             ]
-            found.append(self._told(now, [use for row in uses for use in row]))
+            found.append(self._placing_of(now, [use for row in uses for use in row]))
             used = np.array([[use.used.max() for use in row] for row in uses])
             own = [[x[name].max() / y for name, y in self.bounded.items()] for x in now.sizes]
             scales = used / np.array(own)
@@ -387,7 +391,7 @@ class _Search:
         over = 0.0 if self.aim == "force" else np.inf
         return -min(one.margin, over), one.force
 
-    def _descended(self, now: _Hung, scales: FloatArray, steps: int) -> _Hung:
+    def _descended(self, now: _Trial, scales: FloatArray, steps: int) -> _Trial:
         """State after `steps` steps, or when the trust region has shrunk to nothing."""
         radius, slopes = FIRST, self.slopes(now, scales)
         for _ in range(steps):
@@ -395,7 +399,7 @@ class _Search:
             if radius < LAST or now.merit - foreseen < LAST:
                 break
             try:
-                new = self.hung(now.z + step, scales)
+                new = self.solved_at(now.z + step, scales)
             except EquilibriumError:
                 radius /= 4
                 continue
@@ -410,7 +414,7 @@ class _Search:
         return now
 
     def _step(
-        self, now: _Hung, slopes: tuple[FloatArray, FloatArray], radius: float
+        self, now: _Trial, slopes: tuple[FloatArray, FloatArray], radius: float
     ) -> tuple[FloatArray, float]:
         """Best step of the first-order model within a radius, and the merit that it predicts.
 
@@ -432,7 +436,7 @@ class _Search:
             return np.zeros(size), now.merit
         return found.x[:size], float(found.fun)
 
-    def _told(self, now: _Hung, uses: Sequence[LimitUse]) -> Placing:
+    def _placing_of(self, now: _Trial, uses: Sequence[LimitUse]) -> Placing:
         """Convert a result to a placing in a configuration's terms."""
         poses = self.held(now.z)
         model, worst = self.slipping.model, []

@@ -36,6 +36,7 @@ COMMANDS = {
     "benchmark": ("new", "time the C solver beside other solvers (needs a checkout)"),
 }
 
+EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
 EXAMPLES = """\
 examples:
   dlo new rope.yaml --photographs photographs/     start a configuration
@@ -100,8 +101,7 @@ def _overview() -> str:
     return (
         "usage: dlo SUBCOMMAND ...\n\n"
         "Elastic models of cables in the plane and in space: fit, diagnose, predict, embed.\n\n"
-        f"subcommands:\n{listed}\n\n{EXAMPLES}\n\n"
-        "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
+        f"subcommands:\n{listed}\n\n{EXAMPLES}\n\n{EXIT_CODES}"
     )
 
 

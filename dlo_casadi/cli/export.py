@@ -6,8 +6,9 @@ from typing import Any
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable
-from dlo_casadi.cli.fitted import DRAWN, HELD, POSE
-from dlo_casadi.cli.options import PARAMETERS, Page, command, option
+from dlo_casadi.cable.held import HELD
+from dlo_casadi.cli.fitted import POSE
+from dlo_casadi.cli.options import PARAMETERS, Page, command, figure, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.errors import DloError
 from dlo_casadi.export.rod import Rod
@@ -15,15 +16,17 @@ from dlo_casadi.export.targets import TARGETS, losses, require, target_of
 
 # `--check` without a session.
 _NEAR = Path()
+_SAMPLES = "further cables drawn from the fit's covariance"
+_SEGMENTS = "number of links; by default as many as the bends need"
 
 
 @command(
     PARAMETERS,
     option("--to", required=True, metavar="SIMULATOR", help=f"one of {', '.join(TARGETS)}"),
     option("--output", type=Path, metavar="FILE", help="by default named after the session"),
-    option("--samples", type=int, default=0, metavar="N", help="cables more, from the covariance"),
-    option("--seed", type=int, default=0, metavar="N", help="of the samples (0)"),
-    option("--segments", type=int, metavar="N", help="links of the chain, instead of enough"),
+    option("--samples", type=int, default=0, metavar="N", help=_SAMPLES),
+    option("--seed", type=int, default=0, metavar="N", help="random seed of --samples (0)"),
+    option("--segments", type=int, metavar="N", help=_SEGMENTS),
     option(
         "--check",
         type=Path,
@@ -32,13 +35,14 @@ _NEAR = Path()
         metavar="SESSION",
         help="relax it in the simulator in every held-out pose; SESSION is found if it is near",
     ),
-    option("--figure", type=Path, metavar="FILE", help=f"draw the check: {', '.join(DRAWN)}"),
+    figure("draw the check"),
     *POSE,
     json="print files, losses and errors as JSON",
 )
 def export(chosen: argparse.Namespace) -> None:
     """Write a fitted cable for a simulator: rest shape, stiffness and weight, in the pose that it
-    starts in, by default the session's first. The file's head says which number stands where.
+    starts in, by default the session's first with its clips and obstacles. The file's head says
+    which number stands where.
 
     dlo export results/cable --to mujoco                        cable.xml
     dlo export results/cable --to mujoco --end 0.3 -0.1 --output rope.xml
@@ -52,8 +56,6 @@ def export(chosen: argparse.Namespace) -> None:
     from dlo_casadi.show.style import save_figure
 
     target, cable = target_of(chosen.to), load(chosen.parameters)
-    if chosen.figure is not None and chosen.figure.suffix.lower() not in DRAWN:
-        raise DloError(f"--figure {chosen.figure}: the name must end in {', '.join(DRAWN)}")
     if chosen.figure is not None and chosen.check is None:
         raise DloError("--figure draws the check.\n  Try: with --check")
     config = None
@@ -98,12 +100,14 @@ def _held(cable: FittedCable, chosen: argparse.Namespace) -> dict[str, Any]:
     from dlo_casadi.session.round_trip import session_of
 
     held = {name: getattr(chosen, name) for name in HELD}
-    if any(value not in (None, 0.0) for value in held.values()):
+    if any(value is not None for value in held.values()):
         return held
     try:
-        config = session_of(cable, None if chosen.check in (None, _NEAR) else chosen.check)
+        given = session_of(cable, None if chosen.check in (None, _NEAR) else chosen.check)
     except DloError:
         return held
-    first = config.experiment.poses[0].held
-    branch = first.branch if first.branch != "previous" else None
-    return {**{name: getattr(first, name) for name in HELD}, "branch": branch}
+    first, ends = given.experiment.poses[0], ("start", "end")
+    turning = tuple(f"{side}_" for side in ends if getattr(cable.model, side) != "clamped")
+    held = {name: getattr(first, name) for name in HELD if not name.startswith(turning)}
+    held |= {"clips": first.clips, "over": first.over, "obstacles": given.experiment.obstacles}
+    return held | {"branch": first.branch if first.branch != "previous" else None}

@@ -144,7 +144,7 @@ def fit_many(chosen: argparse.Namespace) -> int:
 
     try:
         with counter, open_executor(chosen.jobs, chosen.scheduler, logs) as executor:
-            result = fit_fleet(
+            rows = fit_fleet(
                 sessions,
                 output,
                 executor,
@@ -157,15 +157,16 @@ def fit_many(chosen: argparse.Namespace) -> int:
         counter.message("What is finished is kept: the same command goes on.")
         raise
     page = Page(chosen)
-    page.data(list(result.rows))
-    odd = [item for item in judge(result.rows) if item.reasons]
+    page.data(rows)
+    odd = [item for item in judge(rows) if item.reasons]
     for item in odd[:10]:
         heading = str(item.row["message"]).partition("\n")[0]
         page.say(": ".join(filter(None, [item.row["session"], ", ".join(item.reasons), heading])))
     if len(odd) > 10:
         page.say(f"and {len(odd) - 10} more")
+    failed = sum(row["status"] != "done" for row in rows)
     page.say(
-        f"{counted(len(result.rows), 'session')}, {len(result.failed)} without results: "
+        f"{counted(len(rows), 'session')}, {failed} without results: "
         f"{output / 'index.html'}, {output / 'table.parquet'}"
     )
-    return BAD_INPUT if result.failed else OK
+    return BAD_INPUT if failed else OK

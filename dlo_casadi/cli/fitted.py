@@ -7,9 +7,18 @@ from typing import Any, get_args
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
-from dlo_casadi.cable.held import listed_poses
+from dlo_casadi.cable.held import HELD, listed_poses
 from dlo_casadi.cable.limits import LimitCheck
-from dlo_casadi.cli.options import PARAMETERS, SCHEDULER, Page, command, jobs, one_of, option
+from dlo_casadi.cli.options import (
+    PARAMETERS,
+    SCHEDULER,
+    Page,
+    command,
+    figure,
+    jobs,
+    one_of,
+    option,
+)
 from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
@@ -21,7 +30,6 @@ from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.parallel import open_executor
 
-DRAWN = (".png", ".pdf", ".svg", ".jpg")
 BRANCH = option("--branch", choices=("ccw", "cw"), help="which way the cable turns")
 MESH = (
     option("--elements", type=int, help="number of elements, instead of the fit's"),
@@ -41,13 +49,9 @@ LIMITS = (
         "--tolerances",
         nargs="+",
         metavar="NAME=VALUE",
-        help="of other fixtures than the session's: end, length [m], heading, rotation, roll [rad]",
+        help="of other fixtures than the session's: end, length, clip, slip [m], heading, "
+        "rotation, roll [rad]",
     ),
-)
-# Options that are arguments of `FittedCable.solve`.
-HELD = (
-    *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
-    *("turns", "branch"),
 )
 POSE = (
     *(
@@ -72,7 +76,7 @@ POSE = (
         )
         for side in ("start", "end")
     ),
-    option("--turns", type=float, default=0.0, metavar="N", help="extra turns of twist in space"),
+    option("--turns", type=float, metavar="N", help="extra turns of twist in space"),
     BRANCH,
 )
 
@@ -89,7 +93,7 @@ POSE = (
         help="over or under bars: true or false of all, or NAME=true ... of some",
     ),
     *LIMITS,
-    option("--figure", type=Path, metavar="FILE", help=f"draw it: {', '.join(DRAWN)}"),
+    figure("draw it"),
     codes="2 is also a pose without an equilibrium",
 )
 def predict(chosen: argparse.Namespace) -> None:
@@ -105,14 +109,11 @@ def predict(chosen: argparse.Namespace) -> None:
     from dlo_casadi.report.terminal import limits_table, prediction_table
     from dlo_casadi.show.style import save_figure
 
-    figure = chosen.figure
-    if figure is not None and figure.suffix.lower() not in DRAWN:
-        raise DloError(f"--figure {figure}: the name must end in {', '.join(DRAWN)}")
     asked = {name: getattr(chosen, name) for name in HELD}
     asked |= {name: _listed(chosen, name) for name in ("clips", "obstacles")}
     shape = load(chosen.parameters).solve(**asked, over=_sides(chosen.over))
-    if figure is not None:
-        save_figure(figure, shape.plot())
+    if chosen.figure is not None:
+        save_figure(chosen.figure, shape.plot())
     # What a reader of the prediction should know about the file it came from.
     notes = []
     if shape.cable.metadata.edited:
@@ -128,15 +129,16 @@ def predict(chosen: argparse.Namespace) -> None:
             "than forces and energy"
         )
     page, found = Page(chosen), shape.as_dict()
-    checks = None if chosen.limits is None else _checked(shape, chosen)
+    asked_for = (chosen.limits, chosen.tolerances) != (None, None)
+    checks = _checked(shape, chosen) if asked_for else None
     if checks is not None:
         found["limits"] = [check.as_dict() for check in checks]
     page.data(found)
     page.print(prediction_table(shape, notes))
     if checks is not None:
         page.print(limits_table(shape.cable.name, checks))
-    if figure is not None:
-        page.say(f"Figure: {figure}")
+    if chosen.figure is not None:
+        page.say(f"Figure: {chosen.figure}")
 
 
 def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:
@@ -155,16 +157,14 @@ def _sides(words: list[str] | None) -> bool | dict[str, bool] | None:
     said = {"true": True, "false": False}
     if len(words) == 1 and words[0] in said:
         return said[words[0]]
-    pairs = [word.rpartition("=") for word in words]
-    if wrong := [
-        word
-        for word, (name, _, side) in zip(words, pairs, strict=True)
-        if not (name and side in said)
-    ]:
-        raise DloError(
-            f"--over {wrong[0]}: true, false or NAME=true belongs here, such as bar=true"
-        )
-    return {name: said[side] for name, _, side in pairs}
+    sides = {}
+    for word in words:
+        name, _, side = word.rpartition("=")
+        if not name or side not in said:
+            text = f"--over {word}: true, false or NAME=true belongs here, such as bar=true"
+            raise DloError(text)
+        sides[name] = said[side]
+    return sides
 
 
 def _checked(shape: Shape, chosen: argparse.Namespace) -> tuple[LimitCheck, ...]:
@@ -268,25 +268,21 @@ def shape_table(chosen: argparse.Namespace) -> None:
     cable = cable.with_mesh(chosen.elements, chosen.element)
     metadata = cable.metadata
     poses = _poses(cable, chosen)
-    output = chosen.output.resolve()
-    plan = Plan(
-        cable.model, cable.p, cable.rest, chosen.branch, output.with_name(f"{output.name}.parts")
-    )
+    plan = Plan(cable.model, cable.p, cable.rest, chosen.branch, chosen.output.resolve())
     counter = Counter(quiet=chosen.quiet, noun="pose", size=plan.chunk, count=poses.count)
     with counter, open_executor(chosen.jobs, chosen.scheduler) as executor:
         counts = tables.shape_table(
             plan,
             poses,
-            output,
             executor,
             metadata={"parameters_model_hash": metadata.model_hash, "config": metadata.config},
             restart=chosen.restart,
             progress=counter.show,
         )
     page = Page(chosen)
-    page.data({"output": str(output), "solver_hash": plan.digest, "poses": counts})
+    page.data({"output": str(plan.output), "solver_hash": plan.digest, "poses": counts})
     said = ", ".join(f"{n} {status.replace('_', ' ')}" for status, n in counts.items())
-    page.say(f"{output}: {said or 'complete already'}")
+    page.say(f"{plan.output}: {said or 'complete already'}")
 
 
 def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
@@ -333,7 +329,7 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
         type=int,
         default=0,
         metavar="N",
-        help="most obstacles on which the cable may lie, handed over with each pose",
+        help="maximum number of obstacles; they are given with each pose",
     ),
     *MESH,
     json="print files and hash as JSON",
@@ -354,5 +350,5 @@ def generate_solver(chosen: argparse.Namespace) -> None:
     written = solver.write(chosen.output)
     page = Page(chosen)
     page.data({"files": [str(path) for path in written], "solver_hash": solver.hash})
-    for text in (*written, f"model hash {solver.hash}"):
+    for text in (*written, f"solver hash {solver.hash}"):
         page.say(text)

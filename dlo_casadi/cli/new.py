@@ -12,7 +12,7 @@ from typing import Literal
 import dlo_casadi
 from dlo_casadi.cli.options import Page, command, one_of, option
 from dlo_casadi.config.supports import KINDS
-from dlo_casadi.config.template import schema_text, template
+from dlo_casadi.config.template import schema_text, template, to_fill_in
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
 
@@ -72,10 +72,8 @@ def new(chosen: argparse.Namespace) -> None:
     write_file(target, text)
     page = Page(chosen)
     page.data({"files": [str(path) for path in written], "poses": len(files)})
-    left = text.count("FILL_IN") - 1  # one is in a comment
-    places = f"{counted(left, 'place')} to fill in, each marked FILL_IN"
     poses = counted(len(files), "pose") if files else "a pose to copy"
-    page.say(f"{target}: {poses}, {places}\nthen: dlo check {target}")
+    page.say(f"{target}: {poses}, {to_fill_in(text)}\nthen: dlo check {target}")
 
 
 def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list[str]:
@@ -90,7 +88,7 @@ def _listed(folder: Path, endings: Sequence[str], what: str, base: Path) -> list
         raise DloError(f"{folder} holds no {what} ({', '.join(endings)})")
 
     def parts(path: Path) -> list[int | str]:
-        return [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", path.name)]
+        return [int(t) if t.isdecimal() else t for t in re.split(r"(\d+)", path.name)]
 
     return [Path(os.path.relpath(path, base)).as_posix() for path in sorted(found, key=parts)]
 

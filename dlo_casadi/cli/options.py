@@ -16,11 +16,12 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from dlo_casadi.cli import OK
+from dlo_casadi.cli import EXIT_CODES, OK
 from dlo_casadi.config import Config, load_config
-from dlo_casadi.errors import ConfigError
+from dlo_casadi.errors import ConfigError, DloError
 
-EXIT_CODES = "exit codes: 0 done, 1 a bug, 2 bad input, 130 interrupted"
+# Endings of figures' names.
+DRAWN = (".png", ".pdf", ".svg", ".jpg")
 
 # Function that adds an option to a parser or a group.
 Option = Callable[[Any], object]
@@ -52,6 +53,18 @@ def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text}: a number of processes, 1 or more")
     return int(text)
+
+
+def figure(what: str) -> Option:
+    """`--figure`, the name of a file that can be drawn."""
+    text = f"{what}: {', '.join(DRAWN)}"
+    return option("--figure", type=_drawn, metavar="FILE", help=text)
+
+
+def _drawn(text: str) -> Path:
+    if Path(text).suffix.lower() not in DRAWN:
+        raise DloError(f"--figure {text}: the name must end in {', '.join(DRAWN)}")
+    return Path(text)
 
 
 CONFIG = option("config", type=Path, help="configuration, such as configs/cable.yaml")
@@ -131,9 +144,11 @@ class Page(Console):
         self.as_json: bool = chosen.json
 
     def data(self, data: Any) -> None:
-        """Print plain data as JSON, if requested."""
+        """Print plain data as JSON, if requested; numbers that are not finite as null."""
         if self.as_json:
-            print(json.dumps(data, indent=1, allow_nan=False))
+            from dlo_casadi.report.documents import finite
+
+            print(json.dumps(finite(data), indent=1, allow_nan=False))
 
     def say(self, text: object, mark: str = "") -> None:
         """Print a line unchanged, however long, after a mark with markup."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from dlo_casadi.cli.options import Option, Page, command, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import load_config
-from dlo_casadi.config.template import schema_text
+from dlo_casadi.config.template import schema_text, to_fill_in
 from dlo_casadi.errors import DloError, MeasurementError, counted
 from dlo_casadi.io.files import FolderDraft, write_file
 from dlo_casadi.io.points import write_points
@@ -112,10 +112,10 @@ def import_(chosen: argparse.Namespace) -> None:
     page.data({"file": str(target), "poses": len(session.poses), "remarks": session.remarks})
     for remark in session.remarks:
         page.say(remark)
-    left = session.text().count("FILL_IN") - 1  # one is in a comment
+    left = to_fill_in(session.text())
     follow = f"dlo {'check' if left else 'fit'} {target}"
-    filling = f", {counted(left, 'place')} to fill in, each marked FILL_IN" if left else ""
-    page.say(f"{target}: {counted(len(session.poses), 'pose')}{filling}\nthen: {follow}")
+    filled = ", ".join(filter(None, [counted(len(session.poses), "pose"), left]))
+    page.say(f"{target}: {filled}\nthen: {follow}")
 
 
 def _write(session: Imported, folder: Path) -> None:

@@ -137,9 +137,9 @@ class Document(Source):
         return self.source.absolute().parent
 
     @classmethod
-    def read(cls, source: Path) -> Self:
-        """Read a file, or raise a ConfigError."""
-        text = _read_bytes(source)
+    def read(cls, source: Path, largest: int = _LARGEST) -> Self:
+        """Read a file of at most `largest` bytes, or raise a ConfigError."""
+        text = _read_bytes(source, largest)
         try:
             loader = _Loader(text)
             root = loader.get_single_node()
@@ -186,20 +186,20 @@ class Document(Source):
         return ConfigError(message, self.source, line)
 
 
-def _read_bytes(source: Path) -> bytes:
+def _read_bytes(source: Path, largest: int) -> bytes:
     """Contents of a file, unless it is too large."""
     try:
         with source.open("rb") as file:
-            text = file.read(_LARGEST + 1)
+            text = file.read(largest + 1)
     except FileNotFoundError:
         near = did_you_mean(source.name, [p.name for p in source.parent.glob("*.y*ml")])
         raise ConfigError(f"no such file{near}", file=source) from None
     except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"cannot be read: {reason}", file=source) from None
-    if len(text) > _LARGEST:
+    if len(text) > largest:
         raise ConfigError(
-            f"larger than {_LARGEST} bytes, which no configuration or fitted cable is. Try: is it "
+            f"larger than {largest:d} bytes, which no configuration or fitted cable is. Try: is it "
             "the right file?",
             file=source,
         )

@@ -4,7 +4,7 @@ import difflib
 import math
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,7 +23,7 @@ from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
 from dlo_casadi.effects.cable import height_of
 from dlo_casadi.errors import ConfigError, counted
-from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 
 Kind = TypeVar("Kind", bound=Config)
 
@@ -114,16 +114,17 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
 
 
 _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
-
-
 _RELATIVE = "files are found relative to the YAML, from Python relative to the working directory"
 
 
 def any_photographs(poses: object) -> bool:
-    """Whether any file of the poses has a picture's name."""
-    listed = poses if isinstance(poses, list | tuple) else ()
-    paths = [path for pose in listed if isinstance(pose, Pose) for path in pose.paths]
-    return any(path.suffix.lower() in _IMAGE_ENDINGS for path in paths)
+    """Whether any file of the poses has a picture's name; a pose is a `Pose` or a mapping."""
+    paths: list[object] = []
+    for pose in poses if isinstance(poses, list | tuple) else ():
+        given = vars(pose) if isinstance(pose, Pose) else pose if isinstance(pose, Mapping) else {}
+        several = given.get("files")
+        paths += [given.get("file"), *(several if isinstance(several, list | tuple) else ())]
+    return any(Path(str(path)).suffix.lower() in _IMAGE_ENDINGS for path in paths)
 
 
 # Names of results add up to forty characters to a pose's name; file systems allow 255 bytes.
@@ -165,7 +166,8 @@ def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
             text = "results are named after the file without its ending, give each its own"
             wrong.append((f"pose {first + 1} is called {pose.name!r} too; {text}", None))
         if pose.branch == "previous" and i == 0:
-            wrong.append(("the first pose continues none; branch: ccw or cw?", "branch"))
+            text = "branch: previous needs a pose before this one; use ccw or cw"
+            wrong.append((text, "branch"))
         for message, key in wrong:
             at: Place = ("experiment", "poses", i)
             yield ConfigProblem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
@@ -213,12 +215,13 @@ def _weightless(config: Config) -> Iterator[ConfigProblem]:
     if not any(experiment.gravity):
         yield ConfigProblem(at, "mass: null: without gravity nothing depends on it; declare any")
     elif not any(pose.readings for pose in experiment.poses if pose.role == "fit"):
-        text = "mass: null: shapes tell stiffness over weight alone. Try: the mass in kg, or "
-        yield ConfigProblem(at, f"{text}end_force of a fit pose, which tells both")
+        text = "mass: null: shapes determine only the ratio of stiffness to weight. Try: the mass "
+        yield ConfigProblem(at, f"{text}in kg, or end_force of a fit pose")
     elif any(item.name == UNKNOWN_MASS.name for item in config.model.effects):
-        yield ConfigProblem(
-            at, f"mass: null: {UNKNOWN_MASS.name} is of a declared mass; one of the two"
+        text = (
+            f"{UNKNOWN_MASS.name} corrects a declared mass: declare the mass, or leave the effect"
         )
+        yield ConfigProblem(at, f"mass: null: {text} out")
 
 
 def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
@@ -290,8 +293,9 @@ def _absent(file: Path) -> str:
         near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
         meant = f"did you mean {near[0]}?" if near else _RELATIVE
         return f"{file} does not exist; {meant}"
-    except OSError as error:
-        return f"{show(str(file))} cannot be read: {error.strerror}"
+    except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
+        reason = getattr(error, "strerror", None) or error
+        return f"{show(str(file))} cannot be read: {reason}"
 
 
 def _oddities(config: Config) -> Iterator[str]:
@@ -303,8 +307,8 @@ def _oddities(config: Config) -> Iterator[str]:
         yield f"youngs_modulus {young:g} Pa is softer than any cable: in pascal?"
     if cable.mass is None:
         yield (
-            f"cable.mass is not declared: stages before the batch take {cable.prior_mass:.3g} kg, "
-            "that of a solid cable of this diameter; the readings tell it from there on"
+            f"cable.mass is not declared: the first stages assume {cable.prior_mass:.3g} kg (a "
+            "solid cable of this diameter); the batch fit then estimates it from the force readings"
         )
     spans = [math.dist(pose.start, pose.end) for pose in experiment.poses if pose.end is not None]
     if spans and 0.0 < 50.0 * max(spans) < cable.length:
@@ -403,9 +407,13 @@ def declared_setup(config: Config) -> Setup:
 
 
 def wrong_effects(config: Config) -> list[ConfigProblem]:
-    """Find effects, and parameters of effects, that do not exist or are impossible as declared."""
-    setup = declared_setup(config)
+    """Find elements, effects and their parameters that do not exist or are impossible here."""
+    setup, element = declared_setup(config), config.model.element
     found: list[ConfigProblem] = []
+    if config.experiment.in_space and element not in ELEMENTS_IN_SPACE:
+        known = " or ".join(ELEMENTS_IN_SPACE)
+        text = f"model.element: {element} is of a cable in a plane. Try: {known}"
+        found.append(ConfigProblem(("model", "element"), text))
     for i, item in enumerate(config.model.effects):
         found += _wrong(item, ("model", "effects", i), setup)
     for i, name in enumerate(config.diagnosis.exclude):

@@ -124,7 +124,8 @@ class Limits(ConfigSection):
     twist: Annotated[Positive, within(_TWIST)] | None = None
     """Greatest twist in space, the angle about the axis per length [1/m]."""
     clearance: Annotated[Positive, within(LENGTH._replace(least=1.0e-6))] | None = None
-    """Least distance of the cable's surface from obstacles without touch: allowed [m]."""
+    """Smallest distance [m] of the cable's surface from obstacles it must not touch
+    (`touch: avoided`)."""
 
     @property
     def given(self) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """The checked objects: one class for each section of a configuration. All units are SI.
 
-Sections on how it was measured are in `measuring`.
+Sensors, tolerances and options are in `options`.
 """
 
 import dataclasses

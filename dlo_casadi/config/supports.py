@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
 from dlo_casadi.config.values import (
@@ -21,16 +21,17 @@ from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 
 # Kinds of clips that a configuration may declare.
-KINDS = ("pinned", "clamped", "eyelet")
+_Kind = Literal["pinned", "clamped", "eyelet"]
+KINDS = get_args(_Kind)
 
 
 def undetermined(start: str, end: str, in_space: bool) -> Iterator[ConfigProblem]:
     """Why ends held in this way leave the cable's position undetermined."""
     if in_space and start == "pinned" and end == "free":
         text = (
-            "on a ball joint and with a free end a cable in space may be turned about gravity, "
-            "which holds it in no shape of all these. Try: start: clamped, with start_orientation; "
-            "or two numbers of gravity, in the plane in which it hangs"
+            "on a ball joint and with a free end a cable in space can turn freely about the "
+            "direction of gravity, so its position is undetermined. Try: start: clamped, with "
+            "start_orientation; or two numbers of gravity, in the plane in which it hangs"
         )
         yield ConfigProblem(("experiment", "boundary"), text)
 
@@ -40,7 +41,7 @@ class Clip(ConfigSection):
 
     name: Name = ""
     """What to call the clip; clip_1, clip_2, ... when absent."""
-    kind: Literal["pinned", "clamped", "eyelet"]
+    kind: _Kind
     """pinned (holds the cable at `at`, it may turn), clamped (a saddle: holds its direction and
     roll, too) or eyelet (the cable slides through without friction)."""
     at: NonNegative | None = None
@@ -72,12 +73,10 @@ class Clip(ConfigSection):
 class _Clipped(Protocol):
     """A pose with clips."""
 
-    @property
-    def start(self) -> Sequence[float]: ...
-    @property
-    def end(self) -> Sequence[float] | None: ...
-    @property
-    def clips(self) -> Sequence[Clip]: ...
+    start: Place
+    end: Place | None
+    clips: tuple[Clip, ...]
+
     @property
     def held(self) -> Any: ...
 

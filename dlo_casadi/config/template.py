@@ -10,8 +10,7 @@ from jinja2 import Template
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.problems import PLACEHOLDER
 from dlo_casadi.config.sections import Config
-
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
+from dlo_casadi.errors import counted
 
 
 def template(
@@ -69,6 +68,12 @@ def template(
     )
 
 
+def to_fill_in(text: str) -> str:
+    """What a configuration leaves to its user, in words; empty if nothing."""
+    left = text.count(PLACEHOLDER) - 1  # one is in a comment
+    return f"{counted(left, 'place')} to fill in, each marked {PLACEHOLDER}" if left else ""
+
+
 def _clip(kind: str, in_space: bool) -> str:
     """A clip with placeholders."""
     keys = [] if kind == "eyelet" else ["at"]
@@ -87,7 +92,8 @@ def config_schema() -> dict[str, Any]:
     It covers keys, types, ranges and help; only `load_config` checks several values together.
     """
     schema: dict[str, Any] = _plain(Config.model_json_schema())
-    return {"$schema": DIALECT, **schema, "title": "Configuration of dlo_casadi"}
+    dialect = "https://json-schema.org/draft/2020-12/schema"
+    return {"$schema": dialect, **schema, "title": "Configuration of dlo_casadi"}
 
 
 def schema_text() -> str:

@@ -1,4 +1,4 @@
-"""Types of the values in a file: numbers, places, orientations; how they were measured.
+"""Types of the values in a file: numbers, places, orientations, lists.
 
 A value beyond its range is a typing error (a unit, an exponent) that cannot be computed with: it is
 refused, and the message gives the range. A computable but unlikely value is a warning of

@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 from urllib.parse import quote
@@ -197,9 +197,6 @@ def arrow_schema() -> pyarrow.Schema:
 
 # ---- the page ------------------------------------------------------------------------------------
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
 # Modified z-score beyond which a value is an outlier (Iglewicz and Hoaglin, 1993).
 OUTLYING = 3.5
 # Fewest sessions for a search for outliers.
@@ -292,37 +289,27 @@ def robust_z(values: Sequence[float | None]) -> list[float | None]:
     return [None if np.isnan(score) else float(score) for score in scores]
 
 
-def overview_html(rows: Sequence[Row], output: Path) -> str:
+def overview_html(rows: Sequence[Row], output: Path | None) -> str:
     """The page of a fleet as text: one row per session; self-contained, without a script.
 
-    `output`: folder of the page; sessions with results in it are linked.
+    `output`: folder of the page; sessions with results in it are linked. None: nothing is linked.
     """
+    # Imported late: workers import this module but write no page.
+    from jinja2 import StrictUndefined, Template
+
+    text = (files("dlo_casadi.fleet") / "templates" / "overview.html").read_text("utf-8")
+    page = Template(text, trim_blocks=True, autoescape=True, undefined=StrictUndefined)
     judged = judge(rows)
     verdicts = Counter(item.verdict for item in judged)
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in verdicts.most_common())
     odd = sum(bool(item.reasons) for item in judged)
-    return _template().render(
+    return page.render(
         title=counted(len(rows), "session"),
         summary=f"{counts or 'nothing is finished yet'}. {odd} to look at first.",
-        judged=[(item, _link(item.row, output)) for item in judged],
+        judged=[(item, None if output is None else _link(item.row, output)) for item in judged],
         outlying=OUTLYING,
         version=__version__,
     )
-
-
-@cache
-def _template() -> Template:
-    # Imported late: workers import this module but write no page.
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("dlo_casadi.fleet"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        keep_trailing_newline=True,
-    )
-    return environment.get_template("overview.html")
 
 
 def _link(row: Row, output: Path) -> str | None:

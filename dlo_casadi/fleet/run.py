@@ -6,7 +6,7 @@ import os
 import re
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -36,23 +36,7 @@ ENDINGS = (".yaml", ".yml")
 _SECTION = re.compile(rb"^(cable|experiment)\s*:", re.MULTILINE)
 
 
-@dataclass(frozen=True, order=True)
-class SessionFile:
-    """One configuration of many.
-
-    Parameters
-    ----------
-    key : str
-        Its path below the common folder, with `/`; unique.
-    path : Path
-        The YAML file, absolute.
-    """
-
-    key: str
-    path: Path
-
-
-def find_sessions(where: str | Path) -> tuple[Path, tuple[SessionFile, ...]]:
+def find_sessions(where: str | Path) -> tuple[Path, dict[str, Path]]:
     """Find all configurations in and below a folder, or those that match a pattern.
 
     In a folder a YAML file counts if it has a `cable:` or an `experiment:` and is not a fit's
@@ -61,8 +45,9 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[SessionFile, ...]]:
 
     Returns
     -------
-    Path, tuple of SessionFile
-        The common folder, and the sessions in the order of their keys.
+    Path, dict of Path
+        The common folder, and the YAML files, absolute, by their keys and in the order of these: a
+        key is the path below the common folder, with `/`.
 
     Raises
     ------
@@ -88,8 +73,7 @@ def find_sessions(where: str | Path) -> tuple[Path, tuple[SessionFile, ...]]:
             "  Try: a folder, or a pattern in quotes, such as 'cables/*/session.yaml'."
         )
     keys = [well_formed(path.relative_to(base).as_posix()) for path in found]
-    sessions = sorted(map(SessionFile, keys, found))
-    return base, tuple(sessions)
+    return base, dict(sorted(zip(keys, found, strict=True)))
 
 
 def _is_session(path: Path) -> bool:
@@ -101,7 +85,7 @@ def _is_session(path: Path) -> bool:
     return bool(_SECTION.search(content)) and not re.search(rb"^schema\s*:", content, re.MULTILINE)
 
 
-def digest_of(session: SessionFile, options: tuple[Any, ...]) -> str:
+def digest_of(path: Path, options: tuple[Any, ...]) -> str:
     """SHA-256 of everything that determines a session's results.
 
     It covers the package's version, the options of the run, the configuration's bytes, and name and
@@ -115,15 +99,15 @@ def digest_of(session: SessionFile, options: tuple[Any, ...]) -> str:
 
     add(repr((__version__, options)).encode())
     try:
-        poses = read_yaml(session.path)["experiment"]["poses"]
+        poses = read_yaml(path)["experiment"]["poses"]
         named = [name for pose in poses for name in (pose.get("file"), *(pose.get("files") or ()))]
         names = [str(name) for name in named if name is not None]
     except (DloError, KeyError, TypeError, AttributeError):
         names = []  # an unreadable configuration
-    add(_content(session.path))
+    add(_content(path))
     for name in names:
         add(well_formed(name).encode())
-        add(_content(session.path.parent / name))
+        add(_content(path.parent / name))
     return digest.hexdigest()
 
 
@@ -158,26 +142,8 @@ class Options:
     reports: bool = True
 
 
-@dataclass(frozen=True)
-class FleetResult:
-    """Result of a run.
-
-    Parameters
-    ----------
-    rows : tuple of dict
-        One per session, in the order of their keys.
-    """
-
-    rows: tuple[Row, ...]
-
-    @property
-    def failed(self) -> tuple[Row, ...]:
-        """Rows without results."""
-        return tuple(row for row in self.rows if row["status"] != "done")
-
-
 def fit_fleet(
-    sessions: Sequence[SessionFile],
+    sessions: Mapping[str, Path],
     output: Path,
     executor: Executor,
     options: Options | None = None,
@@ -185,8 +151,10 @@ def fit_fleet(
     retry_failed: bool = False,
     begin: Callable[[int, int], None] = lambda taken_over, left: None,
     progress: Callable[[Tally], None] | None = None,
-) -> FleetResult:
+) -> tuple[Row, ...]:
     """Fit many sessions; finished ones of an earlier run are reused.
+
+    Returns one row per session, in the order of their keys.
 
     Writes `table.parquet`, `index.html`, `rows/` (one durable file per session, as it finishes),
     `sessions/` (the results of each) and, with an executor that logs, `logs/`. A finished session
@@ -194,6 +162,8 @@ def fit_fleet(
 
     Parameters
     ----------
+    sessions : mapping of str to Path
+        See `find_sessions`.
     output : Path
         On a file system visible to all workers.
     retry_failed : bool
@@ -222,24 +192,25 @@ def fit_fleet(
         nonlocal next_fold
         begun = time.perf_counter()
         write_table(output, rows.values())
-        write_file(output / PAGE, overview_html(list(rows.values()), output))
+        shown = output if options.reports else None
+        write_file(output / PAGE, overview_html(list(rows.values()), shown))
         end = time.perf_counter()
         next_fold = end + max(FOLD_AFTER, (end - begun) / FOLD_SHARE)
 
     with only_run(output):
         make_folder(output / "rows")
-        for session in sessions:
-            job = Job(session, digest_of(session, astuple(options)), output, options)
-            row = read_row(output, session.key, job.digest)
+        for key, path in sessions.items():
+            job = Job(key, path, digest_of(path, astuple(options)), output, options)
+            row = read_row(output, key, job.digest)
             if row is not None and row["status"] in kept:
-                rows[session.key] = row
+                rows[key] = row
             else:
                 jobs.append(job)
                 make_folder(job.folder.parent)
         begin(len(rows), len(jobs))
         try:
             for done in map_as_completed(executor, fit_one, jobs, progress=progress):
-                key, row = done.item.session.key, done.result
+                key, row = done.item.key, done.result
                 if row is None:
                     row = empty_row(key, done.item.digest, "lost", str(done.error), 0.0)
                     write_row(output, row)
@@ -248,14 +219,15 @@ def fit_fleet(
                     fold()
         finally:
             fold()
-    return FleetResult(tuple(rows[key] for key in sorted(rows)))
+    return tuple(rows[key] for key in sorted(rows))
 
 
 @dataclass(frozen=True)
 class Job:
     """One session to fit, with everything that a worker needs."""
 
-    session: SessionFile
+    key: str
+    path: Path
     digest: str  # of everything that determines the results
     output: Path  # folder of all results, absolute
     options: Options
@@ -263,10 +235,10 @@ class Job:
     @property
     def folder(self) -> Path:
         """Folder of the session's results, named after its file and therefore unique."""
-        return self.output / "sessions" / self.session.key
+        return self.output / "sessions" / self.key
 
     def __repr__(self) -> str:
-        return self.session.key
+        return self.key
 
 
 def fit_one(job: Job) -> Row:
@@ -274,7 +246,7 @@ def fit_one(job: Job) -> Row:
 
     Raises OutputError if the results or the row cannot be written: that is not the session's fault.
     """
-    begin, key = time.perf_counter(), job.session.key
+    begin, key = time.perf_counter(), job.key
     try:
         row = _fitted(job, begin)
     except OutputError:
@@ -282,15 +254,17 @@ def fit_one(job: Job) -> Row:
     except Exception as error:
         message = str(error)
         if not isinstance(error, DloError):
-            worker_log(None).error("bug in %s:\n%s", key, traceback.format_exc())
-            message = f"a bug: {type(error).__name__}: {error}; see the worker's log"
+            log = worker_log(None)
+            log.error("bug in %s:\n%s", key, traceback.format_exc())
+            where = "; see the worker's log" if log.handlers else ""
+            message = f"a bug: {type(error).__name__}: {error}{where}"
         row = empty_row(key, job.digest, "failed", message, time.perf_counter() - begin)
     write_row(job.output, row)
     return row
 
 
 def _fitted(job: Job, begin: float) -> Row:
-    config = load_config(job.session.path)
+    config = load_config(job.path)
     if not job.options.diagnosis:
         config = config.changed(diagnosis={"enabled": False})
     if job.options.reports:
@@ -303,4 +277,4 @@ def _fitted(job: Job, begin: float) -> Row:
     else:
         outcome = run_session(config)
     seconds = time.perf_counter() - begin
-    return row_of(job.session.key, job.digest, config.cable.name, report_dict(outcome), seconds)
+    return row_of(job.key, job.digest, config.cable.name, report_dict(outcome), seconds)

@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from dlo_casadi.codegen.generate import solver_hash
 from dlo_casadi.codegen.shapes import STATUSES, records_of
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.fleet import parquet_library
-from dlo_casadi.io.files import only_run, write_file
+from dlo_casadi.io.files import LOCK, only_run, write_file
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import Tally, map_as_completed
 
@@ -108,10 +109,8 @@ class PoseList:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        try:
+        with self._explained():
             names = self._data.schema.names
-        except (OSError, ValueError) as error:
-            raise DloError(f"--list {self.path}: {error}") from None
         missing = [name for name in self.needed if name not in names]
         unknown = [name for name in names if name not in HEADER]
         if missing or unknown:
@@ -125,18 +124,18 @@ class PoseList:
     @property
     def count(self) -> int:
         """Number of poses."""
-        return int(self._data.count_rows())
+        with self._explained():
+            return int(self._data.count_rows())
 
     @property
     def identity(self) -> Mapping[str, Any]:
         """Plain data that identify the poses."""
-        with self.path.open("rb") as stream:
+        with self._explained(), self.path.open("rb") as stream:
             digest = hashlib.file_digest(stream, "sha256").hexdigest()
         return {"list_sha256": digest, "fixed": dict(self.fixed)}
 
     @property
     def _data(self) -> Any:
-        parquet_library()
         from pyarrow import csv, dataset, float64
 
         types = csv.ConvertOptions(column_types=dict.fromkeys(HEADER, float64()))
@@ -144,10 +143,20 @@ class PoseList:
         is_parquet = self.path.suffix.lower() == ".parquet"
         return dataset.dataset(self.path, format="parquet" if is_parquet else comma)
 
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Say what is wrong with the file."""
+        pyarrow, _ = parquet_library()
+        try:
+            yield
+        except (OSError, pyarrow.ArrowException) as error:
+            text = f"--list {self.path}: {error}.\n  Try: a CSV or Parquet file of numbers"
+            raise DloError(text) from None
+
     def chunks(self, size: int) -> Iterator[FloatArray]:
         """Arrays (size, 6); the last may be shorter."""
         held = np.zeros((0, len(COLUMNS)))
-        try:
+        with self._explained():
             for batch in self._data.to_batches():
                 poses = _fixed(batch.num_rows, self.fixed)
                 for name in batch.schema.names:
@@ -157,8 +166,6 @@ class PoseList:
                 while len(held) >= size:
                     yield held[:size]
                     held = held[size:]
-        except (OSError, ValueError) as error:
-            raise DloError(f"--list {self.path}: {error}") from None
         if len(held):
             yield held
 
@@ -188,15 +195,20 @@ class Plan:
     p : (n_parameters,)
     rest : (n_rests,) [1/m]
     branch : "ccw", "cw" or None
-    parts : Path
-        Folder of the finished chunks.
+    output : Path
+        The Parquet file, absolute.
     """
 
     model: CableModel
     p: FloatArray
     rest: FloatArray
     branch: Branch | None
-    parts: Path
+    output: Path
+
+    @property
+    def parts(self) -> Path:
+        """Folder of the finished chunks."""
+        return self.output.with_name(f"{self.output.name}.parts")
 
     @property
     def digest(self) -> str:
@@ -228,7 +240,6 @@ class Chunk:
 def shape_table(
     plan: Plan,
     poses: Grid | PoseList,
-    output: Path,
     executor: Executor,
     *,
     metadata: dict[str, Any] | None = None,
@@ -242,8 +253,6 @@ def shape_table(
 
     Parameters
     ----------
-    output : Path
-        The file.
     metadata : dict, optional
         Additional plain data for the file.
     restart : bool
@@ -272,18 +281,19 @@ def shape_table(
         },
         sort_keys=True,
     )
-    if os.path.exists(output) and not restart:
-        if _identity_of(output) == identity:
+    if os.path.exists(plan.output) and not restart:
+        if _identity_of(plan.output) == identity:
             return {}
         raise DloError(
-            f"{output} is there already and holds something else.\n"
+            f"{plan.output} is there already and holds something else.\n"
             "  Try: another --output, or --restart to replace it."
         )
-    if restart:
-        shutil.rmtree(plan.parts, ignore_errors=True)
     schema = _schema(plan.model, {"identity": identity, **(metadata or {})})
     counts = np.zeros(len(STATUSES), int)
     with only_run(plan.parts):
+        for path in plan.parts.iterdir() if restart else ():
+            if path.name != LOCK:
+                path.unlink()
         mark = plan.parts / "identity.json"
         if not mark.exists():
             write_file(mark, identity)
@@ -309,7 +319,7 @@ def shape_table(
                     counts[:] += np.bincount(codes, minlength=len(STATUSES))
                     writer.write_table(part)
 
-        write_file(output, fill, plan.parts / "draft.parquet")
+        write_file(plan.output, fill, plan.parts / "draft.parquet")
         shutil.rmtree(plan.parts, ignore_errors=True)
     return {name: int(n) for name, n in zip(STATUSES, counts, strict=True) if n}
 

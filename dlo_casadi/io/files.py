@@ -18,6 +18,8 @@ from dlo_casadi.errors import OutputError, well_formed
 
 # Prefix of the names of all drafts.
 _DRAFT = ".dlo-draft-"
+# Name of the file by which a run locks its folder.
+LOCK = ".lock"
 
 
 def write_file(
@@ -99,7 +101,10 @@ class FolderDraft:
                 with suppress(FileNotFoundError):
                     self.path.stat()  # a name that no folder can have
                 for parent in [p for p in self.path.parents if not os.path.exists(p)][::-1]:
-                    parent.mkdir()
+                    try:
+                        parent.mkdir()
+                    except FileExistsError:  # another run has made it meanwhile
+                        continue
                     self._made.insert(0, parent)
                 self.folder.mkdir(parents=True)
         except BaseException:
@@ -196,7 +201,7 @@ def only_run(folder: Path) -> Iterator[None]:
     make_folder(folder)
     with _explained(folder):
         try:
-            held = FileLock(folder / ".lock", timeout=0).acquire()
+            held = FileLock(folder / LOCK, timeout=0).acquire()
         except Timeout:
             raise OutputError(
                 f"another run is writing to {folder}; wait for its end", folder

@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from dlo_casadi.arrays import chord_lengths, length_of
+from dlo_casadi.arrays import FloatArray, chord_lengths, length_of
 from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import write_file
 
-FloatArray = npt.NDArray[np.float64]
-AXES = ["x_m", "y_m", "z_m"]
+COLUMNS = ["x_m", "y_m", "z_m"]
 PLACE = "s_m"
 
 _LONGEST = 100.0
@@ -192,7 +191,7 @@ def write_points(path: str | Path, points: npt.ArrayLike, s: npt.ArrayLike | Non
     if not np.all(np.isfinite(array)):
         bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise MeasurementError(f"point {bad} is {array[bad]}, not finite", pose=target.name)
-    header = AXES[: array.shape[1]]
+    header = COLUMNS[: array.shape[1]]
     if s is not None:
         header, array = [PLACE, *header], np.column_stack([np.asarray(s, dtype=float), array])
     write_table(target, header, array)
@@ -219,7 +218,7 @@ def _parse(source: Path, dimension: int) -> tuple[list[str], FloatArray]:
             f"is larger than {_LARGEST} bytes; keep every tenth point, a few hundred suffice",
             pose=source.name,
         )
-    axes = AXES[:dimension]
+    axes = COLUMNS[:dimension]
     line, markers = ",".join(axes), ",".join([PLACE, *axes])
     header: list[str] = []
     table: list[list[float]] = []

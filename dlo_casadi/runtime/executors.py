@@ -344,15 +344,10 @@ def software() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in packages}}
 
 
-def worker_name() -> str:
-    """Machine and process."""
-    return f"{platform.node()}-{os.getpid()}"
-
-
 def worker_log(folder: Path | None) -> logging.Logger:
     """Logger of this process, to its own file in that folder if there is one."""
     logger = logging.getLogger("dlo_casadi.worker")
-    path = folder and folder / f"worker-{worker_name()}.log"
+    path = folder and folder / f"worker-{platform.node()}-{os.getpid()}.log"
     if path is None or any(old.name == str(path) for old in logger.handlers):
         return logger
     for old in list(logger.handlers):

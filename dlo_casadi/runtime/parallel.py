@@ -17,19 +17,8 @@ from typing import Any, Generic, TypeVar, cast
 import numpy as np
 
 from dlo_casadi.errors import DloError
-from dlo_casadi.runtime.executors import one_thread, open_executor, worker_log
-
-__all__ = [
-    "Finished",
-    "LostTaskError",
-    "Tally",
-    "begin",
-    "generator_of",
-    "map_as_completed",
-    "map_in_order",
-    "one_thread",
-    "open_executor",
-]
+from dlo_casadi.runtime.executors import one_thread, worker_log
+from dlo_casadi.runtime.executors import open_executor as open_executor
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -101,8 +90,6 @@ def map_as_completed(
     items: Iterable[Item],
     *,
     total: int | None = None,
-    in_flight: int | None = None,
-    retries: int = RETRIES,
     progress: Callable[[Tally], None] | None = None,
 ) -> Generator[Finished[Item, Result]]:
     """Apply a function to all items; yield each as soon as it has ended.
@@ -120,14 +107,9 @@ def map_as_completed(
     function : callable
         Of one item. Both, and its result, must be picklable unless all run in this process.
     items : iterable
-        Consumed as tasks are submitted.
+        Consumed as tasks are submitted, two for each worker.
     total : int, optional
         Number of items, if they have no length.
-    in_flight : int, optional
-        Maximum number of submitted tasks; by default two for each worker.
-    retries : int
-        Number of repetitions of a lost task, the last of them without other tasks; with 0 its first
-        loss ends it, although another task may have been the cause.
     progress : callable, optional
         Called after each task.
     """
@@ -142,8 +124,8 @@ def map_as_completed(
     started, taken, failed, durations = time.perf_counter(), 0, 0, list[float]()
 
     def room() -> int:
-        workers = getattr(executor, "workers", 1)  # asked again: workers of a cluster come and go
-        most = in_flight or 2 * (workers - here)
+        workers = _workers(executor)  # asked again: workers of a cluster come and go
+        most = 2 * (workers - here)
         if here and (workers == 1 or total is not None):
             # Towards the end, leave waiting tasks to this process.
             left = (total or 0) - taken
@@ -159,8 +141,8 @@ def map_as_completed(
         failed += done.error is not None
         durations.append(done.seconds)
         if progress is not None:
+            left = _remaining(durations, total, _workers(executor))
             elapsed = time.perf_counter() - started
-            left = _remaining(durations, total, elapsed, executor)
             progress(Tally(len(durations), failed, total, elapsed, left))
         return done
 
@@ -193,15 +175,14 @@ def map_as_completed(
                     task = _run(function, index, item, None)
                 else:
                     if isinstance(error, losses):
-                        if lost < retries:
+                        if lost < RETRIES:
                             # The last repetition runs alone: no other task can cause its loss.
-                            put_off = again if lost + 1 < retries else suspects
+                            put_off = again if lost + 1 < RETRIES else suspects
                             put_off.append((index, item, lost + 1))
                             continue
-                        times = f"{lost + 1} times, at last alone" if retries else "once"
                         error = LostTaskError(
-                            f"task {index} was lost {times}: its worker was killed.\n"
-                            "  Try: more memory; see the workers' logs."
+                            f"task {index} was lost {lost + 1} times, at last alone: its worker "
+                            "was killed.\n  Try: more memory; see the workers' logs."
                         )
                     task = Finished(index, None, None, error, 0.0)
                 yield ended(item, task)
@@ -232,7 +213,7 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
     """
     task = partial(_run, call, 0, partial(function, *args))
     begun: Future[Finished[Any, Result]] | None = None
-    if getattr(executor, "workers", 1) > 1:
+    if _workers(executor) > 1:
         begun = executor.submit(task, getattr(executor, "logs", None))
 
     def result() -> Result:
@@ -242,6 +223,11 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
             return task(None).value
 
     return result
+
+
+def _workers(executor: Executor) -> int:
+    """Number of workers; the standard library's executors have it as `_max_workers`."""
+    return int(getattr(executor, "workers", getattr(executor, "_max_workers", 1)))
 
 
 def generator_of(seed: int, index: int) -> np.random.Generator:
@@ -277,7 +263,7 @@ def _run(
 
 
 def _remaining(
-    durations: Sequence[float], total: int | None, elapsed: float, executor: Executor
+    durations: Sequence[float], total: int | None, workers: int
 ) -> tuple[float, float] | None:
     """90 % interval of the remaining time, from mean and deviation of the durations so far.
 
@@ -287,7 +273,6 @@ def _remaining(
     if total is None or m < 2:
         return None
     seconds = np.array(durations)
-    workers = getattr(executor, "workers", max(1.0, float(seconds.sum()) / elapsed))
     k = total - m
     middle = k * float(seconds.mean())
     spread = NINETY * float(seconds.std(ddof=1)) * (k + k**2 / m) ** 0.5

@@ -10,6 +10,15 @@ def millimetres(value: float | None, nothing: str = "-") -> str:
     return nothing if value is None else f"{1e3 * value:.3g} mm"
 
 
+# Bend radius [m] from which on a cable is straight: over 100 m it deviates by a millimetre.
+STRAIGHT = 1e6
+
+
+def bend_radius(value: float) -> str:
+    """A bend radius [m] as text."""
+    return "straight" if value > STRAIGHT else millimetres(value)
+
+
 def vector(components: Iterable[float], form: str, unit: str) -> str:
     """Components of a vector in brackets, and their unit."""
     return f"({', '.join(format(x, form) for x in components)}) {unit}"

@@ -264,7 +264,7 @@ def test_a_sensor_at_a_clip_makes_stiffness_absolute_where_the_mass_is_unknown(t
 
 
 def test_wrong_readings_of_clips_are_told():
-    with pytest.raises(ConfigError, match="shapes tell stiffness over weight alone"):
+    with pytest.raises(ConfigError, match="shapes determine only the ratio of"):
         through_a_clip(lambda force: None)
     with pytest.raises(ConfigError, match=r"clip_1: clip_force: \[fx, fy\] belongs here"):
         through_a_clip(lambda force: [*force, 0.0])

@@ -82,6 +82,12 @@ def test_a_session_without_results_is_told_by_the_exit_code(tmp_path, capsys):
         assert row["status"] == "failed"
 
 
+def test_a_bug_names_a_log_only_where_there_is_one(fleet, tmp_path, monkeypatch):
+    monkeypatch.setattr("dlo_casadi.fleet.run.load_config", lambda _: 1 / 0)
+    (row, *_) = fit_fleet(find_sessions(fleet)[1], tmp_path, InProcess(), QUICK)
+    assert row["message"] == "a bug: ZeroDivisionError: division by zero"
+
+
 def test_a_run_opens_one_pool_of_workers(tmp_path, monkeypatch, capsys):
     (tmp_path / "broken.yaml").write_text("cable: {lenght: 1.0}\nexperiment: {}\n")
     opened = []
@@ -184,7 +190,7 @@ def test_each_photograph_of_a_pose_decides_the_results(tmp_path):
     config.write_text(
         "experiment: {poses: [{file: a.csv}, {files: [b.jpg, c.jpg]}, {role: fit}]}\n"
     )
-    (session,) = find_sessions(config)[1]
+    (session,) = find_sessions(config)[1].values()
     digests = {digest_of(session, ())}
     for name in ("a.csv", "b.jpg", "c.jpg"):
         (tmp_path / name).write_text("changed")
@@ -200,7 +206,7 @@ def test_results_and_hidden_folders_are_no_sessions(tmp_path):
     (tmp_path / "cables" / "parameters.yaml").write_text("schema: dlo-parameters/1\ncable: {}\n")
     (tmp_path / "cables" / "notes.yaml").write_text("shed: north\n")
     base, sessions = find_sessions(tmp_path / "cables")
-    assert [session.key for session in sessions] == KEYS
+    assert list(sessions) == KEYS
     assert base == (tmp_path / "cables").resolve()
     with pytest.raises(DloError, match="no configuration in"):
         find_sessions(tmp_path / "nowhere")
@@ -283,3 +289,4 @@ def test_the_page_is_escaped_and_asks_for_nothing(tmp_path):
     (folder / "report.html").touch()
     page = overview_html([row], tmp_path)
     assert 'href="sessions/%3Cscript%3Ealert%281%29%3C/script%3E/report.html"' in page
+    assert "href" not in overview_html([row], None), "results of an earlier run, with reports"

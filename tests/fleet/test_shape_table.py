@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.fleet import shape_table as shape_table_module
 from dlo_casadi.fleet.shape_table import Grid, Plan, PoseList, shape_table
+from dlo_casadi.io.files import only_run
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.runtime.executors import InProcess
@@ -35,7 +37,7 @@ GRID = Grid((-0.4, 0.4, 9), (-0.3, 0.3, 7))
 
 def plan_of(tmp_path, **options):
     model = CableModel(CABLE, n=10, n_rest=4, **options)
-    return Plan(model, model.nominal, model.rest_basis @ np.ones(4), None, tmp_path / "parts")
+    return Plan(model, model.nominal, model.rest_basis @ np.ones(4), None, tmp_path / "a.parquet")
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +105,8 @@ def test_a_list_of_poses_of_a_clamped_cable(kind, tmp_path):
         pq.write_table(pa.table(columns), path)
     plan = plan_of(tmp_path, start="clamped", end="clamped")
     poses = PoseList(path, ("end_x_m", "end_y_m", "end_heading_rad"), {"start_heading": 0.2})
-    output = tmp_path / "shapes.parquet"
-    assert shape_table(plan, poses, output, InProcess()) == {"ok": 2, "unreachable": 1}
-    rows = pq.read_table(output).to_pylist()
+    assert shape_table(plan, poses, InProcess()) == {"ok": 2, "unreachable": 1}
+    rows = pq.read_table(plan.output).to_pylist()
     for k, row in enumerate(rows[:2]):
         end = (columns["end_x_m"][k], columns["end_y_m"][k])
         pose = HeldPose(
@@ -120,9 +121,9 @@ def test_a_list_of_poses_of_a_clamped_cable(kind, tmp_path):
 
 
 def test_interrupted_and_resumed_or_in_a_pool_the_bytes_are_the_same(tmp_path, small_chunks):
-    whole = tmp_path / "whole.parquet"
     plan = plan_of(tmp_path)
-    counts = shape_table(plan, GRID, whole, InProcess())
+    whole = plan.output
+    counts = shape_table(plan, GRID, InProcess())
     assert sum(counts.values()) == GRID.count
     assert not plan.parts.exists()
 
@@ -131,41 +132,46 @@ def test_interrupted_and_resumed_or_in_a_pool_the_bytes_are_the_same(tmp_path, s
             raise KeyboardInterrupt
 
     again = tmp_path / "again.parquet"
+    other = replace(plan, output=again)
     with pytest.raises(KeyboardInterrupt):
-        shape_table(plan, GRID, again, InProcess(), progress=interrupt)
+        shape_table(other, GRID, InProcess(), progress=interrupt)
     assert not again.exists()
-    before = len(list(plan.parts.glob("*.arrow")))
+    before = len(list(other.parts.glob("*.arrow")))
     assert before == 3
     tallies = []
-    assert shape_table(plan, GRID, again, InProcess(), progress=tallies.append) == counts
+    assert shape_table(other, GRID, InProcess(), progress=tallies.append) == counts
     assert len(tallies) == -(-GRID.count // plan.chunk) - before > 2
     assert again.read_bytes() == whole.read_bytes()
 
     pooled = tmp_path / "pooled.parquet"
     with open_executor(jobs=2) as executor:
-        shape_table(plan, GRID, pooled, executor)
+        shape_table(replace(plan, output=pooled), GRID, executor)
     assert pq.read_table(pooled).equals(pq.read_table(whole))
 
-    assert shape_table(plan, GRID, whole, InProcess()) == {}, "complete already"
+    assert shape_table(plan, GRID, InProcess()) == {}, "complete already"
 
 
 def test_what_belongs_to_something_else_is_refused(tmp_path, small_chunks):
-    plan, output = plan_of(tmp_path), tmp_path / "shapes.parquet"
+    plan = plan_of(tmp_path)
+    output = plan.output
 
     def interrupt(tally):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        shape_table(plan, GRID, output, InProcess(), progress=interrupt)
+        shape_table(plan, GRID, InProcess(), progress=interrupt)
     other = Grid((-0.4, 0.4, 9), (-0.3, 0.2, 3))
     with pytest.raises(DloError, match="holds parts of another table"):
-        shape_table(plan, other, output, InProcess())
-    shape_table(plan, other, output, InProcess(), restart=True)
+        shape_table(plan, other, InProcess())
+    with only_run(plan.parts), pytest.raises(DloError, match="another run is writing"):
+        shape_table(plan, other, InProcess(), restart=True)
+    assert list(plan.parts.glob("*.arrow")), "the parts of a run in progress stay"
+    shape_table(plan, other, InProcess(), restart=True)
     with pytest.raises(DloError, match="holds something else"):
-        shape_table(plan, GRID, output, InProcess())
+        shape_table(plan, GRID, InProcess())
     output.write_text("my notes")
     with pytest.raises(DloError, match="holds something else"):
-        shape_table(plan, other, output, InProcess())
+        shape_table(plan, other, InProcess())
     assert output.read_text() == "my notes"
 
 
@@ -182,6 +188,16 @@ def test_bad_lists(text, message, tmp_path):
     path.write_text(text)
     with pytest.raises(DloError, match=message):
         list(PoseList(path).chunks(10))
+
+
+def test_a_long_bad_list_is_no_bug(tmp_path):
+    """It is read in blocks of a megabyte: the first one tells the columns, others the count."""
+    path = tmp_path / "ends.csv"
+    path.write_text("end_x_m,end_y_m\n" + 200_000 * "0.1,0.2\n" + "0.1,0.2,0.3\n")
+    poses = PoseList(path)
+    for read in (lambda: poses.count, lambda: list(poses.chunks(100_000))):
+        with pytest.raises(DloError, match=r"(?s)ends.csv: .* Try: a CSV or Parquet file"):
+            read()
 
 
 def test_a_model_is_pickled_without_its_expressions():

@@ -112,6 +112,13 @@ def test_equal_results_give_equal_bytes(outcome):
     assert parameters_text(outcome) == parameters_text(outcome)
 
 
+def test_a_covariance_of_many_estimates_is_read(file, tmp_path):
+    """300 kB beyond the largest configuration."""
+    path = tmp_path / "parameters.yaml"
+    path.write_text(file.read_text() + "# " + 800_000 * "x" + "\n")
+    assert load(path).name == load(file).name
+
+
 def test_a_folder_of_results_will_do(file):
     assert load(file.parent).metadata.path == file
 

@@ -186,7 +186,7 @@ def test_the_first_pose_continues_none(tmp_path):
         },
     }
     (tmp_path / "c.yaml").write_text(dump_yaml(data))
-    with pytest.raises(ConfigError, match="the first pose continues none; branch: ccw or cw"):
+    with pytest.raises(ConfigError, match="branch: previous needs a pose before this one"):
         load_config(tmp_path / "c.yaml")
 
 
