@@ -127,7 +127,7 @@ def test_the_results_tell_of_it(result, tmp_path):
     assert [effect["name"] for effect in report["effects"]] == ["balloon"]
     assert report["stages"][-1]["parameters"]["balloon.lift"]["value"] > 0
     assert "A balloon tied to the cable" in (tmp_path / "results" / "report.html").read_text()
-    assert "the declared model lacked balloon" in str(result)
+    assert "The declared model lacked balloon" in str(result)
     cable = load(tmp_path / "results")
     assert cable.model.effects == result.fit.model.effects
     assert cable.p[cable.model.names.index("balloon.lift")] == result.fit.value("balloon.lift")

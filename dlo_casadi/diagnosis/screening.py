@@ -37,7 +37,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess
-from dlo_casadi.runtime.parallel import begin
+from dlo_casadi.runtime.parallel import begin, workers_of
 from dlo_casadi.thresholds import COLLINEAR, IN_QUESTION, SCANS_APART, SCANS_PER_TEST
 
 
@@ -175,7 +175,7 @@ class Screen:
         If the first scan is among them it has to come first: later ones overwrite its derivatives.
         Scans are split into one part per worker, because each part has a fixed cost.
         """
-        workers = max(1, min(getattr(executor, "workers", 1), len(scans)))
+        workers = max(1, min(workers_of(executor), len(scans)))
         parts = [scans[i::workers] for i in range(workers)]
         begun = [begin(executor, _derivatives, self.fit, self.listed, part) for part in parts[1:]]
         problem, point, lin = self._linearized

@@ -26,7 +26,7 @@ from dlo_casadi.estimation.prediction import uncertainty_of
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
-from dlo_casadi.report.words import ALWAYS, all_warnings
+from dlo_casadi.report.words import all_warnings
 from dlo_casadi.runtime.executors import software
 from dlo_casadi.session.fitting import Declared
 from dlo_casadi.session.hypotheses import Suspicion
@@ -35,7 +35,6 @@ from dlo_casadi.session.outcome import (
     PoseInput,
     RestCurvatureEstimate,
     Stage,
-    StageName,
 )
 
 # Fields in report.json for a parameter of an added effect.
@@ -48,9 +47,6 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
     Every key of the schema is present; unknown values are None, never NaN.
     """
     m, load, proposal = outcome.measurement, outcome.unexplained, outcome.next_pose
-    names: list[StageName] = [*ALWAYS]
-    if outcome.stage("closed") is not None:
-        names.append("closed")
     repeats, model, weight = outcome.repeatability, outcome.fit.model, outcome.hidden_weight
     document = {
         "schema": "dlo-report/1",
@@ -64,7 +60,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
             "correlation_length_m": m.correlation_length,
             **fields_of(m, "readings", "force_std", "moment_std"),
         },
-        "stages": [_stage(name, outcome) for name in names],
+        "stages": [_stage(stage, outcome) for stage in outcome.stages],
         "repeatability": {
             "rest_curvature_std": outcome.fit.problem.priors.pose_scatter.rest_std,
             "from_pose_to_pose": _scatter(outcome.fit),
@@ -126,15 +122,13 @@ def fields_of(item: object, *names: str) -> dict[str, Any]:
     return {name: getattr(item, name) for name in names}
 
 
-def _stage(name: StageName, outcome: Outcome) -> dict[str, Any]:
-    """One stage; all numbers are None if it did not run."""
-    stage, held_out = outcome.stage(name), None
-    if stage is None or not stage.parameters:
+def _stage(stage: Stage, outcome: Outcome) -> dict[str, Any]:
+    """One stage; all numbers are None where it does not apply."""
+    held_out = asdict(outcome.held_out(stage)) if stage.parameters else None
+    if not stage.parameters:
         nothing = RestCurvatureEstimate(*np.zeros((3, 0)))
         unknown = {"bending_stiffness": Estimate(math.nan, math.nan, "N m^2")}
-        stage = Stage(name, None, None, None, unknown, nothing, {})
-    else:
-        held_out = asdict(outcome.held_out(stage))
+        stage = replace(stage, parameters=unknown, rest_curvature=nothing)
     rest = stage.rest_curvature
     curvature: dict[str, Any] = {"s": rest.s, "value": rest.value, "std": rest.std}
     if rest.value.ndim > 1:  # in space one row per material axis

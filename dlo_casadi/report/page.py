@@ -33,14 +33,6 @@ from dlo_casadi.thresholds import NORMAL_95
 GENERATOR = '<meta name="generator" content="dlo_casadi">'
 # Text for a missing number.
 NOTHING = "–"
-VERDICT_WORDS = {
-    None: "Not diagnosed",
-    "complete": "Complete",
-    "effect_found": "Effect found",
-    "unexplained": "Unexplained",
-}
-
-
 # ---- of a run ----------------------------------------------------------------------------------
 
 
@@ -71,13 +63,13 @@ def report_page(outcome: Outcome, drawn: Mapping[str, Figure] | None = None) -> 
 
 def page_data(outcome: Outcome) -> dict[str, Any]:
     """Data for the template of a run, besides pictures, charts and the outcome itself."""
-    first, *details = (line.strip() for line in words.verdict_lines(outcome))
+    found = words.conclusion_of(outcome)
     labels = {item.kind: item.label for item in compared(outcome)}
     return {
         "verdict": outcome.verdict or "off",
-        "verdict_word": "Fit failed" if outcome.fit.failed else VERDICT_WORDS[outcome.verdict],
-        "sentence": sentence(first),
-        "details": details,
+        "verdict_word": words.sentence(found.word),
+        "sentence": found.sentence,
+        "details": [line.strip() for line in words.details(outcome)],
         "before": labels.get("before"),
         "after": labels.get("after"),
         "tiles": tiles(outcome),
@@ -172,7 +164,7 @@ def failure_page(config: Config, error: DloError, poses: Sequence[PoseInput] = (
         "failed.html",
         config,
         kind=type(error).__name__,
-        heading=sentence(heading),
+        heading=words.sentence(heading),
         rest=rest,
         hints=hints([error.message, *(pose.problem for pose in shown)]),
         read=sum(pose.readable for pose in shown),
@@ -213,14 +205,6 @@ def _render(template: str, config: Config, **data: Any) -> str:
     )
 
 
-def sentence(line: str) -> str:
-    """Turn a line of the terminal into a full sentence."""
-    text = line.removeprefix("Verdict: ")
-    for word in ("unexplained. ", "complete. ", "the fit has failed. "):
-        text = text.removeprefix(word)
-    return text[:1].upper() + text[1:]
-
-
 def configuration_text(config: Config) -> str:
     """Text of the configuration's file; without a file the text that it would have."""
     try:
@@ -250,7 +234,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals |= {"words": words, "tables": tables}
-    for item in (units, breakable, counted, sentence, millimetres, text.vector):
+    for item in (units, breakable, counted, words.sentence, millimetres, text.vector):
         environment.filters[item.__name__] = item
     return environment
 

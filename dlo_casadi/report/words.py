@@ -20,8 +20,6 @@ NOISE_ALONE = "noise alone"
 ON_BRANCH = "on the measured branch"
 # Order of candidates; the score alone does not show how good a refit is.
 CANDIDATE_ORDER = "first those that were refitted, by log likelihood, the rest by score"
-# Stages of every report, in this order; `closed` only where an effect was added.
-ALWAYS: tuple[StageName, ...] = ("initial", "stiffness_only", "algorithm1", "batch")
 STAGE_LABELS: dict[StageName, str] = {
     "initial": "initial guess",
     "stiffness_only": "stiffness alone",
@@ -123,15 +121,12 @@ def all_warnings(outcome: Outcome) -> list[str]:
     """
     lines = list(outcome.warnings)
     held_out = outcome.measurement.poses_held_out > 0
-    for name in ALWAYS:
-        stage = outcome.stage(name)
-        if stage is None:
-            lines.append(f"stage {name} did not run")
-        elif name == "algorithm1" and not stage.shapes:
+    for stage in outcome.stages:
+        if stage.name == "algorithm1" and not stage.shapes:
             continue
-        elif stage.rmse_fit is None or (held_out and stage.rmse_held_out is None):
-            lines.append(f"stage {name}: {stage.note or 'some poses could not be predicted'}")
-    for key, estimate in outcome.stages[-1].parameters.items() if outcome.stages else ():
+        if stage.rmse_fit is None or (held_out and stage.rmse_held_out is None):
+            lines.append(f"stage {stage.name}: {stage.note or 'some poses could not be predicted'}")
+    for key, estimate in outcome.stages[-1].parameters.items():
         if estimate.at_bound:
             value = f"{estimate.value:.4g} {estimate.unit}".strip()
             lines.append(f"{key} sits on a bound of what physics permits: {value}")
@@ -141,16 +136,26 @@ def all_warnings(outcome: Outcome) -> list[str]:
 # ---- findings ----------------------------------------------------------------------------------
 
 
+class Conclusion(NamedTuple):
+    """The verdict in a word and a sentence."""
+
+    word: str
+    sentence: str
+
+
+def sentence(text: str) -> str:
+    """A text that begins with a capital letter."""
+    return text[:1].upper() + text[1:]
+
+
 def verdict_lines(outcome: Outcome) -> list[str]:
-    """Result of the diagnosis, in sentences."""
-    if outcome.doubts:
-        head, *others = (f"{text[:1].upper()}{text[1:]}." for text in outcome.doubts)
-        word = "the fit has failed" if outcome.fit.failed else "unexplained"
-        lines = [f"Verdict: {word}. {head}", *(f"  {text}" for text in others)]
-    elif outcome.verdict is not None:
-        lines = [_verdict(outcome)]
-    else:
-        lines = ["Diagnosis: switched off; nothing was looked for in the residual."]
+    """Verdict and all findings of the diagnosis, in sentences."""
+    return [f"Verdict: {'. '.join(conclusion_of(outcome))}", *details(outcome)]
+
+
+def details(outcome: Outcome) -> list[str]:
+    """Findings beside the verdict."""
+    lines = [f"  {sentence(text)}." for text in outcome.doubts[1:]]
     lines += [_either_side(name, found) for name, found in outcome.either_side.items()]
     lines += structure_lines(outcome)
     for effect in outcome.effects:
@@ -177,22 +182,30 @@ def verdict_lines(outcome: Outcome) -> list[str]:
     return lines
 
 
-def _verdict(outcome: Outcome) -> str:
+def conclusion_of(outcome: Outcome) -> Conclusion:
+    """Result of the diagnosis."""
+    if outcome.doubts:
+        word = "fit failed" if outcome.fit.failed else "unexplained"
+        return Conclusion(word, f"{sentence(outcome.doubts[0])}.")
+    if outcome.verdict is None:
+        return Conclusion("not diagnosed", "Nothing was looked for in the residual.")
     names = " and ".join(effect.name for effect in outcome.effects)
     if outcome.verdict == "unexplained":
         after = outcome.structure[1] if outcome.structure else None
         if names and after and after.p_value >= outcome.config.diagnosis.significance:
             error = outcome.effects[-1].rmse_cross_validated_after
-            return (
-                f"Verdict: unexplained. With {names} every pose is fitted, but one that is left "
-                f"out is predicted {millimetres(error)} off "
+            said = (
+                f"With {names} every pose is fitted, but one that is left out is predicted "
+                f"{millimetres(error)} off "
                 f"({NOISE_ALONE}: {millimetres(outcome.measurement.noise_distance)})."
             )
+            return Conclusion("unexplained", said)
         found = f" even with {names}" if names else ""
-        return f"Verdict: unexplained. The residual is not noise{found}."
+        return Conclusion("unexplained", f"The residual is not noise{found}.")
     if outcome.effects:
-        return f"Verdict: the declared model lacked {names}; with it the residual is noise."
-    return "Verdict: complete. The declared model explains the shapes down to their noise."
+        said = f"The declared model lacked {names}; with it the residual is noise."
+        return Conclusion("effect found", said)
+    return Conclusion("complete", "The declared model explains the shapes down to their noise.")
 
 
 def _either_side(name: str, found: EitherSide) -> str:

@@ -124,7 +124,7 @@ def map_as_completed(
     started, taken, failed, durations = time.perf_counter(), 0, 0, list[float]()
 
     def room() -> int:
-        workers = _workers(executor)  # asked again: workers of a cluster come and go
+        workers = workers_of(executor)  # asked again: workers of a cluster come and go
         most = 2 * (workers - here)
         if here and (workers == 1 or total is not None):
             # Towards the end, leave waiting tasks to this process.
@@ -141,7 +141,7 @@ def map_as_completed(
         failed += done.error is not None
         durations.append(done.seconds)
         if progress is not None:
-            left = _remaining(durations, total, _workers(executor))
+            left = _remaining(durations, total, workers_of(executor))
             elapsed = time.perf_counter() - started
             progress(Tally(len(durations), failed, total, elapsed, left))
         return done
@@ -213,7 +213,7 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
     """
     task = partial(_run, call, 0, partial(function, *args))
     begun: Future[Finished[Any, Result]] | None = None
-    if _workers(executor) > 1:
+    if workers_of(executor) > 1:
         begun = executor.submit(task, getattr(executor, "logs", None))
 
     def result() -> Result:
@@ -225,7 +225,7 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
     return result
 
 
-def _workers(executor: Executor) -> int:
+def workers_of(executor: Executor) -> int:
     """Number of workers; the standard library's executors have it as `_max_workers`."""
     return int(getattr(executor, "workers", getattr(executor, "_max_workers", 1)))
 

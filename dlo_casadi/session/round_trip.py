@@ -12,7 +12,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.config import Config, Pose, load_config
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.errors import ConfigError, EquilibriumError, counted
+from dlo_casadi.errors import ConfigError, DloError, EquilibriumError, counted
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.export.rod import ROUND, Rod
 from dlo_casadi.export.targets import Target, require
@@ -105,9 +105,15 @@ def round_trip(
     """Relax a cable in every held-out pose, or in every pose if none was held out.
 
     `poses` limits their number; fitted poses make up for too few held-out ones.
-    Raises DloError if the target is not installed, EquilibriumError if no pose can be predicted.
+    Raises DloError if the target is not installed, or if the session has clips or obstacles,
+    EquilibriumError if no pose can be predicted.
     """
     require(target)
+    if config.experiment.clips or config.experiment.obstacles:
+        raise DloError(
+            f"{config.name} has clips or obstacles, and {target.title} would not: shapes cannot be "
+            "compared.\n  Try: --check SESSION.yaml, with poses of the same cable without them"
+        )
     config, inputs = read_session(config)
     measured = measured_poses(config, inputs)
     declared = config.experiment.poses

@@ -171,14 +171,6 @@ def test_a_baseline_that_did_not_run_is_null_without_a_warning(outcome):
     assert not any("algorithm1" in said for said in report["warnings"])
 
 
-def test_missing_stages_are_present(outcome):
-    report = report_dict(replace(outcome, stages=(stage("batch"),)))
-
-    assert [entry["name"] for entry in report["stages"]][:2] == ["initial", "stiffness_only"]
-    assert report["stages"][0]["rmse_fit"] is None
-    assert "stage initial did not run" in report["warnings"]
-
-
 def test_the_closed_stage_is_there_only_with_an_effect(outcome):
     closed = replace(outcome, stages=(*outcome.stages, stage("closed")))
 

@@ -76,7 +76,7 @@ def test_a_diagnosis_that_is_switched_off_is_no_verdict(outcome, page):
     assert outcome.verdict is None
     data = page_data(outcome)
     assert (data["verdict"], data["verdict_word"]) == ("off", "Not diagnosed")
-    assert data["sentence"].startswith("Diagnosis: switched off")
+    assert data["sentence"].startswith("Nothing was looked for")
     assert "What the declared model may lack" not in page
 
 

@@ -48,7 +48,7 @@ def test_a_summary_tells_units_what_was_fixed_and_the_noise(outcome):
     assert "declared model, fitted" in text
     assert "noise alone (estimated)" in text
     assert "warning: stage algorithm1" not in text
-    assert "Diagnosis: switched off" in text
+    assert "Verdict: not diagnosed. Nothing was looked for" in text
     assert "without imports and writing; of it or beside it IPOPT" in text
     assert "total" in text
 
@@ -102,7 +102,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
         )
     )
 
-    assert "the declared model lacked lumped_mass; with it the residual is noise" in text
+    assert "Verdict: effect found. The declared model lacked lumped_mass; with it the" in text
     assert "A reading of end_force there differs by 0.3 N" in text
     assert "4 standard deviations of one: read it 2 times." in text
     assert "lumped_mass: mass 0.0500 ± 0.0020 kg (p = 1e-09)" in text
@@ -173,7 +173,7 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
     off = fit.point.theta + 0.5 * np.eye(problem.unknowns.size)[0]  # ln EI
     point = problem.balanced(replace(fit.point, theta=off))
     stopped = replace(found, fit=replace(fit, point=point, converged=False))
-    assert "Verdict: the fit has failed. Fit poses" in said(stopped)
+    assert "Verdict: fit failed. Fit poses" in said(stopped)
     assert page_data(stopped)["verdict_word"] == "Fit failed"
 
 
