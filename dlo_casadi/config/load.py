@@ -218,10 +218,8 @@ def _weightless(config: Config) -> Iterator[ConfigProblem]:
         text = "mass: null: shapes determine only the ratio of stiffness to weight. Try: the mass "
         yield ConfigProblem(at, f"{text}in kg, or end_force of a fit pose")
     elif any(item.name == UNKNOWN_MASS.name for item in config.model.effects):
-        text = (
-            f"{UNKNOWN_MASS.name} corrects a declared mass: declare the mass, or leave the effect"
-        )
-        yield ConfigProblem(at, f"mass: null: {text} out")
+        text = f"mass: null: {UNKNOWN_MASS.name} corrects a declared mass"
+        yield ConfigProblem(at, f"{text}: declare the mass, or leave the effect out")
 
 
 def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
