@@ -1,6 +1,8 @@
 """One thread per process: the matrices are small, and the tests run in two processes."""
 
 import os
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +12,9 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 # Nothing that a test writes has to outlast a power cut, and each wait for the disk takes
 # milliseconds. Tests of disks that fail put their own in its place.
 os.fsync = lambda number: None
+
+# Some tests run what scripts share. At the end, so that scripts/fit.py hides no other module.
+sys.path.append(str(Path(__file__).parents[1] / "scripts"))
 
 
 @pytest.fixture

@@ -1,11 +1,10 @@
 """Contact with obstacles against closed forms, balance of forces, and differences."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.ipopt import Ipopt
 
 from dlo_casadi.cable.held import among
 from dlo_casadi.config import load_config
@@ -26,9 +25,6 @@ from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.obstacles import Capsule, Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-from benchmarks.ipopt import Ipopt
 
 LENGTH, WEIGHT, EI, RADIUS = 1.0, 1.0, 0.02, 0.003  # m, N, N m^2, m
 CABLE = CableData(LENGTH, WEIGHT / 9.81, 2 * RADIUS, EI)

@@ -6,6 +6,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from solvers import QUICK, STRICT, moved
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import CompiledSolver, compile_library
@@ -16,9 +17,6 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod import obstacles as rod
 
-WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror")
-# Compiling without optimisation takes a third of the time; only -Wmaybe-uninitialized needs -O1.
-STRICT, OPTIMISED = ("-O0", *WARNINGS), ("-O1", *WARNINGS)
 TABLE = {2: rod.Plane((0.0, -0.19), (0.0, 1.0)), 3: rod.Plane((0.0, 0.0, -0.19), (0.0, 0.0, 1.0))}
 # Under the middle of the cable.
 ROUND = {
@@ -52,20 +50,20 @@ def pose_of(model: CableModel, *, drop: float = 0.05) -> HeldPose:
 
 def compiled(model: CableModel, *flags: str, obstacles: int = 2) -> CompiledSolver:
     rest = np.zeros(model.chain.n_rests)
-    return CompiledSolver(model, model.nominal, rest, flags=flags or STRICT, obstacles=obstacles)
+    return CompiledSolver(model, model.nominal, rest, flags=flags or QUICK, obstacles=obstacles)
 
 
 @pytest.fixture(scope="module", params=[2, 3], ids=["plane", "space"])
 def own(request) -> tuple[CableModel, CompiledSolver]:
     """A cable that touches its table, and its solver."""
     model = cable(request.param)
-    return model, compiled(replace(model, obstacles=(TABLE[request.param],)), *OPTIMISED)
+    return model, compiled(replace(model, obstacles=(TABLE[request.param],)), *STRICT)
 
 
 @cache
 def at_nodes(d: int, end: str = "clamped") -> CompiledSolver:
     """A solver whose contacts are at nodes alone, as Python's are."""
-    return compiled(replace(cable(d, end), obstacles=(TABLE[d],)), *STRICT, "-DBETWEEN=0")
+    return compiled(replace(cable(d, end), obstacles=(TABLE[d],)), *QUICK, "-DBETWEEN=0")
 
 
 @pytest.mark.parametrize(
@@ -140,33 +138,6 @@ def test_no_obstacles_are_as_a_solver_without(own):
     assert not found.contact_forces.any()
 
 
-def moved(pose: HeldPose, column: int, step: float, d: int) -> HeldPose:
-    """The pose with one of the numbers moved by which a slope has derivatives."""
-    if d == 2:
-        start, end = np.array(pose.start), np.array(pose.end)
-        first, last = pose.start_heading, pose.end_heading
-        if column < 2:
-            end = end + step * np.eye(2)[column]
-        elif column < 4:
-            first, last = (first + step, last) if column == 2 else (first, last + step)
-        else:
-            start = start + step * np.eye(2)[column - 4]
-        return replace(
-            pose, start=tuple(start), end=tuple(end), start_heading=first, end_heading=last
-        )
-    from scipy.spatial.transform import Rotation
-
-    side, axis = divmod(column, 6)
-    name = ("start", "end")[side]
-    if axis < 3:
-        place = np.array(getattr(pose, name)) + step * np.eye(3)[axis]
-        return replace(pose, **{name: tuple(place)})
-    key = f"{name}_orientation"
-    turn = Rotation.from_rotvec(step * np.eye(3)[axis - 3])
-    frame = (turn * Rotation.from_quat(getattr(pose, key))).as_quat()
-    return replace(pose, **{key: tuple(frame)})
-
-
 @pytest.mark.parametrize("where", ["nodes", "between"])
 @pytest.mark.parametrize("what", ["table", "round"])
 def test_derivatives_through_contacts(own, what, where):
@@ -189,7 +160,7 @@ def test_derivatives_through_contacts(own, what, where):
     step = 1e-5
     for column in range(slope.min_bend_radius.size):
         sides = [
-            solver.step(shape, moved(pose, column, sign * step, d), steps=10, obstacles=listed)
+            solver.step(shape, moved(pose, column, sign * step), steps=10, obstacles=listed)
             for sign in (1, -1)
         ]
         assert {side.status for side in sides} == {"ok"}
@@ -239,7 +210,7 @@ def test_obstacles_of_the_model_with_what_a_fit_moved():
     p = model.nominal.copy()
     p[model.names.index("obstacle_offset.offset")] = 0.01
     p[model.names.index("contact_plane.height")] = -0.3
-    solver = CompiledSolver(model, p, np.zeros(model.chain.n_rests), flags=STRICT)
+    solver = CompiledSolver(model, p, np.zeros(model.chain.n_rests), flags=QUICK)
     assert [x.point[2] for x in solver.obstacles] == pytest.approx([-0.18, -0.3])
     shape = solver.solve(pose_of(model))
     assert shape.points[:, 2].min() == pytest.approx(-0.18 + 0.006, abs=2e-3)
@@ -251,7 +222,7 @@ def test_casadi_knows_the_obstacles_of_the_model(own, tmp_path):
     d = model.node.dimension
     touching = replace(model, obstacles=(TABLE[d],))
     source = generate(touching, model.nominal, np.zeros(model.chain.n_rests))
-    external = ca.external("dlo_cable", str(compile_library(source, tmp_path, STRICT)))
+    external = ca.external("dlo_cable", str(compile_library(source, tmp_path, QUICK)))
     pose = pose_of(model)
     numbers = np.array([*pose.ends, *([0.0] if d == 3 else [])])
     shape = solver.solve(pose)

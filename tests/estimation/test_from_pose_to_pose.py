@@ -1,14 +1,10 @@
 """What differs at random from pose to pose is named, sized, and does not pull the stiffness."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import hidden_sets
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-import hidden_sets
 from hidden_sets import simulated
 
 from dlo_casadi.diagnosis.crossval import cross_validate
