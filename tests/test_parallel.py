@@ -127,7 +127,7 @@ def test_one_call_has_one_thread_wherever_it_is_made(two_of_us):
 def test_a_pool_ends_its_own_processes_and_no_task():
     with open_executor(jobs=2, here=True) as executor:
         begin(executor, os.getpid)()
-        other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(1.5,))
+        other = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(0.6,))
         other.start()
         late = executor.submit(slowly, 5)
     assert late.result()[0] == 5
