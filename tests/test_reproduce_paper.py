@@ -34,6 +34,7 @@ def test_table_4_within_its_print():
     assert len(rows) == len(printed) == 12
     for row, line in zip(rows, printed, strict=True):
         assert abs(row.before - line["V_theta0_alpha0_J"]) <= energies.ENERGY_TOLERANCE, row.pose
+        assert row.stable
 
 
 def test_bound_on_the_first_heading_contradicts_the_print():
