@@ -1,26 +1,13 @@
 """Inputs made wrong at random: each ends in a result or a message, soon, and whole."""
 
 import os
-import sys
-from pathlib import Path
 
+import check_inputs as script
 import numpy as np
 import pytest
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 
-
-@pytest.fixture(scope="module")
-def script():
-    sys.path.insert(0, str(SCRIPTS))
-    try:
-        import check_inputs
-    finally:
-        sys.path.remove(str(SCRIPTS))
-    return check_inputs
-
-
-def test_wrong_inputs_end_in_a_message(script, capsys):
+def test_wrong_inputs_end_in_a_message(capsys):
     counts = script.check(count=30, seed=217, jobs=1)  # few that hold every family
 
     assert counts.total() == 30
@@ -40,7 +27,7 @@ def misbehave(how):
     return "ok", how
 
 
-def test_the_watch_sees_hangs_crashes_and_memory(script):
+def test_the_watch_sees_hangs_crashes_and_memory():
     items = ["one", "hang", "crash", "memory", "two"]
 
     watched = script.watched(misbehave, items, jobs=1, allowed=lambda _: 0.5)
@@ -53,7 +40,7 @@ def test_the_watch_sees_hangs_crashes_and_memory(script):
     ("command", "left", "named"),
     [("check", "shape.draft", "shape.draft"), ("fit", "results/report.json", "report.html")],
 )
-def test_half_written_output_is_seen(script, tmp_path, command, left, named):
+def test_half_written_output_is_seen(tmp_path, command, left, named):
     (tmp_path / left).parent.mkdir(exist_ok=True)
     (tmp_path / left).touch()
     case = script.Case("text", {}, [command])

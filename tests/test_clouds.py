@@ -1,18 +1,14 @@
 """Depth clouds, rendered from shapes that are known, come back as the lines of the cable."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
-from scipy.spatial import cKDTree
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 from recorded.clouds import CABLE, HIDDEN, WALL, depth_cloud, write_pcd, write_ply
 from recorded.takes import HOLD, MOVE, led, write_grippers, write_mcap
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
 
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config

@@ -60,7 +60,9 @@ def bench(tmp_path_factory):
 
 
 @pytest.mark.parametrize("page", having("python"))
-def test_python_runs_from_top_to_bottom(page, bench, monkeypatch, capsys):
+def test_python_runs_from_top_to_bottom(page, bench, monkeypatch, capsys, request):
+    if page == "docs/pages/how-to/keep-limits.md":
+        request.getfixturevalue("fewer_starts")
     folder, result = bench
     monkeypatch.chdir(folder)
     monkeypatch.setattr(dlo, "fit", lambda config: {"configs/cable.yaml": result}[config])

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from files import tree
 
 from dlo_casadi.errors import OutputError
 from dlo_casadi.io.files import FolderDraft, refuse_foreign, write_file
@@ -26,14 +27,6 @@ def no_more_than(size):
 
 def full(*_):
     raise OSError(28, os.strerror(28))
-
-
-def tree(folder):
-    """Relative path -> content of every file, None of a folder; hidden ones included."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
-        for path in sorted(folder.rglob("*"))
-    }
 
 
 # ---- files -------------------------------------------------------------------------------------

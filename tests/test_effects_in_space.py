@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from sections import principal
 
 from dlo_casadi.effects import (
     EFFECTS,
@@ -240,12 +241,6 @@ def test_a_soft_tether_to_a_far_anchor_keeps_its_force():
     np.testing.assert_allclose(far["stiffness"] * anchor, [-0.6, 0.8, 2.4], rtol=1e-14)
     nowhere = effect.of_linear(CABLE, dict.fromkeys((*force, "stiffness"), 0.0))
     assert (nowhere["stiffness"], nowhere["anchor_z"]) == (0.0, 0.0)
-
-
-def principal(ratio: float, angle: float) -> np.ndarray:
-    """Stiffness matrix about y and z, over that about the first axis."""
-    first, second = (np.array([np.cos(a), np.sin(a)]) for a in (angle, angle + np.pi / 2))
-    return np.outer(first, first) + ratio * np.outer(second, second)
 
 
 @pytest.mark.parametrize(("ratio", "angle"), [(3.0, 0.0), (3.0, 0.4), (0.3, -0.7), (1.0, 0.4)])

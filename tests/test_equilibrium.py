@@ -1,6 +1,5 @@
-"""Equilibria against closed forms, the paper's table, an independent integrator and balances."""
+"""Equilibria against closed forms, an independent integrator and balances."""
 
-import csv
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -32,7 +31,6 @@ from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
 DATA = Path(__file__).parent / "data"
-SCRIPTS = Path(__file__).parents[1] / "scripts"
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WEIGHTLESS = (0.0, 0.0)  # m/s^2
 MESHES = (10, 20, 40)
@@ -47,29 +45,6 @@ def solve(model: CableModel, stiffness: float, pose: HeldPose, rest: float = 0.0
 
 def orders(errors: list) -> np.ndarray:
     return np.log2(np.divide(errors[:-1], errors[1:]))
-
-
-# ---- the paper's table -------------------------------------------------------------------------
-
-
-def test_energies_of_table_4():
-    """All twelve V(theta^0, alpha^0) of Quartaro et al. 2025, printed with two decimals.
-
-    Ends on a grid of one inch, a cable of 0.8125 m, k_theta = 949.56 N m/rad, ten links, turning
-    counter-clockwise; the last one starts steeper than -pi/2.
-    """
-    length, n, k_theta = 0.8125, 10, 949.56
-    stiffness = k_theta * length / n
-    model = CableModel(CableData(length, 0.23, 0.0128, stiffness), n=n, element="link")
-    with (SCRIPTS / "paper" / "data" / "table4.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 12
-    for row in rows:
-        end = (0.0254 * float(row["grid_x"]), 0.0254 * float(row["grid_y"]))
-        found = solve(model, stiffness, HeldPose((0.0, 0.0), end, branch="ccw"))
-        assert found.stable
-        # The print gives 0.005 J, COBYLA's end point the rest: within 0.03 J on all twelve.
-        assert found.energy == pytest.approx(float(row["V_theta0_alpha0_J"]), abs=0.04), end
 
 
 # ---- closed forms, and the order of both elements ----------------------------------------------

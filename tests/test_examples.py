@@ -108,7 +108,7 @@ def test_an_effect_of_ones_own_is_found(simulated, tmp_path, monkeypatch):
 
 
 def test_clips_of_a_door_keep_limits_at_openings_between_those_they_were_placed_for(
-    simulated, tmp_path, monkeypatch
+    simulated, fewer_starts, tmp_path, monkeypatch
 ):
     script = example("place_clips")
     monkeypatch.setattr(script, "OPENINGS", np.array([-0.3, 0.6, 1.5]))  # quicker

@@ -78,7 +78,7 @@ def test_in_space_a_rest_curvature_is_about_the_axes_y_and_z():
         assert cable.solve(**FORWARD).points[-1] == pytest.approx(end, abs=1e-5)
 
 
-def test_it_is_what_a_fit_returns(rope, tmp_path):
+def test_it_is_what_a_fit_returns(rope, fewer_starts, tmp_path):
     """All that a fitted cable can, and the same when it is written and read."""
     assert type(rope) is dlo.FittedCable
     shape = rope.solve(end=(0.5, 0.1))

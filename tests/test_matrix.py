@@ -1,13 +1,8 @@
 """Sessions of every kind, drawn from the toolkit's own model, go all the way."""
 
-import sys
 from itertools import combinations
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 from check_matrix import CELLS, Row, matching, run_cell, summary
 from matrix.cells import admitted, covering, pairwise
 from matrix.sessions import SMALL

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.cable import placing
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.limits import Resolved
 from dlo_casadi.cable.placing import ROOM, placed
@@ -21,11 +20,7 @@ LIMITS = {"bend_radius": 0.04, "force": 6.0}
 POSES = [{"end": (0.5, 0.0)}, {"end": (0.4, 0.2)}]
 
 
-@pytest.fixture(autouse=True)
-def fewer_starts(monkeypatch):
-    """Quicker, and good enough for one or two clips on a line."""
-    monkeypatch.setattr(placing, "GUESSES", 4)
-    monkeypatch.setattr(placing, "STARTS", 2)
+pytestmark = pytest.mark.usefixtures("fewer_starts")
 
 
 def cable(n=12, **more) -> CasadiCable:

@@ -7,11 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 from recorded.takes import HOLD, WRITERS, rendered
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.cli import main
 from dlo_casadi.config import load_config

@@ -1,15 +1,10 @@
 """The reproduction of the paper: Table 4, the small replica, what the equations miss, the page."""
 
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 from paper import chords, energies, equations, monte_carlo, page, published, replica, scale, tables
 from paper.content import Claim, Part, Section, Target, drawing
 from paper.fits import estimate
@@ -39,6 +34,7 @@ def test_table_4_within_its_print():
     assert len(rows) == len(printed) == 12
     for row, line in zip(rows, printed, strict=True):
         assert abs(row.before - line["V_theta0_alpha0_J"]) <= energies.ENERGY_TOLERANCE, row.pose
+        assert row.stable
 
 
 def test_bound_on_the_first_heading_contradicts_the_print():

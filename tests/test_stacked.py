@@ -17,9 +17,10 @@ from dlo_casadi.rod.chain import ELEMENTS_IN_SPACE
 
 CABLE = CableData(length=1.2, mass=0.3, diameter=0.01, bending_stiffness=0.02)
 EFFECTS = PointForce(), StiffSection(), BendingSoftening()
-NAMES = (
-    *("segment", "segment_slope", "segment_curve", "segment_curve_slopes", "segment_sensitivity"),
-    *("at_ends", "end_slope", "end_sensitivity", "station", "station_slopes", "reading_slopes"),
+NAMES = ("segment", "segment_sensitivity", "at_ends", "station_slopes")
+OTHERS = (
+    *("segment_slope", "segment_curve", "segment_curve_slopes", "end_slope", "end_sensitivity"),
+    *("station", "reading_slopes"),
 )
 
 
@@ -28,7 +29,9 @@ def arguments(function: ca.Function, m: int, count: int) -> list[np.ndarray]:
     return [rng.uniform(0.1, 1, (m, count, function.numel_in(i))) for i in range(function.n_in())]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [*NAMES, *(pytest.param(name, marks=pytest.mark.long) for name in OTHERS)]
+)
 @pytest.mark.parametrize("torsion", [None, 0.015])
 @pytest.mark.parametrize("element", ELEMENTS_IN_SPACE)
 def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(

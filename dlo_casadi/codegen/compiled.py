@@ -66,7 +66,7 @@ def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",
     if compiler is None:
         raise DloError(
             "no C compiler found (looked for $CC, cc, gcc, clang).\n"
-            "  Try: apt-get install gcc, or set CC; scripts/generate_solver.py needs none."
+            "  Try: apt-get install gcc, or set CC; dlo generate-solver needs none."
         )
     if isinstance(flags, str):
         raise DloError(f"flags is a sequence of words, found {flags!r}\n  Try: {flags.split()}")

@@ -43,6 +43,7 @@ class Row:
     spread: float
     distance: float
     first_heading: float
+    stable: bool
 
 
 def chain() -> CableModel:
@@ -79,6 +80,7 @@ def rows_of_table_4(roundings: int = ROUNDINGS) -> list[Row]:
                 float(np.std([shape.energy for shape in rounded])),
                 rms(NodeCurve(model.cable.length, after.points, None).distances(before.points)),
                 float(before.phi[0]),
+                before.stable,
             )
         )
     return rows

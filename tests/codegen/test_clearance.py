@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from solvers import QUICK, moved
 
 from dlo_casadi.codegen import Capsule, CompiledSolver, Plane
 from dlo_casadi.effects import CableData
@@ -30,7 +31,7 @@ FLOOR = Plane((0.0, 0.0, -0.3), (0.0, 0.0, 2.0))
 def space():
     cable = CableData(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011)
     model = CableModel(cable, 12, "quadratic", "clamped", "clamped", gravity=(0.0, 0.0, -9.81))
-    return CompiledSolver(model, model.nominal, np.zeros(model.chain.n_rests), flags=("-O0",))
+    return CompiledSolver(model, model.nominal, np.zeros(model.chain.n_rests), flags=QUICK)
 
 
 def fine(shape):
@@ -59,15 +60,7 @@ def test_distance_is_that_of_many_points_and_its_gradient_central_differences(sp
     for column in range(12):
         ahead = []
         for sign in (1, -1):
-            by = sign * step * np.eye(3)[column % 3]
-            side = ("start", "end")[column // 6]
-            name = side if column % 6 < 3 else f"{side}_orientation"
-            value = np.array(getattr(POSE, name))
-            if column % 6 < 3:
-                moved = value + by
-            else:
-                moved = (Rotation.from_rotvec(by) * Rotation.from_quat(value)).as_quat()
-            there = space.solve(replace(POSE, **{name: tuple(moved)}), warm=shape)
+            there = space.solve(moved(POSE, column, sign * step), warm=shape)
             ahead.append(space.clearance(there, [obstacle]).distance)
         expected = (ahead[0] - ahead[1]) / (2 * step)
         assert gap.gradient[column] == pytest.approx(expected, abs=1e-6)
@@ -96,7 +89,7 @@ def test_the_nearest_of_many_obstacles_is_told_and_a_cut_is_negative(space):
 @pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_in_a_plane(element):
     model = CableModel(CableData(0.8, 0.2, 0.01, 0.1), 12, element, "clamped", "pinned")
-    solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells), flags=("-O0",))
+    solver = CompiledSolver(model, model.nominal, np.zeros(model.chain.n_cells), flags=QUICK)
     pose = np.array([0.5, 0.1, 0.4])
 
     def posed(at):

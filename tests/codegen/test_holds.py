@@ -3,10 +3,13 @@
 import shutil
 import subprocess
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from benchmarks import memory
 from scipy.spatial.transform import Rotation
+from solvers import QUICK, moved
 
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.effects import (
@@ -23,7 +26,6 @@ from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
-from scripts.benchmarks import memory
 
 
 def turned(*vector):
@@ -88,9 +90,14 @@ def numbers(model, values):
     return p, np.full(model.chain.n_rests, 0.3)
 
 
-def compiled(model, values=()):
+@cache
+def solver_of(model, values):
     p, rest = numbers(model, dict(values))
-    return CompiledSolver(model, p, rest, flags=("-O0",)), p, rest
+    return CompiledSolver(model, p, rest, flags=QUICK), p, rest
+
+
+def compiled(model, values=()):
+    return solver_of(model, tuple(dict(values).items()))
 
 
 @pytest.fixture(scope="module")
@@ -163,24 +170,24 @@ def moves_of(model, pose):
     for k, clip in enumerate(pose.clips):
         column = first + width * k
 
-        def moved(k=k, **change):
+        def of_clip(k=k, **change):
             clips = [*pose.clips]
             clips[k] = replace(clips[k], **change)
             return replace(pose, clips=tuple(clips))
 
         if clip.kind != "eyelet":
-            yield column, lambda h, m=moved, s=clip.at: m(at=s + h), None
+            yield column, lambda h, m=of_clip, s=clip.at: m(at=s + h), None
         for axis in range(d):
             unit = np.eye(d)[axis]
-            move = lambda h, m=moved, x=clip.place, e=unit: m(place=tuple(x + h * e))  # noqa: E731
+            move = lambda h, m=of_clip, x=clip.place, e=unit: m(place=tuple(x + h * e))  # noqa: E731
             yield column + 1 + axis, move, lambda shape, k=k, i=axis: -shape.clip_forces[k][i]
         for axis in range(turns if clip.frame is not None else 0):
             work = lambda shape, k=k, i=axis: -np.atleast_1d(shape.clip_moments[k])[i]  # noqa: E731
             if not model.in_space:
-                move = lambda h, m=moved, x=clip.heading: m(heading=x + h)  # noqa: E731
+                move = lambda h, m=of_clip, x=clip.heading: m(heading=x + h)  # noqa: E731
             else:
                 own, unit = Rotation.from_quat(clip.orientation), np.eye(3)[axis]
-                move = lambda h, m=moved, q=own, e=unit: m(  # noqa: E731
+                move = lambda h, m=of_clip, q=own, e=unit: m(  # noqa: E731
                     orientation=tuple((Rotation.from_rotvec(h * e) * q).as_quat())
                 )
             yield column + 1 + d + axis, move, work
@@ -208,8 +215,8 @@ def test_slopes_by_clips_and_ends_are_differences(two, case):
     slope = solver.sensitivity(shape, pose)
     names = ["points", "end_force", "moments", "clip_forces", "clip_at", "min_bend_radius"]
     names += ["clip_moments", "places"] if case != "pinned" else []
-    for column, moved, work in moves_of(solver.model, pose):
-        ahead, back = (solver.solve(moved(h), warm=shape) for h in (step, -step))
+    for column, move, work in moves_of(solver.model, pose):
+        ahead, back = (solver.solve(move(h), warm=shape) for h in (step, -step))
         for name in names:
             change = (np.array(getattr(ahead, name)) - getattr(back, name)) / (2 * step)
             own = getattr(slope, name)[..., column]
@@ -269,7 +276,7 @@ def test_a_saddle_at_the_first_node_has_no_equilibrium_as_in_python(obstacles):
     ends = {"start_heading": 0.0, "end_heading": 0.0}
     clip = HeldClip("clamped", (0.06, 0.0), 0.083, heading=0.0)
     pose = HeldPose((0.0, 0.0), (0.7, 0.1), clips=(clip,), **ends)
-    solver = CompiledSolver(model, model.nominal, rest, flags=("-O1",), obstacles=obstacles)
+    solver = CompiledSolver(model, model.nominal, rest, flags=QUICK, obstacles=obstacles)
     assert solver.solve(pose, throw=False).status == "iteration_limit"
     with pytest.raises(DloError, match="no equilibrium found"):
         solve_equilibrium(model, model.nominal, rest, pose)
@@ -324,12 +331,8 @@ def test_clamps_in_space_that_give_way(clips):
     assert_agree(shape, solve_equilibrium(model, p, rest, pose))
     slope, step = solver.sensitivity(shape, pose), 1e-5
     for side, column in (("start", 3), ("end", 9)):
-        frame = Rotation.from_quat(getattr(pose, f"{side}_orientation"))
-        for axis, unit in enumerate(np.eye(3)):
-            turned = [
-                tuple((Rotation.from_rotvec(h * unit) * frame).as_quat()) for h in (step, -step)
-            ]
-            ways = [replace(pose, **{f"{side}_orientation": q}) for q in turned]
+        for axis in range(3):
+            ways = [moved(pose, column + axis, h) for h in (step, -step)]
             ahead, back = (solver.solve(way, warm=shape) for way in ways)
             own = shape.moments[int(side == "end")][axis]
             assert -own == pytest.approx((ahead.energy - back.energy) / (2 * step), abs=1e-8)

@@ -1,14 +1,9 @@
 """A few thousand random problems; scripts/benchmark.py solves a hundred thousand."""
 
 import shutil
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-
 from benchmarks.ipopt import Ipopt
 from benchmarks.random_cables import (
     AnyCable,

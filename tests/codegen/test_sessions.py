@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from solvers import QUICK
 
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config, read_yaml
@@ -63,7 +64,7 @@ def session(name, n):
 @pytest.mark.parametrize("name", SESSIONS)
 def test_session(name):
     model, p, rest, poses = session(name, n=12)
-    solver = CompiledSolver(model, p, rest, flags=("-O0",))  # compiles quickly
+    solver = CompiledSolver(model, p, rest, flags=QUICK)
     for pose in poses[: 3 if model.has_state else 6]:
         expected = solve_equilibrium(model, p, rest, pose)
         shape = solver.solve(pose)
@@ -72,4 +73,4 @@ def test_session(name):
         if model.has_state:  # a drift enters with its latest state: compile anew
             given = Inputs.of(p, rest, pose.vector[None])
             rest = assembly_of(model).state_after(expected.shapes, given)[0][0]
-            solver = CompiledSolver(model, p, rest, flags=("-O0",))
+            solver = CompiledSolver(model, p, rest, flags=QUICK)

@@ -1,10 +1,12 @@
 """Contact in the generated C solver: beside Python, its derivatives, paths, what it refuses."""
 
 from dataclasses import replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
+from solvers import QUICK, STRICT, moved
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import CompiledSolver, compile_library
@@ -15,9 +17,6 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod import obstacles as rod
 
-STRICT = ("-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
-# Python's contacts are at nodes alone.
-NODES = (*STRICT, "-DBETWEEN=0")
 TABLE = {2: rod.Plane((0.0, -0.19), (0.0, 1.0)), 3: rod.Plane((0.0, 0.0, -0.19), (0.0, 0.0, 1.0))}
 # Under the middle of the cable.
 ROUND = {
@@ -51,14 +50,20 @@ def pose_of(model: CableModel, *, drop: float = 0.05) -> HeldPose:
 
 def compiled(model: CableModel, *flags: str, obstacles: int = 2) -> CompiledSolver:
     rest = np.zeros(model.chain.n_rests)
-    return CompiledSolver(model, model.nominal, rest, flags=flags or STRICT, obstacles=obstacles)
+    return CompiledSolver(model, model.nominal, rest, flags=flags or QUICK, obstacles=obstacles)
 
 
 @pytest.fixture(scope="module", params=[2, 3], ids=["plane", "space"])
 def own(request) -> tuple[CableModel, CompiledSolver]:
     """A cable that touches its table, and its solver."""
     model = cable(request.param)
-    return model, compiled(replace(model, obstacles=(TABLE[request.param],)))
+    return model, compiled(replace(model, obstacles=(TABLE[request.param],)), *STRICT)
+
+
+@cache
+def at_nodes(d: int, end: str = "clamped") -> CompiledSolver:
+    """A solver whose contacts are at nodes alone, as Python's are."""
+    return compiled(replace(cable(d, end), obstacles=(TABLE[d],)), *QUICK, "-DBETWEEN=0")
 
 
 @pytest.mark.parametrize(
@@ -73,7 +78,7 @@ def own(request) -> tuple[CableModel, CompiledSolver]:
 def test_nodes_alone_touch_as_in_python(what, d, end):
     surface = TABLE[d] if what == "table" else ROUND[what]
     model = replace(cable(d, end), obstacles=(surface,))
-    found = compiled(model, *NODES).solve(pose_of(model))
+    found = at_nodes(d, end).solve(pose_of(model), obstacles=model.obstacles)
     eq = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose_of(model))
     assert eq.contacts, "the cable touches"
     scale = model.cable.mass * 9.81
@@ -133,40 +138,15 @@ def test_no_obstacles_are_as_a_solver_without(own):
     assert not found.contact_forces.any()
 
 
-def moved(pose: HeldPose, column: int, step: float, d: int) -> HeldPose:
-    """The pose with one of the numbers moved by which a slope has derivatives."""
-    if d == 2:
-        start, end = np.array(pose.start), np.array(pose.end)
-        first, last = pose.start_heading, pose.end_heading
-        if column < 2:
-            end = end + step * np.eye(2)[column]
-        elif column < 4:
-            first, last = (first + step, last) if column == 2 else (first, last + step)
-        else:
-            start = start + step * np.eye(2)[column - 4]
-        return replace(
-            pose, start=tuple(start), end=tuple(end), start_heading=first, end_heading=last
-        )
-    from scipy.spatial.transform import Rotation
-
-    side, axis = divmod(column, 6)
-    name = ("start", "end")[side]
-    if axis < 3:
-        place = np.array(getattr(pose, name)) + step * np.eye(3)[axis]
-        return replace(pose, **{name: tuple(place)})
-    key = f"{name}_orientation"
-    turn = Rotation.from_rotvec(step * np.eye(3)[axis - 3])
-    frame = (turn * Rotation.from_quat(getattr(pose, key))).as_quat()
-    return replace(pose, **{key: tuple(frame)})
-
-
-@pytest.mark.parametrize("flags", [NODES, STRICT], ids=["nodes", "between"])
+@pytest.mark.parametrize("where", ["nodes", "between"])
 @pytest.mark.parametrize("what", ["table", "round"])
-def test_derivatives_through_contacts(own, what, flags):
+def test_derivatives_through_contacts(own, what, where):
     """Of forces, moments, points and the force on the obstacle, by central differences."""
-    model, _ = own
+    model, solver = own
     d = model.node.dimension
-    name, solver = "disc" if d == 2 else "ball", compiled(own[1].model, *flags)
+    name = "disc" if d == 2 else "ball"
+    if where == "nodes":
+        solver = at_nodes(d)
     listed = solver.obstacles
     if what == "round":
         listed = (ROUND[name],)
@@ -180,7 +160,7 @@ def test_derivatives_through_contacts(own, what, flags):
     step = 1e-5
     for column in range(slope.min_bend_radius.size):
         sides = [
-            solver.step(shape, moved(pose, column, sign * step, d), steps=10, obstacles=listed)
+            solver.step(shape, moved(pose, column, sign * step), steps=10, obstacles=listed)
             for sign in (1, -1)
         ]
         assert {side.status for side in sides} == {"ok"}
@@ -230,7 +210,7 @@ def test_obstacles_of_the_model_with_what_a_fit_moved():
     p = model.nominal.copy()
     p[model.names.index("obstacle_offset.offset")] = 0.01
     p[model.names.index("contact_plane.height")] = -0.3
-    solver = CompiledSolver(model, p, np.zeros(model.chain.n_rests), flags=STRICT)
+    solver = CompiledSolver(model, p, np.zeros(model.chain.n_rests), flags=QUICK)
     assert [x.point[2] for x in solver.obstacles] == pytest.approx([-0.18, -0.3])
     shape = solver.solve(pose_of(model))
     assert shape.points[:, 2].min() == pytest.approx(-0.18 + 0.006, abs=2e-3)
@@ -242,7 +222,7 @@ def test_casadi_knows_the_obstacles_of_the_model(own, tmp_path):
     d = model.node.dimension
     touching = replace(model, obstacles=(TABLE[d],))
     source = generate(touching, model.nominal, np.zeros(model.chain.n_rests))
-    external = ca.external("dlo_cable", str(compile_library(source, tmp_path, STRICT)))
+    external = ca.external("dlo_cable", str(compile_library(source, tmp_path, QUICK)))
     pose = pose_of(model)
     numbers = np.array([*pose.ends, *([0.0] if d == 3 else [])])
     shape = solver.solve(pose)

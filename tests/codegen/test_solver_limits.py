@@ -5,13 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from dlo_casadi.codegen import QUANTITIES, Capsule, Plane
-from dlo_casadi.equilibrium.limits import places_of, sizes_of
-from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.errors import DloError
-from dlo_casadi.model.assembly import Inputs
-from tests.codegen.test_holds import (
+from test_holds import (
     CLIPS,
     EYELET,
     FLAT_EYELET,
@@ -24,6 +18,12 @@ from tests.codegen.test_holds import (
     loom,
     moves_of,
 )
+
+from dlo_casadi.codegen import QUANTITIES, Capsule, Plane
+from dlo_casadi.equilibrium.limits import places_of, sizes_of
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.assembly import Inputs
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from files import tree
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.generate import MARK, comment
@@ -39,10 +40,6 @@ NASTY = {
 def solver(name="bench cable", prefix="dlo"):
     model = CableModel(replace(CABLE, name=name), n=6)
     return generate(model, model.nominal, np.zeros(6), prefix)
-
-
-def tree(folder):
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")

@@ -49,12 +49,16 @@ def fit(session):
     return fit_of(session)
 
 
+# The search among all effects is in test_bench_sessions.py.
+OTHERS = tuple(set(EFFECTS) - {"bending_softening", "gravity_tilt"})
+
+
 @pytest.fixture(scope="module")
 def found(fit):
-    return diagnose(fit)
+    return diagnose(fit, exclude=OTHERS)
 
 
-def test_held_out_poses_are_not_looked_at(session, fit):
+def test_held_out_poses_are_not_looked_at(session, found):
     """Measured points of held-out poses are moved by a centimetre: nothing changes."""
     _, measured = session
     spoiled = tuple(
@@ -64,21 +68,11 @@ def test_held_out_poses_are_not_looked_at(session, fit):
         for item in measured
     )
     assert any(item.held_out for item in measured)
-    others = tuple(set(EFFECTS) - {"bending_softening", "gravity_tilt"})
-    found, again = (diagnose(one, exclude=others) for one in (fit, fit_of(session, spoiled)))
+    again = diagnose(fit_of(session, spoiled), exclude=OTHERS)
     assert found.added
     assert [a.candidate.name for a in found.added] == [a.candidate.name for a in again.added]
     assert found.ranked == again.ranked
     assert found.after.p == pytest.approx(again.after.p, rel=1e-12)
-
-
-def test_every_refit_that_is_not_chosen_says_why(found):
-    chosen = {x.candidate.name for item in found.added for x in (item, *item.rivals)}
-    lost = {row.name: row.reason for row in found.ranked if row.reason}
-    refitted = {row.name for row in found.ranked if row.rmse_cross_validated is not None}
-    assert lost
-    assert refitted <= chosen | set(lost)
-    assert not chosen & set(lost)
 
 
 @pytest.mark.long
@@ -112,24 +106,6 @@ def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):
     fit = refit(start, larger, values=values)
     assert equivalents(fit, force, tried=()) == (untried,)
     assert equivalents(fit, force, tried=(untried,)) == ()
-
-
-def test_effects_that_do_not_predict_a_pose_left_out_are_no_explanation(monkeypatch):
-    """A stretching cable, without stretch: others are added, fit every pose, and predict none.
-
-    They are withdrawn: what is left is what the declared model leaves.
-    """
-    # Half a minute, not needed.
-    monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: None)
-    tried = {"stiffness_gradient", "gravity_tilt"}
-    config = load_config(BENCH / "stretch" / "session.yaml")
-    measured = measured_poses(config, read_inputs(config))
-    fit = fit_of((declared_model(config), measured), std=config.experiment.measurement.std)
-    found = diagnose(fit, exclude=tuple(set(EFFECTS) - tried))
-    assert found.verdict == "unexplained"
-    assert found.added == ()
-    assert found.validation_after.rmse == pytest.approx(found.validation_before.rmse)
-    assert all(row.rmse_cross_validated for row in found.ranked)  # all were refitted
 
 
 @pytest.mark.parametrize("from_shapes", [True, False])

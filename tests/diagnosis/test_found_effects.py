@@ -103,6 +103,7 @@ def test_wrong_causes_beside_an_unexplained_residual_are_withdrawn(monkeypatch):
     assert found.validation_after.rmse == pytest.approx(found.validation_before.rmse)
     assert found.structure_after.p_value < 0.005
     assert {row.name for row in found.ranked} == {"point_force", "stiff_section"}
+    assert all(row.rmse_cross_validated for row in found.ranked)  # all were refitted
 
 
 def test_in_one_pose_a_tether_is_a_point_force():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
 from scipy.spatial.transform import Rotation
+from sections import principal
 
 from dlo_casadi.effects import (
     EFFECTS,
@@ -181,12 +182,6 @@ def _softening(own: Physics, v: dict[str, float]) -> Physics:
         return (factor * EI * bend @ bend + GJ * twist**2) / 2
 
     return replace(own, density=density)
-
-
-def principal(ratio: float, angle: float) -> np.ndarray:
-    """Stiffness matrix about y and z, over that about the first axis."""
-    first, second = (np.array([np.cos(a), np.sin(a)]) for a in (angle, angle + np.pi / 2))
-    return np.outer(first, first) + ratio * np.outer(second, second)
 
 
 def _anisotropic(own: Physics, v: dict[str, float]) -> Physics:

@@ -188,7 +188,6 @@ def test_runaway_is_reported_on_a_bench_session():
     held = [item for item in poses if item.held_out]
     assert 1e-3 < rmse(result, fit) < 1e-2
     assert 1e-3 < rmse(result, held) < 1e-2
-    assert result.seconds < 10  # 0.2 s on one core; the promise is 15 s
 
 
 def test_stiff_session_predicts_better_than_its_prior():

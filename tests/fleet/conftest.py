@@ -1,10 +1,18 @@
 """A fleet of tiny sessions and its table, computed in this process."""
 
 import pytest
-from tiny_sessions import QUICK, without_times, write_fleet
+from tiny_sessions import QUICK, without_times, write_fleet, write_session
 
+from dlo_casadi.config import load_config
 from dlo_casadi.fleet.run import find_sessions, fit_fleet
 from dlo_casadi.runtime.executors import InProcess
+
+
+@pytest.fixture(scope="session")
+def tiny(run_once, tmp_path_factory):
+    """Outcome of one tiny session."""
+    path = write_session(tmp_path_factory.mktemp("tiny") / "cable")
+    return run_once("tiny", load_config(path))
 
 
 @pytest.fixture(scope="session")

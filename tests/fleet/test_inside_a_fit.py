@@ -11,9 +11,8 @@ from dlo_casadi.session import run_session
 
 
 @pytest.fixture(scope="module")
-def fit(tmp_path_factory):
-    config = load_config(write_session(tmp_path_factory.mktemp("one") / "cable"))
-    return run_session(config).fit
+def fit(tiny):
+    return tiny.fit
 
 
 @pytest.fixture(scope="module")

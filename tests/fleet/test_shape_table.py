@@ -12,11 +12,9 @@ pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-cas
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from tiny_sessions import write_session
 
 from dlo_casadi import predict
 from dlo_casadi.cli import main
-from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -28,7 +26,6 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor
-from dlo_casadi.session import run_session
 
 CABLE = CableData(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
 REST = np.zeros(10)
@@ -41,11 +38,10 @@ def plan_of(tmp_path, **options):
 
 
 @pytest.fixture(scope="module")
-def parameters(tmp_path_factory):
+def parameters(tiny, tmp_path_factory):
     """parameters.yaml of a fitted cable, with all nuisances."""
     folder = tmp_path_factory.mktemp("fitted")
-    outcome = run_session(load_config(write_session(folder / "cable")))
-    (folder / "parameters.yaml").write_text(parameters_text(outcome))
+    (folder / "parameters.yaml").write_text(parameters_text(tiny))
     return folder / "parameters.yaml"
 
 

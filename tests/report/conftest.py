@@ -1,38 +1,13 @@
 """Small sessions, each run once, that all tests of the report look at."""
 
-import os
+from contextlib import redirect_stdout
+from io import StringIO
 
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")  # before numpy: the matrices are small
+import pytest
+from small_sessions import BARE, in_space, photographs, small
 
-import pickle  # noqa: E402
-from contextlib import redirect_stdout  # noqa: E402
-from io import StringIO  # noqa: E402
-
-import pytest  # noqa: E402
-from filelock import FileLock  # noqa: E402
-from small_sessions import BARE, in_space, photographs, small  # noqa: E402
-
-from dlo_casadi.cli import main  # noqa: E402
-from dlo_casadi.report import writer  # noqa: E402
-from dlo_casadi.session import run_session  # noqa: E402
-
-
-@pytest.fixture(scope="session")
-def run_once(tmp_path_factory):
-    """Function that runs a session once for all processes of the tests, and names its outcome."""
-    parallel = "PYTEST_XDIST_WORKER" in os.environ
-    own = tmp_path_factory.getbasetemp()
-    folder = own.parent if parallel else own
-
-    def run(name, config):
-        path = folder / f"{name}.pickle"
-        with FileLock(path.with_suffix(".lock")):
-            if not path.exists():
-                path.write_bytes(pickle.dumps(run_session(config)))
-            return pickle.loads(path.read_bytes())
-
-    return run
+from dlo_casadi.cli import main
+from dlo_casadi.report import writer
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from files import tree
 from small_sessions import BENCH
 
 from dlo_casadi.errors import DloError, OutputError
@@ -15,15 +16,6 @@ from dlo_casadi.report import writer
 from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.writer import OWNED, ResultsFolder
 from dlo_casadi.runtime.parallel import open_executor
-
-
-def tree(folder):
-    """Relative path -> content of every file, hidden ones included."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture
