@@ -463,7 +463,6 @@ def test_a_wrong_export_is_refused_before_anything_is_written(loom, tmp_path, ca
         (["--to", "mjx"], "MJX ignores bend and twist"),
         (["--to", "mujocco"], "did you mean 'mujoco'"),
         (["--to", "mujoco", "--figure", "a.png"], "--figure draws the check"),
-        (["--to", "mujoco", "--samples", "-1"], "--samples -1: 0 or more"),
         (["--to", "mujoco", "--check", "gone.yaml"], "gone.yaml"),
     ):
         assert main(["export", str(loom), *held, *more]) == 2

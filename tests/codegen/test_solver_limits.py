@@ -73,7 +73,7 @@ def test_values_and_places_are_those_of_python(case):
             assert own.value == 0.0
             continue
         sizes = sizes_of(model, found.shapes, given, size)[0]
-        places, holders = places_of(model, pose, found, size)
+        places, holders = places_of(model, pose, found, given, size)
         tight = int(sizes.argmax())
         expected = 1 / sizes[tight] if name == "bend_radius" else sizes[tight]
         assert own.value == pytest.approx(expected, rel=1e-9), name
