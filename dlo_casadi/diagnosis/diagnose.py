@@ -23,10 +23,10 @@ from dlo_casadi.diagnosis.selection import (
     Ranked,
     added_by,
     choose,
-    closed_by,
     likelier_by,
     p_of_removal,
     ranking,
+    with_new_noise,
 )
 from dlo_casadi.diagnosis.structure import noise_degrees, screening_degrees, structure_of
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
@@ -93,7 +93,7 @@ def diagnose(
         effects are tested on up to FINEST_MESH elements.
     """
     run_in = executor or InProcess()
-    return Search(fit, center, exclude, significance, max_effects, step, run_in, finest).closed()
+    return Search(fit, center, exclude, significance, max_effects, step, run_in, finest).diagnosis()
 
 
 @dataclass(frozen=True)
@@ -152,12 +152,12 @@ class Search:
         listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
         return refits.scored(current, listed, degrees, self.executor)
 
-    def closed(self) -> Diagnosis:
+    def diagnosis(self) -> Diagnosis:
         """Result of the search, without effects that explain too little."""
         fit, found, force = self.declared, self._searched(), None
         near = self.at_random(found)
         if near is not None:
-            return replace(self, declared=near).closed()
+            return replace(self, declared=near).diagnosis()
         if found.unexplained:
             found, force = self._or_causes(found)
         if found.unexplained and found.added:
@@ -179,7 +179,7 @@ class Search:
             added=tuple(added),
             ranked=found.ranked,
             unexplained=found.unexplained,
-            pull=force if found.unexplained else None,
+            unknown_force=force if found.unexplained else None,
             weight=None if found.unexplained else hidden_weight(found.fit, self.exclude),
         )
 
@@ -226,24 +226,26 @@ class Search:
             tried = self._tried(current, first, len(added))
             chosen, lost = choose(tried.refits, current, validation, self.doubt)
             lost |= dict.fromkeys(tried.far, NOT_NEAR)
-            closed, p_value = current, 1.0
+            better, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen
-                closed, p_value = closed_by(winner, current, tried.p_values, self._astray(current))
+                better, p_value = with_new_noise(
+                    winner, current, tried.p_values, self._starts_at_shapes(current)
+                )
                 if p_value > self.significance:
                     names = [item.candidate.name for item in chosen]
                     lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
-                    if closed is current:
+                    if better is current:
                         lost |= dict.fromkeys((x.candidate.name for x in winner.each), RAN_AWAY)
             if not ranked:
                 rows = ranking(tried, current, validation)
                 ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
             if p_value > self.significance:
                 break
-            if self._astray(current) and force is None:
+            if self._starts_at_shapes(current) and force is None:
                 # The mesh of a misfit is coarse; its error would look like the next effect.
-                closed = self._fine(closed)
-            current, before = closed, validation
+                better = self._fine(better)
+            current, before = better, validation
             validation = cross_validate(current)
             added += added_by(winner, rivals, p_value, before, validation)
         self.step("search for a missing effect", self.max_effects, self.max_effects)
@@ -251,7 +253,7 @@ class Search:
 
     def _tried(self, current: Fit, force: UnknownForce | None, added: int) -> Tried:
         """Candidates screened and refitted beside those already added."""
-        if self._astray(current) and force is None:
+        if self._starts_at_shapes(current) and force is None:
             pairs = added + 2 <= self.max_effects
             return refits.near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
         screened = self.first if current is self.declared else self._screened(current)
@@ -265,7 +267,7 @@ class Search:
             p_values[item.candidate.name] = sidak(single, len(screened))
         return Tried(screened, p_values, causes)
 
-    def _astray(self, current: Fit) -> bool:
+    def _starts_at_shapes(self, current: Fit) -> bool:
         """Whether candidates start at the measured shapes because the fit is too far from them."""
         first = self.from_shapes and current is self.declared
         return first or current.noise.source == "misfit"
@@ -358,7 +360,7 @@ class Search:
         if not chosen or chosen[0].name == name:
             return fit, effect
         winner = chosen[0]
-        better, p_value = closed_by(winner, smaller, p_values, self._astray(smaller))
+        better, p_value = with_new_noise(winner, smaller, p_values, self._starts_at_shapes(smaller))
         with suppress(EstimationError):
             if better.log_evidence > fit.log_evidence and p_value <= self.significance:
                 after = cross_validate(better)

@@ -115,7 +115,7 @@ class Diagnosis:
         All candidates of the first step: the refitted ones by `support`, then the others by score.
     unexplained : bool
         Whether structure is left, or most left-out poses are not predicted.
-    pull : UnknownForce or None
+    unknown_force : UnknownForce or None
         If unexplained: the load that assumes no cause; None if no load fits.
     weight : HiddenWeight or None
         Hidden weight that the fit would not notice.
@@ -130,7 +130,7 @@ class Diagnosis:
     added: tuple[AddedEffect, ...] = ()
     ranked: tuple[Ranked, ...] = ()
     unexplained: bool = False
-    pull: UnknownForce | None = None
+    unknown_force: UnknownForce | None = None
     weight: HiddenWeight | None = None
 
     @property
@@ -214,27 +214,27 @@ def _on_mesh(fit: Fit, n: int) -> Fit:
     return fit
 
 
-def closed_by(
-    winner: Confirmed, current: Fit, p_values: Mapping[str, float], astray: bool
+def with_new_noise(
+    winner: Confirmed, current: Fit, p_values: Mapping[str, float], from_shapes: bool
 ) -> tuple[Fit, float]:
     """A refit with its noise estimated anew, and its p-value, also under that noise.
 
-    `astray`: the current fit is too far from the shapes for that second p-value. A refit that is
-    weighed by its misfit stays so. If no noise can be estimated, or poses are lost with it, the
-    refit has run away: the current fit and 1 are returned.
+    `from_shapes`: the refit started at the measured shapes, because the current fit is too far from
+    them for that second p-value. A refit that is weighed by its misfit stays so. If no noise can be
+    estimated, or poses are lost with it, the refit has run away: the current fit and 1 are returned.
     """
-    p_value, closed = max(p_values[item.candidate.name] for item in winner.each), winner.fit
+    p_value, fit = max(p_values[item.candidate.name] for item in winner.each), winner.fit
     with suppress(EstimationError):
-        closed = settle(closed) if closed.noise.source != "misfit" else closed
-        if astray or not (current.scatters or not closed.errors_known):
-            return closed, p_value
-        again = p_with_closed_noise(current, closed, winner, len(p_values))
+        fit = settle(fit) if fit.noise.source != "misfit" else fit
+        if from_shapes or not (current.scatters or not fit.errors_known):
+            return fit, p_value
+        again = p_with_new_noise(current, fit, winner, len(p_values))
         # A scatter from pose to pose may be due to the effect alone.
-        return closed, again if current.scatters else max(p_value, again)
+        return fit, again if current.scatters else max(p_value, again)
     return current, 1.0
 
 
-def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) -> float:
+def p_with_new_noise(before: Fit, after: Fit, winner: Confirmed, tried: int) -> float:
     """Significance of an effect under the noise that is left once it is in the model.
 
     Noise estimated without the effect includes part of the effect or, where it was kept out, lacks
@@ -243,17 +243,17 @@ def p_with_closed_noise(open_: Fit, closed: Fit, winner: Confirmed, tried: int) 
     """
     try:
         noise, pose_scatter = errors_of(
-            closed,
+            after,
             modes=0,
-            estimated=not closed.noise.known,
-            repeats=closed.problem.priors.pose_scatter.std == 0,
+            estimated=not after.noise.known,
+            repeats=after.problem.priors.pose_scatter.std == 0,
         )
     except EstimationError:  # too few points are left with the effect to show anything
         return 1.0
-    priors = replace(open_.problem.priors, pose_scatter=pose_scatter)
-    larger = closed.reweighed(noise, priors)
-    smaller = replace(larger.problem, unknowns=open_.problem.unknowns)
-    without = descend(Fit(smaller, smaller.evaluate(open_.point)))
+    priors = replace(before.problem.priors, pose_scatter=pose_scatter)
+    larger = after.reweighed(noise, priors)
+    smaller = replace(larger.problem, unknowns=before.problem.unknowns)
+    without = descend(Fit(smaller, smaller.evaluate(before.point)))
     gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
     dof = len(winner.candidate.frees)
     return sidak(survival(gain, dof, noise_degrees(larger)), tried)

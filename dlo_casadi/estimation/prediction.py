@@ -184,7 +184,7 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
         else None
         for one, pose, x in zip(known, poses, shapes.x, strict=True)
     ]
-    told = _told(model, p, poses, elsewhere)
+    told = _named_ways(model, p, poses, elsewhere)
     x, lam = shapes.x.copy(), shapes.lam.copy()
     for j, (one, way) in enumerate(zip(known, told, strict=True)):
         if one is not None and way is None:
@@ -265,7 +265,7 @@ def measured_branches(
 ) -> list[MeasuredBranch | None]:
     """`measured_elsewhere`, with the branch that a pose has to name for that equilibrium."""
     others = measured_elsewhere(model, p, rest, measured, predictions, fitted)
-    told = _told(model, p, [item.pose for item in measured], others)
+    told = _named_ways(model, p, [item.pose for item in measured], others)
     out: list[MeasuredBranch | None] = []
     last: tuple[HeldPose, FloatArray] | None = None
     for item, known, found, way in zip(measured, predictions, others, told, strict=True):
@@ -288,7 +288,7 @@ def _square(prediction: Prediction, item: MeasuredPose) -> float:
     return float((item.distances(prediction.curve) ** 2).mean())
 
 
-def _told(
+def _named_ways(
     model: CableModel, p: FloatArray, poses: Sequence[HeldPose], others: Sequence[Prediction | None]
 ) -> list[HeldPose | None]:
     """Poses with the branch or turns for which the other equilibrium is predicted, if any."""

@@ -195,10 +195,10 @@ def _fitted(lines: Lines, turn: FloatArray) -> Hypothesis[FloatArray]:
         u, _, v = np.linalg.svd((goal - centres[1]).T @ (source - centres[0]))
         turn = u @ np.diag([*np.ones(d - 1), hand * np.sign(np.linalg.det(u @ v))]) @ v
         shift = centres[1] - turn @ centres[0]
-    return _in_frame(_told(turn, shift), lines.measured @ turn.T + shift)
+    return _in_frame(_described(turn, shift), lines.measured @ turn.T + shift)
 
 
-def _told(turn: FloatArray, shift: FloatArray) -> str:
+def _described(turn: FloatArray, shift: FloatArray) -> str:
     """Describe a frame: by its exchanged axes, or by how far it is rotated and moved."""
     d, moved = len(turn), f"moved by ({listed(shift, '.3g')}) m"
     near = min(exchanges(d), key=lambda axes: float(np.linalg.norm(turn - axes)))

@@ -198,7 +198,7 @@ def judged(outcome: Outcome) -> Outcome:
         said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))
     if verdict is not None:
         verdict = "unexplained" if doubts else verdict
-        stages = (*stages[:-1], _told(stages[-1], verdict != "unexplained"))
+        stages = (*stages[:-1], _marked(stages[-1], verdict != "unexplained"))
     return replace(
         outcome,
         verdict=verdict,
@@ -208,7 +208,7 @@ def judged(outcome: Outcome) -> Outcome:
     )
 
 
-def _told(stage: Stage, explains: bool) -> Stage:
+def _marked(stage: Stage, explains: bool) -> Stage:
     """Mark a stage by whether its model explains the data; if not, remove the intervals."""
     found = stage.parameters
     if not explains:
@@ -272,7 +272,7 @@ def close_the_loop(
     confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
     next_pose = separating_pose(diagnosis.after, diagnosis.added)
     if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
-        stages[-1] = _told(stages[-1], explains=False)
+        stages[-1] = _marked(stages[-1], explains=False)
     elif diagnosis.added:
         parameters = fitted_parameters(declared, profile_intervals(declared), reported)
         stages[-1] = replace(stages[-1], parameters=parameters)
@@ -298,7 +298,7 @@ def close_the_loop(
         "verdict": diagnosis.verdict,
         "effects": found_effects(diagnosis),
         "candidates": diagnosis.ranked,
-        "unexplained": diagnosis.pull,
+        "unexplained": diagnosis.unknown_force,
         "next_pose": next_pose,
         "structure": (diagnosis.structure_before, diagnosis.structure_after),
         "cross_validated": validated.rmse if told else None,

@@ -147,7 +147,7 @@ class _Model:
                 predictions[j], others[j] = known, other
             if known is not None:
                 shape = replace(pose_shape(known, item, other), measured_side=side)
-                shapes[item.pose.name] = self._told(item, known, other, shape)
+                shapes[item.pose.name] = self._with_uncertainty(item, known, other, shape)
         lost = [item for item in measured if item.pose.name not in shapes]
         if lost:
             names = ", ".join(item.pose.name for item in lost)
@@ -173,7 +173,7 @@ class _Model:
             surfaces=surfaces_at(self.model, self.p),
         )
 
-    def _told(
+    def _with_uncertainty(
         self, item: MeasuredPose, known: Prediction, other: MeasuredBranch | None, shape: PoseShape
     ) -> PoseShape:
         """Add to a predicted pose its uncertainty and that of its next repeat."""

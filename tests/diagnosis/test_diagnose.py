@@ -81,9 +81,9 @@ def test_without_the_cause_nothing_false_is_claimed(fit):
     tied = all(item.rivals for item in found.added)
     assert found.verdict == "unexplained" or (found.added and tied)
     # What is left is smaller with a force in each pose, all at one place.
-    assert found.pull is not None
-    assert 0 < found.pull.position < fit.model.cable.length
-    assert found.pull.fit.chi2_per_dof < found.after.chi2_per_dof
+    assert found.unknown_force is not None
+    assert 0 < found.unknown_force.position < fit.model.cable.length
+    assert found.unknown_force.fit.chi2_per_dof < found.after.chi2_per_dof
 
 
 @pytest.mark.parametrize(
