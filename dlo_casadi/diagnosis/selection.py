@@ -220,8 +220,8 @@ def with_new_noise(
     """A refit with its noise estimated anew, and its p-value, also under that noise.
 
     `from_shapes`: the refit started at the measured shapes, because the current fit is too far from
-    them for that second p-value. A refit that is weighed by its misfit stays so. If the refit has
-    run away, so that no noise can be estimated or poses are lost, the current fit and 1 are returned.
+    them for that second p-value. A refit that is weighed by its misfit stays so. If a refit has run
+    away (no noise can be estimated, or poses are lost), the current fit and 1 are returned.
     """
     p_value, fit = max(p_values[item.candidate.name] for item in winner.each), winner.fit
     with suppress(EstimationError):
