@@ -52,7 +52,7 @@ def export(chosen: argparse.Namespace) -> None:
     dlo export results/cable --to mujoco --check cable.yaml --figure check.png
     """
     from dlo_casadi.report.round_trip import draw_round_trip, round_trip_dict, round_trip_table
-    from dlo_casadi.session.round_trip import round_trip, session_of
+    from dlo_casadi.session.round_trip import comparable, round_trip, session_of
     from dlo_casadi.show.style import save_figure
 
     target, cable = target_of(chosen.to), load(chosen.parameters)
@@ -62,6 +62,7 @@ def export(chosen: argparse.Namespace) -> None:
     if chosen.check is not None:
         require(target)
         config = session_of(cable, None if chosen.check == _NEAR else chosen.check)
+        comparable(config, target)
     held = _held(cable, chosen)
     path = chosen.output or Path(f"{cable.metadata.config}{target.suffix}")
     shape = cable.solve(**held)

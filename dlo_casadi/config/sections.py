@@ -218,9 +218,9 @@ class Pose(ConfigSection):
 
     @property
     def labelled(self) -> dict[str, Path]:
-        """Its files by names that other poses' files do not have: they begin with the pose's."""
+        """Its files by names that begin with the pose's: two poses may have files of one name."""
         return {
-            name if name.startswith(self.name) else f"{self.name}_{name}": path
+            name if f"{name}_".startswith(f"{self.name}_") else f"{self.name}_{name}": path
             for name, path in self.photographs.items()
         }
 

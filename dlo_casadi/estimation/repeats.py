@@ -142,7 +142,9 @@ def _alike(pose: HeldPose, other: HeldPose, model: CableModel) -> bool:
 
     def told(one: HeldPose) -> tuple[Any, ...]:
         clips = [(clip.kind, clip.at is None) for clip in one.clips]
-        return one.turns, one.branch, one.over, clips
+        # A pose after the first one may name the pose before it where the first names nothing.
+        named = None if one.branch == "previous" else one.branch
+        return one.turns, named, one.over, clips
 
     if told(pose) != told(other):
         return False

@@ -179,7 +179,7 @@ def measured_moment_curve(
     parts = min(MOST_PARTS, len(points) // 2 - DEGREE)
     order = np.argsort(s, kind="stable")
     s, points = s[order], points[order]
-    # As many points between two knots everywhere: none of them lies in a hidden stretch.
+    # As many points between two knots everywhere, also beside a hidden stretch.
     edges = np.quantile(s, np.linspace(0.0, 1.0, max(parts, 1) + 1))
     spline = make_lsq_spline(s, points, np.pad(edges, DEGREE, mode="edge"), DEGREE)
     fine = np.linspace(s[0], s[-1], FINE)

@@ -94,6 +94,16 @@ def session_of(cable: FittedCable, given: Path | None) -> Config:
     )
 
 
+def comparable(config: Config, target: Target) -> None:
+    """Raise DloError if a target is not installed, or if the session has clips or obstacles."""
+    require(target)
+    if config.experiment.clips or config.experiment.obstacles:
+        raise DloError(
+            f"{config.name} has clips or obstacles, and {target.title} would not: shapes cannot be "
+            "compared.\n  Try: --check SESSION.yaml, with poses of the same cable without them"
+        )
+
+
 def round_trip(
     cable: FittedCable,
     config: Config,
@@ -105,15 +115,9 @@ def round_trip(
     """Relax a cable in every held-out pose, or in every pose if none was held out.
 
     `poses` limits their number; fitted poses make up for too few held-out ones.
-    Raises DloError if the target is not installed, or if the session has clips or obstacles,
-    EquilibriumError if no pose can be predicted.
+    Raises EquilibriumError if no pose can be predicted, and as `comparable` does.
     """
-    require(target)
-    if config.experiment.clips or config.experiment.obstacles:
-        raise DloError(
-            f"{config.name} has clips or obstacles, and {target.title} would not: shapes cannot be "
-            "compared.\n  Try: --check SESSION.yaml, with poses of the same cable without them"
-        )
+    comparable(config, target)
     config, inputs = read_session(config)
     measured = measured_poses(config, inputs)
     declared = config.experiment.poses

@@ -94,6 +94,7 @@ def test_poses_that_hold_a_cable_in_different_ways_are_no_repeats():
     ]
     held = [replace(item, pose=one) for one in (pose, *others, *others)]
     assert different_poses(held, MODEL) == 1 + len(others)
+    assert different_poses([item, replace(item, pose=replace(pose, branch="previous"))], MODEL) == 1
     # Beside a table it matters where they stand.
     raised = replace(pose, start=(0.0, 0.1), end=(LENGTH, 0.1))
     two = [item, replace(item, pose=raised)]
