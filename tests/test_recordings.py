@@ -285,17 +285,31 @@ def test_forces_go_to_the_fixture_of_their_whole_name(take):
 @pytest.mark.parametrize(
     ("sensors", "said"),
     [
-        ([("left_ft", "left_ft", 1.0)], "left_ft .* after none .*--start or --end .*/start/wrench"),
         ([("start/end/wrench", "", 1.0)], "after both of the fixtures"),
         ([("a", "end", 1.0), ("b", "end", 1.0)], "two force sensors are at the end: a and b"),
-        ([("end/wrench", "ft_sensor", 1.0)], "no body has its frame 'ft_sensor'"),
     ],
-    ids=["neither", "both", "two", "unknown axes"],
+    ids=["both", "two"],
 )
-def test_forces_that_belong_nowhere(sensors, said, take):
+def test_forces_whose_fixture_is_not_clear(sensors, said, take):
     with pytest.raises(MeasurementError, match=f"(?s){said}") as told:
         make_session("loom", recorded(take, sensors), Wishes())
     assert "Try: " in told.value.message
+
+
+@pytest.mark.parametrize("end", ["end", "free"])
+@pytest.mark.parametrize(
+    ("sensor", "said"),
+    [
+        (("table", "table", 1.0), "no fixture has the name of its frame or topic"),
+        (("start/wrench", "ft_sensor", 1.0), "no TF and no body has its frame"),
+    ],
+    ids=["of no fixture", "unknown axes"],
+)
+def test_forces_that_belong_nowhere_are_left_out_with_a_remark(sensor, said, end, take):
+    known = {"length": 0.6}
+    session = make_session("loom", recorded(take, [sensor]), Wishes(end=end, known=known))
+    assert not any("force" in key for pose in session.poses for key in pose)
+    assert any(f"force sensor {sensor[0]}" in x and said in x for x in session.remarks)
 
 
 def test_a_pose_without_the_cables_markers_is_named(take):

@@ -128,7 +128,8 @@ def _markers(message: Any, kind: str, topic: str) -> Iterator[tuple[str, Any, li
 def _add(link: Any, links: Links, static: bool) -> None:
     """Add a TransformStamped to TF; of a static one only the last pose is valid."""
     pose = _pose(link.transform.translation, link.transform.rotation)
-    if not np.isfinite(pose).all() or not any(pose[3:]):
+    itself = link.child_frame_id.strip("/") == _frame(link)
+    if itself or not np.isfinite(pose).all() or not any(pose[3:]):
         return
     _, poses = links.setdefault(link.child_frame_id.strip("/"), (_frame(link), []))
     if static:

@@ -14,6 +14,7 @@ from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.recordings.forces import readings_of
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.stills import (
     Gripper,
@@ -162,7 +163,8 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             (np.round(line, 6), np.round(s[here], 6))
             for line, here in zip(lines, seen.T, strict=True)
         ]
-    readings = _readings(recording, stills, wishes, remarks)
+    readings, on_forces = readings_of(recording, stills, wishes.holders)
+    remarks += on_forces
     whole = {"length": length} if start and end else {}  # beyond the last marker it is unknown
     known = {**whole, **wishes.known}
     if "mass" in known and "bending_stiffness" not in known:
@@ -174,7 +176,11 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
         {key: f"{value:.6g}" for key, value in known.items()},
         known.get("length", length),
         tuple(
-            {"remark": told[k], **_declared(k, start, end, wishes), **readings[k]}
+            {
+                "remark": told[k],
+                **_declared(k, start, end, wishes),
+                **{key: _row(value) for key, value in readings[k].items()},
+            }
             for k in range(len(stills))
         ),
         FREE if wishes.end == FREE else "clamped",
@@ -201,57 +207,6 @@ def _declared(k: int, start: Gripper | None, end: Gripper | None, wishes: Wishes
 
 def _row(values: FloatArray) -> str:
     return f"[{', '.join(f'{x:.6f}' for x in values + 0.0)}]"
-
-
-# ---- forces -------------------------------------------------------------------------------------
-
-
-def _readings(
-    recording: Recording, stills: Sequence[Still], wishes: Wishes, remarks: list[str]
-) -> list[dict[str, str]]:
-    """Forces and moments of each pose in the world's axes, by their configuration keys."""
-    found: list[dict[str, str]] = [{} for _ in stills]
-    sensors: dict[str, str] = {}  # of each side
-    for name, stream in recording.of("wrench").items():
-        side = _side(stream, wishes)
-        if side in sensors:
-            raise MeasurementError(
-                f"two force sensors are at the {side}: {sensors[side]} and {name}.\n  Try: leave "
-                "the topic of one of them out."
-            )
-        sensors[side] = name
-        if stream.frame and stream.frame not in recording.of("body"):
-            raise MeasurementError(
-                f"the axes of the force sensor {name} are unknown: no TF and no body has its frame "
-                f"{stream.frame!r}.\n  Try: record /tf and /tf_static, too, or leave its topic out."
-            )
-        for still, row in zip(stills, found, strict=True):
-            wrench = still.values.get(("wrench", name))
-            body = still.values.get(("body", stream.frame))
-            if wrench is not None and (body is not None or not stream.frame):
-                turn = Rotation.from_quat([0.0, 0.0, 0.0, 1.0] if body is None else body[3:])
-                row[f"{side}_force"] = _row(turn.apply(wrench[:3]))
-                row[f"{side}_moment"] = _row(turn.apply(wrench[3:]))
-        remarks.append(
-            f"{side}_force, {side}_moment: means of {name}, in axes of "
-            f"{stream.frame or 'the world'}; taken as those of the cable on its fixture, about its "
-            "place, with the gripper's weight taken off"
-        )
-    return found
-
-
-def _side(sensor: Stream, wishes: Wishes) -> str:
-    """The fixture, start or end, that a force sensor's frame or topic is called after."""
-    for names in ([sensor.frame], [sensor.name, *sensor.name.split("/")]):
-        sides = [side for side, parts in wishes.holders.items() if {*parts} & {*names}]
-        if len(sides) == 1:
-            return sides[0]
-    raise MeasurementError(
-        f"the force sensor {sensor.name} (frame {sensor.frame!r}) is called after "
-        f"{'both' if sides else 'none'} of the fixtures {wishes.start!r} and {wishes.end!r}.\n  "
-        f"Try: --start or --end with its frame; a topic such as /{wishes.start.split(',')[0]}/"
-        "wrench; or leave its topic out."
-    )
 
 
 # ---- clouds -------------------------------------------------------------------------------------
