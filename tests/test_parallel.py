@@ -221,7 +221,7 @@ def test_any_executor_of_the_standard_library_takes_items_only_when_there_is_roo
     with ThreadPoolExecutor(3) as executor:
         for k, done in enumerate(map_as_completed(executor, square, items())):
             assert done.value == done.item**2
-            assert len(taken) in (50, *range(k + 3, k + 8)), "two are submitted for each worker"
+            assert len(taken) <= k + 4, "two are submitted at a time: threads are one worker"
 
 
 def test_a_killed_worker_loses_nothing(tmp_path):

@@ -120,8 +120,8 @@ class CompiledShape:
 class ShapePath:
     """Shapes along a path of poses.
 
-    `shapes` has one shape per pose; `first_jump` is the first pose that cannot be reached on
-    the held branch, None if there is none.
+    `shapes` has one shape per pose; `first_jump` is the first pose without a shape on the held
+    branch (also if its arguments are refused), None if there is none.
     """
 
     shapes: tuple[CompiledShape, ...]

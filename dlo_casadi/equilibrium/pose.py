@@ -116,6 +116,8 @@ class HeldPose:
         start, end = place(before.ends[:d], self.ends[:d]).reshape(2, -1)
         for one, own in zip(before.clips, self.clips, strict=True):
             held: dict[str, Any] = {"place": tuple(place(np.array(one.place), np.array(own.place)))}
+            if one.at is not None and own.at is not None:
+                held["at"] = one.at + share * (own.at - one.at)
             if one.frame is not None and own.frame is not None:
                 held[self.node.direction] = self.node.declared(frame(one.frame, own.frame))
             clips.append(replace(own, **held))

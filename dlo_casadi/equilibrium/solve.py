@@ -421,7 +421,7 @@ def continued(
     """
     both, d = (before, pose), model.node.dimension
     ends = [one.ends[: 2 * d] for one in both]
-    clips = [[x for clip in one.clips for x in clip.place] for one in both]
+    clips = [[x for clip in one.clips for x in (*clip.place, clip.at or 0.0)] for one in both]
     moved = float(np.abs(np.diff(np.hstack([ends, clips]), axis=0)).max()) / model.cable.length
     held = [[*one.frames, *(clip.frame for clip in one.clips)] for one in both]
     frames = np.array([[x for x in each if x is not None] for each in held])

@@ -72,7 +72,7 @@ def with_repeats(
 ) -> NoiseModel:
     """Noise of one line; of few poses that of their repeats, if it is more than twice as large.
 
-    Few are less than DIFFERENT.
+    Poses are few if fewer than DIFFERENT are different.
 
     Pure error: the distances of repeats from their mean, with their correlation along the cable,
     times sqrt(m / (m - 1)) because the mean of m takes one degree of freedom. A fit that

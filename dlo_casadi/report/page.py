@@ -33,6 +33,8 @@ from dlo_casadi.thresholds import NORMAL_95
 GENERATOR = '<meta name="generator" content="dlo_casadi">'
 # Text for a missing number.
 NOTHING = "–"
+
+
 # ---- of a run ----------------------------------------------------------------------------------
 
 

@@ -77,8 +77,11 @@ class ResultsFolder(FolderDraft):
                 with FolderDraft(self.path) as draft:
                     write_file(draft.folder / FAILURE, page)
                     draft.put_in_place()
-            except Exception:
+            except OutputError:
                 return  # the user must see the original error
+            except Exception as other:  # a fault of the page, which must not hide it either
+                error.add_note(f"Without {FAILURE}, which cannot be made: {other}")
+                return
             error.add_note(f"Pose by pose: {self.path / FAILURE}")
 
     def write(self, outcome: Outcome, executor: Executor | None = None) -> Path:

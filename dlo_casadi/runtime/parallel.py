@@ -6,7 +6,14 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Generator, Iterable, Sequence, Sized
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -226,8 +233,13 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
 
 
 def workers_of(executor: Executor) -> int:
-    """Number of workers; the standard library's executors have it as `_max_workers`."""
-    return int(getattr(executor, "workers", getattr(executor, "_max_workers", 1)))
+    """Number of processes; the standard library's executors have it as `_max_workers`.
+
+    Threads count as one: they share an interpreter, and the paper's loop and IPOPT with it.
+    """
+    if isinstance(executor, ThreadPoolExecutor):
+        return 1
+    return int(getattr(executor, "workers", getattr(executor, "_max_workers", 1)) or 1)
 
 
 def generator_of(seed: int, index: int) -> np.random.Generator:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -353,12 +354,11 @@ def calibrate_session(config: Config, step: Step = nobody) -> vision.Calibration
             "a camera is calibrated from photographs of a board of markers, and this session has "
             "none. Try: measurement: {kind: images, board: ...}"
         )
-    paths = {
-        name: path
-        for pose in config.experiment.poses
-        for name, path in pose.labelled.items()
-        if path.suffix.lower() != ".csv"
-    }
+    paths: dict[str, Path] = {}
+    for pose in config.experiment.poses:
+        for name, path in pose.labelled.items():
+            if path.suffix.lower() != ".csv":
+                paths[str(path) if name in paths else name] = path
     images = {}
     for k, (name, path) in enumerate(paths.items()):
         step(f"calibrate {name}", k, len(paths))

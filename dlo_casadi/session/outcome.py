@@ -249,9 +249,9 @@ class Repeatability:
     expected_spread : float [m]
         RMS distance of two repeats of a pose, at the measured points.
     source : "repeats", "poses" or None
-        "repeats": repeats of one or two poses, each compared with the mean of the others. "poses":
-        the scatter between poses that nothing common to all of them explains. None: it could not
-        be estimated.
+        "repeats": repeats of few poses, see `with_repeats`, each compared with the mean of the
+        others. "poses": the scatter between poses that nothing common to all of them explains.
+        None: it could not be estimated.
     """
 
     expected_spread: float

@@ -26,7 +26,7 @@ def vector(components: Iterable[float], form: str, unit: str) -> str:
 
 def plus_minus(value: float, std: float) -> str:
     """A value rounded to two significant digits of its standard deviation."""
-    if not 0 < std < math.inf:
+    if not (0 < std < math.inf and math.isfinite(value)):
         return f"{value:.4g}"
     decimals = 1 - math.floor(math.log10(std))
     if std >= 10 * abs(value) or not 0 <= decimals <= 7:

@@ -153,6 +153,17 @@ def test_a_page_that_cannot_be_written_does_not_hide_the_error(outcome, tmp_path
     assert not hasattr(error, "__notes__")
 
 
+def test_a_fault_of_the_page_is_noted_beside_the_error(outcome, tmp_path, monkeypatch):
+    def broken(*_):
+        raise ValueError("no such scale")
+
+    monkeypatch.setattr(writer, "failure_page", broken)
+    error = DloError("broken")
+    fail(tmp_path / "results", outcome.config, error)
+
+    assert error.__notes__ == ["Without failed.html, which cannot be made: no such scale"]
+
+
 def test_a_page_of_that_name_from_elsewhere_is_not_replaced(outcome, tmp_path):
     (tmp_path / "failed.html").write_text("<p>mine")
     with (

@@ -215,6 +215,7 @@ def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcom
         (123456.0, 2000.0, "1.235e+05 ± 2e+03"),
         (0.0, 3e-12, "0 ± 3e-12"),
         (0.25, np.inf, "0.25"),
+        (np.nan, 1e-9, "nan"),
     ],
 )
 def test_digits_follow_the_standard_deviation(value, std, text):

@@ -84,12 +84,13 @@ def test_a_cable_is_followed_over_the_top_until_it_snaps():
 
 def test_clips_move_with_the_ends_while_a_cable_is_followed(monkeypatch):
     """A clip is raised by half the cable's length, in steps of a twentieth."""
-    clips = [(HeldClip("clamped", (0.3, y), 0.4, heading=a),) for y, a in ((-0.2, 0.2), (0.3, 0.4))]
+    moves = ((-0.2, 0.4, 0.2), (0.3, 0.5, 0.4))
+    clips = [(HeldClip("clamped", (0.3, y), at, heading=a),) for y, at, a in moves]
     before, after = (HeldPose((0.0, 0.0), start_heading=0.0, clips=x) for x in clips)
     way = after.on_the_way(before, 0.4)
     assert way.clips[0].place == pytest.approx((0.3, 0.0))
     assert way.clips[0].heading == pytest.approx(0.28)
-    assert way.clips[0].at == 0.4
+    assert way.clips[0].at == pytest.approx(0.44)
     assert after.on_the_way(before, 1.0).clips == after.clips
     solved = []
 
