@@ -67,19 +67,20 @@ def student_95(fit: Fit, name: str) -> float:
     return float(stdtrit(fit.variance_degrees(name), BELOW_HIGH_END))
 
 
-def threshold(fit: Fit, name: str = BENDING_STIFFNESS) -> float:
+def threshold(fit: Fit, name: str = BENDING_STIFFNESS, *, systematic: bool = False) -> float:
     """Rise of twice the objective at the ends of a parameter's interval.
 
     (t + b)^2 times the parameter's marginal variance over that at the given noise and roughness,
     at which all refits are made. t is Student's t of 95 % where the sizes of noise and scatter are
-    estimated, and 1.96 where they are declared. b is used for a declared noise: the whitened norm
-    of a systematic error of SYSTEMATIC_SHARE in all points.
+    estimated, and 1.96 where they are declared. b is zero unless `systematic` and the noise is
+    declared: then the whitened norm of an error of SYSTEMATIC_SHARE in all points, in the direction
+    that changes the parameter most.
     """
     k = fit.problem.unknowns.names.index(name)
     more = fit.marginal_covariance[k, k] / fit.covariance[k, k]
     square = 0.0
     for j, white in zip(fit.problem.used, fit.problem.whitening, strict=True):
-        if fit.noise.source != "declared":
+        if not systematic or fit.noise.source != "declared":
             break
         item = fit.problem.measured[j]
         constant = np.zeros(item.n_residuals)
@@ -102,10 +103,24 @@ def profile_intervals(fit: Fit) -> dict[str, Interval]:
 def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
     """Profile-likelihood interval of a positive parameter, such as a stiffness [N m^2].
 
-    The parameter is fixed and everything else is refitted; its own prior does not count. The
-    default `name` is the bending stiffness.
+    The parameter is fixed and everything else refitted; its own prior does not count. The interval
+    allows for a systematic error of a declared noise if the parameter is not identifiable with it:
+    then only averages far below the noise tell its value. The default `name` is the bending
+    stiffness.
     """
-    k, limit = fit.problem.unknowns.names.index(name), threshold(fit, name)
+    limit, allowing = threshold(fit, name), threshold(fit, name, systematic=True)
+    found = _cut(fit, name, limit)
+    # In logarithms a wider interval grows like the roots of the limits; twice that is not reached.
+    widest = np.log(found.high / found.low) if found.low and found.high else np.inf
+    if 2 * np.sqrt(allowing / limit) * widest < np.log(IDENTIFIABLE):
+        return found
+    wide = found if allowing == limit else _cut(fit, name, allowing)
+    return found if wide.identifiable else wide
+
+
+def _cut(fit: Fit, name: str, limit: float) -> Interval:
+    """Where a parameter's profile has risen to a limit."""
+    k = fit.problem.unknowns.names.index(name)
     first = min(max(np.sqrt(limit * fit.covariance[k, k]), 1e-4), 0.7)
     ends = [_crossing(_Profile(fit, name), limit, direction * first) for direction in (-1, 1)]
     low, high = (None if end is None else float(np.exp(end) * fit.value(name)) for end in ends)

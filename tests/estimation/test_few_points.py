@@ -89,11 +89,17 @@ def test_how_well_the_variance_of_a_parameter_is_known():
     assert like().variance_degrees("bending_stiffness") == pytest.approx(expected, rel=1e-3)
     declared = fitted(9, std=STD)
     assert declared.variance_degrees("bending_stiffness") == np.inf
-    assert threshold(declared) > threshold_of_t(np.inf)
-    wider = fit.marginal_covariance[0, 0] / fit.covariance[0, 0]
+    wider, own = (x.marginal_covariance[0, 0] / x.covariance[0, 0] for x in (fit, declared))
     assert wider > fit.inflation**2
+    assert threshold(fit) == threshold(fit, systematic=True)
     assert threshold(fit) == pytest.approx(
         threshold_of_t(fit.variance_degrees("bending_stiffness")) * wider
+    )
+    # A twentieth of a white noise in each of 8 x 9 distances.
+    allowance = 0.05 * np.sqrt(72)
+    assert threshold(declared) == pytest.approx(threshold_of_t(np.inf) * own)
+    assert np.sqrt(threshold(declared, systematic=True) / own) == pytest.approx(
+        t.ppf(0.975, np.inf) + allowance
     )
 
 
