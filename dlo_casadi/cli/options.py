@@ -19,6 +19,7 @@ from rich.markup import escape
 from dlo_casadi.cli import EXIT_CODES, OK
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import ConfigError, DloError
+from dlo_casadi.io.files import finite
 
 # Endings of figures' names.
 DRAWN = (".png", ".pdf", ".svg", ".jpg")
@@ -146,8 +147,6 @@ class Page(Console):
     def data(self, data: Any) -> None:
         """Print plain data as JSON, if requested; numbers that are not finite as null."""
         if self.as_json:
-            from dlo_casadi.report.documents import finite
-
             print(json.dumps(finite(data), indent=1, allow_nan=False))
 
     def say(self, text: object, mark: str = "") -> None:

@@ -21,7 +21,8 @@ from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.continuation import loosely_relaxed, relaxed, with_springs_in_place
 from dlo_casadi.estimation.fit import FIRST_STD
 from dlo_casadi.estimation.measured_shapes import measured_shapes
-from dlo_casadi.estimation.problem import Priors, Problem, Values
+from dlo_casadi.estimation.point import Values
+from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from, retry_outlying_poses

@@ -11,7 +11,8 @@ from dlo_casadi.effects import UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.continuation import relaxed
 from dlo_casadi.estimation.descent import descend, refit
-from dlo_casadi.estimation.problem import Problem, Values
+from dlo_casadi.estimation.point import Values
+from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from

@@ -9,7 +9,8 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray
 from dlo_casadi.equilibrium.solve import solve_after
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.problem import Problem, Values
+from dlo_casadi.estimation.point import Values
+from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.model.functions import functions_of
 

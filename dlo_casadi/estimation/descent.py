@@ -12,14 +12,8 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.solve import solve_after
 from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.errors import EquilibriumError, EstimationError
-from dlo_casadi.estimation.problem import (
-    NO_INFORMATION,
-    Linearization,
-    Normal,
-    Point,
-    Problem,
-    Values,
-)
+from dlo_casadi.estimation.point import NO_INFORMATION, Linearization, Normal, Point, Values
+from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Shapes

@@ -15,8 +15,9 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.estimation.continuation import loosened, relaxed, with_springs_in_place
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.measured_shapes import measured_shapes
+from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_each
-from dlo_casadi.estimation.problem import Problem, Values
+from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.assembly import Shapes

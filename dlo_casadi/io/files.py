@@ -2,8 +2,10 @@
 
 The whole package writes through this module, so that every failure is the same: the earlier file is
 unchanged, no draft is left, and the error names the place, the system's reason and a remedy.
+What is written as JSON goes through `finite`.
 """
 
+import math
 import os
 import secrets
 import shutil
@@ -12,6 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
+import numpy as np
 from filelock import FileLock, Timeout
 
 from dlo_casadi.errors import OutputError, well_formed
@@ -20,6 +23,21 @@ from dlo_casadi.errors import OutputError, well_formed
 _DRAFT = ".dlo-draft-"
 # Name of the file by which a run locks its folder.
 LOCK = ".lock"
+
+
+def finite(value: Any) -> Any:
+    """Copy with Python numbers, None for values that are not finite, and `well_formed` text."""
+    if isinstance(value, dict):
+        return {finite(str(key)): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return finite(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, str):
+        return well_formed(value)
+    return value
 
 
 def write_file(

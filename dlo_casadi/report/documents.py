@@ -21,9 +21,10 @@ from dlo_casadi.config import Config, Limits, dump_yaml
 from dlo_casadi.config.values import AXES
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.errors import DloError, well_formed
+from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.prediction import uncertainty_of
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.io.files import finite
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.report.words import all_warnings
@@ -100,21 +101,6 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
 def report_text(outcome: Outcome) -> str:
     """The text of report.json."""
     return json.dumps(report_dict(outcome), indent=1, allow_nan=False) + "\n"
-
-
-def finite(value: Any) -> Any:
-    """Copy with Python numbers, None for values that are not finite, and `well_formed` text."""
-    if isinstance(value, dict):
-        return {finite(str(key)): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return finite(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, str):
-        return well_formed(value)
-    return value
 
 
 def fields_of(item: object, *names: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from dlo_casadi.errors import counted
 from dlo_casadi.export.targets import Target
-from dlo_casadi.report.documents import finite
+from dlo_casadi.io.files import finite
 from dlo_casadi.report.terminal import plain_table
 from dlo_casadi.session.round_trip import CASES, Distance, Relaxation
 from dlo_casadi.show import style

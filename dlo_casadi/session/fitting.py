@@ -24,8 +24,8 @@ from dlo_casadi.estimation.fit import (
     mesh_error,
     refine_mesh,
 )
+from dlo_casadi.estimation.point import Point
 from dlo_casadi.estimation.prediction import predicted_shapes
-from dlo_casadi.estimation.problem import Point
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
 from dlo_casadi.estimation.variances import first_reading_noise, refine

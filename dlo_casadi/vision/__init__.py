@@ -2,13 +2,7 @@
 
 from dlo_casadi.vision.board import Board, locate_board, locate_camera
 from dlo_casadi.vision.calibration import Calibration, calibrate_camera
-from dlo_casadi.vision.camera import (
-    Camera,
-    CameraPose,
-    View,
-    compare_pixels,
-    from_reference,
-)
+from dlo_casadi.vision.camera import Camera, CameraPose, View, compare_pixels, from_reference
 from dlo_casadi.vision.centerline import ExtractedCenterline, extract_centerline
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.cloud import line_in_cloud, of_color

@@ -7,8 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import VisionError, counted
-from dlo_casadi.vision.camera import Array, Camera, CameraPose, Picture, View
+from dlo_casadi.vision.camera import Camera, CameraPose, Picture, View
 from dlo_casadi.vision.image import spoilt
 
 MAX_ERROR_PX = 2.0  # largest error of a marker at its declared place
@@ -38,10 +39,10 @@ class Board:
     """Side of the black square [m]."""
     standoff: float
     """Distance [m] of the cable's axis in front of the board, towards the camera."""
-    marker_centers: Mapping[int, tuple[float, float] | Array]
+    marker_centers: Mapping[int, tuple[float, float] | FloatArray]
     """Centre (x, y) [m] of each marker in the board frame, by its number."""
 
-    def corners(self, marker: int) -> Array:
+    def corners(self, marker: int) -> FloatArray:
         """Corners (4, 2) [m] in the order in which ArUco reports them: clockwise from top left."""
         square = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * (self.marker_size / 2)
         return np.asarray(self.marker_centers[marker], float) + square
@@ -109,9 +110,9 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> CameraPose:
 class _Fit:
     """The board's plane, fitted to markers."""
 
-    found: dict[int, Array]  # corners (4, 2) [px] of each marker
-    plane: Array  # (3, 3), homography to pixels; with a camera [r_1, r_2, t]
-    errors: Array  # (n,) [px], RMS of each marker
+    found: dict[int, FloatArray]  # corners (4, 2) [px] of each marker
+    plane: FloatArray  # (3, 3), homography to pixels; with a camera [r_1, r_2, t]
+    errors: FloatArray  # (n,) [px], RMS of each marker
 
     @property
     def rms(self) -> float:
@@ -169,7 +170,7 @@ def _located(
     }
 
 
-def _fit(found: dict[int, Array], board: Board, camera: Camera | None) -> _Fit:
+def _fit(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> _Fit:
     """Fit the board's plane to markers; of the two poses that fit a plane, return the better."""
     pixels = np.vstack(list(found.values()))
     points = np.vstack([board.corners(marker) for marker in found])
@@ -222,7 +223,7 @@ def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, in
     )
 
 
-def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) -> str:
+def _other_axes(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> str:
     """Sentence on other axes for which the declared places would fit, if there are any."""
     for what, axes in _AXES.items():
         centers = {n: np.array(axes) @ np.array(board.marker_centers[n], float) for n in found}
@@ -232,7 +233,7 @@ def _other_axes(found: dict[int, Array], board: Board, camera: Camera | None) ->
     return ""
 
 
-def detect_markers(image: Picture, board: Board) -> tuple[dict[int, Array], set[int]]:
+def detect_markers(image: Picture, board: Board) -> tuple[dict[int, FloatArray], set[int]]:
     """Corners (4, 2) [px] of the board's markers, and numbers of markers seen more than once."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if not board.dictionary.startswith("DICT_") or number is None:
@@ -241,10 +242,10 @@ def detect_markers(image: Picture, board: Board) -> tuple[dict[int, Array], set[
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
 
-    def markers(picture: Picture) -> dict[int, list[Array]]:
+    def markers(picture: Picture) -> dict[int, list[FloatArray]]:
         """Corners of all markers by number, a list for each."""
         quads, numbers, _ = detector.detectMarkers(picture)
-        found: dict[int, list[Array]] = {}
+        found: dict[int, list[FloatArray]] = {}
         for n, quad in zip([] if numbers is None else numbers.ravel(), quads, strict=True):
             found.setdefault(int(n), []).append(quad.reshape(4, 2))
         return found
@@ -265,7 +266,7 @@ def detect_markers(image: Picture, board: Board) -> tuple[dict[int, Array], set[
     return single, set(ours) - set(single)
 
 
-def _refine(grey: Picture, quad: Array) -> Array:
+def _refine(grey: Picture, quad: FloatArray) -> FloatArray:
     """Corners of a black square on white as the intersections of its four straight sides.
 
     Corner detectors look for saddles; on the L of a blurred square they are biased inwards by
@@ -282,7 +283,7 @@ def _refine(grey: Picture, quad: Array) -> Array:
     return corners if jump < 0.1 * size else np.asarray(quad, float)
 
 
-def _side(grey: Picture, a: Array, b: Array) -> tuple[Array, Array]:
+def _side(grey: Picture, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Line (point, direction) along the step from black (right of a -> b) to white (left)."""
     length = float(np.linalg.norm(b - a))
     along = (b - a) / length

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from scipy.linalg import block_diag
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import (
     CORNERS_THAT_SHARE,
@@ -15,7 +16,7 @@ from dlo_casadi.vision.board import (
     Board,
     detect_markers,
 )
-from dlo_casadi.vision.camera import Array, Camera, Picture
+from dlo_casadi.vision.camera import Camera, Picture
 
 _LEAST_PHOTOGRAPHS = 3  # each gives two equations for the five numbers of the camera matrix
 _GOOD_FOCAL = 0.005  # largest relative std of a good focal length: 0.5 % of lengths along the view
@@ -43,7 +44,7 @@ class Calibration:
 
     camera: Camera
     """Matrix [px] and distortion k1, k2, p1, p2, k3."""
-    matrix_std: Array
+    matrix_std: FloatArray
     """Standard deviations (4,) [px] of fx, fy, cx, cy."""
     spread: float
     """Degrees between the most different directions from which photographs were taken."""
@@ -96,7 +97,7 @@ def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibr
                 "turned nor cut."
             )
     problems: dict[str, str] = {}
-    seen: dict[str, dict[int, Array]] = {}
+    seen: dict[str, dict[int, FloatArray]] = {}
     for name, image in photographs.items():
         try:
             markers, _ = detect_markers(image, board)
@@ -128,7 +129,10 @@ def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibr
 
 
 def _solve(
-    seen: dict[str, dict[int, Array]], board: Board, size: tuple[int, int], problems: dict[str, str]
+    seen: dict[str, dict[int, FloatArray]],
+    board: Board,
+    size: tuple[int, int],
+    problems: dict[str, str],
 ) -> tuple[Calibration, dict[str, dict[int, float]]]:
     """Calibrate with the lens of the least BIC; errors [px] of each marker by picture."""
     if len(seen) < _LEAST_PHOTOGRAPHS:
@@ -182,7 +186,7 @@ def _solve(
     return replace(found, advice=tuple(_advice(found, filled))), errors
 
 
-def _matrix_std(slopes: list[Array], displaced: list[Array], rms: float) -> Array:
+def _matrix_std(slopes: list[FloatArray], displaced: list[FloatArray], rms: float) -> FloatArray:
     """Marginal standard deviations (4,) [px] of the matrix, over poses and lens.
 
     They include the scatter of corners, where the corners of a marker count as one, and errors of

@@ -10,9 +10,6 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.errors import VisionError
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 Picture = NDArray[np.uint8]
 
 # Stopping rule of OpenCV's fixed-point inversion of a lens. Its five default steps leave 0.6 px
@@ -24,9 +21,9 @@ _UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
 class Camera:
     """A pinhole camera with a lens, both as OpenCV defines them."""
 
-    matrix: Array
+    matrix: FloatArray
     """(3, 3) [px]: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
-    distortion: Array
+    distortion: FloatArray
     """k1, k2, p1, p2[, k3[, k4, k5, k6[, s1, s2, s3, s4[, tau_x, tau_y]]]], or none: radial and
     tangential, rational, thin prism, tilted sensor."""
 
@@ -39,7 +36,7 @@ class Camera:
         """Focal length [px], the mean of both axes."""
         return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
 
-    def project(self, points: Array) -> tuple[Array, Array]:
+    def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels (K, 2) of points (K, 3) [m] in the camera's frame, d(pixel)/d(point) (K, 2, 3)."""
         if not len(points):
             return np.zeros((0, 2)), np.zeros((0, 2, 3))
@@ -47,11 +44,11 @@ class Camera:
         pixels, slopes = cv2.projectPoints(points, still, still, self.matrix, self.distortion)
         return pixels[:, 0], slopes[:, 3:6].reshape(-1, 2, 3)
 
-    def distort(self, rays: Array) -> Array:
+    def distort(self, rays: FloatArray) -> FloatArray:
         """Pixels (K, 2) at which undistorted normalised rays (K, 2) are seen."""
         return self.project(np.column_stack([rays, np.ones(len(rays))]))[0]
 
-    def undistort(self, pixels: Array) -> Array:
+    def undistort(self, pixels: FloatArray) -> FloatArray:
         """Undistorted normalised rays (K, 2) of pixels (K, 2): the inverse of `distort`."""
         if not len(pixels):
             return pixels
@@ -69,7 +66,7 @@ class Photograph:
     """Its matrix and lens."""
     reprojection_error: float = 0.0
     """Root mean square [px] over the corners of the markers; 0 for two reference points."""
-    markers: Array = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    markers: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 2)))
     """Corners (n, 4, 2) [px] of the markers that were used."""
     numbers: tuple[int, ...] = ()
     """Their numbers."""
@@ -89,22 +86,22 @@ class View(Photograph):
     and the pixel (u, v) itself when not.
     """
 
-    homography: Array
+    homography: FloatArray
     """H (3, 3): board frame [m] to rays [-], or to pixels [px] without a camera."""
 
-    def to_board(self, pixels: ArrayLike) -> Array:
+    def to_board(self, pixels: ArrayLike) -> FloatArray:
         """Points of the cable's plane [m] seen at pixels (K, 2) [px]; shape (K, 2)."""
         seen = np.asarray(pixels, float).reshape(-1, 2)
         rays = seen if self.camera is None else self.camera.undistort(seen)
         return _apply(np.linalg.inv(self.homography), rays)
 
-    def to_pixels(self, points: ArrayLike) -> Array:
+    def to_pixels(self, points: ArrayLike) -> FloatArray:
         """Pixels (K, 2) [px] at which points (K, 2) [m] of the cable's plane are seen."""
         rays = _apply(self.homography, np.asarray(points, float).reshape(-1, 2))
         return rays if self.camera is None else self.camera.distort(rays)
 
     @property
-    def camera_center(self) -> Array | None:
+    def camera_center(self) -> FloatArray | None:
         """Centre of the camera (3,) [m]; None if it is not known.
 
         x, y in the board frame, z in front of the cable's plane: C = -R^T t with
@@ -125,7 +122,7 @@ class View(Photograph):
         return float(np.sqrt(4.0 / area))
 
 
-def _apply(homography: FloatArray, points: Array) -> Array:
+def _apply(homography: FloatArray, points: FloatArray) -> FloatArray:
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return mapped[:, :2] / mapped[:, 2:]
 
@@ -176,43 +173,43 @@ class CameraPose(Photograph):
     """
 
     camera: Camera
-    rotation: Array
+    rotation: FloatArray
     """R (3, 3), from the board's axes to the camera's."""
-    translation: Array
+    translation: FloatArray
     """t (3,) [m], the board's origin in the camera's frame."""
-    covariance: Array
+    covariance: FloatArray
     """(6, 6) [rad, m], of a small rotation w and a shift d of the board in the camera's frame,
     q -> q + w x q + d, from the scatter of the corners."""
 
     @property
-    def center(self) -> Array:
+    def center(self) -> FloatArray:
         """Centre of the camera (3,) [m] in the board frame, C = -R^T t."""
         return -self.rotation.T @ self.translation
 
-    def in_camera(self, points: ArrayLike) -> Array:
+    def in_camera(self, points: ArrayLike) -> FloatArray:
         """Points (K, 3) [m] of the board frame in the camera's frame."""
         return np.asarray(points, float).reshape(-1, 3) @ self.rotation.T + self.translation
 
-    def to_pixels(self, points: ArrayLike) -> Array:
+    def to_pixels(self, points: ArrayLike) -> FloatArray:
         """Pixels (K, 2) [px] at which points (K, 3) [m] are seen."""
         return self.project(points)[0]
 
-    def project(self, points: ArrayLike) -> tuple[Array, Array]:
+    def project(self, points: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Pixels (K, 2) [px] of points (K, 3) [m], and d(pixel)/d(point) (K, 2, 3) [px/m]."""
         pixels, slopes = self.camera.project(self.in_camera(points))
         return pixels, slopes @ self.rotation
 
-    def rays(self, pixels: ArrayLike) -> Array:
+    def rays(self, pixels: ArrayLike) -> FloatArray:
         """Undistorted rays (K, 2), q_xy / q_z, of pixels (K, 2) [px]."""
         return self.camera.undistort(np.asarray(pixels, float).reshape(-1, 2))
 
-    def moved(self, motion: Array) -> "CameraPose":
+    def moved(self, motion: FloatArray) -> "CameraPose":
         """Turn the board by the rotation vector w and shift it by d in the camera's frame."""
         turn = Rotation.from_rotvec(motion[:3]).as_matrix()
         shift = turn @ self.translation + motion[3:]
         return replace(self, rotation=turn @ self.rotation, translation=shift)
 
-    def flattened(self, points: ArrayLike, distance: float) -> Array:
+    def flattened(self, points: ArrayLike, distance: float) -> FloatArray:
         """Places (K, 2) [m] in the plane of `facing` at which points (K, 3) [m] are seen."""
         at = self.in_camera(points)
         return np.asarray(at[:, :2] / at[:, 2:] * distance * [1.0, -1.0])
@@ -225,7 +222,7 @@ class CameraPose(Photograph):
 
 def project_outline(
     viewpoint: CameraPose, points: ArrayLike, tangents: ArrayLike, diameter: float
-) -> tuple[Array, Array, Array]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Project the outline of a round cable.
 
     Parameters
@@ -282,7 +279,7 @@ def compare_pixels(
     points: ArrayLike,
     tangents: ArrayLike,
     diameter: float,
-) -> tuple[Array, Array]:
+) -> tuple[FloatArray, FloatArray]:
     """Pixels measured minus those of a curve, across it.
 
     Parameters

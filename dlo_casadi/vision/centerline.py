@@ -7,9 +7,9 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.ndimage import binary_dilation, gaussian_filter1d, label
 
-from dlo_casadi.arrays import chord_lengths, length_of
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, chord_lengths, length_of
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, View
+from dlo_casadi.vision.camera import Picture, View
 from dlo_casadi.vision.chain import Workings, find_cable
 from dlo_casadi.vision.profiles import (
     Crossings,
@@ -43,20 +43,20 @@ _SHORT = 0.97  # share of the length: a shorter line between both fixtures has a
 class Trace:
     """Middle of the cable at closely spaced profiles."""
 
-    t: Array  # (K,) [m], length along the line, gaps included
-    points: Array  # (K, 2) [m], middle of the two edges
-    std: Array  # (K,) [m], standard deviation across the cable
-    sound: Flags  # (K,), the profile shows the cable and nothing else
-    inside: Flags  # (K,), it lies in the photograph
-    glare: Flags  # (K,), half of the cable's width is white beyond measure
-    direction: Array = field(default_factory=lambda: np.zeros(3))
+    t: FloatArray  # (K,) [m], length along the line, gaps included
+    points: FloatArray  # (K, 2) [m], middle of the two edges
+    std: FloatArray  # (K,) [m], standard deviation across the cable
+    sound: BoolArray  # (K,), the profile shows the cable and nothing else
+    inside: BoolArray  # (K,), it lies in the photograph
+    glare: BoolArray  # (K,), half of the cable's width is white beyond measure
+    direction: FloatArray = field(default_factory=lambda: np.zeros(3))
     """Weights (3,) of blue, green and red by which most of the cable stands out."""
     shape: EdgeShape = field(default_factory=EdgeShape)  # typical; 0 where no edges were found
     width_std: float = 0.0  # [m], scatter of the width along the line
 
 
 def trace_cable(
-    image: Picture, view: View, strands: tuple[Array, ...], expected: ExpectedLine
+    image: Picture, view: View, strands: tuple[FloatArray, ...], expected: ExpectedLine
 ) -> Trace:
     """Fit a smooth curve to the strands and move it onto the middle between the edges.
 
@@ -108,7 +108,9 @@ def trace_cable(
     return Trace(t, points, std, sound, raw.inside, glare, common, shape, width_std)
 
 
-def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BSpline, Array]:
+def _first_curve(
+    strands: tuple[FloatArray, ...], expected: ExpectedLine
+) -> tuple[BSpline, FloatArray]:
     """Smooth curve through the strands, extended straight at both ends, and its samples t.
 
     It is extended to a near fixture, otherwise by two diameters: a skeleton ends half a width too
@@ -134,14 +136,14 @@ def _first_curve(strands: tuple[Array, ...], expected: ExpectedLine) -> tuple[BS
     return fit_curve(t, line, np.ones(len(t)), 2 * diameter, 0.5 * diameter), t
 
 
-def _is_usual(found: Crossings, usual: Flags, diameter: float) -> Flags:
+def _is_usual(found: Crossings, usual: BoolArray, diameter: float) -> BoolArray:
     """Profiles with usual height, width and place of the cable."""
     tall, wide = (part / np.median(part[usual]) for part in (found.height, found.width))
     alike = (tall > 0.35) & (tall < 2.5) & (np.abs(wide - 1) < 0.3)
     return alike & (np.abs(found.offset) < 0.4 * diameter)
 
 
-def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Flags:
+def _beside_end(found: Crossings, t: FloatArray, sound: BoolArray, diameter: float) -> BoolArray:
     """Profiles within a diameter of a line's end, up to the last one that differs from inner ones.
 
     Blur of the cable's end, or a holder, moves the middle before a profile looks unusual.
@@ -159,7 +161,7 @@ def _beside_end(found: Crossings, t: Array, sound: Flags, diameter: float) -> Fl
     return beside
 
 
-def _without_rims(sound: Flags) -> Flags:
+def _without_rims(sound: BoolArray) -> BoolArray:
     """Leave out short sound intervals, and the neighbourhood of long unsound ones.
 
     Beside a holder, a pin or an occluder its colour leaks into profiles that still look sound. This
@@ -172,13 +174,13 @@ def _without_rims(sound: Flags) -> Flags:
     return _longer(kept, 1.5 / _STEP)
 
 
-def _longer(flags: Flags, least: float) -> Flags:
+def _longer(flags: BoolArray, least: float) -> BoolArray:
     """Flags (K,) in runs longer than `least`."""
     runs, _ = label(flags)
     return flags & (np.bincount(runs)[runs] > least)
 
 
-def _std(rough: Array, fine: Array, sound: Flags, view: View) -> Array:
+def _std(rough: FloatArray, fine: FloatArray, sound: BoolArray, view: View) -> FloatArray:
     """Standard deviation of each point (K,) [m].
 
     It is the scatter of the rough places about the fine ones, over two diameters, which decreases
@@ -199,11 +201,11 @@ def _std(rough: Array, fine: Array, sound: Flags, view: View) -> Array:
 class ExtractedCenterline:
     """The centre-line of a cable, as seen in one photograph."""
 
-    points: Array
+    points: FloatArray
     """(K, 2) [m], in the board frame, ordered from start to end."""
-    std: Array
+    std: FloatArray
     """(K,) [m], standard deviation across the cable. Neighbours share their errors."""
-    pixels: Array
+    pixels: FloatArray
     """(K, 2) [px], the same points in the photograph."""
     coverage: float
     """Length along the points, without the gaps, over the length of the cable, 0..1."""
@@ -266,12 +268,12 @@ class MeasuredLine:
     """The trace of a cable and its sound points."""
 
     trace: Trace
-    kept: Indices  # (K,), sound profiles, evenly spaced
+    kept: IntArray  # (K,), sound profiles, evenly spaced
     gaps: tuple[int, ...]  # indices of kept profiles that are followed by a gap
     seen: float  # [m], length along the kept profiles, without the gaps
     confidence: float  # share of the line inside the picture that was measured soundly
     messages: tuple[str, ...]  # on its width and soundness
-    unreached: list[tuple[str, Array, Array, float]]
+    unreached: list[tuple[str, FloatArray, FloatArray, float]]
     """Of the fixtures in the picture those far from the line's ends, see `ExpectedLine.tips`."""
 
 

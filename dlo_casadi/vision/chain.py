@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from dlo_casadi.arrays import length_of, unit
+from dlo_casadi.arrays import BoolArray, FloatArray, length_of, unit
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Flags, View
+from dlo_casadi.vision.camera import View
 from dlo_casadi.vision.workplane import (
     Contrast,
     ExpectedLine,
@@ -38,11 +38,11 @@ _ALIKE = 0.5  # largest colour difference of a cable's strands, over that from t
 class Strand:
     """An unbranched line in metres, with its width and colour."""
 
-    points: Array  # (K, d) [m]
+    points: FloatArray  # (K, d) [m]
     width: float  # relative to the cable's
     level: float  # how much it stands out from its surroundings
-    colour: Array  # (3,) [grey levels]
-    step: Array  # (3,) [grey levels], its difference from the surroundings
+    colour: FloatArray  # (3,) [grey levels]
+    step: FloatArray  # (3,) [grey levels], its difference from the surroundings
 
     @property
     def length(self) -> float:
@@ -60,10 +60,10 @@ class Workings:
     candidate: NDArray[np.float32] | None = None  # (h, w), contrast of its pixels
     cut: float = 0.0  # level above which a pixel may be cable
     strands: list[Strand] = field(default_factory=list)  # all at that level
-    chosen: tuple[Array, ...] = ()  # those that make up the cable, from start to end
-    unsound: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    chosen: tuple[FloatArray, ...] = ()  # those that make up the cable, from start to end
+    unsound: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """Places (K, 2) [m] on it that do not look like the cable."""
-    pixels: Array | None = None  # (K, 2) [px], the line that was found
+    pixels: FloatArray | None = None  # (K, 2) [px], the line that was found
     gaps: tuple[int, ...] = ()  # indices of pixels that are followed by a gap
 
 
@@ -71,7 +71,7 @@ class Workings:
 class StrandChain:
     """Strands in the order in which the cable runs through them."""
 
-    strands: tuple[Array, ...]  # each (K, d) [m], directed from start to end
+    strands: tuple[FloatArray, ...]  # each (K, d) [m], directed from start to end
     used: tuple[int, ...]  # their places in the list that was searched
     supported: float  # [m], length that was seen
     total: float  # [m], length with straight gaps
@@ -126,7 +126,7 @@ def find_cable(plane: WorkPlane, expected: ExpectedLine, workings: Workings) -> 
 
 
 def _strands(
-    mask: Flags, candidate: NDArray[np.float32], contrast: Contrast, expected: ExpectedLine
+    mask: BoolArray, candidate: NDArray[np.float32], contrast: Contrast, expected: ExpectedLine
 ) -> list[Strand]:
     """Strands of a mask in metres, smoothed, and cut where they pass a fixture.
 
@@ -209,16 +209,16 @@ def order_strands(strands: Sequence[Strand], expected: ExpectedLine) -> StrandCh
     )
 
 
-def _links(ways: list[Array], diameter: float, scene: Scene) -> tuple[Array, Array]:
+def _links(ways: list[FloatArray], diameter: float, scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Gap [m] and cost [m] of going from the last point of way i to the first of way j."""
 
-    def direction(line: Array) -> Array:
+    def direction(line: FloatArray) -> FloatArray:
         """Direction (d,) at the first point of a line, over its first two diameters."""
         far = int(np.argmax(np.linalg.norm(line - line[0], axis=1) > 2 * diameter))
         far = far or len(line) - 1
         return np.asarray(line[far] - line[min(1, far - 1)])
 
-    def angle(a: Array, b: Array) -> Array:
+    def angle(a: FloatArray, b: FloatArray) -> FloatArray:
         """Angle [rad] of unit vectors (..., d), in any dimension."""
         a, b = np.broadcast_arrays(a, b)
         return 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
@@ -256,7 +256,7 @@ def _with_folds(chain: StrandChain, strands: list[Strand], diameter: float) -> S
     where the chain turns back, and both adjacent parts of the chain lead into it.
     """
 
-    def step(line: Array) -> Array:
+    def step(line: FloatArray) -> FloatArray:
         """Step (2,) [m] from the first point of a line to a point four diameters away."""
         far = np.linalg.norm(line - line[0], axis=1) > 4 * diameter
         return np.asarray(line[int(np.argmax(far)) if far.any() else -1] - line[0])

@@ -9,9 +9,8 @@ from scipy.interpolate import BSpline
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from dlo_casadi.arrays import FloatArray, chord_lengths, length_of, unit
+from dlo_casadi.arrays import BoolArray, FloatArray, chord_lengths, length_of, unit
 from dlo_casadi.errors import VisionError, counted
-from dlo_casadi.vision.camera import Array, Flags
 from dlo_casadi.vision.chain import Strand, order_strands
 from dlo_casadi.vision.profiles import fit_curve
 from dlo_casadi.vision.workplane import BEFORE_BOARD, ExpectedLine, KnownCable
@@ -28,10 +27,10 @@ _LEAST = 0.25  # smallest share of the length that must be seen
 _TOLD = 0.05  # share of the length: a longer hidden part is reported
 
 
-def of_color(colors: FloatArray, wanted: Sequence[float]) -> Flags:
+def of_color(colors: FloatArray, wanted: Sequence[float]) -> BoolArray:
     """Which colours (K, 3), red, green, blue from 0 to 255, are like the wanted one."""
 
-    def lab(rgb: FloatArray) -> Array:
+    def lab(rgb: FloatArray) -> FloatArray:
         row = np.asarray(rgb, np.float32).reshape(1, -1, 3) / 255.0
         return np.asarray(cv2.cvtColor(row, cv2.COLOR_RGB2LAB)[0])
 
@@ -41,7 +40,7 @@ def of_color(colors: FloatArray, wanted: Sequence[float]) -> Flags:
 
 def line_in_cloud(
     points: FloatArray, cable: KnownCable, camera: FloatArray | None
-) -> tuple[Array, tuple[str, ...]]:
+) -> tuple[FloatArray, tuple[str, ...]]:
     """Find the line of a cable in a cloud of its surface.
 
     Neighbouring points form strands, which are ordered like those in a photograph; a spline
@@ -107,7 +106,7 @@ def line_in_cloud(
     return found, tuple(messages)
 
 
-def _strands(points: Array, diameter: float) -> list[Strand]:
+def _strands(points: FloatArray, diameter: float) -> list[Strand]:
     """Lines through the connected parts of a cloud, lonely points left out."""
     reach = _REACH * diameter
     if len(points) < _FEWEST:
@@ -140,8 +139,8 @@ def _strands(points: Array, diameter: float) -> list[Strand]:
 
 
 def _refitted(
-    curve: BSpline, points: Array, diameter: float, camera: FloatArray | None
-) -> tuple[BSpline, Array, Array]:
+    curve: BSpline, points: FloatArray, diameter: float, camera: FloatArray | None
+) -> tuple[BSpline, FloatArray, FloatArray]:
     """The spline fitted to all points near it, their places on it, and the points on the axis."""
     lower, upper = curve.t[curve.k], curve.t[-curve.k - 1]
     margin = diameter if upper - lower > 4 * diameter else 0.0
@@ -164,7 +163,7 @@ def _refitted(
     return fit_curve(t, points, np.ones(len(t)), _KNOT * diameter, _SMOOTH * diameter), t, points
 
 
-def _means(curve: BSpline, t: Array, points: Array) -> Array:
+def _means(curve: BSpline, t: FloatArray, points: FloatArray) -> FloatArray:
     """Points (K, 3) of the curve, each moved by the mean of the cloud beside it."""
     bins = np.floor((t - t[0]) / SPACING).astype(int)
     found = []

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 from PIL import Image, ImageFile
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import VisionError, counted
-from dlo_casadi.vision.camera import Array, Picture
+from dlo_casadi.vision.camera import Picture
 from dlo_casadi.vision.chain import Workings
 
 # Blue, green, red.
@@ -182,7 +183,7 @@ def encoded(picture: Picture, ending: str) -> bytes:
 
 
 def _mark_fixtures(
-    picture: Picture, workings: Workings, to_pixels: Callable[[Array], Array], size: float
+    picture: Picture, workings: Workings, to_pixels: Callable[[FloatArray], FloatArray], size: float
 ) -> None:
     """The declared fixtures, as rings with their names."""
     assert workings.expected is not None
@@ -192,17 +193,19 @@ def _mark_fixtures(
         _text(picture, at + 16 * size, name, _RED, size)
 
 
-def _text(picture: Picture, at: Array, text: str, color: tuple[int, int, int], size: float) -> None:
+def _text(
+    picture: Picture, at: FloatArray, text: str, color: tuple[int, int, int], size: float
+) -> None:
     font, thick = cv2.FONT_HERSHEY_SIMPLEX, max(1, round(2 * size))
     for shade, wide in (((255, 255, 255), 3 * thick), (color, thick)):
         cv2.putText(picture, text, _pixel(at), font, size, shade, wide, cv2.LINE_AA)
 
 
-def _polyline(picture: Picture, at: Array, color: tuple[int, int, int], thick: int) -> None:
+def _polyline(picture: Picture, at: FloatArray, color: tuple[int, int, int], thick: int) -> None:
     points = np.round(np.clip(at, -1e5, 1e5)).astype(np.int32)
     cv2.polylines(picture, [points], False, color, thick, cv2.LINE_AA)
 
 
-def _pixel(at: Array) -> tuple[int, int]:
+def _pixel(at: FloatArray) -> tuple[int, int]:
     u, v = np.clip(at, -1e5, 1e5).round().astype(int)
     return int(u), int(v)

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
-from dlo_casadi.arrays import chord_lengths
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, chord_lengths
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, CameraPose, Flags, Indices, Picture
+from dlo_casadi.vision.camera import CameraPose, Picture
 from dlo_casadi.vision.centerline import FINE, measure_line
 from dlo_casadi.vision.chain import Workings
 from dlo_casadi.vision.profiles import normals
@@ -31,11 +31,11 @@ class ImageCurve:
 
     viewpoint: CameraPose
     """Where the camera stands."""
-    pixels: Array
+    pixels: FloatArray
     """(K, 2) [px], middle of the cable's outline, as photographed."""
-    std: Array
+    std: FloatArray
     """(K,) [px], standard deviation of each across the line."""
-    whole: Flags
+    whole: BoolArray
     """(K,), both edges are seen; where not, another stretch of the cable lies beside or behind,
     and the pixel is only somewhere in their common outline."""
     width: float
@@ -53,7 +53,7 @@ class ImageCurve:
     """Share of the line inside the picture that was measured soundly, 0..1."""
     messages: tuple[str, ...]
     """What a user should know."""
-    direction: Array
+    direction: FloatArray
     """Colours (3,) by which the cable stands out."""
     blur: float
     """Blur [px] of its edges."""
@@ -139,7 +139,7 @@ def _expected_line(cable: KnownCable, viewpoint: CameraPose, distance: float) ->
     return ExpectedLine(flat, cable.diameter, shortest, longest, BEFORE_BOARD)
 
 
-def other_stretches(points: Array, t: Array, width: float) -> Array:
+def other_stretches(points: FloatArray, t: FloatArray, width: float) -> FloatArray:
     """Signed distance (K,) from each point of a line to the nearest other part of it.
 
     It is positive to the left, and nan where no other part shares an edge. Points (K, 2) are
@@ -181,7 +181,7 @@ def loops_either_way(curve: ImageCurve) -> list[ImageCurve]:
     return ways
 
 
-def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Indices, Indices, float]:
+def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[IntArray, IntArray, float]:
     """Match two lines, in order, by the distances from each other's epipolar lines.
 
     For rays a and b of the same point b^T E a = 0, with the essential matrix E = [t]_x R of the
@@ -222,7 +222,7 @@ def match_lines(one: ImageCurve, other: ImageCurve) -> tuple[Indices, Indices, f
     return first, second, found / (len(one.pixels) + len(other.pixels))
 
 
-def places_along(curve: ImageCurve, points: Array) -> Array:
+def places_along(curve: ImageCurve, points: FloatArray) -> FloatArray:
     """Places (K,), 0 to 1, of a photograph's pixels along a line in space, in order.
 
     The line's points (M, 3) [m] are evenly and closely spaced; the place is that of the point whose
@@ -235,7 +235,7 @@ def places_along(curve: ImageCurve, points: Array) -> Array:
     return np.where((found >= 0) & (off < _CAP), found / (len(points) - 1), np.nan)
 
 
-def nearest_in_order(away: Array) -> Indices:
+def nearest_in_order(away: FloatArray) -> IntArray:
     """Column of each row in a table of distances (K, M), never decreasing.
 
     Distances are in standard deviations. Of several columns of a row the nearest is taken; -1 where
@@ -248,7 +248,9 @@ def nearest_in_order(away: Array) -> Indices:
     return found
 
 
-def triangulate(one: ImageCurve, other: ImageCurve, first: Indices, second: Indices) -> Array:
+def triangulate(
+    one: ImageCurve, other: ImageCurve, first: IntArray, second: IntArray
+) -> FloatArray:
     """Least-squares points (P, 3) [m] of the rays of matched pixels.
 
     With a = q_xy / q_z and q = R p + t each ray gives two equations, (a R_z - R_xy) p = t_xy - a
@@ -265,7 +267,7 @@ def triangulate(one: ImageCurve, other: ImageCurve, first: Indices, second: Indi
     return np.linalg.solve(normal, np.einsum("pki,pk->pi", A, b)[..., None])[..., 0]
 
 
-def _cheapest_way(cost: Array) -> tuple[Indices, Indices]:
+def _cheapest_way(cost: FloatArray) -> tuple[IntArray, IntArray]:
     """Places (P,), (P,) of the pairs on the cheapest way through a table of costs (K, L).
 
     In a row, D_l = c_l + min(A_l, D_l-1) with A the best from the row before; with C the running

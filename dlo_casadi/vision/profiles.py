@@ -10,8 +10,8 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import gaussian_filter1d, median_filter
 from scipy.sparse import csr_array, diags_array
 
-from dlo_casadi.arrays import unit
-from dlo_casadi.vision.camera import Array, Flags, View
+from dlo_casadi.arrays import BoolArray, FloatArray, unit
+from dlo_casadi.vision.camera import View
 
 _LUMINANCE = np.array([0.114, 0.587, 0.299])  # blue, green, red
 _BESIDE = 2.2  # blurs beyond the edge: where the surroundings begin
@@ -28,12 +28,14 @@ _BARE = 0.35  # share of the cable's width free of highlights
 DEGREE = 3  # of all splines
 
 
-def normals(steps: Array) -> Array:
+def normals(steps: FloatArray) -> FloatArray:
     """Unit vectors (K, 2) to the left of steps (K, 2)."""
     return unit(steps)[:, ::-1] * [-1.0, 1.0]
 
 
-def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: float) -> BSpline:
+def fit_curve(
+    t: FloatArray, points: FloatArray, weights: FloatArray, knot: float, smooth: float
+) -> BSpline:
     """Fit a cubic smoothing spline r(t).
 
         minimise  sum_k w_k |r(t_k) - p_k|^2  +  W (smooth / knot)^4 sum_i |D^2 c_i|^2
@@ -65,17 +67,17 @@ def fit_curve(t: Array, points: Array, weights: Array, knot: float, smooth: floa
 class Profiles:
     """Brightness across the cable."""
 
-    t: Array  # (K,) [m], where along the curve
-    offset: Array  # (M,) [m], where across it, positive to the left
-    values: Array  # (K, M, 3), colours
-    inside: Flags  # (K,), the cable and its edges lie in the photograph
+    t: FloatArray  # (K,) [m], where along the curve
+    offset: FloatArray  # (M,) [m], where across it, positive to the left
+    values: FloatArray  # (K, M, 3), colours
+    inside: BoolArray  # (K,), the cable and its edges lie in the photograph
 
-    def core_and_rim(self, diameter: float) -> tuple[Array, Array]:
+    def core_and_rim(self, diameter: float) -> tuple[FloatArray, FloatArray]:
         """Colours (K, 3) of the cable in each profile, and those (K, R, 3) of its surroundings."""
         core = self.values[:, np.abs(self.offset) < 0.3 * diameter].mean(axis=1)
         return core, self.values[:, np.abs(self.offset) > 0.8 * diameter]
 
-    def average(self, trusted: Flags, along: float) -> "Profiles":
+    def average(self, trusted: BoolArray, along: float) -> "Profiles":
         """Average trusted profiles along the curve by a Gaussian; its std is `along` [m].
 
         That reduces the noise of pixels and compression without a bias by curvature, since the
@@ -102,14 +104,14 @@ class EdgeShape:
 class Crossings:
     """Where the cable lies across each profile."""
 
-    offset: Array  # (K,) [m], middle between the two edges, relative to the curve
-    width: Array  # (K,) [m], distance of the two edges
-    rise: Array  # (K,) [m], blur of the edges, as a standard deviation
-    height: Array  # (K,) [grey levels], step from the surroundings to the cable
+    offset: FloatArray  # (K,) [m], middle between the two edges, relative to the curve
+    width: FloatArray  # (K,) [m], distance of the two edges
+    rise: FloatArray  # (K,) [m], blur of the edges, as a standard deviation
+    height: FloatArray  # (K,) [grey levels], step from the surroundings to the cable
 
 
 def sample_profiles(
-    image: NDArray[np.float32], view: View, curve: BSpline, t: Array, diameter: float
+    image: NDArray[np.float32], view: View, curve: BSpline, t: FloatArray, diameter: float
 ) -> Profiles:
     """Read the photograph along the normals of the curve.
 
@@ -130,7 +132,7 @@ def sample_profiles(
     return Profiles(t, offset, np.asarray(values, dtype=float), inside)
 
 
-def cable_direction(profiles: Profiles, trusted: Flags, diameter: float) -> Array:
+def cable_direction(profiles: Profiles, trusted: BoolArray, diameter: float) -> FloatArray:
     """Weights of colours (3,) that separate the cable from its surroundings.
 
     Luminance if it does: JPEG stores colour at half the resolution. Otherwise Fisher's direction,
@@ -150,8 +152,8 @@ def cable_direction(profiles: Profiles, trusted: Flags, diameter: float) -> Arra
 
 
 def local_directions(
-    profiles: Profiles, direction: Array, trusted: Flags, diameter: float
-) -> Array:
+    profiles: Profiles, direction: FloatArray, trusted: BoolArray, diameter: float
+) -> FloatArray:
     """Weights of colours (K, 3) for a cable that passes in front of different surroundings.
 
     Where the step from the surroundings to the cable, smoothed along it, is less than half of the
@@ -171,7 +173,7 @@ def local_directions(
 
 
 def find_edges(
-    profiles: Profiles, direction: Array, shape: EdgeShape, lit_aside: bool = False
+    profiles: Profiles, direction: FloatArray, shape: EdgeShape, lit_aside: bool = False
 ) -> Crossings:
     """Find both edges of every profile, and the middle between them.
 
@@ -216,7 +218,9 @@ def find_edges(
     return Crossings(centre, to_left + to_right, 0.5 * (left_blur + right_blur), core - around)
 
 
-def edge_shape(profiles: Profiles, direction: Array, trusted: Flags, first: EdgeShape) -> EdgeShape:
+def edge_shape(
+    profiles: Profiles, direction: FloatArray, trusted: BoolArray, first: EdgeShape
+) -> EdgeShape:
     """Width and blur that are typical of the trusted profiles, from a first guess of both."""
     shape = first
     for _ in range(2):
@@ -227,7 +231,7 @@ def edge_shape(profiles: Profiles, direction: Array, trusted: Flags, first: Edge
     return shape
 
 
-def _own_level(body: Array, around: Array) -> Array:
+def _own_level(body: FloatArray, around: FloatArray) -> FloatArray:
     """Level (K,) of the cable in the middle of each profile (K, P), without any highlight.
 
     Whether it is darker or brighter than its surroundings is the same for all profiles, and judged
@@ -239,7 +243,9 @@ def _own_level(body: Array, around: Array) -> Array:
     return np.asarray(np.quantile(body, 1 - _BARE if brighter else _BARE, axis=1))
 
 
-def _mean_crossing(side: Array, core: Array, around: Array, step: float) -> tuple[Array, Array]:
+def _mean_crossing(
+    side: FloatArray, core: FloatArray, around: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray]:
     """Distance (K,) [m] from the middle to the edge of one side (K, M), and its blur (K,) [m].
 
     The levels 1/4 and 3/4 of a blurred step are 1.35 standard deviations apart.
@@ -253,7 +259,7 @@ def _mean_crossing(side: Array, core: Array, around: Array, step: float) -> tupl
     return 0.5 * (inner + outer), np.maximum(outer - inner, 0.0) / 0.69
 
 
-def _interpolate(x: Array, data: Array, at: Array) -> Array:
+def _interpolate(x: FloatArray, data: FloatArray, at: FloatArray) -> FloatArray:
     """Values (K, P) of rows of data (K, M), sampled evenly at x (M,), at places (K, P)."""
     place = np.clip((at - x[0]) / (x[1] - x[0]), 0, len(x) - 1.001)
     left = place.astype(int)

@@ -8,8 +8,8 @@ from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import find_objects, label
 
-from dlo_casadi.arrays import chord_lengths, length_of, unit
-from dlo_casadi.vision.camera import Array, Picture, compare_pixels
+from dlo_casadi.arrays import FloatArray, chord_lengths, length_of, unit
+from dlo_casadi.vision.camera import Picture, compare_pixels
 from dlo_casadi.vision.centerline import FINE
 from dlo_casadi.vision.image_curve import ImageCurve, other_stretches, places_along
 from dlo_casadi.vision.profiles import (
@@ -37,26 +37,26 @@ _FINE = np.linspace(0.0, 1.0, 1001)  # closely spaced places along a line in spa
 class SpaceCurve:
     """A cubic B-spline r(t), 0 <= t <= 1, with t close to arc length over the whole."""
 
-    coefficients: Array  # (n, 3) [m], in the board frame
+    coefficients: FloatArray  # (n, 3) [m], in the board frame
 
     @property
-    def knots(self) -> Array:
+    def knots(self) -> FloatArray:
         """Knots (n + 4,), evenly spaced."""
         n = len(self.coefficients)
         return np.asarray(np.arange(-DEGREE, n + 1) / (n - DEGREE))
 
-    def design(self, t: Array) -> Array:
+    def design(self, t: FloatArray) -> FloatArray:
         """Basis functions (K, n) at t (K,)."""
         inside = np.clip(t, 0.0, 1.0 - 1e-12)
         if not len(t):
             return np.zeros((0, len(self.coefficients)))
         return np.asarray(BSpline.design_matrix(inside, self.knots, DEGREE).toarray())
 
-    def position(self, t: Array) -> Array:
+    def position(self, t: FloatArray) -> FloatArray:
         """Points (K, 3) [m]."""
         return self.design(t) @ self.coefficients
 
-    def tangent(self, t: Array) -> Array:
+    def tangent(self, t: FloatArray) -> FloatArray:
         """Give the unit tangents (K, 3)."""
         return unit(np.asarray(BSpline(self.knots, self.coefficients, DEGREE)(t, 1)))
 
@@ -65,7 +65,7 @@ class SpaceCurve:
         """Arc length [m]."""
         return length_of(self.position(_FINE))
 
-    def away_from(self, fixtures: Array) -> Array:
+    def away_from(self, fixtures: FloatArray) -> FloatArray:
         """Distances [m] of its ends from the fixtures: one of the start alone, or both."""
         ends = self.position(np.array([0.0, 1.0]))[: len(fixtures)]
         return np.asarray(np.linalg.norm(ends - fixtures, axis=1))
@@ -83,27 +83,29 @@ class CurveFit:
     """A curve, its covariance, and the place on it of each pixel."""
 
     curve: SpaceCurve
-    covariance: Array  # (n, 3, n, 3) [m^2] of its coefficients, across the curve
-    params: tuple[Array, ...]  # (K,), t of each photograph's pixels; nan where not of the curve
-    residuals: tuple[Array, ...]  # (K,) [px], distances across the projected curve, or nan
+    covariance: FloatArray  # (n, 3, n, 3) [m^2] of its coefficients, across the curve
+    params: tuple[
+        FloatArray, ...
+    ]  # (K,), t of each photograph's pixels; nan where not of the curve
+    residuals: tuple[FloatArray, ...]  # (K,) [px], distances across the projected curve, or nan
     surprise: float  # -2 log of the marginal likelihood, up to a constant: compares hypotheses
 
     @property
-    def places(self) -> list[Array]:
+    def places(self) -> list[FloatArray]:
         """Places (K, 3) [m] of the pixels of each photograph; nan where not of the curve."""
         return [
             np.where(np.isfinite(t)[:, None], self.curve.position(np.nan_to_num(t)), np.nan)
             for t in self.params
         ]
 
-    def std(self, t: Array) -> Array:
+    def std(self, t: FloatArray) -> FloatArray:
         """Largest standard deviation (K,) [m], in any direction across the curve, at t."""
         basis = self.curve.design(t)
         at = np.einsum("ka,aibj,kb->kij", basis, self.covariance, basis, optimize=True)
         return np.sqrt(np.maximum(np.linalg.eigvalsh(at)[:, -1], 0.0))
 
 
-def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
+def first_curve(points: FloatArray, along: FloatArray, spans: int) -> SpaceCurve:
     """Smooth curve of `spans` polynomials through points (P, 3) [m], `along` it in this order."""
     n = spans + DEGREE
     basis = SpaceCurve(np.zeros((n, 3))).design((along - along[0]) / (along[-1] - along[0]))
@@ -114,7 +116,7 @@ def first_curve(points: Array, along: Array, spans: int) -> SpaceCurve:
 
 
 def fit_curve_to_images(
-    curves: Sequence[ImageCurve], first: SpaceCurve, params: Sequence[Array] | None = None
+    curves: Sequence[ImageCurve], first: SpaceCurve, params: Sequence[FloatArray] | None = None
 ) -> CurveFit:
     """Fit a curve to its pixels in all photographs.
 
@@ -183,8 +185,13 @@ def fit_curve_to_images(
 
 
 def _solve(
-    A: Array, e: Array, x: Array, rough: Array, prior: Array, wander: Array
-) -> tuple[float, float, Array, tuple[Array, bool]]:
+    A: FloatArray,
+    e: FloatArray,
+    x: FloatArray,
+    rough: FloatArray,
+    prior: FloatArray,
+    wander: FloatArray,
+) -> tuple[float, float, FloatArray, tuple[FloatArray, bool]]:
     """Gauss-Newton step with the most likely of the densities `wander`.
 
     Returns -2 log p, q, dx and the factor of H:
@@ -205,8 +212,8 @@ def _solve(
 
 
 def _linearise(
-    curve: SpaceCurve, seen: ImageCurve, motion: Array, t: Array
-) -> tuple[Array, Array, Array, Array]:
+    curve: SpaceCurve, seen: ImageCurve, motion: FloatArray, t: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Nearest places (K,) on the projected curve, from near ones t; nan beyond its ends.
 
     Then the residuals (K,) [px] across it, nan where there is no place, and minus the derivatives
@@ -259,8 +266,12 @@ def measure_shared_outlines(
 
 
 def see_beside(
-    image: Picture, seen: ImageCurve, line: SpaceCurve, params_seen: Array, crossed: bool | None
-) -> tuple[ImageCurve, Array]:
+    image: Picture,
+    seen: ImageCurve,
+    line: SpaceCurve,
+    params_seen: FloatArray,
+    crossed: bool | None,
+) -> tuple[ImageCurve, FloatArray]:
     """Measure parts of the line that share an outline, given the side of each of them.
 
     An outline of width W contains two parts of the width w, known from the rest of the line and

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dlo_casadi.arrays import chord_lengths
+from dlo_casadi.arrays import FloatArray, IntArray, chord_lengths
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
-from dlo_casadi.vision.camera import Array, Camera, Indices, Picture
+from dlo_casadi.vision.camera import Camera, Picture
 from dlo_casadi.vision.centerline import SPACING
 from dlo_casadi.vision.image import spoilt
 from dlo_casadi.vision.image_curve import (
@@ -49,9 +49,9 @@ _MISSING = 0.1  # of the length: a line that is shorter by more lacks a hidden p
 class SpaceLine:
     """A line in space, with the uncertainty of each point."""
 
-    points: Array
+    points: FloatArray
     """(K, 3) [m], in the board frame, ordered from start to end, evenly spaced."""
-    std: Array
+    std: FloatArray
     """(K,) [m], largest standard deviation in any direction across the line; where a point lies
     along it, photographs do not tell."""
     gaps: tuple[int, ...]
@@ -70,7 +70,7 @@ class Views:
     """Why a photograph is not used, and what to try."""
     messages: tuple[str, ...]
     """What else a user should know; those on one photograph begin with its name."""
-    places: Mapping[str, Array]
+    places: Mapping[str, FloatArray]
     """Where the pixels of the curves lie, (K, 3) [m]: on the line in space, nan for those that are
     not of it. Without a line it is a guess, at depths from fixture to fixture."""
 
@@ -203,8 +203,8 @@ class _Pair(NamedTuple):
 
     one: ImageCurve
     other: ImageCurve
-    first: Indices
-    second: Indices
+    first: IntArray
+    second: IntArray
     share: float
     angle: float
 
@@ -253,13 +253,13 @@ def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agree
     return best
 
 
-def _tips_off(curve: ImageCurve, cable: KnownCable) -> Array:
+def _tips_off(curve: ImageCurve, cable: KnownCable) -> FloatArray:
     """Distances [px] of the line's ends from the fixtures in the photograph."""
     places = curve.viewpoint.to_pixels(cable.fixtures)
     return np.asarray(np.linalg.norm(curve.pixels[[0, -1]][: len(places)] - places, axis=1))
 
 
-def _guessed(curve: ImageCurve, cable: KnownCable) -> Array:
+def _guessed(curve: ImageCurve, cable: KnownCable) -> FloatArray:
     """Places (K, 3) [m] of pixels, with depth linear along the line from fixture to fixture."""
     viewpoint = curve.viewpoint
     depths = viewpoint.in_camera(cable.fixtures)[:, 2]

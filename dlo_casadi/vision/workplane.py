@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dlo_casadi.arrays import unit
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, unit
 from dlo_casadi.errors import VisionError
-from dlo_casadi.vision.camera import Array, Flags, Indices, Picture, View
+from dlo_casadi.vision.camera import Picture, View
 
 CABLE_PX = 6.0  # width of the cable in this picture
 _MAX_PIXELS = 3.0e6
@@ -35,7 +35,7 @@ class KnownCable:
     length: float  # [m]
 
     @property
-    def fixtures(self) -> Array:
+    def fixtures(self) -> FloatArray:
         """Places (1, d) or (2, d) [m] of the ends that are held."""
         return np.array([at for at in (self.start, self.end) if at is not None], float)
 
@@ -68,7 +68,7 @@ class ExpectedLine:
     of it the line may be shorter (a part that points to the camera) or longer (a near one).
     """
 
-    fixtures: Array  # (1, 2) or (2, 2) [m], the start, and the end unless that is free
+    fixtures: FloatArray  # (1, 2) or (2, 2) [m], the start, and the end unless that is free
     diameter: float  # [m]
     shortest: float  # [m]
     longest: float  # [m]
@@ -79,7 +79,7 @@ class ExpectedLine:
         """Length [m], the scale of other lengths and areas."""
         return 0.5 * (self.shortest + self.longest)
 
-    def tips(self, points: Array) -> list[tuple[str, Array, Array, float]]:
+    def tips(self, points: FloatArray) -> list[tuple[str, FloatArray, FloatArray, float]]:
         """Name and place of each fixture, the line's end there, and their distance [m]."""
         ends = zip(("start", "end"), self.fixtures, points[[0, -1]], strict=False)
         return [(name, at, tip, float(np.linalg.norm(tip - at))) for name, at, tip in ends]
@@ -91,15 +91,15 @@ class WorkPlane:
 
     image: Picture  # (h, w, 3), rectified; rows run down, i.e. along -y
     pixel: float  # [m], side of one of its pixels
-    origin: Array  # (2,) [m], board coordinates of the centre of its first pixel
-    inside: Flags  # (h, w), inside the photograph and off the markers
-    reachable: Flags  # (h, w), inside, and near enough to the fixtures for the cable
+    origin: FloatArray  # (2,) [m], board coordinates of the centre of its first pixel
+    inside: BoolArray  # (h, w), inside the photograph and off the markers
+    reachable: BoolArray  # (h, w), inside, and near enough to the fixtures for the cable
 
-    def to_board(self, at: Array) -> Array:
+    def to_board(self, at: FloatArray) -> FloatArray:
         """Points (K, 2) [m] of pixels (K, 2) of the working picture."""
         return self.origin + self.pixel * np.asarray(at, float) * [1.0, -1.0]
 
-    def to_pixels(self, points: Array) -> Array:
+    def to_pixels(self, points: FloatArray) -> FloatArray:
         """Pixels (K, 2) of the working picture of points (K, 2) [m]."""
         return (points - self.origin) / self.pixel * [1.0, -1.0]
 
@@ -169,7 +169,7 @@ def rectify(image: Picture, view: View, expected: ExpectedLine) -> WorkPlane:
     return WorkPlane(np.asarray(flat, np.uint8), pixel, origin, inside, inside & (far <= reach))
 
 
-def _sources(view: View, origin: Array, pixel: float, rows: int, columns: int) -> Array:
+def _sources(view: View, origin: FloatArray, pixel: float, rows: int, columns: int) -> FloatArray:
     """Pixels (rows, columns, 2) of the photograph for each pixel of the working picture.
 
     Computed on every eighth pixel and interpolated: the map is nearly linear between them.
@@ -190,7 +190,7 @@ class Contrast:
 
     plane: WorkPlane
     difference: NDArray[np.float32]  # (h, w, 3), (pixel - background) / noise, per channel
-    noise: Array  # (3,) [grey levels], robust standard deviation per channel
+    noise: FloatArray  # (3,) [grey levels], robust standard deviation per channel
 
 
 def local_contrast(plane: WorkPlane, width_px: float) -> Contrast:
@@ -251,7 +251,7 @@ def _upper_level(values: NDArray[np.float32], area: float) -> float:
     return float(np.partition(high, high.size - rank)[high.size - rank])
 
 
-def find_strands(mask: Flags, width_px: float) -> list[tuple[Indices, float]]:
+def find_strands(mask: BoolArray, width_px: float) -> list[tuple[IntArray, float]]:
     """Thin a mask (Zhang and Suen) and cut it into strands, longest first.
 
     A highlight along the cable is closed first. Parts of the wrong width, junctions, and spurs
@@ -299,7 +299,7 @@ def find_strands(mask: Flags, width_px: float) -> list[tuple[Indices, float]]:
     return strands
 
 
-def _walk(pixels: Indices) -> Indices:
+def _walk(pixels: IntArray) -> IntArray:
     """Order the pixels (K, 2) of an unbranched 8-connected line from one end to the other."""
     places = {(x, y) for x, y in pixels.tolist()}
     steps = [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)]

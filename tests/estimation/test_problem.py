@@ -27,8 +27,9 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.point import Point, Values
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.problem import Point, Priors, Problem, Values
+from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.assembly import Inputs, Shapes

@@ -11,8 +11,9 @@ from dlo_casadi.effects import BendingAnisotropy, CableData, PointForce
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.continuation import relaxed
 from dlo_casadi.estimation.measured_shapes import _along, measured_shapes
+from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.problem import Priors, Problem, Values
+from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.start import (
     _either_way,

@@ -9,7 +9,8 @@ import pytest
 
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.equilibrium.spread import Tipping
-from dlo_casadi.report.documents import finite, report_dict, report_text
+from dlo_casadi.io.files import finite
+from dlo_casadi.report.documents import report_dict, report_text
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.words import all_warnings, verdict_lines
 from dlo_casadi.session.outcome import RestCurvatureEstimate, Stage
