@@ -352,7 +352,7 @@ class Search:
         p_values = p_values_of(screened)
         own = [item for item in screened if item.candidate.name == name]
         known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}
-        tried = self._leading(smaller, screened, p_values, known)
+        tried = self._leading(smaller, screened, p_values, known, fit)
         chosen, _ = choose(tried, smaller, before, self.doubt)
         others = tuple(item for item in chosen if item.name != name)
         if len(others) < len(chosen):
@@ -375,8 +375,12 @@ class Search:
         screened: Sequence[Screened],
         p_values: Mapping[str, float],
         known: dict[str, Confirmed | None],
+        beside: Fit | None = None,
     ) -> list[Confirmed]:
-        """Refits, beside `known` ones, of the significant candidates with the highest scores."""
+        """Refits, beside `known` ones, of the significant candidates with the highest scores.
+
+        `beside`: see `confirm`.
+        """
         # A scatter from pose to pose may hide the effect: test the refit with what is left.
         significant = [
             x
@@ -388,7 +392,8 @@ class Search:
         new = [item for item in worthy if item.candidate.name not in known]
         among = [known.get(item.candidate.name) for item in worthy]
         ceiling = min((refits.ceiling_beside(x.fit) for x in among if x), default=np.inf)
-        found = map_in_order(self.executor, partial(refits.confirm, current, ceiling=ceiling), new)
+        confirm = partial(refits.confirm, current, ceiling=ceiling, beside=beside)
+        found = map_in_order(self.executor, confirm, new)
         known.update(zip((item.candidate.name for item in new), found, strict=True))
         tried = [x for item in worthy if (x := known[item.candidate.name]) is not None]
         return refits.loads_from_best(current, worthy, tried, self.executor)

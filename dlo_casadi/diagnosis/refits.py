@@ -170,12 +170,22 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     return Screened(candidate, gain, survival(gain, len(start), noise_dof), start, best)
 
 
-def confirm(base: Fit, screened: Screened, ceiling: float = np.inf) -> Confirmed | None:
+def confirm(
+    base: Fit, screened: Screened, ceiling: float = np.inf, beside: Fit | None = None
+) -> Confirmed | None:
     """Refit with a candidate added; None if its equilibria cannot be followed.
 
-    `ceiling`: see `descend`.
+    `ceiling`: see `descend`. The refit also starts from the fit `beside` it, which has another
+    effect in the candidate's place: where the base's other effects have lost their places without
+    it, only this start finds them again.
     """
-    return Confirmed.of(screened, base, screened.fit or refit_with(base, screened, ceiling))
+    found = screened.fit or refit_with(base, screened, ceiling)
+    if beside is not None:
+        same = beside.reweighed(base.noise, base.problem.priors)
+        model = screened.candidate.add_to(base.model)
+        fits = (found, _followed(same, model, screened.start, MOST_STEPS, ceiling))
+        found = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
+    return Confirmed.of(screened, base, found)
 
 
 def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirmed | None:

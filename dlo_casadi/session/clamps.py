@@ -29,6 +29,7 @@ from dlo_casadi.thresholds import (
     NEARLY_ALL,
     READ_OTHERWISE,
     READ_SCALE,
+    TURNED,
 )
 
 # A full turn [rad] with room for rounding; a declared heading beyond it needs a line that turns.
@@ -277,9 +278,9 @@ def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple
             meant = likeliest(_otherwise(one), one.misfit, MUCH_BETTER * own, READ_OTHERWISE)
             if meant is None:
                 continue
-            (said, rows), left = meant
+            (said, rows, certain), left = meant
             text = f"{one.name} is {own:.0%} off what the shapes need, but {left:.0%} {said}"
-            found.append(Suspicion(text, True))
+            found.append(Suspicion(text, certain))
         scales[one.name] = float((rows * one.model).sum() / (one.model**2).sum())
     for name, scale in scales.items():
         if sized or (name.endswith("moment") and any(x.endswith("force") for x in scales)):
@@ -321,7 +322,7 @@ def _fitted(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
         vector = Rotation.from_matrix(whole).as_rotvec()
         angle = np.degrees(np.linalg.norm(vector) if size > 2 else vector[2])
         text = f"once all are turned by {angle:.0f} degrees. Try: the axes of start and end."
-        yield Hypothesis(text, a @ turn.T)
+        yield Hypothesis(text, a @ turn.T, one.misfit(a) > TURNED)
 
 
 def _about_elsewhere(one: ComparedReading, forces: FloatArray) -> Iterator[Hypothesis[FloatArray]]:

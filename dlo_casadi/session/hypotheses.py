@@ -85,10 +85,13 @@ class Hypothesis(NamedTuple, Generic[T]):
         Its description, in which `{own}` and `{left}` stand for the misfits without and with it.
     meant : T
         What to compare under this hypothesis.
+    certain : bool
+        Whether nothing else explains what it does, such as a missing effect.
     """
 
     said: str
     meant: T
+    certain: bool = True
 
 
 def likeliest(
