@@ -214,8 +214,8 @@ def compare(
     if own is None or (own.weight and own.rms <= UNEXPLAINED * length):
         return None
     tried = []
-    for what, meant in hypotheses:
-        tried.append(Comparison(what, own, coarse_fit(meant, most), length))
+    for way in hypotheses:
+        tried.append(Comparison(way.said, own, coarse_fit(way.meant, most), length))
         if tried[-1].certain and tried[-1].other.rms < UNEXPLAINED * length:
             break
     return min(tried, key=lambda found: found.other.rms)
