@@ -282,15 +282,15 @@ class Shape:
 
     @property
     def start_moment(self) -> FloatArray:
-        """Moment [N m] of the cable on its start clamp, about the world's axes (3,).
+        """Moment [N m] of the cable on whatever holds its start, about the world's axes (3,).
 
-        In a plane one number (), counter-clockwise; zero at a pin.
+        In a plane one number (), counter-clockwise; zero at a pin without a spring.
         """
         return np.asarray(self.equilibrium.moments[0])
 
     @property
     def end_moment(self) -> FloatArray:
-        """Moment [N m] of the cable on its end clamp, as `start_moment`."""
+        """Moment [N m] of the cable on whatever holds its end, as `start_moment`."""
         return np.asarray(self.equilibrium.moments[1])
 
     @property

@@ -20,6 +20,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
 from dlo_casadi.model.contact import Contact, outwards
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.show.text import millimetres, vector
 
 # Arguments of `FittedCable.solve` that say how the ends are held.
@@ -84,7 +85,7 @@ def reaction_texts(
             place = vector(reached, ".5f", "m")
             rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
         rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
-        if getattr(model, side) == "clamped":
+        if side in functions_of(model).moment_ends:
             flat = not np.ndim(moment)
             said = f"{moment:.4g} N m" if flat else vector(moment, ".4g", "N m")
             rows.append((f"moment of the cable on its {side}", said))

@@ -247,7 +247,7 @@ class _PlaneCase(Case):
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
             "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings,
-            "HOLDERS": "" if kernels.ends is None else "    add_ends(q, w->table);",
+            "SPRUNG": kernels.ends is not None,
         }
 
 
@@ -341,6 +341,7 @@ class _SpaceCase(Case):
             "FIRST": 0,
             "GIVES_START": self.compliances[0] > 0,
             "GIVES_END": self.compliances[1] > 0,
+            "SPRUNG": False,
             # Elimination and solution: about 500 operations a node.
             "OPERATIONS": self.meshes["kernel"].operations + 500 * (n + 1),
             "STEPS": (1 + 3 * guesses + 3 * self.obstacles) * 80,

@@ -59,7 +59,8 @@ class CompiledShape:
     start_force, end_force : (dimension,) [N]
         Of the cable on whatever holds its start and its end.
     moments : (2, increment) [N m]
-        Of the cable on its clamps (start, end); in space about the world's axes.
+        Of the cable on its clamps and on springs of pins (start, end); in space about the world's
+        axes.
     energy : float [J]
     min_bend_radius, min_bend_at : float [m]
         Smallest bend radius, and its arc length along the declared length.

@@ -40,8 +40,8 @@ class Equilibrium:
     start_force : (dimension,) [N]
         Force of the cable on whatever holds its start.
     moments : (2, increment) [N m]
-        Of the cable on its clamps (start, end); zero at pins. In space about the world's axes. In
-        a plane (2,).
+        Of the cable on whatever holds it (start, end); zero at pins without springs. In space
+        about the world's axes. In a plane (2,).
     multipliers : (n_border,)
         Of the end conditions, then unknowns of springs and clips: see `model.border_names`.
     bound_multipliers : (n_nodes - 1,) [N m]
@@ -174,10 +174,7 @@ def equilibria_of(
     for j in range(len(shapes.x)):
         curvature = chain.curvatures(strains[j]).ravel()
         sizes = curvatures_along(curvature, clipped.cells[j], clipped.clamped_nodes(j))
-        moments = [
-            on_fixtures[j, rows[f"{side}_moment"]] * (getattr(model, side) == "clamped")
-            for side in ("start", "end")
-        ]
+        moments = [on_fixtures[j, rows[f"{side}_moment"]] for side in ("start", "end")]
         twisted = "twist" in node.strains
         out.append(
             Equilibrium(

@@ -22,6 +22,7 @@ from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, tangents
 from dlo_casadi.model.contact import outwards
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.thresholds import FIRST_ORDER, RESOLVED, SAFE
 
@@ -43,13 +44,14 @@ class Fixture(NamedTuple):
 
     name: str
     at: float
-    clamped: bool
+    turns: bool
 
 
 def fixtures_of(model: CableModel, pose: HeldPose, found: Equilibrium) -> list[Fixture]:
     """All that holds a cable in a pose: the held ends, then the clips."""
     ends = (("start", 0.0, model.start), ("end", model.cable.length, model.end))
-    held = [Fixture(name, at, kind == "clamped") for name, at, kind in ends if kind != "free"]
+    turned = functions_of(model).moment_ends
+    held = [Fixture(name, at, name in turned) for name, at, kind in ends if kind != "free"]
     clips = zip(pose.clips, found.clips, strict=True)
     return [*held, *(Fixture(x.name, load.at, x.kind in CLAMPS) for x, load in clips)]
 
@@ -63,7 +65,7 @@ def places_of(
     """
     if quantity in ("force", "moment"):
         held = fixtures_of(model, pose, found)
-        own = [item for item in held if quantity == "force" or item.clamped]
+        own = [item for item in held if quantity == "force" or item.turns]
         return np.array([item.at for item in own]), [item.name for item in own]
     if quantity == "clearance":
         names, deep = _depths(model, found.points[None], found.x[None], given)
@@ -93,8 +95,9 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
         return curvatures_along(bends.reshape((len(bends), -1)), clipped.cells, clamped)
     found, loads = assembly.reactions(shapes, given), assembly.clip_loads(shapes, given)
     known = ("pinned", "eyelet", *CLAMPS) if quantity == "force" else CLAMPS
-    ends = (("start", model.start), ("end", model.end))
-    each = [found[:, rows[f"{side}_{quantity}"]] for side, kind in ends if kind in known]
+    held = tuple(side for side in ("start", "end") if getattr(model, side) != "free")
+    ends = held if quantity == "force" else functions_of(model).moment_ends
+    each = [found[:, rows[f"{side}_{quantity}"]] for side in ends]
     each += [
         np.array([getattr(load[k], quantity) for load in loads])
         for k, kind in enumerate(model.clips)

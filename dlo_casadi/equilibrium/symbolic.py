@@ -97,7 +97,7 @@ class CasadiCable:
 
             points : (d, n + 1) [m], element boundaries from start to end.
             end_force : (d,) [N] of the cable on whatever holds its end.
-            end_moment : (1,) or (3,) [N m] of the cable on its end clamp, world axes; zero at pins.
+            end_moment : (1,) or (3,) [N m] of the cable on what holds its end, world axes.
             energy : [J]
             min_bend_radius : [m]. It has a kink where the tightest place jumps along the cable, and
             IPOPT stalls there: as a constraint, bound the curvature instead.

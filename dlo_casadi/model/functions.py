@@ -165,16 +165,13 @@ class Functions:
 
     @cached_property
     def end_shape(self) -> ca.Function:
-        """As `at_ends` -> Lagrangian of the ends, forces on both holders, moments on clamps.
+        """As `at_ends` -> Lagrangian of the ends, forces and moments on both holders.
 
         The forces (dimension, 2) [N] and moments (increment, 2) [N m] are those of `Equilibrium`.
         """
         rows, sides = reaction_rows(self.node), ("start", "end")
         forces = [self._reactions[rows[f"{side}_force"]] for side in sides]
-        moments = [
-            self._reactions[rows[f"{side}_moment"]] * (getattr(self.model, side) == "clamped")
-            for side in sides
-        ]
+        moments = [self._reactions[rows[f"{side}_moment"]] for side in sides]
         value = self.terms.ends_lagrangian
         return self._of_ends("end_shape", value, ca.horzcat(*forces), ca.horzcat(*moments))
 
@@ -321,6 +318,13 @@ class Functions:
         here = [row for force, own, turn in pairs for row in (force, node.to_world(own, turn))]
         clips = (self.terms.lam[rows] for rows in self.model.pulls[self.model.n_springs :])
         return ca.substitute(ca.vertcat(*here, *clips), x, ca.vertcat(*self.terms.moved))
+
+    @cached_property
+    def moment_ends(self) -> tuple[str, ...]:
+        """The ends whose fixtures take a moment: clamps, and pins with springs."""
+        rows = reaction_rows(self.node)
+        moments = {side: self._reactions[rows[f"{side}_moment"]] for side in ("start", "end")}
+        return tuple(side for side, moment in moments.items() if not moment.is_zero())
 
     @cached_property
     def reactions(self) -> ca.Function:

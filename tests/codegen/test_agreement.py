@@ -108,6 +108,24 @@ def test_clamps_that_give_way(element, end):
             assert getattr(slope, name)[..., 2 + k] == pytest.approx(change, abs=1e-6)
 
 
+def test_springs_of_pins():
+    """M = k (phi - heading) at either end, and its slopes by the place of the end."""
+    names = ("start_spring", "end_spring")
+    model, p, rest = problem(names, n=10)
+    solver, pose, d = CompiledSolver(model, p, rest, flags=QUICK), HeldPose((0, 0), ENDS[0]), 1e-5
+    shape = solver.solve(pose)
+    stiffnesses, relaxed = p[1::2], p[2::2]
+    expected = stiffnesses * (shape.x[[0, -1], 0] - relaxed)
+    assert shape.moments[:, 0] == pytest.approx(expected, abs=1e-9)
+    slope = solver.sensitivity(shape, pose).moments[:, 0]
+    for k in range(2):
+        step = d * np.eye(2)[k]
+        ahead, back = (solver.solve(replace(pose, end=ENDS[0] + w * step)) for w in (1, -1))
+        change = (ahead.moments - back.moments)[:, 0] / (2 * d)
+        assert slope[:, k] == pytest.approx(change, abs=1e-6)
+    assert np.all(slope[:, 2:] == 0)
+
+
 @pytest.mark.parametrize(("start", "end"), BOUNDARIES)
 @pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
 def test_all_effects_together(element, start, end):

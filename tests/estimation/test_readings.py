@@ -8,6 +8,7 @@ import pytest
 import dlo_casadi as dlo
 from dlo_casadi.effects import CableData, SensorBias, Setup, StartSpring
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
+from dlo_casadi.equilibrium.limits import fixtures_of, sizes_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError, MeasurementError
@@ -106,7 +107,12 @@ def test_a_spring_at_a_pin_holds_a_moment():
     rest, pose = np.zeros(model.chain.n_rests), HeldPose((0.0, 0.0), (0.6, 0.0))
     eq = solve_equilibrium(model, p, rest, pose)
     found = assembly_of(model).reactions(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
-    np.testing.assert_allclose(found[[2, 5]], [0.05 * (eq.phi[0] - 0.4), 0.0], atol=1e-12)
+    expected = np.array([0.05 * (eq.phi[0] - 0.4), 0.0])
+    np.testing.assert_allclose(found[[2, 5]], expected, atol=1e-12)
+    np.testing.assert_allclose(eq.moments, expected, atol=1e-12)
+    assert [x.name for x in fixtures_of(model, pose, eq) if x.turns] == ["start"]
+    sizes = sizes_of(model, eq.shapes, Inputs.of(p, rest, pose.vector[None]), "moment")
+    np.testing.assert_allclose(sizes, [np.abs(expected[:1])], atol=1e-12)
 
 
 def clipped(space: bool) -> tuple[CableModel, HeldPose]:
