@@ -36,6 +36,12 @@ def undetermined(start: str, end: str, in_space: bool) -> Iterator[ConfigProblem
         yield ConfigProblem(("experiment", "boundary"), text)
 
 
+def unused_directions(start: str, end: str) -> list[str]:
+    """Keys of a pose that ends held in this way do not use: directions of pinned ends."""
+    pinned = [side for side, how in (("start", start), ("end", end)) if how == "pinned"]
+    return [f"{side}_{axes.direction}" for side in pinned for axes in AXES.values()]
+
+
 class Clip(ConfigSection):
     """A clip that holds the cable between its ends."""
 
