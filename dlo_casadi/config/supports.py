@@ -93,8 +93,11 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
     `axes`: 2 in a plane, 3 in space.
     """
     last, own, other = 0.0, AXES[axes], AXES[5 - axes]
-    for k, (clip, held) in enumerate(zip(pose.clips, pose.held.clips, strict=True)):
-        called, clamped = held.name, clip.kind == "clamped"
+    names = [held.name for held in pose.held.clips]
+    for k, (clip, called) in enumerate(zip(pose.clips, names, strict=True)):
+        clamped = clip.kind == "clamped"
+        if names.index(called) < k:
+            yield f"two clips are called {called}", k
         if len(clip.place) != axes:
             yield f"{called}: place: {own.place} belongs here", k
         if clamped and getattr(clip, own.direction) is None:
