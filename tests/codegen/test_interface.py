@@ -196,6 +196,17 @@ def test_a_warm_start_of_the_other_branch_is_not_followed(straight):
     assert right.turn == -1
 
 
+def test_parallel_clamps_are_on_either_branch(clamped):
+    """Their headings fix the turn, 0 to rounding, of which no sign is asked."""
+    shapes = [
+        clamped.solve(at((0.5, 0.0), headings=(0.0, 0.0), branch=branch))
+        for branch in (None, "ccw", "cw")
+    ]
+    assert [shape.turn for shape in shapes] == [0, 0, 0]
+    against = at((0.5, 0.0), headings=(0.0, 0.1), branch="cw")
+    assert clamped.solve(against, throw=False).status == "other_branch"
+
+
 def test_a_clamped_loop_turns_once_clockwise():
     model, p, rest = cable("arc", "clamped", "clamped", n=40, straight=True)
     shape = compiled(model, p, rest).solve(at((0.2, 0.0), headings=(0.0, -2 * np.pi)))
