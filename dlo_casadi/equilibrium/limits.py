@@ -96,7 +96,7 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
     ends = (("start", model.start), ("end", model.end))
     each = [found[:, rows[f"{side}_{quantity}"]] for side, kind in ends if kind in known]
     each += [
-        np.array([getattr(load[k], quantity) for load in loads])
+        np.array([np.atleast_1d(getattr(load[k], quantity)) for load in loads])
         for k, kind in enumerate(model.clips)
         if kind in known
     ]
