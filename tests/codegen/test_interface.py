@@ -97,9 +97,19 @@ def test_what_is_no_pose_is_refused(links, arguments, message):
         links.solve(at(**({"end": (0.3, -0.1)} | arguments)))
 
 
+@pytest.mark.parametrize(
+    ("headings", "name"), [((None, 0.1), "start_heading"), ((0.1, None), "end_heading")]
+)
+def test_a_clamp_without_a_direction_is_refused(clamped, headings, name):
+    with pytest.raises(DloError, match=rf"is clamped, give {name} \[rad\], continuous along the"):
+        clamped.solve(at((0.5, 0.1), headings=headings))
+
+
 def test_a_place_is_no_pose_and_three_is_no_shape(links):
     with pytest.raises(DloError, match=r"a Pose belongs here, found \(0.3, -0.1\)\n  Try: dlo"):
         links.solve((0.3, -0.1))
+    with pytest.raises(DloError, match=r"a Pose belongs here, found a CompiledShape\n"):
+        links.step(at((0.3, -0.1)), links.solve(at((0.3, -0.1))))
     with pytest.raises(DloError, match=r"shape of this solver, with x of the shape \(10, 1\)"):
         links.solve(at((0.3, -0.1)), warm=3)
 
