@@ -90,7 +90,8 @@ def test_a_rod_clamped_in_three_places_is_two_rods():
     (load,) = whole.clips
     assert load.force == pytest.approx(first.end_force + last.start_force, rel=1e-9)
     moment = np.ravel(first.moments)[1] + np.ravel(last.moments)[0]
-    assert load.moment == pytest.approx([moment], rel=1e-9)
+    assert np.shape(load.moment) == ()
+    assert load.moment == pytest.approx(moment, rel=1e-9)
 
 
 def turned(*vector):
@@ -268,6 +269,14 @@ def test_an_offset_brings_a_clip_within_reach():
     assert eq.stable
 
 
+def test_a_way_through_eyelets_that_is_too_long_is_told_as_such():
+    """0.75 + 0.559 m by way of the eyelet, though the ends are 0.7 m apart."""
+    with pytest.raises(
+        EquilibriumError, match=r"are 1\.3090 m apart by way of the eyelets, with 1"
+    ):
+        solved([HeldClip("eyelet", (0.45, 0.6))], (0.7, 0.1))
+
+
 SESSION = """\
 cable: {name: harness, length: 0.8, mass: 0.05, diameter: 0.005, bending_stiffness: 0.01}
 experiment:
@@ -301,6 +310,7 @@ def test_a_session_with_clips(tmp_path):
         ("kind: eyelet", "kind: pinned, at: 0.2", "at 0.2 m follows 0.3 m: clips stand in the"),
         ("kind: pinned", "kind: clamped", "first: a clamped clip needs its heading"),
         ("place: [0.45, 0.0]", "place: [0.45, 0.0, 0]", r"clip_2: place: \[x, y\] belongs here"),
+        ("kind: eyelet", "name: first, kind: eyelet", "two clips are called first"),
         ("place: [0.25, 0.05]", "place: [0.3, 0.2]", "first are 0.3606 m apart, with 0.3 m of"),
     ],
 )

@@ -498,6 +498,8 @@ def test_headings_follow_the_boundary(tmp_path):
         load(tmp_path, ("end: [0.4, 0.1], ", ""))
     unused = load(tmp_path, ("end: [0.4", "start_heading: 0.1, end: [0.4"))
     assert unused.warnings == ("start_heading is not used, the start is pinned: b",)
+    assert all("start_heading" not in x.model_fields_set for x in unused.experiment.poses)
+    assert unused.experiment.poses[1].held.start_heading is None
 
 
 def test_a_ball_joint_and_a_free_end_hold_no_shape_in_space(tmp_path):

@@ -135,6 +135,18 @@ def test_the_branch_asked_for():
         assert sign * points[1, 3] > 0.1
 
 
+@pytest.mark.parametrize("branch", ["ccw", "cw"])
+def test_parallel_clamps_are_on_either_branch(branch):
+    """Their headings fix the turn, 0 to rounding, of which no sign is asked."""
+    held = {"start": "clamped", "end": "clamped"}
+    model = CableModel(CableData(0.8, 0.05, 0.005, 0.01), n=6, n_rest=0, **held)
+    rest, pose = np.zeros(model.chain.n_rests), np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
+    function = CasadiCable(model, model.nominal, rest).function(branch=branch)
+    assert function(pose)[-1] == 0
+    pose[-1] = {"ccw": -0.1, "cw": 0.1}[branch]
+    assert function(pose)[-1] == 2
+
+
 def test_a_cable_between_ball_joints_may_roll_and_has_derivatives_all_the_same():
     model = CableModel(
         CableData(0.8, 0.05, 0.005, 0.01, torsional_stiffness=0.008), n=6, gravity=(0.0, 0.0, -9.81)

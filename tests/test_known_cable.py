@@ -214,6 +214,27 @@ def test_what_needs_a_fit_says_so(rope, tmp_path):
         rope.solve(end=(0.5, 0.1)).check()
 
 
+@pytest.mark.parametrize("clips", [["pinned", "eyelt"], "pinned", None])
+def test_clips_are_a_list_of_kinds(rope, clips):
+    with pytest.raises(dlo.DloError, match="clips: a list of kinds belongs here, found"):
+        rope.with_clips(clips)
+
+
+def test_two_clips_of_one_name_are_refused(rope):
+    clips = [dlo.Clip(kind="pinned", name="a", at=s, place=(s, 0.0)) for s in (0.2, 0.4)]
+    with pytest.raises(dlo.DloError, match="two clips are called a"):
+        rope.solve(end=(0.5, 0.1), clips=clips)
+
+
+def test_a_saddle_in_a_plane_takes_one_moment_as_a_clamp_does(rope):
+    saddle = dlo.Clip(kind="clamped", at=0.4, place=(0.3, -0.1), heading=0.1)
+    shape = rope.solve(end=(0.5, 0.1), clips=[saddle])
+    moment = shape.clips["clip_1"].moment
+    assert np.shape(moment) == np.shape(shape.end_moment) == ()
+    assert shape.as_dict()["clips"][0]["moment"] == float(moment)
+    assert f"moment of the cable on clip_1: {moment:.4g} N m\n" in str(shape)
+
+
 def test_a_straight_cable_keeps_every_bend_radius():
     """Without gravity nothing bends it, and nothing pulls at its clamp: sizes of exactly 0."""
     shape = dlo.known_cable(ROPE, **WEIGHTLESS).solve(start_heading=0.0)

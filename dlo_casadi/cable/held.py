@@ -52,9 +52,12 @@ def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tup
         rows.append((clip.name, at))
         rows.append((f"force of the cable on {clip.name}", vector(load.force, ".4g", "N")))
         if clip.kind in CLAMPS:
-            said = vector(load.moment, ".4g", "N m")
-            rows.append((f"moment of the cable on {clip.name}", said))
+            rows.append((f"moment of the cable on {clip.name}", _moment_text(load.moment)))
     return rows
+
+
+def _moment_text(moment: FloatArray) -> str:
+    return vector(moment, ".4g", "N m") if np.ndim(moment) else f"{moment:.4g} N m"
 
 
 def contact_texts(contacts: Sequence[Contact]) -> list[tuple[str, str]]:
@@ -86,9 +89,7 @@ def reaction_texts(
             rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
         rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
         if side in functions_of(model).moment_ends:
-            flat = not np.ndim(moment)
-            said = f"{moment:.4g} N m" if flat else vector(moment, ".4g", "N m")
-            rows.append((f"moment of the cable on its {side}", said))
+            rows.append((f"moment of the cable on its {side}", _moment_text(moment)))
     return rows + clip_texts(pose.clips, found.clips) + contact_texts(found.contacts)
 
 

@@ -38,6 +38,8 @@ from dlo_casadi.rod.obstacles import Obstacle
 # Poses, or rows of numbers in the layout of dlo_pose in the C header.
 Poses = Sequence[AnyPose] | FloatArray
 
+# Value of a quantity that there is not in the C header: nothing bends, no obstacle.
+_NOTHING = 1e300
 # Argument types of the header's functions: a pointer, an int, a count (size_t).
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "n": ctypes.c_size_t}
 _ARGUMENTS = {
@@ -336,8 +338,8 @@ class CompiledSolver:
         Raises
         ------
         DloError
-            If a limit has an unknown name or is not a positive finite number, the shape is empty,
-            or a number is not finite.
+            If a limit has an unknown name or is not a positive finite number, a clearance has no
+            obstacles, the shape is empty, or a number is not finite.
         """
         if unknown := [name for name in limits if name not in QUANTITIES]:
             text = f"a shape has no limit {unknown[0]!r}"
@@ -348,11 +350,14 @@ class CompiledSolver:
                     f"a limit must be positive and finite, found {name} {limit!r}\n"
                     f"  Try: a number; without {name} there is no limit"
                 )
+        if "clearance" in limits and not len(obstacles):
+            raise DloError("a limit of the clearance, and no obstacle\n  Try: obstacles=[...]")
         bounds = np.array([limits.get(name, 0.0) for name in QUANTITIES], float)
         given, along = self._table_of(obstacles), self._along(slope)
         kept, out = self._record_of(shape), np.zeros(len(QUANTITIES), self._records.usage)
         tightest = np.zeros(1, np.intc)
         status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
+        out["value"][out["value"] == _NOTHING] = np.inf
         if status:
             raise DloError(
                 f"no limits ({STATUSES[status]}): the shape is {shape.status!r}\n"

@@ -8,11 +8,12 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
+from dlo_casadi.config.values import AXES
 from dlo_casadi.equilibrium.implicit import pose_size
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.model.clips import CLAMPS, HeldClip
 from dlo_casadi.rod.ends import EndConditions
 
 # Same values as in the header.
@@ -210,7 +211,7 @@ class Usage:
     ----------
     value : float
         Smallest bend radius [m], largest force [N] and moment [N m] on a fixture, largest twist
-        [1/m], smallest distance from obstacles [m]; 1e300 if nothing bends, or without obstacles.
+        [1/m], smallest distance from obstacles [m]; inf if nothing bends, or without obstacles.
     margin : float
         Remaining share of the limit, negative where it is violated: 1 - value / limit; for a bend
         radius 1 - limit / value; for a clearance value / limit - 1. 1 without a limit.
@@ -315,7 +316,9 @@ def pose_table(
     if branch is not None:
         raise DloError(f"branch {branch!r} is for poses in an array; a Pose names its own")
     if not isinstance(poses, Sequence):
-        raise DloError(f"a list of poses or an array belongs here, found {poses!r}\n  Try: [pose]")
+        raise DloError(
+            f"a list of poses or an array belongs here, found {_told(poses)}\n  Try: [pose]"
+        )
     table = np.array([_row(model, pose) for pose in poses]).reshape(-1, pose_size(model))
     numbers = {_branch_number(pose.branch) for pose in poses} or {0}
     if len(numbers) > 1:
@@ -334,7 +337,9 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     if isinstance(pose, Pose):
         pose = pose.held
     if not isinstance(pose, HeldPose):
-        raise DloError(f"a Pose belongs here, found {pose!r}\n  Try: dlo_casadi.Pose(start, end)")
+        raise DloError(
+            f"a Pose belongs here, found {_told(pose)}\n  Try: dlo_casadi.Pose(start, end)"
+        )
     said = f"{pose.name}: " if pose.name else ""
     if pose.end is None and model.end != "free":
         raise DloError(f"{said}the end of the cable is {model.end}: where is it?\n  Try: end")
@@ -347,6 +352,20 @@ def _row(model: CableModel, pose: object) -> FloatArray:
                 f"{said}{name} must have {counted(d, 'number')}, found {place!r}\n"
                 "  Try: as many as the cable's gravity has"
             )
+    own = AXES[d]
+    directions = {
+        f"{side}_{own.direction}": getattr(pose, f"{side}_{own.direction}")
+        for side in ("start", "end")
+        if getattr(model, side) == "clamped"
+    }
+    directions |= {
+        f"the {own.direction} of clip {k}": getattr(clip, own.direction)
+        for k, clip in enumerate(pose.clips, 1)
+        if clip.kind in CLAMPS
+    }
+    for name, direction in directions.items():
+        if direction is None:
+            raise DloError(f"{said}the cable is clamped, give {name} {own.unit}")
     try:
         numbers = np.asarray([*pose.ends, pose.turns], float)
     except (TypeError, ValueError):
@@ -355,14 +374,19 @@ def _row(model: CableModel, pose: object) -> FloatArray:
         raise DloError(f"{said}an orientation must have 4 numbers, found {pose!r}")
     kinds = tuple(clip.kind for clip in pose.clips)
     if kinds != model.clips:
-        own, others = (", ".join(x) or "none" for x in (kinds, model.clips))
-        raise DloError(f"{said}the pose has the clips {own}, the solver {others}")
+        mine, others = (", ".join(x) or "none" for x in (kinds, model.clips))
+        raise DloError(f"{said}the pose has the clips {mine}, the solver {others}")
     clips = [
         [clip.at or 0.0, *clip.place, *(_frame(clip, model) if model.clamped_between else ())]
         for clip in pose.clips
     ]
     ends = EndConditions.size(model.node) + model.node.twists
     return np.concatenate([numbers[:ends], *clips])
+
+
+def _told(value: object) -> str:
+    """What was found in the place of a pose; a shape has too many numbers to show."""
+    return "a CompiledShape" if isinstance(value, CompiledShape) else repr(value)
 
 
 def _frame(clip: HeldClip, model: CableModel) -> FloatArray:

@@ -18,6 +18,7 @@ from dlo_casadi.config.supports import (
     obstacle_problems,
     too_short,
     undetermined,
+    unused_directions,
 )
 from dlo_casadi.config.values import AXES, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
@@ -91,10 +92,10 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
 
     poses = config.experiment.poses
     unreachable = _unreachable(poses, config.cable, config.experiment.tolerances)
-    reachable = tuple(pose for pose in poses if pose.name not in unreachable)
+    unused = unused_directions(config.experiment.boundary.start, config.experiment.boundary.end)
+    reachable = tuple(pose.without(unused) for pose in poses if pose.name not in unreachable)
     absent = {pose.name: [_absent(path) for path in pose.paths] for pose in reachable if pose.paths}
-    missing = {name: "; ".join(told) for name, told in absent.items() if all(told)}
-    reasons = unreachable | missing
+    reasons = unreachable | {name: "; ".join(told) for name, told in absent.items() if all(told)}
     n_fit = sum(pose.role == "fit" and pose.name not in reasons for pose in poses)
     if n_fit == 0:
         lost = [
@@ -334,10 +335,9 @@ def _oddities(config: Config) -> Iterator[str]:
             f"estimation.algorithm1_n: COBYLA takes about {(links / 10) ** 2:.0f} s for one shape "
             f"of {links} links, and the loop needs hundreds; ipopt takes milliseconds"
         )
-    for end in ("start", "end"):
-        given = [p.name for p in experiment.poses if getattr(p, f"{end}_heading") is not None]
-        if given and getattr(experiment.boundary, end) == "pinned":
-            yield f"{end}_heading is not used, the {end} is pinned: {', '.join(given)}"
+    for key in unused_directions(experiment.boundary.start, experiment.boundary.end):
+        if given := [p.name for p in experiment.poses if getattr(p, key) is not None]:
+            yield f"{key} is not used, the {key.partition('_')[0]} is pinned: {', '.join(given)}"
 
 
 def _impossible_values(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:

@@ -36,6 +36,12 @@ def undetermined(start: str, end: str, in_space: bool) -> Iterator[ConfigProblem
         yield ConfigProblem(("experiment", "boundary"), text)
 
 
+def unused_directions(start: str, end: str) -> list[str]:
+    """Keys of a pose that ends held in this way do not use: directions of pinned ends."""
+    pinned = [side for side, how in (("start", start), ("end", end)) if how == "pinned"]
+    return [f"{side}_{axes.direction}" for side in pinned for axes in AXES.values()]
+
+
 class Clip(ConfigSection):
     """A clip that holds the cable between its ends."""
 
@@ -87,8 +93,11 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
     `axes`: 2 in a plane, 3 in space.
     """
     last, own, other = 0.0, AXES[axes], AXES[5 - axes]
-    for k, (clip, held) in enumerate(zip(pose.clips, pose.held.clips, strict=True)):
-        called, clamped = held.name, clip.kind == "clamped"
+    names = [held.name for held in pose.held.clips]
+    for k, (clip, called) in enumerate(zip(pose.clips, names, strict=True)):
+        clamped = clip.kind == "clamped"
+        if names.index(called) < k:
+            yield f"two clips are called {called}", k
         if len(clip.place) != axes:
             yield f"{called}: place: {own.place} belongs here", k
         if clamped and getattr(clip, own.direction) is None:

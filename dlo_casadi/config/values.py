@@ -8,7 +8,7 @@ refused, and the message gives the range. A computable but unlikely value is a w
 import inspect
 import math
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -221,6 +221,13 @@ class ConfigSection(BaseModel):
         inner = {name: getattr(self, name) for name, x in values.items() if isinstance(x, dict)}
         changed = {name: section.changed(**values[name]) for name, section in inner.items()}
         return self.model_copy(update=values | changed)
+
+    def without(self, keys: Collection[str]) -> Self:
+        """Copy with the defaults of these keys, as if they were not given."""
+        defaults = {key: type(self).model_fields[key].default for key in keys}
+        copy = self.model_copy(update=defaults)
+        copy.model_fields_set.difference_update(keys)
+        return copy
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:

@@ -20,7 +20,6 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
@@ -38,7 +37,7 @@ from dlo_casadi.diagnosis.screening import (
     sidak,
     survival,
 )
-from dlo_casadi.diagnosis.unknown_force import UnknownForce
+from dlo_casadi.diagnosis.unknown_force import UnknownForce, places_in, start_from
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
@@ -371,27 +370,6 @@ def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
     return found
 
 
-def start_from(
-    fit: Fit, position: float, forces: FloatArray, candidate: Candidate
-) -> dict[str, float]:
-    """Qualified parameters of a load at one place that reproduce given forces best.
-
-    `forces` (fitted poses, dimension) [N], at the arc length `position` [m] of the fit's shapes.
-    """
-    model, effect = fit.model, candidate.effect.linear()
-    assert isinstance(effect, PointLoad)
-    place = ca.SX.sym("r", len(model.gravity))
-    names = [q.name for q in effect.parameters(model.cable) if q.name != "position"]
-    linear = ca.SX.sym("linear", len(names))
-    params = {name: linear[k] for k, name in enumerate(names)} | {"position": ca.SX(position)}
-    law = effect.force(place, ca.SX(ca.DM(model.gravity)), params)
-    slopes = ca.Function("slopes", [place], [ca.jacobian(law, linear)])
-    arms = np.concatenate([np.array(slopes(at)) for at in _places(fit, position)])
-    found = np.linalg.lstsq(arms, forces.ravel(), rcond=None)[0]
-    values = dict(zip(names, map(float, found), strict=True)) | {"position": position}
-    return candidate.of_linear(model.cable, values)
-
-
 def loads_from_best(
     base: Fit,
     screened: Sequence[Screened],
@@ -436,7 +414,7 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
     gravity, position = ca.SX(ca.DM(model.gravity)), effect.place(known)
     at = ca.SX.sym("r", len(model.gravity))
     law = ca.Function("force", [at], [effect.force(at, gravity, params)])
-    forces = np.array([np.array(law(place)).ravel() for place in _places(best.fit, position)])
+    forces = np.array([np.array(law(place)).ravel() for place in places_in(best.fit, position)])
     values = start_from(best.fit, position, forces, screened.candidate)
     without = best.candidate.remove_from(model, base.model)
     larger, ceiling = screened.candidate.add_to(without), ceiling_beside(best.fit)
@@ -449,10 +427,3 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
             found = replace(found, screened=replace(screened, p_value=p_value))
         return found
     return None
-
-
-def _places(fit: Fit, position: float) -> FloatArray:
-    """Where (fitted poses, dimension) [m] an arc length [m] is in the fitted shapes."""
-    seen = fit.problem.observed(fit.point)
-    at = np.array([position])
-    return np.array([seen[j].curve.at(at)[0] for j in fit.problem.used])

@@ -1,13 +1,15 @@
-"""A missing load without an assumed cause: where the cable is pulled, and how in each pose."""
+"""A missing load without an assumed cause: where and how the cable is pulled, and what could pull."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
+import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects import UnknownPull
+from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.effects import PointLoad, UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.continuation import relaxed
 from dlo_casadi.estimation.descent import descend, refit
@@ -156,3 +158,31 @@ class _Search:
         bending = cable.bending_stiffness / cable.length**2
         scatter[_columns(model)] = FORCE_WEIGHTS * max(model.weight, bending)
         return replace(problem, unknowns=unknowns, priors=replace(problem.priors, scatter=scatter))
+
+
+def start_from(
+    fit: Fit, position: float, forces: FloatArray, candidate: Candidate
+) -> dict[str, float]:
+    """Qualified parameters of a load at one place that reproduce given forces best.
+
+    `forces` (fitted poses, dimension) [N], at the arc length `position` [m] of the fit's shapes.
+    """
+    model, effect = fit.model, candidate.effect.linear()
+    assert isinstance(effect, PointLoad)
+    place = ca.SX.sym("r", len(model.gravity))
+    names = [q.name for q in effect.parameters(model.cable) if q.name != "position"]
+    linear = ca.SX.sym("linear", len(names))
+    params = {name: linear[k] for k, name in enumerate(names)} | {"position": ca.SX(position)}
+    law = effect.force(place, ca.SX(ca.DM(model.gravity)), params)
+    slopes = ca.Function("slopes", [place], [ca.jacobian(law, linear)])
+    arms = np.concatenate([np.array(slopes(at)) for at in places_in(fit, position)])
+    found = np.linalg.lstsq(arms, forces.ravel(), rcond=None)[0]
+    values = dict(zip(names, map(float, found), strict=True)) | {"position": position}
+    return candidate.of_linear(model.cable, values)
+
+
+def places_in(fit: Fit, position: float) -> FloatArray:
+    """Where (fitted poses, dimension) [m] an arc length [m] is in the fitted shapes."""
+    seen = fit.problem.observed(fit.point)
+    at = np.array([position])
+    return np.array([seen[j].curve.at(at)[0] for j in fit.problem.used])

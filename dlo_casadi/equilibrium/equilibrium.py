@@ -20,6 +20,8 @@ JOINT_BOUND = np.pi / 2
 END_TOLERANCE = 1e-8
 # Largest imbalance of an accepted equilibrium, relative to the tangent matrix.
 BALANCE = 1e-12
+# Turn of the cable [rad] below which it is on either branch: rounding decides its sign.
+NO_TURN = 1e-9
 # Largest difference of two shapes that count as the same one [rad].
 NEARBY = 0.05
 
@@ -101,8 +103,8 @@ class Equilibrium:
         return float(self.phi[-1] - self.phi[0])
 
     def has_branch(self, branch: Branch | None) -> bool:
-        """Whether the cable turns as the branch says; always for None."""
-        return branch is None or SIGNS[branch] * self.turn > 0
+        """Whether the cable turns as the branch says, or not at all; always for None."""
+        return branch is None or SIGNS[branch] * self.turn > -NO_TURN
 
 
 def places_along(cells: FloatArray, clamped: Sequence[int] = ()) -> FloatArray:

@@ -99,7 +99,7 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
     ends = held if quantity == "force" else functions_of(model).moment_ends
     each = [found[:, rows[f"{side}_{quantity}"]] for side in ends]
     each += [
-        np.array([getattr(load[k], quantity) for load in loads])
+        np.array([np.atleast_1d(getattr(load[k], quantity)) for load in loads])
         for k, kind in enumerate(model.clips)
         if kind in known
     ]

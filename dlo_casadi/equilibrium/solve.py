@@ -61,9 +61,10 @@ def solve_equilibrium(
 
     Among the equilibria reached from the first guesses (see `guesses`), the stable one of lowest
     energy is returned, or an unstable one if no other is found. If the pose names its branch, the
-    result is on that branch, or an error; between two pins it is the first stable one, as a rule
-    that of the branch's own arc. If it names sides of bars, the cable passes them there. With
-    `x_init` it is the equilibrium reached from there, on any branch or side.
+    result is on that branch, or an error; between two clamps the headings fix the branch, between
+    two pins it is the first stable one, as a rule that of the branch's own arc. If it names sides
+    of bars, the cable passes them there. With `x_init` it is the equilibrium reached from there, on
+    any branch or side.
 
     Parameters
     ----------
@@ -201,14 +202,12 @@ def _chosen(
     for eq in found:
         if eq.has_branch(named) and eq.stable is lowest.stable:
             return eq
-    there = next(
-        (f"branch {branch}" for branch in SIGNS if lowest.has_branch(branch)), "neither branch"
-    )
+    there = next(branch for branch in SIGNS if branch != named)
     kind = "stable equilibrium" if lowest.stable else "equilibrium"
     what = (
         f"no {kind} found on the branch {named} from its first guesses with {where}: the lowest "
         f"one, of {lowest.energy:.4g} J, turns by {lowest.turn:+.3g} rad from start to end "
-        f"({there})"
+        f"(branch {there})"
     )
     return no_equilibrium(pose, what, "the other branch, or none.")
 

@@ -419,9 +419,10 @@ def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str,
     for low, high, declared in fixed_stretches(held):
         length = declared * true_length / model.cable.length
         if sum(apart[low:high]) >= length:
+            way = " by way of the eyelets" if high > low + 1 else ""
             what = (
                 f"no equilibrium: {names[low]} and {names[high]} are {sum(apart[low:high]):.4f} m "
-                f"apart, with {length:.4f} m of cable between them"
+                f"apart{way}, with {length:.4f} m of cable between them"
             )
             return what, "places and arc lengths in metres, in the order along the cable?"
     return None

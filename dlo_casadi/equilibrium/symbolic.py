@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, get_args
 
 import casadi as ca
 import numpy as np
@@ -56,7 +56,20 @@ class CasadiCable:
     rest: FloatArray
 
     def with_clips(self, clips: Sequence[ClipKind]) -> Self:
-        """Return the same cable held by clips of these kinds, in the order along it."""
+        """Return the same cable held by clips of these kinds, in the order along it.
+
+        Raises
+        ------
+        DloError
+            If they are no list of kinds: pinned, clamped, swivel, eyelet.
+        """
+        known = get_args(ClipKind)
+        listed = isinstance(clips, Sequence) and not isinstance(clips, str)
+        if not listed or any(kind not in known for kind in clips):
+            raise DloError(
+                f"clips: a list of kinds belongs here, found {clips!r}\n"
+                f'  Try: ["pinned"]; kinds are {", ".join(known)}'
+            )
         return replace(self, model=replace(self.model, clips=tuple(clips)))
 
     def function(
@@ -80,7 +93,8 @@ class CasadiCable:
             `parameters` (SI), in the order of `model.names` or of the names, in place of the fitted
             values.
         branch : "ccw" or "cw", optional
-            In a plane, which way the cable turns from start to end.
+            In a plane, which way the cable turns from start to end; between two clamps their
+            headings fix it.
         search : casadi.Function, optional
             Function that finds equilibria in place of Python: `casadi.external("dlo_equilibrium",
             library)`, or `dlo_equilibrium_ccw`, `_cw`, of this cable's generated C, compiled into a

@@ -79,8 +79,9 @@ class ClipLoad:
     at : float [m]
         Arc length at which it holds the cable.
     force : (dimension,) [N]
-    moment : (increment,) [N m]
-        In space about the world's axes; zero where the cable may turn.
+    moment : () or (3,) [N m]
+        In a plane one number, counter-clockwise; in space about the world's axes. Zero where the
+        cable may turn.
     """
 
     at: float
@@ -256,7 +257,10 @@ class Clipped:
             own = -by_turns[rows, clamp.index] * clamp.held
             moments[:, k] = node.to_world(clamp.frame, own)
         return [
-            tuple(ClipLoad(float(s), *both) for s, *both in zip(*each, strict=True))
+            tuple(
+                ClipLoad(float(s), force, np.squeeze(own))
+                for s, force, own in zip(*each, strict=True)
+            )
             for each in zip(self.at, forces, moments, strict=True)
         ]
 

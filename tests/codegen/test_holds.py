@@ -114,7 +114,7 @@ def assert_agree(shape, eq):
     for own, load in zip(shape.clip_forces[: len(eq.clips)], eq.clips, strict=True):
         assert own == pytest.approx(load.force, abs=1e-9)
     for own, load in zip(shape.clip_moments, eq.clips, strict=False):
-        assert own == pytest.approx(load.moment, abs=1e-9)
+        assert own == pytest.approx(np.ravel(load.moment), abs=1e-9)
     at = [load.at for load in eq.clips]
     assert shape.clip_at[: len(at)] == pytest.approx(at, abs=1e-9)
 

@@ -97,9 +97,19 @@ def test_what_is_no_pose_is_refused(links, arguments, message):
         links.solve(at(**({"end": (0.3, -0.1)} | arguments)))
 
 
+@pytest.mark.parametrize(
+    ("headings", "name"), [((None, 0.1), "start_heading"), ((0.1, None), "end_heading")]
+)
+def test_a_clamp_without_a_direction_is_refused(clamped, headings, name):
+    with pytest.raises(DloError, match=rf"is clamped, give {name} \[rad\], continuous along the"):
+        clamped.solve(at((0.5, 0.1), headings=headings))
+
+
 def test_a_place_is_no_pose_and_three_is_no_shape(links):
     with pytest.raises(DloError, match=r"a Pose belongs here, found \(0.3, -0.1\)\n  Try: dlo"):
         links.solve((0.3, -0.1))
+    with pytest.raises(DloError, match=r"a Pose belongs here, found a CompiledShape\n"):
+        links.step(at((0.3, -0.1)), links.solve(at((0.3, -0.1))))
     with pytest.raises(DloError, match=r"shape of this solver, with x of the shape \(10, 1\)"):
         links.solve(at((0.3, -0.1)), warm=3)
 
@@ -194,6 +204,17 @@ def test_a_warm_start_of_the_other_branch_is_not_followed(straight):
     left = straight.solve(at((0.5, 0.0), branch="ccw"))
     right = straight.solve(at((0.5, 0.0), branch="cw"), warm=left)
     assert right.turn == -1
+
+
+def test_parallel_clamps_are_on_either_branch(clamped):
+    """Their headings fix the turn, 0 to rounding, of which no sign is asked."""
+    shapes = [
+        clamped.solve(at((0.5, 0.0), headings=(0.0, 0.0), branch=branch))
+        for branch in (None, "ccw", "cw")
+    ]
+    assert [shape.turn for shape in shapes] == [0, 0, 0]
+    against = at((0.5, 0.0), headings=(0.0, 0.1), branch="cw")
+    assert clamped.solve(against, throw=False).status == "other_branch"
 
 
 def test_a_clamped_loop_turns_once_clockwise():

@@ -8,6 +8,7 @@ import pytest
 
 from dlo_casadi.codegen import CompiledSolver, Plane, generate
 from dlo_casadi.codegen.generate import solver_hash
+from dlo_casadi.codegen.shapes import pose_table
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, EquilibriumError
@@ -46,6 +47,21 @@ def test_a_failed_shape_has_no_clearance_and_no_limits(solver, failed):
     for ask in (solver.clearance, lambda shape, given: solver.limits(shape, {}, given)):
         with pytest.raises(DloError, match=r"bad_argument.* 'unreachable'.*\n  Try: a shape whose"):
             ask(failed, [TABLE])
+
+
+def test_directions_of_clamps_and_saddles_are_needed_in_space():
+    cable, held = replace(CABLE, torsional_stiffness=0.04), {"start": "clamped", "end": "clamped"}
+    model = CableModel(cable, 6, gravity=(0.0, 0.0, -9.81), clips=("clamped",), **held)
+    ahead = (0.0, 0.0, 0.0, 1.0)
+    saddle = HeldClip("clamped", (0.3, 0.0, -0.1), 0.4, orientation=ahead)
+    pose = HeldPose((0.0,) * 3, (0.5, 0.0, 0.1), clips=(saddle,), start_orientation=ahead)
+    with pytest.raises(DloError, match=r"is clamped, give end_orientation \[qx"):
+        pose_table(model, [pose])
+    pose = replace(pose, end_orientation=ahead)
+    assert np.isfinite(pose_table(model, [pose])[0]).all()
+    pose = replace(pose, clips=(replace(saddle, orientation=None),))
+    with pytest.raises(DloError, match=r"is clamped, give the orientation of clip 1 \[qx"):
+        pose_table(model, [pose])
 
 
 def test_a_failed_shape_is_no_start(solver, failed):

@@ -65,7 +65,7 @@ def test_values_and_places_are_those_of_python(case):
     model, pose = CASES[case]()
     solver, p, rest = compiled(model)
     shape, found = solver.solve(pose), solve_equilibrium(model, p, rest, pose)
-    usages = solver.limits(shape, LIMITS)
+    usages = solver.limits(shape, {name: LIMITS[name] for name in SIZES})
     given = Inputs.of(p, rest, pose.vector[None])
     for name, size in SIZES.items():
         own, limit = usages[name], LIMITS[name]
@@ -83,7 +83,7 @@ def test_values_and_places_are_those_of_python(case):
         if name in ("force", "moment"):
             names = ["start", "end", *(clip.name for clip in pose.clips)]
             assert names[own.which] == holders[tight]
-    assert usages["clearance"].value == 1e300
+    assert (usages["clearance"].value, usages["clearance"].margin) == (np.inf, 1.0)
     first, *_ = usages
     assert usages[first].margin == min(item.margin for item in usages.values())
 
@@ -133,8 +133,10 @@ def test_limits_that_cannot_be_checked():
         solver.limits(shape, {"bend": 0.1})
     with pytest.raises(DloError, match="must be positive and finite, found force -1"):
         solver.limits(shape, {"force": -1.0})
+    with pytest.raises(DloError, match="a limit of the clearance, and no obstacle"):
+        solver.limits(shape, {"clearance": 0.01})
     with pytest.raises(DloError, match="the shape is 'unreachable'"):
-        solver.limits(none, LIMITS)
+        solver.limits(none, {})
     with pytest.raises(DloError, match="not_finite"):
         solver.limits(shape, LIMITS, [Capsule((0.0, 0.0), (0.0, 0.0), np.nan)])
     assert all(item.margin == 1.0 for item in solver.limits(shape, {}).values())

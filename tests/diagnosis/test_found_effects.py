@@ -14,9 +14,9 @@ from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.diagnosis.refits import confirm, loads_from_best, start_from
+from dlo_casadi.diagnosis.refits import confirm, loads_from_best
 from dlo_casadi.diagnosis.screening import Screened
-from dlo_casadi.diagnosis.unknown_force import UnknownForce
+from dlo_casadi.diagnosis.unknown_force import UnknownForce, start_from
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
