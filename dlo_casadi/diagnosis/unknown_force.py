@@ -1,4 +1,4 @@
-"""A missing load without an assumed cause: where and how the cable is pulled, and what could pull."""
+"""A missing load without an assumed cause: where and how the cable is pulled, and by what load."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
