@@ -245,6 +245,17 @@ def load(path: str | Path) -> FittedCable:
             f"no fitted parameters: schema {SCHEMA!r} expected, {found!r} found.\n  Try: {remedy}",
             source,
         )
+    listed = data.get("effects")
+    rows = listed if isinstance(listed, list) else []
+    named = [row.get("name") for row in rows if isinstance(row, dict)]
+    if own := [name for name in named if isinstance(name, str) and known_effect(name) is None]:
+        raise ConfigError(
+            f"effects: no effect is called {own[0]!r} in this process; "
+            f"known: {', '.join((*EFFECTS, *NUISANCES))}.\n"
+            f"  Try: for an effect of your own, in Python: dlo.EFFECTS[{own[0]!r}] = its class, "
+            "before loading.",
+            source,
+        )
     file = document.checked(ParametersFile, _DAMAGED, _REMEDY)
     try:
         model = _model(file)

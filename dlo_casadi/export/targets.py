@@ -155,6 +155,18 @@ REFUSED = {
 }
 
 
+def check_counts(segments: int | None, samples: int, seed: int) -> None:
+    """Raise DloError if a number is too small, or is no whole number; see `FittedCable.export`."""
+    for name, value, least in (
+        ("segments", 4 if segments is None else segments, 4),
+        ("samples", samples, 0),
+        ("seed", seed, 0),
+    ):
+        if not isinstance(value, int | np.integer) or value < least:
+            text = f"{name}: a whole number, {least} or more, found {value!r}"
+            raise DloError(f"{text}\n  Try: {name}={least}")
+
+
 def target_of(name: str) -> Target:
     """Find a target by name.
 

@@ -256,8 +256,8 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
         )
     if fit.noise.source == "misfit":
         lines.append(
-            f"the model misses the points by {1e3 * fit.residual_rms:.2g} mm RMS, far more than "
-            f"their noise: the fit weighs them as if that were {1e3 * fit.noise.std:.2g} mm"
+            "the model misses the points by far more than their noise: the fit weighs them as if "
+            f"that were {1e3 * fit.noise.std:.2g} mm"
         )
     rest = fit.problem.priors.pose_scatter
     if rest.std > 0:

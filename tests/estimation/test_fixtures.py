@@ -58,3 +58,13 @@ def test_fixtures_that_hold_the_ends_where_they_should_are_not_blamed():
     assert fit.fixture_error < NOISE / 2
     assert seen == pytest.approx(NOISE, rel=0.1)
     assert not any("fixtures" in line for line in fit_warnings(fit, 0.0))
+
+
+def test_a_misfit_is_told_as_the_noise_that_the_fit_assumes():
+    """The residual of all points may be that of one pose in another equilibrium."""
+    fit, _ = moved_session(1e-6)
+    noise = replace(fit.noise, source="misfit", before=fit.noise)
+    fit = replace(fit, problem=replace(fit.problem, noise=noise))
+    (said,) = (line for line in fit_warnings(fit, 0.0) if line.startswith("the model misses"))
+    assert said.endswith(f"as if that were {1e3 * noise.std:.2g} mm")
+    assert said.count(" mm") == 1
