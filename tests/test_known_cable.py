@@ -148,6 +148,29 @@ STRAIGHT = dlo.Cable(
 
 
 @pytest.mark.parametrize(
+    "load",
+    [
+        effect("point_force", fx=0.0, fy=-2.0, position=0.4),
+        effect("lumped_mass", mass=0.2, position=0.4),
+        effect("side_load", force_per_length=2.0),
+    ],
+)
+def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
+    """The forces at both pins carry it; and it is what its file holds."""
+    known = dlo.known_cable(ROPE, **PINNED, model=load | {"n": 20})
+    shape = known.solve(end=(0.6, 0.0))
+    values = load["effects"][0]["parameters"]
+    added = np.array([values.get("force_per_length", 0.0) * ROPE.length, values.get("fy", 0.0)])
+    added[1] -= 9.81 * (ROPE.mass + values.get("mass", 0.0))
+    assert shape.end_force + shape.start_force == pytest.approx(added, abs=1e-6)
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(known.metadata.document))
+    again = dlo.load(tmp_path).solve(end=(0.6, 0.0))
+    assert again.points == pytest.approx(shape.points, abs=1e-9)
+    repeats = shape.check({"force": 10.0}, tolerances={"end": 1e-3})
+    assert repeats[0].std > 0
+
+
+@pytest.mark.parametrize(
     ("cable", "wrong", "message"),
     [
         (ROPE, {"boundary": None}, "'boundary' is missing in the arguments: How the two ends"),

@@ -336,8 +336,9 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
 
 def _beyond(q: Parameter, row: _Value) -> str:
     """Message on a value outside the bounds of the file or the model; empty if it is inside."""
-    lower = max(q.lower, -math.inf if row.lower is None else row.lower)
-    upper = min(q.upper, math.inf if row.upper is None else row.upper)
+    least, most = q.bounds(estimated=row.fitted)
+    lower = max(least, -math.inf if row.lower is None else row.lower)
+    upper = min(most, math.inf if row.upper is None else row.upper)
     bound = lower if lower > row.value else upper
     beyond = max(lower - row.value, row.value - upper)
     if not (q.log and row.value <= 0) and beyond <= _ROUNDING * max(q.scale, abs(bound)):

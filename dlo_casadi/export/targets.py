@@ -364,7 +364,8 @@ def samples_of(
 def _cable(cable: SolvedCable, values: Mapping[str, float], count: int) -> SolvedCable | None:
     """The cable with other values; None if they are outside their bounds, or if it has no shape."""
     model = cable.model
-    if not all(q.lower <= values[q.name] <= q.upper for q in model.parameters):
+    bounds = {q.name: q.bounds(estimated=False) for q in model.parameters}
+    if not all(least <= values[name] <= most for name, (least, most) in bounds.items()):
         return None
     p = np.array([values[name] for name in model.names])
     rest = model.rest_basis @ np.array([values[f"rest_curvature[{k}]"] for k in range(count)])
