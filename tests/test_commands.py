@@ -58,7 +58,7 @@ def test_every_subcommand_has_help_with_examples_and_exit_codes(name, capsys):
         main([name, "--help"])
     text = capsys.readouterr().out
     assert left.value.code == 0
-    assert f"usage: dlo {name}" in text
+    assert f"usage: dlo {name} [-h]" in text
     assert f"\n  dlo {name}" in text
     assert "exit codes: 0 done" in text
 
@@ -283,6 +283,9 @@ def test_scripts_of_the_checkout_are_run_with_their_options(tmp_path, monkeypatc
     (tmp_path / "scripts").mkdir()
     (tmp_path / "scripts/benchmark.py").write_text("import sys; sys.exit(len(sys.argv))")
     assert main(["benchmark", "--", "--a", "b"]) == 3
+    with pytest.raises(SystemExit):
+        main(["benchmark", "--a"])
+    assert "usage: dlo benchmark [-h] [-- OPTION ...]" in capsys.readouterr().err
 
 
 # ---- progress ----------------------------------------------------------------------------------

@@ -367,19 +367,26 @@ def test_a_tolerance_lies_within_the_bounds_of_what_takes_it_up(tmp_path, key, v
 @pytest.mark.parametrize(
     ("effect", "parameter", "message"),
     [
-        ("lumped_mass", "mass: -1", "-1 kg: 0 to 0.69 kg is possible"),
-        ("lumped_mass", "mass: 1e6", "1e+06 kg: 0 to 0.69 kg is possible"),
+        ("lumped_mass", "mass: -1", "-1 kg: 0 to 23000 kg is possible"),
+        ("lumped_mass", "mass: 1e6", "1e+06 kg: 0 to 23000 kg is possible"),
+        ("lumped_mass", "mass: 1", "1 kg: a fit searches 0 to 0.69 kg only. Try: {value: 1, fixed"),
         ("lumped_mass", "position: 0.81", "0.81 m: 0 to 0.8 m is possible"),
         ("stiff_section", "factor: 0", "0: 0.02 to 100 is possible"),
     ],
 )
 def test_a_declared_effect_lies_within_its_own_bounds(tmp_path, effect, parameter, message):
-    """Three times the cable's 0.23 kg, its 0.8 m."""
+    """Three times the cable's 0.23 kg, if it is estimated; its 0.8 m."""
     options = f"model:\n  effects:\n    - {{name: {effect}, parameters: {{{parameter}}}}}\n"
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, text=GOOD + options)
     assert caught.value.line == 17
     assert f"{effect}.{parameter.split(':')[0]}: {message}" in str(caught.value)
+
+
+def test_a_value_that_is_kept_may_be_more_than_a_fit_searches_for(tmp_path):
+    effect = "{name: lumped_mass, parameters: {mass: {value: 1, fixed: true}}}"
+    config = load(tmp_path, text=GOOD + f"model: {{effects: [{effect}]}}\n")
+    assert config.model.effects[0].parameters["mass"].value == 1.0
 
 
 def load_for_all(folder: Path, options: str, *, clamped: bool) -> Config:

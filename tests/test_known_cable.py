@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 
 import numpy as np
@@ -147,6 +148,29 @@ STRAIGHT = dlo.Cable(
 
 
 @pytest.mark.parametrize(
+    "load",
+    [
+        effect("point_force", fx=0.0, fy=-2.0, position=0.4),
+        effect("lumped_mass", mass=0.2, position=0.4),
+        effect("side_load", force_per_length=2.0),
+    ],
+)
+def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
+    """The forces at both pins carry it; and it is what its file holds."""
+    known = dlo.known_cable(ROPE, **PINNED, model=load | {"n": 20})
+    shape = known.solve(end=(0.6, 0.0))
+    values = load["effects"][0]["parameters"]
+    added = np.array([values.get("force_per_length", 0.0) * ROPE.length, values.get("fy", 0.0)])
+    added[1] -= 9.81 * (ROPE.mass + values.get("mass", 0.0))
+    assert shape.end_force + shape.start_force == pytest.approx(added, abs=1e-6)
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(known.metadata.document))
+    again = dlo.load(tmp_path).solve(end=(0.6, 0.0))
+    assert again.points == pytest.approx(shape.points, abs=1e-9)
+    repeats = shape.check({"force": 10.0}, tolerances={"end": 1e-3})
+    assert repeats[0].std > 0
+
+
+@pytest.mark.parametrize(
     ("cable", "wrong", "message"),
     [
         (ROPE, {"boundary": None}, "'boundary' is missing in the arguments: How the two ends"),
@@ -161,7 +185,7 @@ STRAIGHT = dlo.Cable(
         ),
         (WIRE, IN_SPACE | {"model": {"element": "link"}}, "link is of a cable in a plane. Try: qu"),
         (UNWEIGHED, {}, "cable.mass is not given, and no fit tells it. Try: the mass"),
-        (3, {}, "cable: a mapping of keys and values belongs here, found 3"),
+        (3, {}, "cable: a mapping of keys and values belongs here, found 3. Try: dlo.Cable(...)"),
         (ROPE, {"model": {"effects": ["lumped_mas"]}}, "did you mean 'lumped_mass'?"),
         (ROPE, {"model": effect("lumped_mass", mass=0.1)}, "lumped_mass needs position [m]: no"),
         (ROPE, {"model": {"effects": ["plastic_set"]}}, "Try: rest_curvature as it is now"),
@@ -260,6 +284,23 @@ def test_a_straight_cable_can_be_checked_from_the_command_line(tmp_path, capsys)
     assert main(["predict", str(tmp_path), *words]) == 0
     (row,) = json.loads(capsys.readouterr().out)["limits"]
     assert (row["verdict"], row["std"]) == ("pass", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], r"--end is not given, .* session rope\.yaml .* is not in .*\n  Try: --end X Y"),
+        (["--segments", "2"], "segments: a whole number, 4 or more, found 2"),
+        (["--end", "0.5", "0", "--samples", "-1"], "samples: a whole number, 0 or more, found -1"),
+    ],
+)
+def test_an_export_without_its_session_tells_what_is_missing(tmp_path, capsys, words, said):
+    """Wrong numbers are told first, except that the start needs an end."""
+    (tmp_path / "parameters.yaml").write_text(
+        dump_yaml(dlo.known_cable(ROPE, **PINNED).metadata.document)
+    )
+    assert main(["export", str(tmp_path), "--to", "mujoco", *words]) == 2
+    assert re.search(said, capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("words", [["--start-heading", "0"], []])

@@ -19,7 +19,7 @@ from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.errors import ConfigError
+from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 
@@ -174,3 +174,66 @@ def test_what_an_effect_does_not_declare_has_a_default():
     assert effect.scans(setup) == ({},)
     assert effect.place({"size": 1.0}) is None
     assert not effect.may_be(Fitted(effect, setup, {"size": 1.0}, {"size": 0.1}))
+
+
+class Plumb(PointLoad):
+    """A weight of which only the parameters are written."""
+
+    name = "plumb"
+
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
+        """Declare the mass and its place."""
+        return (Parameter("mass", "kg"), self.position(cable))
+
+
+class NoTuple(Plumb):
+    name = "no_tuple"
+
+    def forces(self, gravity, params):
+        return PointForceAt(params["mass"] * gravity, params["position"])
+
+
+class NoParameters(NoTuple):
+    name = "no_parameters"
+
+    def parameters(self, cable):
+        return Parameter("mass", "kg")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "said"),
+    [
+        ("plumb", Plumb, "Plumb cannot be an effect: it has no law and would do nothing.*springs"),
+        ("no_tuple", NoTuple, "NoTuple .* its forces must return a tuple of PointForceAt, found"),
+        ("no_parameters", NoParameters, "its parameters must return a tuple of Parameter, found"),
+        ("other", Balloon, "Balloon .* its name is 'balloon', not 'other'"),
+        ("plain", type("Plain", (), {}), "Plain .* no class that derives from a kind of effect"),
+        ("balloon", Balloon(), "it is no class that derives from a kind"),
+        ("bare", type("Bare", (PointLoad,), {"name": "bare"}), "Bare .* declares no parameters"),
+    ],
+)
+def test_a_mistake_in_an_effect_is_told_when_it_is_registered(name, kind, said):
+    with pytest.raises(DloError, match=f"(?s){said}"):
+        EFFECTS[name] = kind
+    assert name not in EFFECTS
+
+
+def test_the_registry_accepts_the_effects_of_the_package():
+    for name, kind in EFFECTS.items():
+        EFFECTS[name] = kind
+
+
+def test_a_file_with_an_effect_that_is_not_registered_says_so(known, tmp_path):
+    cable = dlo.Cable(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.3)
+    declared = {"name": "balloon", "parameters": {"lift": LIFT, "position": PLACE}}
+    held = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
+    document = dlo.known_cable(cable, **held, model={"effects": [declared]}).metadata.document
+    (tmp_path / "parameters.yaml").write_text(yaml.safe_dump(document))
+    assert load(tmp_path).model.effects == (Balloon(),)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delitem(EFFECTS, "balloon")
+        said = (
+            r"no effect is called 'balloon' in this process.*dlo\.EFFECTS\['balloon'\] = its class"
+        )
+        with pytest.raises(ConfigError, match=f"(?s){said}"):
+            load(tmp_path)

@@ -84,7 +84,8 @@ def test_the_least_force_may_use_more_of_the_bend_radius():
     mild = placed(known, KNOWN, 1, POSES, wall, sharp, "margin")
     assert least.force < mild.force
     assert 0 <= least.margin < mild.margin
-    free = placed(known, KNOWN, 1, POSES, wall, None, "force")
+    corners = (wall[1][0], wall[0][1]), (wall[0][0], wall[1][1])  # in any order
+    free = placed(known, KNOWN, 1, POSES, corners, None, "force")
     assert (free.uses, free.binding, free.margin) == ((), None, 1.0)
     assert free.force <= least.force + 1e-3
 
@@ -111,7 +112,7 @@ def test_no_place_near_a_clip_in_space_is_better():
             {"within": ((2.0, 0.0), (2.1, 0.1))},
             "a span is longer than 95% of its cable, by [0-9.]+e",
         ),
-        ({"within": ((0.3, 0.0), (0.1, 0.1))}, "two corners of a region"),
+        ({"within": ((0.3, 0.0, 0.1), (0.1, 0.1, 0.2))}, "two corners of a region"),
         ({"within": (0.1, 0.2)}, "two corners of a region"),
         ({"within": "wall"}, "two corners of a region"),
         ({"count": 0}, "1 or more"),

@@ -245,6 +245,17 @@ def load(path: str | Path) -> FittedCable:
             f"no fitted parameters: schema {SCHEMA!r} expected, {found!r} found.\n  Try: {remedy}",
             source,
         )
+    listed = data.get("effects")
+    rows = listed if isinstance(listed, list) else []
+    named = [row.get("name") for row in rows if isinstance(row, dict)]
+    if own := [name for name in named if isinstance(name, str) and known_effect(name) is None]:
+        raise ConfigError(
+            f"effects: no effect is called {own[0]!r} in this process; "
+            f"known: {', '.join((*EFFECTS, *NUISANCES))}.\n"
+            f"  Try: for an effect of your own, in Python: dlo.EFFECTS[{own[0]!r}] = its class, "
+            "before loading.",
+            source,
+        )
     file = document.checked(ParametersFile, _DAMAGED, _REMEDY)
     try:
         model = _model(file)
@@ -325,8 +336,9 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
 
 def _beyond(q: Parameter, row: _Value) -> str:
     """Message on a value outside the bounds of the file or the model; empty if it is inside."""
-    lower = max(q.lower, -math.inf if row.lower is None else row.lower)
-    upper = min(q.upper, math.inf if row.upper is None else row.upper)
+    least, most = q.bounds(estimated=row.fitted)
+    lower = max(least, -math.inf if row.lower is None else row.lower)
+    upper = min(most, math.inf if row.upper is None else row.upper)
     bound = lower if lower > row.value else upper
     beyond = max(lower - row.value, row.value - upper)
     if not (q.log and row.value <= 0) and beyond <= _ROUNDING * max(q.scale, abs(bound)):

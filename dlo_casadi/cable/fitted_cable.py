@@ -32,7 +32,7 @@ from dlo_casadi.equilibrium.spread import (
 )
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.rod import SolvedCable
-from dlo_casadi.export.targets import samples_of, target_of, write_rods
+from dlo_casadi.export.targets import check_counts, samples_of, target_of, write_rods
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
@@ -190,14 +190,7 @@ class FittedCable(EstimatedCable):
         """
         if not isinstance(path, str | PathLike):
             raise DloError(f"path: a file name belongs here, found {path!r}")
-        for name, value, least in (
-            ("segments", 4 if segments is None else segments, 4),
-            ("samples", samples, 0),
-            ("seed", seed, 0),
-        ):
-            if not isinstance(value, int | np.integer) or value < least:
-                text = f"{name}: a whole number, {least} or more, found {value!r}"
-                raise DloError(f"{text}\n  Try: {name}={least}")
+        check_counts(segments, samples, seed)
         to, known, first = target_of(target), self.metadata, self.solve(**held).held
         fitted = (known.coefficients, known.covariance.names, known.covariance.values)
         others = samples_of(first, *fitted, samples, seed)

@@ -60,7 +60,7 @@ SCATTER = 0.05
 PENALTY = 10.0
 # Rounds end when the resolved use of bends changes by less than this relative amount.
 SETTLED = 5e-3
-_TRY = "within=((0.1, 0.0), (0.3, 0.2)) [m]: the lowest and the highest coordinates of the clips"
+_TRY = "within=((0.1, 0.0), (0.3, 0.2)) [m]: two opposite corners"
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def placed(
     except (TypeError, ValueError):
         region = np.full(1, np.nan)
     d = cable.model.node.dimension
-    if region.shape != (2, d) or not np.isfinite(region).all() or (region[0] > region[1]).any():
+    if region.shape != (2, d) or not np.isfinite(region).all():
         raise DloError(
             f"within: two corners of a region belong here, found {within!r}.\n  Try: {_TRY}"
         )
@@ -143,9 +143,8 @@ def placed(
     between, asked = cable.with_clips(["pinned"] * int(count)), Limits()
     if aim == "margin" or limits is not None or known.limits.given:
         asked = asked_limits(between.model, known, limits)
-    return _Search(
-        between, known.coefficients, held, region / cable.model.cable.length, asked, aim
-    ).best()
+    box = np.sort(region, axis=0) / cable.model.cable.length
+    return _Search(between, known.coefficients, held, box, asked, aim).best()
 
 
 @dataclass(frozen=True)

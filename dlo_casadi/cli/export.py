@@ -12,7 +12,7 @@ from dlo_casadi.cli.options import PARAMETERS, Page, command, figure, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.errors import DloError
 from dlo_casadi.export.rod import Rod
-from dlo_casadi.export.targets import TARGETS, losses, require, target_of
+from dlo_casadi.export.targets import TARGETS, check_counts, losses, require, target_of
 
 # `--check` without a session.
 _NEAR = Path()
@@ -56,6 +56,7 @@ def export(chosen: argparse.Namespace) -> None:
     from dlo_casadi.show.style import save_figure
 
     target, cable = target_of(chosen.to), load(chosen.parameters)
+    check_counts(chosen.segments, chosen.samples, chosen.seed)
     if chosen.figure is not None and chosen.check is None:
         raise DloError("--figure draws the check.\n  Try: with --check")
     config = None
@@ -105,8 +106,15 @@ def _held(cable: FittedCable, chosen: argparse.Namespace) -> dict[str, Any]:
         return held
     try:
         given = session_of(cable, None if chosen.check in (None, _NEAR) else chosen.check)
-    except DloError:
-        return held
+    except DloError as error:
+        if cable.model.end == "free":
+            return held
+        reason = error.message.partition("\n")[0]
+        axes = " ".join(cable.model.node.axes).upper()
+        raise DloError(
+            f"--end is not given, and no session tells where its first pose was held: {reason}\n"
+            f"  Try: --end {axes}"
+        ) from None
     first, ends = given.experiment.poses[0], ("start", "end")
     turning = tuple(f"{side}_" for side in ends if getattr(cable.model, side) != "clamped")
     held = {name: getattr(first, name) for name in HELD if not name.startswith(turning)}

@@ -110,7 +110,7 @@ def schema(chosen: argparse.Namespace) -> None:
 
 
 _script = command(
-    option("option", nargs="*", help="passed on to the script"),
+    option("option", nargs="*", metavar="-- OPTION", help="passed on to the script"),
     codes="others are the script's own",
     json=None,
 )

@@ -102,7 +102,7 @@ def command(
                 f"examples:\n{indent(examples, '  ')}\n\n{EXIT_CODES}{'; ' * bool(codes)}{codes}"
             )
             parser = argparse.ArgumentParser(
-                prog=f"dlo {work.__name__.replace('_', '-')}",
+                prog=f"dlo {work.__name__.strip('_').replace('_', '-')}",
                 description=description,
                 epilog=epilog,
                 formatter_class=argparse.RawDescriptionHelpFormatter,

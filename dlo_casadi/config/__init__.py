@@ -5,14 +5,13 @@ together, each with its line.
 """
 
 from dlo_casadi.config.document import dump_yaml, read_yaml
+from dlo_casadi.config.effects import declared_setup, wrong_effects
 from dlo_casadi.config.known import known_config
 from dlo_casadi.config.load import (
     any_photographs,
     checked_config,
-    declared_setup,
     load_as,
     load_config,
-    wrong_effects,
 )
 from dlo_casadi.config.options import (
     Centerlines,

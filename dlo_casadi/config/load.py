@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.options import DeclaredEffect, DeclaredTolerances
-from dlo_casadi.config.problems import ConfigProblem, Place, Source, did_you_mean, kind_of, show
+from dlo_casadi.config.effects import wrong_effects
+from dlo_casadi.config.options import DeclaredTolerances
+from dlo_casadi.config.problems import ConfigProblem, Place, Source, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
 from dlo_casadi.config.supports import (
     clip_problems,
@@ -21,10 +22,9 @@ from dlo_casadi.config.supports import (
     unused_directions,
 )
 from dlo_casadi.config.values import AXES, Range
-from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData, Setup
-from dlo_casadi.effects.cable import height_of
+from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData
 from dlo_casadi.errors import ConfigError, counted
-from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
+from dlo_casadi.rod.chain import ELEMENTS
 
 Kind = TypeVar("Kind", bound=Config)
 
@@ -367,84 +367,3 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Config
         most = min(q.upper - q.nominal, q.nominal - q.lower)
         if wrong := Range(_FINEST_TOLERANCE, most, q.unit).complaint(declared[key]):
             yield ConfigProblem(("experiment", "tolerances", key), f"tolerances.{key}: {wrong}")
-
-
-# ---- declared effects ----------------------------------------------------------------------------
-
-
-def declared_setup(config: Config) -> Setup:
-    """How the cable is held and measured, as far as a configuration says."""
-    cable, experiment = config.cable, config.experiment
-    measurement = experiment.measurement
-    d = len(experiment.gravity)
-    starts = [pose.start for pose in experiment.poses if len(pose.start) == d] or [(0.0,) * d]
-    return Setup(
-        cable=CableData(
-            length=cable.length,
-            mass=cable.prior_mass,
-            diameter=cable.diameter,
-            bending_stiffness=cable.prior_bending_stiffness,
-            name=cable.name,
-            straight=cable.rest_shape == "straight",
-            torsional_stiffness=cable.prior_torsional_stiffness if experiment.in_space else None,
-        ),
-        start=experiment.boundary.start,
-        end=experiment.boundary.end,
-        gravity=experiment.gravity,
-        curved=cable.rest_shape != "straight",
-        n_poses=sum(pose.role == "fit" for pose in experiment.poses),
-        # Only the photographs tell where their middle is.
-        center=(0.0, 0.0) if measurement.kind == "images" else None,
-        camera=measurement.kind == "images" and None not in (measurement.board, measurement.camera),
-        readings=tuple({name for pose in experiment.poses for name in pose.readings}),
-        tolerances=experiment.tolerances.model_dump(),
-        clips=experiment.clips,
-        obstacles=len(experiment.obstacles),
-        level=float(height_of(starts[0], experiment.gravity)),
-    )
-
-
-def wrong_effects(config: Config) -> list[ConfigProblem]:
-    """Find elements, effects and their parameters that do not exist or are impossible here."""
-    setup, element = declared_setup(config), config.model.element
-    found: list[ConfigProblem] = []
-    if config.experiment.in_space and element not in ELEMENTS_IN_SPACE:
-        known = " or ".join(ELEMENTS_IN_SPACE)
-        text = f"model.element: {element} is of a cable in a plane. Try: {known}"
-        found.append(ConfigProblem(("model", "element"), text))
-    for i, item in enumerate(config.model.effects):
-        found += _wrong(item, ("model", "effects", i), setup)
-    for i, name in enumerate(config.diagnosis.exclude):
-        if name not in EFFECTS:
-            text = f"diagnosis.exclude: {_unknown(name)}"
-            found.append(ConfigProblem(("diagnosis", "exclude", i), text))
-    return found
-
-
-def _wrong(item: DeclaredEffect, at: Place, setup: Setup) -> Iterator[ConfigProblem]:
-    """Find what is wrong with one declared effect."""
-    if item.name not in EFFECTS:
-        yield ConfigProblem((*at, "name"), f"model.effects: {_unknown(item.name)}")
-        return
-    effect, said = EFFECTS[item.name].made_for(setup), f"model.effects: {item.name}"
-    known = {q.name: q for q in effect.parameters(setup.cable)}
-    values = {name: q.nominal for name, q in known.items()}
-    if refusal := effect.refusal(setup, values):
-        yield ConfigProblem((*at, "name"), f"{said}: {refusal}")
-        return
-    for name, declared in item.parameters.items():
-        key = (*at, "parameters", name)
-        if name not in known:
-            hint = did_you_mean(name, known)
-            yield ConfigProblem(key, f"{said} has no parameter {name!r}{hint}")
-        elif wrong := Range(*known[name].range, known[name].unit).complaint(declared.value):
-            yield ConfigProblem(key, f"{said}.{name}: {wrong}")
-        else:
-            values[name] = declared.value
-    as_declared = all(values.get(name) == item.parameters[name].value for name in item.parameters)
-    if as_declared and (refusal := effect.refusal(setup, values)):
-        yield ConfigProblem((*at, "name"), f"{said}: {refusal}")
-
-
-def _unknown(name: str) -> str:
-    return f"no effect is called {name!r}{did_you_mean(name, EFFECTS)}"

@@ -141,6 +141,10 @@ class Source:
         """Say that a key belongs in a section; empty if there is no section."""
         return section
 
+    def instead(self, section: str) -> str:
+        """Advice on what may stand for a section, by the name of its class; empty without any."""
+        return ""
+
     def label(self, place: Place) -> str:
         """Name a place in words: cable.length, pose 4 (pose_04.jpg) end."""
         data, words = self.data, []
@@ -159,6 +163,10 @@ class Source:
         return ".".join(word for word in words if word not in self.hidden) or self.top
 
 
+# Classes of sections that a caller in Python makes.
+_OBJECTS = ("Cable", "Clip", "Obstacle", "Pose")
+
+
 class Arguments(Source):
     """Arguments of a call: places are named by their arguments only."""
 
@@ -167,6 +175,10 @@ class Arguments(Source):
 
     def __init__(self, data: dict[str, Any], names: tuple[str, ...] = ()) -> None:
         self.data, self.folder, self.names = data, Path(), names
+
+    def instead(self, section: str) -> str:
+        """Advice to pass an object of the library, if there is one for the section."""
+        return f". Try: dlo.{section}(...)" if section in _OBJECTS else ""
 
     def inside(self, key: str, section: str) -> str:
         """Say that a key belongs in a mapping passed as an argument."""
@@ -205,7 +217,7 @@ def _allowed(section: type[BaseModel], key: object) -> str:
 
 _NUMBER = r"[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?"
 
-_MAPPING = "a mapping of keys and values belongs here, found {kind}"
+_MAPPING = "a mapping of keys and values belongs here, found {kind}{object}"
 _NUMBER_TYPE = "a number belongs here, found {input}{number}"
 _WHOLE = "a whole number belongs here, found {input}"
 _MESSAGES: dict[str, str] = {
@@ -280,6 +292,7 @@ def explain(
                 "kind": kind_of(found),
                 "number": _about_number(found),
                 "allowed": _allowed(section, key),
+                "object": source.instead(str(context.get("class_name"))),
             }
             text = f"{label}: {_MESSAGES[kind].format(**(context | words))}"
             if key == "start" and found == "free":

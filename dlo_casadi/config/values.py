@@ -319,8 +319,12 @@ def _table(words: str, *columns: int) -> BeforeValidator:
             array = np.asarray(value)
         except ValueError:  # rows of different lengths
             array = np.zeros(0, object)
+        # What is masked, or empty in a table, is None.
+        if all(item is None or isinstance(item, float) for item in array.ravel()):
+            array = array.astype(float)
         if array.dtype.kind not in "fiu" or not array.size or not isinstance(value, list | tuple):
-            raise ValueError(f"{belongs}, found {show(value)}")
+            file = ". Try: file, for the name of a file" if isinstance(value, str) else ""
+            raise ValueError(f"{belongs}, found {show(value)}{file}")
         if array.ndim != 1 + bool(columns) or (columns and array.shape[1] not in columns):
             raise ValueError(f"{belongs}, found numbers of the shape {array.shape}")
         rows = array.reshape(len(array), -1)

@@ -33,13 +33,14 @@ from dlo_casadi.effects.lumped_mass import LumpedMass
 from dlo_casadi.effects.mass_error import MassError
 from dlo_casadi.effects.nuisances import EdgeBias, SensorBias
 from dlo_casadi.effects.point_force import PointForce, UnknownPull
+from dlo_casadi.effects.registry import Registry
 from dlo_casadi.effects.rest_shape import PlasticSet, RestCurvatureDrift
 from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiffness import StiffnessGradient, StiffSection
 from dlo_casadi.effects.tether import Tether
 
-EFFECTS: dict[str, type[Effect]] = {
-    effect.name: effect
+EFFECTS = Registry(
+    (effect.name, effect)
     for effect in (
         LumpedMass,
         PointForce,
@@ -70,7 +71,7 @@ EFFECTS: dict[str, type[Effect]] = {
         StandoffError,
         CameraFrame,
     )
-}
+)
 
 # Effect that estimates the mass if it is not declared.
 UNKNOWN_MASS: type[Effect] = MassError

@@ -1,6 +1,7 @@
 """Loads across gravity: a uniform one, and gravity rotated against the measurement's frame."""
 
 from dataclasses import dataclass
+from math import inf
 from typing import Self
 
 import casadi as ca
@@ -51,7 +52,7 @@ class SideLoad(LoadAcrossGravity):
     ----------
     force_per_length : scalar [N/m]
         In space two, force_per_length_x and force_per_length_y.
-        Vanish at 0; at most half the cable's weight on Earth.
+        Vanish at 0; estimated up to half the cable's weight on Earth.
     """
 
     name = "side_load"
@@ -60,7 +61,7 @@ class SideLoad(LoadAcrossGravity):
         """Declare the force per length."""
         weight = 9.81 * cable.mass / cable.length
         names = self.components("force_per_length", cable)
-        return Parameter.symmetric(names, "N/m", 0.1 * weight, 0.5 * weight)
+        return Parameter.symmetric(names, "N/m", 0.1 * weight, 0.5 * weight, inf)
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Force on the part beyond s."""

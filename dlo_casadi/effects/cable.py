@@ -70,12 +70,15 @@ class Parameter:
     scale : float
         Typical size of a change [unit], > 0; solvers work in value / scale.
     lower, upper : float
-        Physical bounds [unit].
+        Bounds of the estimation [unit].
     prior_std : float
         Standard deviation of a Gaussian prior about `nominal`; inf = flat [unit, or
         natural logarithm if `log`].
     log : bool
         Estimated as its natural logarithm (positive, uncertain by decades).
+    possible : (float, float), optional
+        Bounds of a declared value that is not estimated [unit]: what physics allows, if that is
+        more than `lower` and `upper`.
     """
 
     name: str
@@ -86,6 +89,7 @@ class Parameter:
     upper: float = inf
     prior_std: float = inf
     log: bool = False
+    possible: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (isfinite(self.scale) and self.scale > 0):
@@ -100,16 +104,40 @@ class Parameter:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Lowest and highest value that may be declared; finite even if a bound is not."""
+        """Lowest and highest value of an estimation; finite even if a bound is not."""
+        return self._finite(self.lower, self.upper)
+
+    def bounds(self, *, estimated: bool) -> tuple[float, float]:
+        """Bounds of a value that is estimated, or of a declared one that is kept."""
+        return (self.lower, self.upper) if estimated else self.possible or (self.lower, self.upper)
+
+    @property
+    def known_range(self) -> tuple[float, float]:
+        """Lowest and highest value that may be declared and kept; finite, too."""
+        return self._finite(*self.bounds(estimated=False))
+
+    def _finite(self, lower: float, upper: float) -> tuple[float, float]:
         away = _FARTHEST * self.scale
-        return max(self.lower, self.nominal - away), min(self.upper, self.nominal + away)
+        return max(lower, self.nominal - away), min(upper, self.nominal + away)
 
     @classmethod
     def symmetric(
-        cls, names: Iterable[str], unit: str, scale: float, bound: float = inf
+        cls,
+        names: Iterable[str],
+        unit: str,
+        scale: float,
+        bound: float = inf,
+        possible: float | None = None,
     ) -> tuple[Self, ...]:
-        """Parameters of equal scale that vanish at 0 and lie between -bound and bound."""
-        return tuple(cls(name, unit, scale=scale, lower=-bound, upper=bound) for name in names)
+        """Parameters of equal scale that vanish at 0 and lie between -bound and bound.
+
+        Without an estimation they lie between -possible and possible.
+        """
+        known = None if possible is None else (-possible, possible)
+        return tuple(
+            cls(name, unit, scale=scale, lower=-bound, upper=bound, possible=known)
+            for name in names
+        )
 
 
 def height_of(places: ArrayLike, gravity: ArrayLike) -> Any:

@@ -1,5 +1,7 @@
 """A compact mass carried by the cable."""
 
+from math import inf
+
 import casadi as ca
 import numpy as np
 
@@ -18,7 +20,7 @@ class LumpedMass(PointLoad):
     Parameters
     ----------
     mass : scalar [kg], >= 0
-        Vanishes at 0; at most three times the cable's mass.
+        Vanishes at 0; estimated up to three times the cable's mass.
     position : scalar [m], in [0, L]
         Arc length s from the start fixture. r(s) is once differentiable in s.
 
@@ -32,10 +34,9 @@ class LumpedMass(PointLoad):
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare mass and position."""
-        return (
-            Parameter("mass", "kg", lower=0.0, scale=0.1 * cable.mass, upper=3 * cable.mass),
-            self.position(cable),
-        )
+        scale, most = 0.1 * cable.mass, 3 * cable.mass
+        mass = Parameter("mass", "kg", 0.0, scale, 0.0, most, possible=(0.0, inf))
+        return mass, self.position(cable)
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """Weight of the mass."""

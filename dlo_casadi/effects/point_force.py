@@ -1,5 +1,7 @@
 """Forces at one place of the cable: a constant one, and one that is free in every pose."""
 
+from math import inf
+
 import casadi as ca
 
 from dlo_casadi.effects.cable import CableData, Parameter
@@ -14,7 +16,7 @@ class PointForce(PointLoad):
     Parameters
     ----------
     fx, fy, fz : scalar [N]
-        In the board frame, fz in space alone; vanishes at 0; at most
+        In the board frame, fz in space alone; vanishes at 0; estimated up to
         three times the cable's weight on Earth.
     position : scalar [m], in [0, L]
         Arc length from the start fixture.
@@ -25,7 +27,7 @@ class PointForce(PointLoad):
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the force and its place."""
         names, scale = (f"f{axis}" for axis in cable.axes), 0.1 * 9.81 * cable.mass
-        return (*Parameter.symmetric(names, "N", scale, 30 * scale), self.position(cable))
+        return (*Parameter.symmetric(names, "N", scale, 30 * scale, inf), self.position(cable))
 
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """The force."""

@@ -23,11 +23,11 @@ class Tether(PointLoad):
     Parameters
     ----------
     stiffness : scalar k [N/m], >= 0
-        Vanishes at 0; at most a thousand of the cable's weights on Earth per length.
+        Vanishes at 0; estimated up to a thousand of the cable's weights on Earth per length.
     position : scalar [m], in [0, L]
         Arc length s from the start fixture. r(s) is once differentiable in s.
     anchor_x, anchor_y, anchor_z : scalar [m]
-        The fixed point a in the board frame, anchor_z in space alone; at most
+        The fixed point a in the board frame, anchor_z in space alone; estimated up to
         ten lengths of the cable from its origin.
     """
 
@@ -37,7 +37,7 @@ class Tether(PointLoad):
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare stiffness, place and anchor."""
         names, length = (f"anchor_{axis}" for axis in cable.axes), cable.length
-        anchor = Parameter.symmetric(names, "m", 0.1 * length, FARTHEST * length)
+        anchor = Parameter.symmetric(names, "m", 0.1 * length, FARTHEST * length, math.inf)
         return (_stiffness(cable), self.position(cable), *anchor)
 
     @classmethod
@@ -87,4 +87,4 @@ class _LinearTether(PointLoad):
 
 def _stiffness(cable: CableData) -> Parameter:
     scale = 9.81 * cable.mass / cable.length
-    return Parameter("stiffness", "N/m", scale=scale, lower=0.0, upper=1e3 * scale)
+    return Parameter("stiffness", "N/m", 0.0, scale, 0.0, 1e3 * scale, possible=(0.0, math.inf))

@@ -274,7 +274,9 @@ class Varied:
         log = np.array([q.log for q in known])
         p = self.p + np.where(log, 0.0, steps)
         p[:, log] = self.p[log] * np.exp(steps[:, log] / self.p[log])
-        p = np.clip(p, [q.lower for q in known], [q.upper for q in known])
+        # A declared value may be outside of the bounds of an estimation.
+        lower = np.minimum(self.p, [q.lower for q in known])
+        p = np.clip(p, lower, np.maximum(self.p, [q.upper for q in known]))
         poses = np.broadcast_to(self.pose.vector, (len(z), self.model.n_pose))
         return Inputs.of(p, self.rest + z @ by_rest.T, poses)
 

@@ -155,6 +155,18 @@ REFUSED = {
 }
 
 
+def check_counts(segments: int | None, samples: int, seed: int) -> None:
+    """Raise DloError if a number is too small, or is no whole number; see `FittedCable.export`."""
+    for name, value, least in (
+        ("segments", 4 if segments is None else segments, 4),
+        ("samples", samples, 0),
+        ("seed", seed, 0),
+    ):
+        if not isinstance(value, int | np.integer) or value < least:
+            text = f"{name}: a whole number, {least} or more, found {value!r}"
+            raise DloError(f"{text}\n  Try: {name}={least}")
+
+
 def target_of(name: str) -> Target:
     """Find a target by name.
 
@@ -352,7 +364,8 @@ def samples_of(
 def _cable(cable: SolvedCable, values: Mapping[str, float], count: int) -> SolvedCable | None:
     """The cable with other values; None if they are outside their bounds, or if it has no shape."""
     model = cable.model
-    if not all(q.lower <= values[q.name] <= q.upper for q in model.parameters):
+    bounds = {q.name: q.bounds(estimated=False) for q in model.parameters}
+    if not all(least <= values[name] <= most for name, (least, most) in bounds.items()):
         return None
     p = np.array([values[name] for name in model.names])
     rest = model.rest_basis @ np.array([values[f"rest_curvature[{k}]"] for k in range(count)])

@@ -294,7 +294,8 @@ def _cable_dict(
             q.name: {
                 "value": float(value),
                 "std": stds.get(q.name, 0.0),
-                **fields_of(q, "unit", "lower", "upper"),
+                "unit": q.unit,
+                **dict(zip(("lower", "upper"), q.bounds(estimated=q.name in names), strict=True)),
                 "fitted": q.name in names,
                 # Prior standard deviation of a nuisance parameter, from its tolerance.
                 "tolerance": model.priors.get(q.name),

@@ -33,6 +33,7 @@ from dlo_casadi.thresholds import (
     NEAR_UNIT,
     NEARLY_ALL,
     OUT_OF_STEP,
+    SHORTER,
     STRETCHED,
     TOO_LONG,
 )
@@ -329,6 +330,48 @@ def stretched(session: ReadSession) -> tuple[Suspicion, ...]:
     return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())
 
 
+def shorter(session: ReadSession) -> tuple[Suspicion, ...]:
+    """Lines that are shorter than the cable although no gap could hide the difference.
+
+    A straight piece c, of a curve that turns by an angle a along it, is shorter than the curve by
+    a^2 c / 24; with noise, measured angles are too large. A gap that is shorter than the difference
+    hides it only in a loop. Gaps to the held ends count as straight.
+    """
+    length, lines = session.config.cable.length, []
+    if session.config.experiment.boundary.end == "free":
+        return ()
+    read = [item for item in session.read if item.s is None and len(item.points) > 2]
+    for item in read:
+        pose = session.declared[item.name]
+        start, end = np.array(pose.start), np.array(pose.end)
+        ways = (np.vstack([start, points, end]) for points in (item.points, item.points[::-1]))
+        steps = min((np.diff(way, axis=0) for way in ways), key=_gaps)
+        chords = np.linalg.norm(steps, axis=1)
+        steps = steps[chords > 0] / chords[chords > 0, None]
+        chords = chords[chords > 0]
+        turns = np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1), -1.0, 1.0))
+        turned = np.maximum(np.append(turns, turns[-1:]), np.append(turns[:1], turns))
+        least, gap = float(chords.sum()), float(chords.max(initial=0.0))
+        missed = float((chords * turned**2).sum() / 24)
+        if length - least - missed > max(SHORTER * length, gap):
+            lines.append((least, gap))
+    if len(lines) < max(2, NEARLY_ALL * len(read)):
+        return ()
+    shown, gap = np.median(lines, axis=0)
+    text = (
+        f"from the start along its points to the end the cable is {shown:.3g} m long (median of "
+        f"{counted(len(lines), 'pose')}), cable.length is {length:.4g} m, and gaps of at most "
+        f"{gap:.2g} m do not hide the difference. Try: cable.length: {shown:.3g}, the length "
+        "between the places where the ends are held."
+    )
+    return (Suspicion(text, False),)
+
+
+def _gaps(steps: FloatArray) -> float:
+    """Sum of the first and the last step [m]."""
+    return float(np.linalg.norm(steps[[0, -1]], axis=1).sum())
+
+
 # Alternatives: only the first that finds anything is reported; then independent questions.
 ENDS = (wrong_units, counted_from_the_end, wrong_frame, out_of_step, single_poses)
-POINTS = (repeated, stretched)
+POINTS = (repeated, stretched, shorter)

@@ -115,7 +115,7 @@ def declared_model(
     ConfigError
         If the configuration was changed after loading and names unknown effects.
     """
-    if problems := wrong_effects(config):
+    if problems := wrong_effects(config, known=known):
         raise ConfigError("; ".join(problem.message for problem in problems), config.path)
     setup = replace(declared_setup(config), center=center)
     experiment, options = config.experiment, config.model

@@ -16,7 +16,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
-from dlo_casadi.thresholds import FIXTURES, UNSEEN
+from dlo_casadi.thresholds import BEYOND_TOLERANCE, FIXTURES, UNSEEN
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
@@ -256,8 +256,8 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
         )
     if fit.noise.source == "misfit":
         lines.append(
-            f"the model misses the points by {1e3 * fit.residual_rms:.2g} mm RMS, far more than "
-            f"their noise: the fit weighs them as if that were {1e3 * fit.noise.std:.2g} mm"
+            "the model misses the points by far more than their noise: the fit weighs them as if "
+            f"that were {1e3 * fit.noise.std:.2g} mm"
         )
     rest = fit.problem.priors.pose_scatter
     if rest.std > 0:
@@ -277,6 +277,7 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
             f"{1e3 * apart:.2g} mm from its prediction, however good the model ({1e3 * floor:.2g} "
             "mm by noise alone). Try: measure the ends in each pose"
         )
+    lines += _beyond_tolerances(fit)
     if not fit.converged and not fit.failed:
         lines.append("the fit is slow: it stopped within a standard deviation of its minimum")
     unstable = [
@@ -298,6 +299,23 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
             "model.n larger?"
         )
     return lines
+
+
+def _beyond_tolerances(fit: Fit) -> Iterator[str]:
+    """Declared values that the fit has moved by many of their tolerances."""
+    hidden = tuple(f"{effect.label}." for effect in fit.model.effects if not effect.shown)
+    for q in fit.model.parameters:
+        tolerance = fit.model.priors.get(q.name)
+        if tolerance is None or q.name.startswith(hidden):
+            continue
+        moved = fit.value(q.name) - q.nominal
+        if abs(moved) > BEYOND_TOLERANCE * tolerance:
+            unit = f" {q.unit}".rstrip()
+            yield (
+                f"{q.name} is {moved:.3g}{unit} from its declared value, "
+                f"{abs(moved) / tolerance:.0f} times its tolerance of {tolerance:g}{unit}: other "
+                "parameters may be wrong, too. Try: measure it again, or declare a larger tolerance"
+            )
 
 
 def _own(scatter: PoseScatter, fit: Fit) -> str:

@@ -391,7 +391,7 @@ def fitted_parameters(
     for qualified in (*roll, *reported):
         q = model.parameters[model.names.index(qualified)]
         value = fit.value(qualified)
-        at_bound = min(value - q.lower, q.upper - value) < 1e-9 * q.scale
+        at_bound = abs(min(value - q.lower, q.upper - value)) < 1e-9 * q.scale
         parameters[qualified] = Estimate(
             value,
             fit.std(qualified),

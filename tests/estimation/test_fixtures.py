@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import CableData, LengthError
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -58,3 +58,30 @@ def test_fixtures_that_hold_the_ends_where_they_should_are_not_blamed():
     assert fit.fixture_error < NOISE / 2
     assert seen == pytest.approx(NOISE, rel=0.1)
     assert not any("fixtures" in line for line in fit_warnings(fit, 0.0))
+
+
+def test_a_misfit_is_told_as_the_noise_that_the_fit_assumes():
+    """The residual of all points may be that of one pose in another equilibrium."""
+    fit, _ = moved_session(1e-6)
+    noise = replace(fit.noise, source="misfit", before=fit.noise)
+    fit = replace(fit, problem=replace(fit.problem, noise=noise))
+    (said,) = (line for line in fit_warnings(fit, 0.0) if line.startswith("the model misses"))
+    assert said.endswith(f"as if that were {1e3 * noise.std:.2g} mm")
+    assert said.count(" mm") == 1
+
+
+@pytest.mark.parametrize(("longer", "told"), [(0.0, False), (8e-3, True)])
+def test_a_declared_value_that_is_far_off_its_tolerance_is_told(longer, told):
+    """A cable 8 mm longer than declared, with a tolerance of 0.5 mm."""
+    model = MODEL.with_effect(LengthError(), {"length_error.length_difference": 5e-4})
+    poses = [HeldPose((0.0, 0.0), end) for end in ((0.4, 0.0), (0.3, -0.2), (0.35, 0.1))]
+    shapes = predict_poses(model, np.array([0.05, longer]), REST, poses)
+    rng, s = np.random.default_rng(0), np.linspace(0.02, 0.98, 60) * (0.6 + longer)
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(60, 2)))
+        for pose, shape in zip(poses, shapes, strict=True)
+    ]
+    said = fit_warnings(fit_model(model, measured, Tolerances(), NOISE), 0.0)
+    off = [line for line in said if "times its tolerance of 0.0005 m" in line]
+    assert bool(off) == told
+    assert all(line.startswith("length_error.length_difference is 0.0") for line in off)

@@ -281,3 +281,23 @@ def test_every_public_name_is_there():
     assert set(dlo.__all__) < set(dir(dlo))
     with pytest.raises(AttributeError, match="no attribute 'fitt'"):
         dlo.fitt  # noqa: B018
+
+
+LINE = [[0.0, 0.0], [0.1, -0.1], [0.2, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        ("pose_01.csv", "found 'pose_01.csv'. Try: file, for the name of a file"),
+        (np.ma.masked_less(LINE, 0.0), "[0.1, nan] in place 2 is not finite; leave out the points"),
+    ],
+)
+def test_points_that_are_none_say_what_to_try(points, said):
+    with pytest.raises(dlo.ConfigError) as refused:
+        dlo.Pose((0, 0), (0.2, 0), points=points)
+    assert said in str(refused.value)
+
+
+def test_a_masked_array_without_masked_values_has_points():
+    assert dlo.Pose((0, 0), (0.2, 0), points=np.ma.masked_less(LINE, -1.0)).points[1] == (0.1, -0.1)

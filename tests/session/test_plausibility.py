@@ -7,9 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import dlo_casadi as dlo
 from dlo_casadi.config import load_config
-from dlo_casadi.session.ends import out_of_step, repeated, single_poses, wrong_frame, wrong_units
-from dlo_casadi.session.hypotheses import Lines, exchanges, named
+from dlo_casadi.session.ends import (
+    out_of_step,
+    repeated,
+    shorter,
+    single_poses,
+    wrong_frame,
+    wrong_units,
+)
+from dlo_casadi.session.hypotheses import Lines, ReadSession, exchanges, named
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import QUESTIONS, find_suspicions
 
@@ -219,3 +227,51 @@ def test_no_session_of_the_repository_looks_like_a_mistake(path):
             update={"experiment": config.experiment.model_copy(update={"poses": poses})}
         )
     assert find_suspicions(config, read_inputs(config)) == ()
+
+
+HANGING = dlo.Cable(length=0.8, mass=0.06, diameter=0.006, bending_stiffness=0.02)
+HELD = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
+# Arc lengths of 30 points [m]; the same, but none between 0.12 and 0.4 m.
+DENSE = np.linspace(0.01, 0.79, 30)
+GAP = DENSE[(DENSE < 0.12) | (DENSE > 0.4)]
+
+
+@pytest.fixture(scope="module")
+def hanging():
+    """A cable between pins."""
+    return dlo.known_cable(HANGING, **HELD, model={"n": 20})
+
+
+def declared_as(cable, length, s):
+    """The session of a cable of 0.8 m that is declared with another length."""
+    rng = np.random.default_rng(3)
+    ends = ((0.6, 0.0), (0.3, 0.1), (0.5, -0.3), (0.4, 0.25))
+    poses = [
+        dlo.Pose((0, 0), end, points=points + rng.normal(0, 3e-4, points.shape))
+        for end in ends
+        for points in (cable.solve(end=end).curve.at(s),)
+    ]
+    config = dlo.Session(HANGING.changed(length=length), poses, **HELD)
+    return ReadSession(config, tuple(read_inputs(config)))
+
+
+@pytest.mark.parametrize(
+    ("length", "s", "said"),
+    [
+        (0.9, DENSE, True),
+        (0.8, DENSE, False),
+        (0.83, DENSE, False),
+        (0.7, DENSE, False),
+        (0.9, GAP, False),
+        (0.9, DENSE[::8], False),
+    ],
+)
+def test_lines_that_are_too_short_for_the_cable_say_so(hanging, length, s, said):
+    """Unless a gap, few points or noise could hide the difference."""
+    found = shorter(declared_as(hanging, length, s))
+    assert bool(found) == said
+    if said:
+        (one,) = found
+        assert "the cable is 0.8 m long (median of 4 poses)" in one.message
+        assert "cable.length is 0.9 m" in one.message
+        assert not one.certain

@@ -1,0 +1,105 @@
+"""Declared effects: which of them, and which of their values, are possible in a session."""
+
+from collections.abc import Iterator
+
+from dlo_casadi.config.options import DeclaredEffect, EffectParameter
+from dlo_casadi.config.problems import ConfigProblem, Place, did_you_mean
+from dlo_casadi.config.sections import Config
+from dlo_casadi.config.values import Range
+from dlo_casadi.effects import EFFECTS, CableData, Setup
+from dlo_casadi.effects.cable import Parameter, height_of
+from dlo_casadi.rod.chain import ELEMENTS_IN_SPACE
+
+
+def declared_setup(config: Config) -> Setup:
+    """How the cable is held and measured, as far as a configuration says."""
+    cable, experiment = config.cable, config.experiment
+    measurement = experiment.measurement
+    d = len(experiment.gravity)
+    starts = [pose.start for pose in experiment.poses if len(pose.start) == d] or [(0.0,) * d]
+    return Setup(
+        cable=CableData(
+            length=cable.length,
+            mass=cable.prior_mass,
+            diameter=cable.diameter,
+            bending_stiffness=cable.prior_bending_stiffness,
+            name=cable.name,
+            straight=cable.rest_shape == "straight",
+            torsional_stiffness=cable.prior_torsional_stiffness if experiment.in_space else None,
+        ),
+        start=experiment.boundary.start,
+        end=experiment.boundary.end,
+        gravity=experiment.gravity,
+        curved=cable.rest_shape != "straight",
+        n_poses=sum(pose.role == "fit" for pose in experiment.poses),
+        # Only the photographs tell where their middle is.
+        center=(0.0, 0.0) if measurement.kind == "images" else None,
+        camera=measurement.kind == "images" and None not in (measurement.board, measurement.camera),
+        readings=tuple({name for pose in experiment.poses for name in pose.readings}),
+        tolerances=experiment.tolerances.model_dump(),
+        clips=experiment.clips,
+        obstacles=len(experiment.obstacles),
+        level=float(height_of(starts[0], experiment.gravity)),
+    )
+
+
+def wrong_effects(config: Config, *, known: bool = False) -> list[ConfigProblem]:
+    """Find elements, effects and their parameters that do not exist or are impossible here.
+
+    `known`: nothing is estimated, so that all values are kept.
+    """
+    setup, element = declared_setup(config), config.model.element
+    found: list[ConfigProblem] = []
+    if config.experiment.in_space and element not in ELEMENTS_IN_SPACE:
+        others = " or ".join(ELEMENTS_IN_SPACE)
+        text = f"model.element: {element} is of a cable in a plane. Try: {others}"
+        found.append(ConfigProblem(("model", "element"), text))
+    for i, item in enumerate(config.model.effects):
+        found += _wrong(item, ("model", "effects", i), setup, known)
+    for i, name in enumerate(config.diagnosis.exclude):
+        if name not in EFFECTS:
+            text = f"diagnosis.exclude: {_unknown(name)}"
+            found.append(ConfigProblem(("diagnosis", "exclude", i), text))
+    return found
+
+
+def _wrong(item: DeclaredEffect, at: Place, setup: Setup, kept: bool) -> Iterator[ConfigProblem]:
+    """Find what is wrong with one declared effect."""
+    if item.name not in EFFECTS:
+        yield ConfigProblem((*at, "name"), f"model.effects: {_unknown(item.name)}")
+        return
+    effect, said = EFFECTS[item.name].made_for(setup), f"model.effects: {item.name}"
+    declarable = {q.name: q for q in effect.parameters(setup.cable)}
+    values = {name: q.nominal for name, q in declarable.items()}
+    if refusal := effect.refusal(setup, values):
+        yield ConfigProblem((*at, "name"), f"{said}: {refusal}")
+        return
+    for name, declared in item.parameters.items():
+        key = (*at, "parameters", name)
+        if name not in declarable:
+            hint = did_you_mean(name, declarable)
+            yield ConfigProblem(key, f"{said} has no parameter {name!r}{hint}")
+        elif wrong := _out_of_range(declarable[name], declared, kept):
+            yield ConfigProblem(key, f"{said}.{name}: {wrong}")
+        else:
+            values[name] = declared.value
+    as_declared = all(values.get(name) == item.parameters[name].value for name in item.parameters)
+    if as_declared and (refusal := effect.refusal(setup, values)):
+        yield ConfigProblem((*at, "name"), f"{said}: {refusal}")
+
+
+def _out_of_range(q: Parameter, declared: EffectParameter, kept: bool) -> str:
+    """Why a parameter cannot have a value, and what to try; empty if it can."""
+    value, unit = declared.value, q.unit
+    if wrong := Range(*q.known_range, unit).complaint(value):
+        return wrong
+    searched = Range(*q.range, unit)
+    if kept or declared.fixed or value in searched:
+        return ""
+    shown, most = (f"{x:g} {unit}".rstrip() for x in (value, searched.most))
+    text = f"{shown}: a fit searches {searched.least:g} to {most} only"
+    return f"{text}. Try: {{value: {value:g}, fixed: true}}, which keeps it"
+
+
+def _unknown(name: str) -> str:
+    return f"no effect is called {name!r}{did_you_mean(name, EFFECTS)}"
