@@ -20,8 +20,8 @@ _BESIDE_FIXTURES = 0.02
 # Largest difference of ends [lengths] and clamps [rad] between poses that count as held alike: the
 # shape of any cable then changes by at most about this share of its length.
 NEARLY = 1e-3
-# Number of nodes of the mean of repeats, a polyline.
-_NODES = 201
+# Number of nodes of the mean of repeats, a polyline, and of places at which lines are compared.
+_NODES, _GRID = 201, 97
 
 
 def repeatability(measured: Sequence[MeasuredPose], model: CableModel) -> float | None:
@@ -52,14 +52,38 @@ def _gaps(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """For each repeated pose: gaps (m, K, d) from the mean of the others, its tangents (K, d)."""
     length = model.cable.length
-    grid = np.linspace(_BESIDE_FIXTURES, 1 - _BESIDE_FIXTURES, 97) * length
     for group in _groups(measured, model):
+        grid = _compared(group, length)
+        if len(grid) < 2:
+            continue
         curves = np.array([_line(item, grid, length) for item in group])
         mean = curves.mean(axis=0)
         # The gap from the mean of the others is m / (m - 1) times that from the mean of all.
         gaps = (curves - mean) * len(group) / (len(group) - 1)
-        # Beyond the last point of a line, where `_line` is constant, `unit` leaves zeros.
-        yield gaps, unit(np.gradient(mean, axis=0))
+        tangents = unit(np.gradient(mean, axis=0))
+        if not all(sensor.marked for item in group for sensor in item.sensors):
+            # Points of a line have no known place along it.
+            gaps = gaps - (gaps * tangents).sum(axis=2, keepdims=True) * tangents
+        yield gaps, tangents
+
+
+def _compared(group: Sequence[MeasuredPose], length: float) -> FloatArray:
+    """Arc lengths (K,) [m] at which repeats are compared: where each of them was measured.
+
+    Those of the repeat with the fewest points if these are few: lines are straight between points.
+    """
+    low, high = _measured_in_all(group, length)
+    least = min((item.places(length) for item in group), key=len)
+    grid = np.sort(least) if len(least) < _GRID else np.linspace(low, high, _GRID)
+    return grid[(grid >= low) & (grid <= high)]
+
+
+def _measured_in_all(group: Sequence[MeasuredPose], length: float) -> tuple[float, float]:
+    """Arc lengths [m] between which all repeats were measured, away from the fixtures."""
+    places = [item.places(length) for item in group]
+    low, high = max(s.min() for s in places), min(s.max() for s in places)
+    beside = _BESIDE_FIXTURES * length
+    return max(low, beside), min(high, length - beside)
 
 
 def different_poses(measured: Sequence[MeasuredPose], model: CableModel) -> int:
@@ -93,12 +117,13 @@ def with_repeats(
     for group in groups:
         lines = [_line(other, nodes, length) for other in group]
         mean = NodeCurve(length, np.mean(lines, axis=0), None)
+        low, high = _measured_in_all(group, length)
         for item in group:
             places = item.places(length)
             away = item.points - item.pose.start - mean.at(places)
             gap = np.sqrt(len(group) / (len(group) - 1)) * away
             residual = item.components(mean, places, gap[..., None])[:, 0]
-            inside = np.abs(places / length - 0.5) < 0.5 - _BESIDE_FIXTURES
+            inside = (places > low) & (places < high)
             for sensor, points, rows in item.slices:
                 kept = np.repeat(inside[points], sensor.per_point)
                 e, s = residual[rows][kept], places[points][inside[points]]
@@ -137,7 +162,12 @@ def _held_alike(measured: Sequence[MeasuredPose], model: CableModel) -> list[lis
 
 
 def _alike(pose: HeldPose, other: HeldPose, model: CableModel) -> bool:
-    """Whether two poses hold a cable in the same way; without obstacles, wherever they stand."""
+    """Whether two poses hold a cable in the same way; without obstacles, wherever they stand.
+
+    What a cable keeps of earlier poses makes each pose different.
+    """
+    if model.has_state:
+        return False
     both, node = (pose, other), model.node
 
     def told(one: HeldPose) -> tuple[Any, ...]:

@@ -298,7 +298,8 @@ def estimate_pose_scatter(
     without = likelihood.best(smoothness, range_, std=False, guess=guess)
     if not sparse and without.deviance - chosen.deviance < TELLING:
         return ScatterEstimate(PoseScatter(), without.noise, p_systematic, without.deviance)
-    found = PoseScatter(chosen.std, smoothness, chosen.degrees, source)
     sizes = (chosen.noise, chosen.std, chosen.systematic)
     deviance = likelihood.deviance(*sizes, smoothness, range_ or 1.0).value
+    shown = without.deviance - deviance >= TELLING
+    found = PoseScatter(chosen.std, smoothness, chosen.degrees, source, shown=shown)
     return ScatterEstimate(found, chosen.noise, p_systematic, deviance)

@@ -31,6 +31,8 @@ class PoseScatter:
         `rest_curvature`, or the name of one of the RANDOM effects, whose parameters differ.
     rivals : tuple of PoseScatter
         Other random quantities that the data cannot distinguish from it.
+    shown : bool
+        Whether the data show it; if not, poses have too few points to exclude it.
     """
 
     std: float = 0.0
@@ -38,6 +40,7 @@ class PoseScatter:
     dof: float = np.inf
     source: str = REST_CURVATURE
     rivals: tuple["PoseScatter", ...] = ()
+    shown: bool = True
 
     def sizes(self, count: int) -> FloatArray:
         """Standard deviations (count,) along the directions of `ways`."""

@@ -256,7 +256,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
 def _scatter(fit: Fit) -> dict[str, Any] | None:
     """What differs from pose to pose, and which sources cannot be distinguished from it."""
     found = fit.problem.priors.pose_scatter
-    if not found.std:
+    if not found.std or not found.shown:
         return None
     others = [other.source for other in found.rivals]
     return {**fields_of(found, "source", "std"), "unit": found.unit(fit.model), "or": others}

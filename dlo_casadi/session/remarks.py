@@ -16,7 +16,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
-from dlo_casadi.thresholds import BEYOND_TOLERANCE, FIXTURES, UNSEEN
+from dlo_casadi.thresholds import BEYOND_TOLERANCE, DIFFERENT, FIXTURES, UNSEEN
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
@@ -260,11 +260,17 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
             f"that were {1e3 * fit.noise.std:.2g} mm"
         )
     rest = fit.problem.priors.pose_scatter
-    if rest.std > 0:
+    if rest.std > 0 and rest.shown:
         lines.append(
-            "the cable does not come back to the same shape: two repeats of a pose differ by "
-            f"{1e3 * np.sqrt(2) * fit.repeat_error:.2g} mm RMS, as if each had {_own(rest, fit)}; "
-            f"noise alone gives {1e3 * np.sqrt(2) * floor:.2g} mm. A model predicts their mean"
+            "the cable does not come back to the same shape: two repeats of a pose would differ by "
+            f"{1e3 * np.sqrt(2) * fit.repeat_error:.2g} mm RMS beyond the noise "
+            f"({1e3 * np.sqrt(2) * floor:.2g} mm), as if each had {_own(rest, fit)}. "
+            "A model predicts their mean"
+        )
+    elif rest.std > 0:
+        lines.append(
+            "poses have too few points to tell whether the cable comes back to the same shape: "
+            f"intervals and bands include {_own(rest, fit)}"
         )
     if spread is not None or rest.std > 0:
         lines += [
@@ -273,9 +279,10 @@ def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[
     if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor:
         apart = float(np.hypot(fit.fixture_error, floor))
         lines.append(
-            f"fixtures vary from pose to pose, by about {_scatter(fit)}: a new pose is measured "
-            f"{1e3 * apart:.2g} mm from its prediction, however good the model ({1e3 * floor:.2g} "
-            "mm by noise alone). Try: measure the ends in each pose"
+            f"fixtures may vary from pose to pose by about {_scatter(fit)}, as far as tolerances "
+            f"and data tell: a new pose is then measured {1e3 * apart:.2g} mm from its prediction, "
+            f"however good the model ({1e3 * floor:.2g} mm by noise alone). Try: measure the ends "
+            "in each pose, or smaller tolerances if they are known better"
         )
     lines += _beyond_tolerances(fit)
     if not fit.converged and not fit.failed:
@@ -330,7 +337,11 @@ def _beside(fit: Fit, floor: float) -> str:
     """Compare the noise, which alone gives a distance `floor` [m], with the repeats of a pose."""
     std, length = 1e3 * fit.noise.std, 1e3 * fit.noise.length
     if fit.noise.source == "repeats":
-        return f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable"
+        return (
+            f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable, in "
+            f"place of measurement.std. With {DIFFERENT} poses or more that differ, or with a "
+            "declared rest_curvature_drift if the cable takes a set, it need not"
+        )
     return f"noise alone gives {1e3 * floor:.2g} mm, and intervals from this session are too narrow"
 
 
