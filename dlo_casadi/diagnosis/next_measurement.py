@@ -1,6 +1,6 @@
 """What the poses do not determine, and the measurement that would: hidden weight, next pose."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,10 +13,16 @@ from dlo_casadi.diagnosis.selection import AddedEffect, HiddenWeight
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.spread import displacements
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import student_95
 from dlo_casadi.estimation.descent import refit
-from dlo_casadi.estimation.prediction import Prediction, predict_each, predict_poses
+from dlo_casadi.estimation.prediction import (
+    Prediction,
+    predict_each,
+    predict_poses,
+    uncertainty_of,
+)
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.rod.ends import reaction_rows
@@ -151,10 +157,10 @@ class NextPose:
     difference : float [m]
         RMS difference of the two predictions.
     separation : float
-        The same in standard deviations of one measurement, with its noise and correlation along
-        the cable: sqrt(d^T C^-1 d) for the differences d of the predicted measurements at the
-        points of the nearest pose. It is not reduced by what a new fit of either rival could
-        absorb.
+        The same in standard deviations of one measurement: sqrt(d^T C^-1 d) for the differences
+        d of the predicted measurements at the points of the nearest pose. C is the covariance of
+        the noise, of the fixtures, and of the parameters of both fits: what these leave open, new
+        fits could absorb.
     reading : NextReading
         Measurement of a sensor at a fixture that separates them best there.
     separates : tuple of str
@@ -220,7 +226,8 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     difference, pose, one, other = best
     end = np.array(pose.end)
     place = tuple(round(float(x), 4) for x in end)
-    separation = _separation(first, end, (one.curve, other.curve))
+    ways = [_open_ways(fit, pose, found) for fit, found in ((first, one), (second, other))]
+    separation = _separation(first, end, (one.curve, other.curve), ways)
     return NextPose(place, difference, separation, next_reading(first, one.seen, other.seen))
 
 
@@ -240,11 +247,30 @@ def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
     return max(found, key=lambda item: item.separation)
 
 
-def _separation(fit: Fit, end: FloatArray, curves: tuple[NodeCurve, NodeCurve]) -> float:
-    """Difference of two curves in standard deviations of one line like that of the nearest pose."""
+def _open_ways(fit: Fit, pose: HeldPose, found: Prediction) -> Callable[[FloatArray], FloatArray]:
+    """Displacements (K, d, q) [m] of a prediction at arc lengths (K,) [m], see `displacements`."""
+    known = uncertainty_of(fit)
+    shape = (fit.model, fit.p, fit.rest_now, pose, found.equilibrium, known)
+    return lambda s: displacements(*shape, s)[1]
+
+
+def _separation(
+    fit: Fit,
+    end: FloatArray,
+    curves: tuple[NodeCurve, NodeCurve],
+    ways: Sequence[Callable[[FloatArray], FloatArray]] = (),
+) -> float:
+    """Difference of two curves in standard deviations of one line like that of the nearest pose.
+
+    `ways`: independent displacements of the curves at arc lengths, one standard deviation each.
+    """
     problem = fit.problem
     ends = np.array([problem.measured[j].pose.end for j in problem.used])
     k = int(((ends - end) ** 2).sum(axis=1).argmin())
     s, item = fit.point.projections[k], problem.measured[problem.used[k]]
-    gap = item.components(curves[0], s, (curves[0].at(s) - curves[1].at(s))[..., None])
-    return float(np.linalg.norm(item.whitening(fit.noise, s) @ gap))
+    gap = (curves[0].at(s) - curves[1].at(s))[..., None]
+    moved = np.concatenate([gap, *(way(s) for way in ways)], axis=2)
+    seen = item.whitening(fit.noise, s) @ item.components(curves[0], s, moved)
+    difference, unknown = seen[:, 0], seen[:, 1:]
+    covariance = np.eye(len(seen)) + unknown @ unknown.T
+    return float(np.sqrt(difference @ np.linalg.solve(covariance, difference)))

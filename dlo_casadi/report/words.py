@@ -259,7 +259,7 @@ def separation_text(proposal: NextPose) -> str:
     z = proposal.separation
     text = (
         f"they differ there by {millimetres(proposal.difference)} RMS, {z:.2g} "
-        "standard deviations of the noise of one whole line: "
+        "standard deviations of one measured line, with what both fits leave open: "
     )
     repeats = math.ceil(min((APART / max(z, 1e-9)) ** 2, 1e9))
     if repeats <= 1:

@@ -16,7 +16,7 @@ from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
 
 
-def separation(noise):
+def separation(noise, ways=()):
     """Of two straight lines that lie a gap apart, measured at many points."""
     x = np.linspace(0.0, LENGTH, 11)
     lines = [NodeCurve(LENGTH, np.column_stack([x, 0 * x + y]), None) for y in (0.0, GAP)]
@@ -27,12 +27,20 @@ def separation(noise):
         point=SimpleNamespace(projections=(np.linspace(0.0, LENGTH, POINTS),)),
         noise=noise,
     )
-    return _separation(fit, np.array([LENGTH, 0.1]), (lines[0], lines[1]))
+    return _separation(fit, np.array([LENGTH, 0.1]), (lines[0], lines[1]), ways)
 
 
 def test_a_line_averages_the_noise_of_its_points():
     """White noise: K equal distances d are d sqrt(K) / std standard deviations off."""
     assert separation(NoiseModel(STD)) == pytest.approx(GAP / STD * np.sqrt(POINTS))
+
+
+def test_what_the_fits_leave_open_separates_nothing():
+    """A common shift of one std, 3 mm: d / sqrt(std^2 / K + shift^2)."""
+    shift = 3e-3
+    open_ways = [lambda s: np.full((len(s), 2, 1), [[0.0], [shift]])]
+    expected = GAP / np.hypot(STD / np.sqrt(POINTS), shift)
+    assert separation(NoiseModel(STD), open_ways) == pytest.approx(expected)
 
 
 def test_noise_that_is_one_for_the_whole_line_does_not_average():
