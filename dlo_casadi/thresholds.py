@@ -91,6 +91,9 @@ REPEATS_ARE_NOISE = 2.0
 # degrees of freedom: three standard errors, 0.5 = 3 / sqrt(2 x 18). A cable's shape is never white:
 # in ten rendered sessions, most lacking an effect, the estimate was 0.97 to 1.02 of the truth.
 SCATTERED, SCATTERED_DEGREES = 1.5, 18
+# Distance of a point from its neighbours on the line, in robust standard deviations, beyond which
+# it is an outlier: by chance one point in 500 million.
+OUTLYING = 6.0
 
 # ---- intervals ---------------------------------------------------------------------------------
 

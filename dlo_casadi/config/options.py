@@ -85,7 +85,7 @@ class EstimationOptions(ConfigSection):
     algorithm1_inner: Literal["ipopt", "cobyla"] = "ipopt"
     """Its inner minimisation: ipopt, or cobyla as in the paper (about 1 s a pose)."""
     robust: Switch = False
-    """Whether outlying points weigh less."""
+    """Whether single points far off their neighbours on the line are left out."""
     plausibility: Switch = True
     """Whether contradictions of the configuration stop the fit, or leave out a single pose."""
     rest_curvature_coefficients: RestCoefficients | None = None

@@ -232,7 +232,3 @@ class MeasuredPose:
         rows = [x.residual(seen, np.zeros(0)) for x in self.sensors if not len(x.points)]
         kinds = self.kinds[~self.on_points]
         return np.concatenate([np.zeros(0), *rows]) * noise.units(kinds)
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same pose with other relative standard deviations (K,) of its points."""
-        return replace(self, sensors=tuple(x.weighing(w) for x, w in self._each(weight)))

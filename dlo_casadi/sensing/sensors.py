@@ -5,9 +5,8 @@ points, follow from the curve (`located`); derivatives are taken with these unkn
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,10 +96,6 @@ class Sensor(ABC):
     @abstractmethod
     def whitening(self, noise: NoiseModel, places: FloatArray) -> FloatArray:
         """Matrix W (R, R) with W cov W^T = 1."""
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same with other relative standard deviations (K,) of the points."""
-        return replace(self, weight=weight)  # type: ignore[type-var]
 
 
 class _Known(Sensor):
@@ -286,10 +281,6 @@ class Wrench(_Known):
         return np.concatenate(
             [np.full(at.stop - at.start, name.split("_")[-1]) for name, at in self._rows.items()]
         )
-
-    def weighing(self, weight: FloatArray) -> Self:
-        """The same: it measures no points."""
-        return self
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """Zeros (R, q): it measures no points."""

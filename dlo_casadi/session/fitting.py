@@ -46,8 +46,6 @@ SAME_PLACE = 0.02
 # Share of the objective by which IPOPT's minimum may be higher and still count as the same: IPOPT
 # stops once arc lengths move by a thousandth of the noise. Largest of ten fits: 1.5e-7.
 SAME_MINIMUM = 1e-6
-# Huber's constant: points with larger errors count linearly instead of quadratically.
-HUBER = 1.5
 
 
 @dataclass(frozen=True)
@@ -265,18 +263,6 @@ def _moves_others(fit: Fit, point: Point) -> bool:
     others = set(range(fit.problem.equilibria.m)) - set(fit.problem.used)
     own, x = fit.point.shapes.x, point.shapes.x
     return not all(fit.model.node.same(own[j], x[j], NEARBY) for j in others)
-
-
-def reweighted(fit: Fit) -> tuple[MeasuredPose, ...]:
-    """All poses of a fit; outliers in the fitted ones get a smaller weight (Huber's weights)."""
-    out = list(fit.problem.history)
-    for k, d in zip(fit.problem.fitted, fit.linearization.raw, strict=True):
-        item = out[k]
-        square = np.bincount(item.point_of, d[item.on_points] ** 2) / np.bincount(item.point_of)
-        score = np.sqrt(square) / (fit.noise.std * item.relative_white)
-        grown = np.sqrt(np.maximum(1.0, score / HUBER))
-        out[k] = item.weighing(item.relative_std * grown)
-    return tuple(out)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
+from dlo_casadi.session.outliers import LEAST_POINTS, Outliers, outliers_of
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
 from dlo_casadi.thresholds import BEYOND_TOLERANCE, DIFFERENT, FIXTURES, UNSEEN
 
@@ -235,18 +236,34 @@ def _errors(shape: PoseShape) -> FloatArray:
     return np.stack([shape.missed**2, expected])
 
 
-def fit_warnings(fit: Fit, error: float, declared: float | None = None) -> list[str]:
+def left_out(outliers: Outliers) -> list[str]:
+    """Points that `estimation.robust` has left out."""
+    if not outliers.lines:
+        return [
+            f"estimation.robust: no line has the {LEAST_POINTS} points that it takes to tell "
+            "outliers from an effect: all points are kept. Try: more points on each line"
+        ]
+    return [f"estimation.robust leaves out {outliers}"] if outliers.names else []
+
+
+def fit_warnings(
+    fit: Fit, error: float, declared: float | None = None, poses: Sequence[PoseInput] = ()
+) -> list[str]:
     """Limits of what a fit can promise.
 
-    `error` [m]: of its mesh. `declared` [m]: noise of the points.
+    `error` [m]: of its mesh. `declared` [m]: noise of the points. `poses`: as they were measured.
     """
     lines = []
     points, floor = fit.noise.of_points, noise_distance(fit.problem.history, fit.noise.std)
     if declared is not None and points.source == "estimated":
+        outliers = outliers_of(fit, poses) if poses else None
+        cure = f"Try: std: {points.std:.2g}, or no std"
+        if outliers is not None and outliers.names:
+            cure = f"There are {outliers}. Try: estimation: {{robust: true}}"
         lines.append(
             f"the points scatter more about any shape that a cable could take than measurement.std "
             f"declares, {1e3 * declared:.2g} mm: their noise is estimated instead, "
-            f"{1e3 * points.std:.2g} mm. Try: std: {points.std:.2g}, or no std"
+            f"{1e3 * points.std:.2g} mm. {cure}"
         )
     spread = limiting_spread(fit)
     if spread is not None:

@@ -36,6 +36,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     found_effects,
 )
+from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_parameters
 
@@ -122,12 +123,14 @@ def fit_session(
     declared = fitting.declared_model(config, center, float(np.median(pixels)) if pixels else None)
 
     step("fit the declared model", 0, 1)
-    n, refined = config.model.n or fitting.first_mesh(declared.model), None
+    n = config.model.n or fitting.first_mesh(declared.model)
     if config.estimation.robust:
         fit, _ = fitting.fit_declared(config, declared, measured)
-        measured, n, refined = fitting.reweighted(fit), fit.model.n, fit.model.n
+        outliers = outliers_of(fit, inputs)
+        inputs, measured = outliers.poses, measured_poses(config, outliers.poses)
+        warnings += remarks.left_out(outliers)
     compared = begin(executor, fitting.simpler_fits, config.estimation, declared.model, measured, n)
-    fit, error = fitting.fit_declared(config, declared, measured, refined)
+    fit, error = fitting.fit_declared(config, declared, measured)
     meshed = fit  # whose mesh error is known
     confirming = begin(executor, fitting.minimum_by_ipopt, fit)
     step("fit the declared model", 1, 1)
@@ -192,7 +195,7 @@ def judged(outcome: Outcome) -> Outcome:
     fit, stages, verdict = outcome.fit, outcome.stages, outcome.verdict
     doubts = remarks.doubts_of(stages, outcome.poses, fit)
     declared = outcome.config.experiment.measurement.std
-    said = remarks.fit_warnings(fit, outcome.mesh_error, declared)
+    said = remarks.fit_warnings(fit, outcome.mesh_error, declared, outcome.poses)
     said += remarks.worse_than_simpler(stages)
     if outcome.hidden_weight is not None:
         said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))

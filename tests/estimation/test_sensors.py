@@ -118,13 +118,3 @@ def test_sensors_of_a_pose_follow_one_another():
     np.testing.assert_allclose(item.whitening(noise, places), white)
     assert [(x.start, x.stop) for _, x, _ in item.slices] == [(0, 3), (3, 6)]
     assert [(x.start, x.stop) for _, _, x in item.slices] == [(0, 6), (6, 15)]
-
-
-def test_points_are_weighed_and_wrenches_are_not():
-    s = np.array([0.2, 0.4, 0.7])
-    points = seen().curve.at(s)
-    item = MeasuredPose(HeldPose((0.0, 0.0)), (Centerline(points, np.ones(3)),))
-    item = item.with_readings({"end_force": (1.0, 2.0)})
-    weighed = item.weighing(np.array([1.0, 2.0, 3.0]))
-    np.testing.assert_array_equal(weighed.sensors[0].weight, [1.0, 2.0, 3.0])
-    assert weighed.sensors[1] is item.sensors[1]

@@ -1,20 +1,21 @@
-"""The mesh that is asked for, and weights that land on the points they are meant for."""
+"""The mesh that is asked for, and points far off their neighbours."""
 
-from __future__ import annotations
-
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from dlo_casadi.config import load_config
+from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.fit import explains
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.cable_model import CableModel, Tolerances
-from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.session import run_session
-from dlo_casadi.session.fitting import reweighted
+from dlo_casadi.session.fitting import declared_model, fit_declared
+from dlo_casadi.session.measure import measured_poses, read_session
+from dlo_casadi.session.outliers import outliers_of
 
 BENCH = Path(__file__).resolve().parents[1] / "data" / "bench"
 NOISE = 3e-4
@@ -35,24 +36,95 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
     assert "the mesh of 6 elements" in warning
 
 
-def test_the_points_that_weigh_less_are_the_outlying_ones():
-    """The first pose is held out, and no two poses have the same number of points."""
-    model = CableModel(CableData(0.8, 0.03, 0.006, 0.02), 12, n_rest=5)
-    rng = np.random.default_rng(0)
-    poses = [HeldPose((0.0, 0.0), (0.45, y)) for y in (-0.1, 0.0, 0.1, 0.2)]
-    shapes = predict_poses(model, model.nominal, np.ones(model.chain.n_cells), poses)
-    measured = []
-    for k, (pose, shape) in enumerate(zip(poses, shapes, strict=True)):
-        s = np.linspace(0.02, 0.98, 40 + k) * model.cable.length
-        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(len(s), 2))
-        points[20, 1] += 30 * NOISE * (k == 2)
-        measured.append(MeasuredPose.of_points(pose, points, held_out=k == 0))
+EI, PER_LINE, SHARE = 0.026, 80, 0.03
+CABLE = {"length": 0.8, "mass": 0.05, "diameter": 0.008, "bending_stiffness": 0.02}
+ENDS = ((0.5, 0.1), (0.6, -0.1), (0.4, 0.2), (0.45, -0.15), (0.55, 0.2))
 
-    found = reweighted(fit_model(model, measured, Tolerances(), NOISE))
 
-    assert [item.pose for item in found] == poses
-    assert found[0] is measured[0]
-    assert [len(item.relative_std) for item in found[1:]] == [41, 42, 43]
-    # A point of d standard deviations weighs as one of noise sqrt(d / 1.5): 4.5 for 30, and 1.7
-    # for the 4.5 that one of a hundred thousand has.
-    assert np.flatnonzero(np.concatenate([item.relative_std for item in found[1:]]) > 2) == 41 + 20
+def with_outliers(folder, count, std, *, robust):
+    """Lines of `count` points between pins, 3 % of them 6 to 20 mm off; pose and number of each.
+
+    The last pose is held out.
+    """
+    model = CableModel(CableData(*CABLE.values()), 20)
+    values = model.nominal * EI / CABLE["bending_stiffness"]
+    held = [HeldPose((0.0, 0.0), end) for end in ENDS]
+    shapes = predict_poses(model, values, np.zeros(model.chain.n_rests), held)
+    rng, poses, names = np.random.default_rng(0), [], []
+    s = np.linspace(0.02, 0.98, count) * model.cable.length
+    for k, (end, shape) in enumerate(zip(ENDS, shapes, strict=True)):
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(count, 2))
+        if k < len(ENDS) - 1:
+            odd = np.sort(rng.choice(count, round(SHARE * count), replace=False))
+            sign = rng.choice([-1, 1], len(odd))[:, None]
+            tangent = shape.curve.tangents(s[odd])
+            normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+            points[odd] += sign * normal * rng.uniform(6e-3, 20e-3, len(odd))[:, None]
+            names += [f"pose{k} point {1 + i} at" for i in odd]
+        role = "held_out" if k == len(ENDS) - 1 else "fit"
+        pose = {"name": f"pose{k}", "start": [0.0, 0.0], "end": list(end), "role": role}
+        poses.append(pose | {"points": points.tolist()})
+    measurement = {"kind": "centerlines"} | ({} if std is None else {"std": std})
+    document = {
+        "cable": {"name": "rope", "rest_shape": "straight", **CABLE},
+        "experiment": {
+            "gravity": [0.0, -9.81],
+            "boundary": {"start": "pinned", "end": "pinned"},
+            "measurement": measurement,
+            "poses": poses,
+        },
+        "model": {"n": 20},
+        "estimation": {"algorithm1": False, "robust": robust},
+        "diagnosis": {"enabled": False},
+    }
+    path = folder / "session.yaml"
+    path.write_text(dump_yaml(document))
+    return load_config(path), names
+
+
+@pytest.mark.parametrize(("count", "std"), [(PER_LINE, None), (PER_LINE, NOISE), (500, NOISE)])
+def test_robust_leaves_out_outliers_and_names_them(tmp_path, count, std):
+    """Of 500 points a line the fit compares means, and those with an outlier are left out."""
+    config, names = with_outliers(tmp_path, count, std, robust=True)
+    outcome = run_session(config)
+    found = outcome.stages[-1].parameters["bending_stiffness"]
+    low, high = found.interval_95
+    assert low < EI < high
+    assert high - low < 0.1 * EI
+    assert outcome.fit.noise.std == pytest.approx(NOISE, rel=0.3)
+    # Some 250 degrees of freedom or more: three times sqrt(2 / 250).
+    assert outcome.fit.chi2_per_dof == pytest.approx(1, abs=0.27)
+    (said,) = [text for text in outcome.warnings if "estimation.robust leaves out" in text]
+    assert not any("measurement.std" in text for text in outcome.warnings)
+    if count == PER_LINE:
+        assert f"leaves out {len(names)} points" in said
+        assert all(name in said for name in names[:12])
+        assert [len(item.points) for item in outcome.poses] == [78, 78, 78, 78, 80]
+
+
+def test_the_warning_of_a_contradicted_noise_names_outliers(tmp_path):
+    config, names = with_outliers(tmp_path, PER_LINE, NOISE, robust=False)
+    (said,) = [text for text in run_session(config).warnings if "measurement.std" in text]
+    assert f"There are {len(names)} points" in said
+    assert all(name in said for name in names)
+    assert said.endswith("Try: estimation: {robust: true}")
+
+
+def test_the_residual_of_a_missing_effect_has_no_outliers():
+    """A hidden pull moves lines of 40 and of 15 points by many times their noise."""
+    config, inputs = read_session(load_config(BENCH / "unknown_pull" / "session.yaml"))
+    declared = declared_model(config)
+    for every in (6, 16):
+        poses = tuple(replace(item, points=item.points[::every], means=None) for item in inputs)
+        fit, _ = fit_declared(config, declared, measured_poses(config, poses), 12)
+        found = outliers_of(fit, poses)
+        assert not explains(fit)
+        assert found.lines == len(fit.problem.fitted)
+        assert found.names == ()
+
+
+def test_lines_of_few_points_have_no_outliers_and_robust_says_so(tmp_path):
+    config, _ = with_outliers(tmp_path, 13, NOISE, robust=True)
+    outcome = run_session(config)
+    (said,) = [text for text in outcome.warnings if "estimation.robust" in text]
+    assert "no line has the 14 points" in said
