@@ -147,10 +147,12 @@ def ways_of(model: CableModel, pose: HeldPose) -> list[HeldPose]:
     return named or ways_round(model, pose)
 
 
-def ways_round(model: CableModel, pose: HeldPose) -> list[HeldPose]:
-    """Copies of a pose with each direction of half a turn, if its `turns` may name it."""
+def ways_round(
+    model: CableModel, pose: HeldPose, every: Sequence[float] = WAYS_ROUND
+) -> list[HeldPose]:
+    """Copies of a pose with each of these turns, half a turn either way, if `turns` may name it."""
     twists = pose.node.twists and model.tipped_by is not None
-    return [replace(pose, turns=turns) for turns in WAYS_ROUND] if twists else []
+    return [replace(pose, turns=turns) for turns in every] if twists else []
 
 
 def _chosen(

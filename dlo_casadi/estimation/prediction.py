@@ -29,6 +29,9 @@ from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.thresholds import DIFFERENT
 
+# Further values of `turns` that may choose the equilibrium in which a pose was measured.
+WHOLE_TURNS = (1.0, -1.0)
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -63,7 +66,7 @@ class MeasuredBranch:
         the branch were known.
     branch : "ccw", "cw", "previous" or None
         Branch that the pose must name so that this equilibrium is predicted; None if none does.
-    turns : 0.5, -0.5 or None
+    turns : 0.5, -0.5, 1, -1 or None
         The same for a cable in space that is twisted the other way round, see `HeldPose`.
     other_side : bool
         Whether it is the other side, see `CableModel.tipped_by`, and the pose names no side.
@@ -294,7 +297,9 @@ def _named_ways(
 ) -> list[HeldPose | None]:
     """Poses with the branch or turns for which the other equilibrium is predicted, if any."""
     ways = [
-        [] if found is None or pose.turns else ways_of(model, pose)
+        []
+        if found is None or pose.turns
+        else [*ways_of(model, pose), *ways_round(model, pose, WHOLE_TURNS)]
         for pose, found in zip(poses, others, strict=True)
     ]
     out: list[HeldPose | None] = [None] * len(poses)

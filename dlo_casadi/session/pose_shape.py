@@ -22,13 +22,16 @@ class BranchShape:
         Root mean square distance of the measured points from it.
     branch : "ccw", "cw", "previous" or None
         Value of `branch` with which it is predicted; None if there is none.
-    turns : 0.5, -0.5 or None
+    turns : 0.5, -0.5, 1, -1 or None
         Value of `turns` with which it is predicted, see `HeldPose`.
+    above : float [J]
+        Its energy minus that of the predicted equilibrium.
     """
 
     rmse: float
     branch: PoseBranch | None
     turns: float | None = None
+    above: float = 0.0
 
     @property
     def chosen_by(self) -> str | None:

@@ -63,7 +63,7 @@ def held_out_missing(
 
 
 def branch_warnings(stages: Sequence[Stage]) -> list[str]:
-    """Poses measured in another stable equilibrium than the one of lowest energy.
+    """Poses measured in another stable equilibrium than the predicted one.
 
     Only the last stage counts: earlier models lacked something. The verdict reports held-out poses
     on the other side.
@@ -78,39 +78,49 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             for name, shape in stage.other_branch.items()
             if not (side := either[name]) or side.other.chosen_by != shape.chosen_by
         }
-        for chosen_by, names in _by_choice(others):
-            predicted = max(stage.shapes[name].rmse or 0.0 for name in names)
-            measured = max(others[name].rmse for name in names)
+        for group in _by_choice(others):
+            predicted = max(stage.shapes[name].rmse or 0.0 for name in group)
+            measured = max(shape.rmse for shape in group.values())
             lines.append(
-                f"stage {stage.name}: {', '.join(names)}: the equilibrium of lowest energy, which "
-                f"is predicted, is not the one that was measured: up to {1e3 * predicted:.3g} mm "
-                f"off, on the measured branch {1e3 * measured:.3g} mm; {_cure(chosen_by)}"
+                f"stage {stage.name}: {', '.join(group)}: the predicted equilibrium is not the one "
+                f"that was measured, {_energy(group)}: up to {1e3 * predicted:.3g} mm off, on the "
+                f"measured branch {1e3 * measured:.3g} mm; {_cure(group)}"
             )
-            if undecided := [name for name in names if stage.shapes[name].undecided]:
+            if undecided := [name for name in group if stage.shapes[name].undecided]:
                 told = ", ".join(undecided)
                 lines[-1] += (
                     ". Fit, fixtures and scatter from pose to pose leave open which of the two is "
                     f"lower in {told}"
                 )
         lines += [
-            f"stage {stage.name}: {', '.join(names)}: the cable of these fit poses hangs on "
-            "another side than that of lowest energy; they are compared where they hang, and a "
-            f"prediction of the same ends needs `{chosen_by}`"
-            for chosen_by, names in _by_choice(stage.measured_side)
+            f"stage {stage.name}: {', '.join(group)}: the cable hangs on another side than the "
+            f"predicted one, {_energy(group)}; fit poses are compared where they hang, and a "
+            f"prediction of the same ends needs `{next(iter(group.values())).chosen_by}`"
+            for group in _by_choice(stage.measured_side)
         ]
     return lines
 
 
-def _by_choice(found: Mapping[str, BranchShape]) -> Iterator[tuple[str | None, list[str]]]:
-    """Groups of poses that one choice would put on the measured branch."""
-    for chosen_by in dict.fromkeys(shape.chosen_by for shape in found.values()):
-        yield chosen_by, [name for name, shape in found.items() if shape.chosen_by == chosen_by]
+def _by_choice(found: Mapping[str, BranchShape]) -> list[dict[str, BranchShape]]:
+    """Groups of poses that one choice would put on the measured branch, all higher or all lower."""
+    groups: dict[tuple[str | None, bool], dict[str, BranchShape]] = {}
+    for name, shape in found.items():
+        groups.setdefault((shape.chosen_by, shape.above < 0), {})[name] = shape
+    return list(groups.values())
 
 
-def _cure(chosen_by: str | None) -> str:
+def _energy(group: Mapping[str, BranchShape]) -> str:
+    """By how much the energy of measured equilibria is above or below that of the predicted."""
+    most = max((shape.above for shape in group.values()), key=abs)
+    which = f"{'up to ' if len(group) > 1 else ''}{abs(most):.2g} J"
+    return f"whose energy is {which} {'lower' if most < 0 else 'higher'}"
+
+
+def _cure(group: Mapping[str, BranchShape]) -> str:
+    chosen_by = next(iter(group.values())).chosen_by
     if chosen_by is None:
-        return "no `branch` of these poses would choose it: take them again, or leave them out"
-    return f"`{chosen_by}` in these poses chooses it"
+        return "no entry in a pose would choose it: measure again, or leave it out"
+    return f"`{chosen_by}` chooses it"
 
 
 def weight_warning(weight: HiddenWeight, expected: float) -> str:
@@ -194,8 +204,9 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
         elsewhere = {k: stage.other_branch[k] for k in bad if k in stage.other_branch}
         for name, other in elsewhere.items():
             text += (
-                f". The model's lowest equilibrium in {name} is another one than the measured one, "
-                f"to which it comes within {1e3 * other.rmse:.3g} mm; {_cure(other.chosen_by)}"
+                f". The predicted equilibrium in {name} is another one than the measured one, "
+                f"to which the model comes within {1e3 * other.rmse:.3g} mm and "
+                f"{_energy({name: other})}; {_cure({name: other})}"
             )
         lines.append(text)
     return (*lines, *_nothing_predicted(stages))
@@ -213,7 +224,7 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
     if off <= other:
         return []
     return [
-        f"no pose is predicted from its ends: in all {len(shown)} the model's lowest equilibrium "
+        f"no pose is predicted from its ends: in all {len(shown)} the predicted equilibrium "
         f"is another one than the measured one, {1e3 * off:.3g} mm RMS off, and stage "
         f"{nearest.name} comes nearer, {1e3 * other:.3g} mm. Try: are start and end of the poses "
         "exchanged, or headings off by a turn?"

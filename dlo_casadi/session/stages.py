@@ -69,7 +69,7 @@ def pose_shape(
         eq.energy,
         eq.stable,
         np.stack([eq.start_force, eq.end_force]),
-        _branch_shape(other, item) if item.readable and other is not None else None,
+        _branch_shape(other, item, prediction) if item.readable and other is not None else None,
         readings=item.readings_beside(prediction.seen),
         clips=tuple(clip_rows(item.pose.clips, eq.clips)),
         contacts=tuple(contact.row for contact in eq.contacts),
@@ -81,8 +81,13 @@ def _rmse(prediction: Prediction, item: MeasuredPose) -> float:
     return float(np.sqrt((item.distances(prediction.curve) ** 2).mean()))
 
 
-def _branch_shape(found: MeasuredBranch, item: MeasuredPose) -> BranchShape:
-    return BranchShape(_rmse(found.prediction, item), found.branch, found.turns)
+def _branch_shape(
+    found: MeasuredBranch, item: MeasuredPose, known: Prediction | None
+) -> BranchShape:
+    """The equilibrium in which a pose was measured, beside the predicted one."""
+    own = found.prediction.equilibrium.energy
+    above = 0.0 if known is None else own - known.equilibrium.energy
+    return BranchShape(_rmse(found.prediction, item), found.branch, found.turns, above)
 
 
 def _across(prediction: Prediction, s: FloatArray, gap: FloatArray) -> FloatArray:
@@ -142,7 +147,7 @@ class _Model:
             side = None
             if other is not None and other.other_side and not item.held_out:
                 # A fit has used the side on which the cable of each pose hangs.
-                side = _branch_shape(other, item)
+                side = _branch_shape(other, item, known)
                 known, other = other.prediction, None
                 predictions[j], others[j] = known, other
             if known is not None:
@@ -232,10 +237,15 @@ class _Model:
             and not on_other_side(self.model, item.pose, pair[0].x, pair[1].x[None])[0]
         ):
             predicted = BranchShape(_rmse(known, item), None)
-            return EitherSide(predicted, _branch_shape(measured, item), None)
+            return EitherSide(predicted, _branch_shape(measured, item, known), None)
         ways = sides_of(self.model, item.pose, *pair)
         shapes = [
-            BranchShape(_rmse(one, item), way.branch, way.turns or None)
+            BranchShape(
+                _rmse(one, item),
+                way.branch,
+                way.turns or None,
+                one.equilibrium.energy - known.equilibrium.energy,
+            )
             for one, way in zip((known, other), ways, strict=True)
         ]
         tipping = tipping_of(self.model, self.p, known.rest, item.pose, *pair, uncertainty)

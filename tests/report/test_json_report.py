@@ -142,8 +142,8 @@ def test_a_held_out_pose_on_either_side_stands_beside_the_verdict(outcome):
     found = replace(outcome, stages=(*outcome.stages[:-1], found))
 
     row = {
-        "predicted": {"rmse": 0.054, "branch": None, "turns": 0.5},
-        "other": {"rmse": 0.0031, "branch": None, "turns": -0.5},
+        "predicted": {"rmse": 0.054, "branch": None, "turns": 0.5, "above": 0.0},
+        "other": {"rmse": 0.0031, "branch": None, "turns": -0.5, "above": 0.0},
         "tipping": {"angle": 0.03, "std": 0.02},
     }
     assert report_dict(found)["either_side"][names[0]] == row

@@ -120,7 +120,7 @@ def judged(measured):
 def test_a_fit_pose_on_the_other_side_is_compared_there_and_named():
     stage, (said,) = judged(turned_over())
     assert {name: side.branch for name, side in stage.measured_side.items()} == {"-0.30": "ccw"}
-    assert said.startswith("stage batch: -0.30: the cable of these fit poses hangs on another")
+    assert said.startswith("stage batch: -0.30: the cable hangs on another side")
     assert said.endswith("needs `branch: ccw`")
     assert stage.rmse_fit == stage.rmse_fit_measured_branch < 2 * STD
 

@@ -1,5 +1,6 @@
 """Errors of a stage: on which branch, over which poses, in which unit."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -64,8 +65,15 @@ def test_a_pose_measured_on_another_branch_is_named_with_its_error_there():
     assert stage.rmse_fit_measured_branch == pytest.approx(NOISE, rel=0.25)
     assert stage.rmse_held_out_measured_branch == pytest.approx(NOISE, rel=0.35)
     (said,) = branch_warnings([replace(stage, name="batch")])
-    assert said.startswith("stage batch: 0, 2: the equilibrium of lowest energy")
-    assert "`branch: cw` in these poses chooses it" in said
+    assert said.startswith("stage batch: 0, 2: the predicted equilibrium is not")
+    assert re.search(r"whose energy is up to [\d.]+ J higher: .*`branch: cw` chooses it", said)
+    lower = {
+        name: replace(shape, measured_branch=replace(shape.measured_branch, above=-0.01))
+        for name, shape in stage.shapes.items()
+        if name == "0"
+    }
+    (said,) = branch_warnings([replace(stage, name="batch", shapes=lower)])
+    assert "whose energy is 0.01 J lower: " in said
     later = replace(stage, name="closed", shapes={})
     assert branch_warnings([replace(stage, name="batch"), later]) == []
     assert branch_warnings([stage]) == []  # of a first guess nobody expects the branch
@@ -118,8 +126,8 @@ def test_a_pose_predicted_on_another_equilibrium_is_in_doubt(held_out):
     assert f"{'held-out' if held_out else 'fit'} poses are predicted" in doubt
     worst = np.sqrt(np.mean(stage.shapes["0"].missed ** 2))
     assert f": 0, at worst {1e3 * worst:.3g} mm instead of 0." in doubt
-    assert "lowest equilibrium in 0 is another one than the measured one" in doubt
-    assert "`branch: cw` in these poses chooses it" in doubt
+    assert "predicted equilibrium in 0 is another one than the measured one" in doubt
+    assert "`branch: cw` chooses it" in doubt
     if not held_out:
         assert cross_validate(fit).rmse < 2 * NOISE
 
@@ -137,7 +145,7 @@ def test_where_no_pose_is_predicted_a_simpler_model_may_do_better(nearer, doubte
     doubts = doubts_of([simpler, stage], [], fit)
     assert len(doubts) == doubted
     for text in doubts:
-        assert text.startswith("no pose is predicted from its ends: in all 3 the model's lowest")
+        assert text.startswith("no pose is predicted from its ends: in all 3 the predicted")
         assert f"{1e3 * stage.rmse_fit:.3g} mm RMS off, and stage initial comes nearer" in text
 
 
@@ -217,3 +225,22 @@ def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():
     shape = pose_shape(predicted, item, found).measured_branch
     assert shape.chosen_by == f"turns: {turns}"
     assert shape.rmse < 1e-4
+
+
+def test_a_whole_turn_of_twist_is_named_before_a_pose_is_to_be_taken_again():
+    """Rolled by half a radian and twisted by a turn more: half a turn either way is less."""
+    cable = CableData(1.0, 0.1, 0.01, bending_stiffness=0.05, torsional_stiffness=0.04)
+    held = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
+    model = CableModel(cable, 10, "quadratic", **held)
+    ahead, rolled = (0.0, 0.0, 0.0, 1.0), (np.sin(0.25), 0.0, 0.0, np.cos(0.25))
+    pose = HeldPose((0, 0, 0), (0.95, 0.1, 0), start_orientation=ahead, end_orientation=rolled)
+    flat = np.zeros(model.chain.n_rests)
+    poses = [replace(pose, name="a"), replace(pose, turns=1.0)]
+    predicted, other = predict_poses(model, model.nominal, flat, poses)
+    item = MeasuredPose.of_points(poses[0], other.curve.at(np.linspace(0.05, 0.95, 20)))
+    nodes = {"a": other.equilibrium.x}
+    (found,) = measured_branches(model, model.nominal, flat, [item], [predicted], nodes)
+    assert (found.branch, found.turns) == (None, 1.0)
+    shape = pose_shape(predicted, item, found).measured_branch
+    apart = other.equilibrium.energy - predicted.equilibrium.energy
+    assert shape.above == pytest.approx(apart, rel=1e-6)
