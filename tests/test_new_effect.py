@@ -215,7 +215,7 @@ class NoParameters(NoTuple):
 def test_a_mistake_in_an_effect_is_told_when_it_is_registered(name, kind, said):
     with pytest.raises(DloError, match=f"(?s){said}"):
         EFFECTS[name] = kind
-    assert name not in EFFECTS
+    assert EFFECTS.get(name) is not kind
 
 
 def test_the_registry_accepts_the_effects_of_the_package():

@@ -28,10 +28,8 @@ LARGEST_BEND = 0.9 * np.pi / 2
 # 3, 4, 5, 6, 8 missed the lowest equilibrium 9, 2, 0, 0, 1 times; high powers converge less often.
 _DECAY = 5
 # A roll within this distance [rad] of half a turn is tried both ways round: the rolls of arcs to
-# four sides differ by that much. Of 500 random clamped poses (ends turned by up to 60 or by up to
-# 120 degrees, any roll) 1.0, 1.25, 1.5, 2.0 miss the lowest equilibrium in 12, 8, 7, 2, in 25, 27,
-# 28, 31 ms each; with all rolls tried both ways round a pose takes 36 ms.
-HALF_TURN = 2.0
+# four sides differ by that much, by 1.2 rad in a pose whose lowest equilibrium is the other way.
+HALF_TURN = 1.0
 # Rounding error allowed in comparing twists [turns]: two may be equally near to half a turn.
 _ROUNDING = 1e-6
 # Coefficients of half_angle^2 / (1 - ratio) in powers of 1 - ratio: least squares, 2e-4 rad error.
@@ -256,9 +254,9 @@ def guessed_frames(
 
     Between two ends: four arcs of the cable's length, the first sagging along gravity, the others
     rotated about the chord by quarter turns. They are bent into the clamps; the roll of the end
-    clamp nearest to `turns` is spread evenly. Without `turns`, a roll within `HALF_TURN` of half a
-    turn is tried both ways round. With a free end: the rest shape, the cable fallen down, and
-    straight on. `turns` refers to the first arc; the other arcs use the nearest value.
+    clamp nearest to `turns` is spread evenly. Without `turns`, a roll of nearly half a turn is
+    tried both ways round. With a free end: the rest shape, the cable fallen down, and straight on.
+    `turns` refers to the first arc; the other arcs use the nearest value.
     """
     u, chord, frames = _held(model, p, pose)
     clamps = frame_rotation(frames[0]), frame_rotation(frames[1])

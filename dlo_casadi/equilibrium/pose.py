@@ -36,7 +36,7 @@ class HeldPose:
     turns : float
         In space, selects the twist about the cable's axis with which its end fits the clamp: the
         one nearest to this number of full turns; +-0.5 select either direction of half a turn. For
-        0 and a clamp rolled by half a turn within 2 rad, the direction of lower energy is taken.
+        0 and a clamp rolled by half a turn within 1 rad, the direction of lower energy is taken.
     branch : "ccw", "cw" or "previous", optional
         Which way the cable turns from start to end: the sign of `Equilibrium.turn`. "previous"
         is the equilibrium that follows from the pose before, see `solve.continued`.

@@ -246,7 +246,7 @@ def test_only_rivals_of_the_same_search_tell_which_refit_is_given_up(monkeypatch
     """An effect that a search among simpler ones excludes may stand for two of them."""
     ceilings = []
 
-    def confirm(current, screened, ceiling):
+    def confirm(current, screened, ceiling, beside):
         ceilings.append(ceiling)
 
     monkeypatch.setattr(module.refits, "confirm", confirm)
