@@ -13,6 +13,10 @@ class LengthError(Kinematics):
 
         true length = L + length_difference
 
+    The whole cable is longer, and with it the arc lengths of its markers, in proportion. A cable
+    that is pulled further into a clamp, or whose length was measured wrongly beyond its markers,
+    leaves them where they are: that is not this effect.
+
     Parameters
     ----------
     length_difference : scalar [m]

@@ -218,7 +218,7 @@ def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
     timing = outcome.timing
     read, search, total = timing["vision"], timing["diagnosis"], timing["total"]
     photographs = sum((pose.image is not None) + len(pose.views) for pose in outcome.poses)
-    rows = [("centre-lines", read, "")]
+    rows = [("reading the lines", read, "")]
     if photographs:
         remark = f"{read / photographs:.2f} s a photograph ({photographs})"
         rows = [("photographs to centre-lines", read, remark)]

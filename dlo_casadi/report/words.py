@@ -31,7 +31,7 @@ STAGE_LABELS: dict[StageName, str] = {
 DEPENDENCES = {
     "order_z": "the order of the poses",
     "span_z": "the distance of the ends",
-    "position_z": "the place in the {plane}",
+    "position_z": "the place in {where}",
 }
 # Largest number of repeats that is proposed.
 MOST_REPEATS = 20
@@ -164,8 +164,8 @@ def details(outcome: Outcome) -> list[str]:
     if load is not None:
         low, high = load.interval
         lines.append(
-            f"  Without naming a cause: pulled by {vector(load.force, '.3g', 'N')} on average "
-            f"at {load.position:.3f} m ({low:.3f} to {high:.3f} m) from the start."
+            f"  Without naming a cause: as if pulled by {vector(load.force, '.3g', 'N')} on "
+            f"average at {load.position:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
         experiment = outcome.config.experiment
         if experiment.boundary.end == "free" and np.dot(load.force, experiment.gravity) < 0:
@@ -228,7 +228,9 @@ def structure_lines(outcome: Outcome) -> list[str]:
     if outcome.structure is None or outcome.verdict == "complete":
         return []
     before, _ = outcome.structure
-    plane = "picture" if outcome.measurement.kind == "images" else "plane"
+    where = "space" if outcome.config.experiment.in_space else "the plane"
+    if outcome.measurement.kind == "images":
+        where = "the picture"
     found = []
     for key, text in DEPENDENCES.items():
         z = getattr(before, key)
@@ -236,7 +238,7 @@ def structure_lines(outcome: Outcome) -> list[str]:
         if abs(z) >= 0.999 * LARGEST_SCORE:  # beyond the resolution of its test
             score = "z > 7" if z > 0 else "z < -7"
         if abs(z) > NOTABLE:
-            found.append(f"{text.format(plane=plane)} ({score})")
+            found.append(f"{text.format(where=where)} ({score})")
     said = [f"depends on {', '.join(found)}"] if found else []
     if abs(before.runs_z) > NOTABLE:
         often, z = "less" if before.runs_z < 0 else "more", before.runs_z

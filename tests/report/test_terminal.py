@@ -157,7 +157,9 @@ def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):
     text = said(replace(outcome, config=config, verdict="unexplained", unexplained=LOAD))
 
     assert "Verdict: unexplained. The residual is not noise." in text
-    assert "pulled by (0, 1) N on average at 0.300 m (0.280 to 0.320 m) from the start" in text
+    assert (
+        "as if pulled by (0, 1) N on average at 0.300 m (0.280 to 0.320 m) from the start" in text
+    )
 
 
 def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
@@ -199,6 +201,10 @@ def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcom
     assert "the place in the plane (z > 7)" in line
     (line,) = structure_lines(replace(found, measurement=photographs))
     assert "the place in the picture (z > 7)" in line
+    experiment = found.config.experiment.model_copy(update={"gravity": (0.0, 0.0, -9.81)})
+    in_space = found.config.model_copy(update={"experiment": experiment})
+    (line,) = structure_lines(replace(found, config=in_space))
+    assert "the place in space (z > 7)" in line
 
 
 @pytest.mark.parametrize(
