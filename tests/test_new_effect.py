@@ -17,6 +17,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.effects import EFFECTS, CableData, Effect, Fitted, PointForce, PointLoad, Setup
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt
+from dlo_casadi.effects.registry import Registry
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError, DloError
@@ -219,8 +220,10 @@ def test_a_mistake_in_an_effect_is_told_when_it_is_registered(name, kind, said):
 
 
 def test_the_registry_accepts_the_effects_of_the_package():
+    accepted = Registry()
     for name, kind in EFFECTS.items():
-        EFFECTS[name] = kind
+        accepted[name] = kind
+    assert accepted == EFFECTS
 
 
 def test_a_file_with_an_effect_that_is_not_registered_says_so(known, tmp_path):

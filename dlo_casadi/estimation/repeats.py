@@ -123,7 +123,7 @@ def with_repeats(
             away = item.points - item.pose.start - mean.at(places)
             gap = np.sqrt(len(group) / (len(group) - 1)) * away
             residual = item.components(mean, places, gap[..., None])[:, 0]
-            inside = (places > low) & (places < high)
+            inside = (places >= low) & (places <= high)
             for sensor, points, rows in item.slices:
                 kept = np.repeat(inside[points], sensor.per_point)
                 e, s = residual[rows][kept], places[points][inside[points]]

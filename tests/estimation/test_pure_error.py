@@ -172,6 +172,19 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     assert np.isfinite(fit.variance_degrees("bending_stiffness"))
 
 
+def test_repeats_of_three_markers_each_tell_the_noise():
+    """The first and the last point that was measured count, too."""
+    pose, s = HeldPose((0.0, 0.0), (LENGTH, 0.0)), np.array([0.3, 0.5, 0.7]) * LENGTH
+    rng = np.random.default_rng(0)
+    measured = [
+        MeasuredPose.of_points(pose, np.stack([s, 0 * s], 1) + rng.normal(0, 3e-3, (3, 2)), s=s)
+        for _ in range(20)
+    ]
+    found = with_repeats(DECLARED, measured, MODEL)
+    assert found.source == "repeats"
+    assert found.std == pytest.approx(3e-3, rel=0.3)
+
+
 def test_repeats_of_a_point_each_tell_of_no_noise():
     pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
     points = [MeasuredPose.of_points(pose, np.array([[0.5, y]])) for y in (-0.01, 0.01)]
