@@ -38,6 +38,8 @@ PROFILE_95 = float(chdtri(1, 0.05))
 # Number of trial end poses, drawn within the region that the session has explored.
 TRIED = 30
 SEED = 0
+# Largest number of repeats that is proposed.
+MOST_REPEATS = 20
 
 
 def hidden_weight(fit: Fit, exclude: Sequence[str] = ()) -> HiddenWeight | None:
@@ -161,6 +163,9 @@ class NextPose:
         d of the predicted measurements at the points of the nearest pose. C is the covariance of
         the noise, of the fixtures, and of the parameters of both fits: what these leave open, new
         fits could absorb.
+    times : int or None
+        Number of measurements that separate them by APART standard deviations; their noise
+        averages, what the fits leave open does not. None if MOST_REPEATS do not.
     reading : NextReading
         Measurement of a sensor at a fixture that separates them best there.
     separates : tuple of str
@@ -170,6 +175,7 @@ class NextPose:
     end: tuple[float, ...]
     difference: float
     separation: float
+    times: int | None
     reading: NextReading
     separates: tuple[str, ...] = ()
 
@@ -227,8 +233,10 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     end = np.array(pose.end)
     place = tuple(round(float(x), 4) for x in end)
     ways = [_open_ways(fit, pose, found) for fit, found in ((first, one), (second, other))]
-    separation = _separation(first, end, (one.curve, other.curve), ways)
-    return NextPose(place, difference, separation, next_reading(first, one.seen, other.seen))
+    found = _separations(first, end, (one.curve, other.curve), ways)
+    times = next((m for m, apart in enumerate(found, 1) if apart >= APART), None)
+    reading = next_reading(first, one.seen, other.seen)
+    return NextPose(place, difference, float(found[0]), times, reading)
 
 
 def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
@@ -254,15 +262,16 @@ def _open_ways(fit: Fit, pose: HeldPose, found: Prediction) -> Callable[[FloatAr
     return lambda s: displacements(*shape, s)[1]
 
 
-def _separation(
+def _separations(
     fit: Fit,
     end: FloatArray,
     curves: tuple[NodeCurve, NodeCurve],
     ways: Sequence[Callable[[FloatArray], FloatArray]] = (),
-) -> float:
-    """Difference of two curves in standard deviations of one line like that of the nearest pose.
+) -> FloatArray:
+    """Difference of two curves in standard deviations of the mean of 1 to MOST_REPEATS lines.
 
-    `ways`: independent displacements of the curves at arc lengths, one standard deviation each.
+    The lines are like that of the nearest pose. `ways`: independent displacements of the curves at
+    arc lengths, one standard deviation each.
     """
     problem = fit.problem
     ends = np.array([problem.measured[j].pose.end for j in problem.used])
@@ -272,5 +281,6 @@ def _separation(
     moved = np.concatenate([gap, *(way(s) for way in ways)], axis=2)
     seen = item.whitening(fit.noise, s) @ item.components(curves[0], s, moved)
     difference, unknown = seen[:, 0], seen[:, 1:]
-    covariance = np.eye(len(seen)) + unknown @ unknown.T
-    return float(np.sqrt(difference @ np.linalg.solve(covariance, difference)))
+    variances, directions = np.linalg.eigh(unknown @ unknown.T)
+    repeats = np.arange(1, MOST_REPEATS + 1)[:, None]
+    return np.sqrt(((directions.T @ difference) ** 2 / (1 / repeats + variances)).sum(axis=1))

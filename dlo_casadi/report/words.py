@@ -1,18 +1,17 @@
 """The report in words: numbers, names of stages, and all sentences."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from dlo_casadi.diagnosis.next_measurement import NextPose, NextReading
+from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextPose, NextReading
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted
 from dlo_casadi.session.outcome import FoundEffect, Outcome, PoseInput, Stage, StageName
 from dlo_casadi.session.pose_shape import EitherSide
 from dlo_casadi.show.text import millimetres, vector
-from dlo_casadi.thresholds import APART, NOTABLE
+from dlo_casadi.thresholds import NOTABLE
 
 # Name of the RMS distance caused by the noise of points alone, in tables and charts.
 NOISE_ALONE = "noise alone"
@@ -33,8 +32,6 @@ DEPENDENCES = {
     "span_z": "the distance of the ends",
     "position_z": "the place in {where}",
 }
-# Largest number of repeats that is proposed.
-MOST_REPEATS = 20
 
 
 # ---- numbers -----------------------------------------------------------------------------------
@@ -258,17 +255,17 @@ def _effect_lines(effect: FoundEffect) -> list[str]:
 
 def separation_text(proposal: NextPose) -> str:
     """Difference of rivals in a proposed pose, and how often it has to be measured."""
-    z = proposal.separation
     text = (
-        f"they differ there by {millimetres(proposal.difference)} RMS, {z:.2g} "
+        f"they differ there by {millimetres(proposal.difference)} RMS, {proposal.separation:.2g} "
         "standard deviations of one measured line, with what both fits leave open: "
     )
-    repeats = math.ceil(min((APART / max(z, 1e-9)) ** 2, 1e9))
-    if repeats <= 1:
-        return text + "one measurement suffices."
-    if repeats <= MOST_REPEATS:
-        return text + f"measure it {repeats} times."
-    return text + f"even {MOST_REPEATS} measurements would not tell them apart."
+    if proposal.times is None:
+        return text + f"even {MOST_REPEATS} measurements would not tell them apart."
+    return text + (
+        "one measurement suffices."
+        if proposal.times == 1
+        else f"measure it {proposal.times} times."
+    )
 
 
 def reading_text(reading: NextReading) -> str:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis.next_measurement import _separation, next_reading
+from dlo_casadi.diagnosis.next_measurement import _separations, next_reading
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import Tolerances
@@ -27,26 +27,26 @@ def separation(noise, ways=()):
         point=SimpleNamespace(projections=(np.linspace(0.0, LENGTH, POINTS),)),
         noise=noise,
     )
-    return _separation(fit, np.array([LENGTH, 0.1]), (lines[0], lines[1]), ways)
+    return _separations(fit, np.array([LENGTH, 0.1]), (lines[0], lines[1]), ways)
 
 
 def test_a_line_averages_the_noise_of_its_points():
     """White noise: K equal distances d are d sqrt(K) / std standard deviations off."""
-    assert separation(NoiseModel(STD)) == pytest.approx(GAP / STD * np.sqrt(POINTS))
+    assert separation(NoiseModel(STD))[0] == pytest.approx(GAP / STD * np.sqrt(POINTS))
 
 
 def test_what_the_fits_leave_open_separates_nothing():
-    """A common shift of one std, 3 mm: d / sqrt(std^2 / K + shift^2)."""
+    """A common shift of one std, 3 mm, in m lines: d / sqrt(std^2 / (K m) + shift^2)."""
     shift = 3e-3
     open_ways = [lambda s: np.full((len(s), 2, 1), [[0.0], [shift]])]
-    expected = GAP / np.hypot(STD / np.sqrt(POINTS), shift)
+    expected = GAP / np.hypot(STD / np.sqrt(POINTS * np.arange(1, 21)), shift)
     assert separation(NoiseModel(STD), open_ways) == pytest.approx(expected)
 
 
 def test_noise_that_is_one_for_the_whole_line_does_not_average():
     alike = NoiseModel(STD, share=0.98, length=100 * LENGTH, kernel="gaussian")
 
-    assert separation(alike) == pytest.approx(GAP / STD, rel=0.02)
+    assert separation(alike)[0] == pytest.approx(GAP / STD, rel=0.02)
 
 
 @pytest.mark.parametrize(("gap", "times"), [(1.2, 1), (0.4, 3), (0.2, None)])

@@ -40,6 +40,7 @@ PROPOSAL = NextPose(
     end=(0.1, -0.2),
     difference=2.5e-3,
     separation=8.2,
+    times=1,
     reading=NextReading("end_force", 0.3, 4.0, 2),
     separates=("lumped_mass", "point_force"),
 )

@@ -116,17 +116,15 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
 
 
 @pytest.mark.parametrize(
-    ("std", "words"),
+    ("times", "words"),
     [
-        (3.0, "one measurement suffices."),
-        (1.5, "measure it 4 times."),
-        (0.2, "even 20 measurements would not tell them apart."),
-        (0.0, "even 20 measurements would not tell them apart."),
+        (1, "one measurement suffices."),
+        (4, "measure it 4 times."),
+        (None, "even 20 measurements would not tell them apart."),
     ],
 )
-def test_a_proposal_says_how_often_to_measure(std, words):
-    """Repeats average: n lines are sqrt(n) times as sharp as one."""
-    proposal = replace(PROPOSAL, separation=std)
+def test_a_proposal_says_how_often_to_measure(times, words):
+    proposal = replace(PROPOSAL, times=times)
 
     assert separation_text(proposal).endswith(words)
 
