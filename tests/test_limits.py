@@ -10,6 +10,7 @@ import pytest
 import yaml
 from scipy.stats import norm
 
+import dlo_casadi as dlo
 from dlo_casadi.cable.limits import LimitCheck, limit_checks
 from dlo_casadi.cli import main
 from dlo_casadi.codegen import CompiledSolver
@@ -368,3 +369,16 @@ def test_a_configuration_with_other_limits_is_refused(tmp_path, limits, said):
     (tmp_path / "session.yaml").write_text(f"{text}\nlimits: {limits}\n")
     with pytest.raises(ConfigError, match=re.escape(said)):
         load_config(tmp_path / "session.yaml")
+
+
+@pytest.mark.parametrize("stiffness", [0.0, 0.05])
+def test_a_pin_with_a_spring_takes_a_moment(stiffness):
+    rope = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+    spring = {"name": "start_spring", "parameters": {"stiffness": stiffness, "heading": 0.0}}
+    cable = dlo.known_cable(
+        rope, gravity=(0, -9.81), boundary=("pinned", "pinned"), model={"effects": [spring]}
+    )
+    shape = cable.solve(end=(0.6, 0.0))
+    (check,) = shape.check({"moment": 1e-3})
+    assert check.value == pytest.approx(abs(shape.start_moment))
+    assert check.verdict == ("fail" if stiffness else "pass")

@@ -201,9 +201,20 @@ class NoParameters(NoTuple):
         return Parameter("mass", "kg")
 
 
+class NoPlace(Plumb):
+    name = "no_place"
+
+    def parameters(self, cable):
+        return (Parameter("mass", "kg"),)
+
+    def forces(self, gravity, params):
+        return (PointForceAt(params["mass"] * gravity, params["position"]),)
+
+
 @pytest.mark.parametrize(
     ("name", "kind", "said"),
     [
+        ("no_place", NoPlace, "NoPlace .* one of its methods fails, KeyError: 'position'"),
         ("plumb", Plumb, "Plumb cannot be an effect: it has no law and would do nothing.*springs"),
         ("no_tuple", NoTuple, "NoTuple .* its forces must return a tuple of PointForceAt, found"),
         ("no_parameters", NoParameters, "its parameters must return a tuple of Parameter, found"),

@@ -22,6 +22,7 @@ from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.assembly import Inputs
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.show.text import STRAIGHT, millimetres
 from dlo_casadi.thresholds import SAFE
 
@@ -178,8 +179,11 @@ def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Li
     if not asked.given:
         raise DloError(f"no limit is given, and none was declared.\n  Try: {_TRY}")
     held = (model.start, model.end, *model.clips)
-    avoided = any(not one.touch for one in model.obstacles)
-    if wrong := [*asked.problems(held, model.node.twists, model.cable.length, avoided)]:
+    sprung, avoided = (
+        bool(functions_of(model).moment_ends),
+        any(not x.touch for x in model.obstacles),
+    )
+    if wrong := [*asked.problems(held, sprung, model.node.twists, model.cable.length, avoided)]:
         raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
     return asked
 

@@ -38,7 +38,7 @@ from dlo_casadi.rod.obstacles import Obstacle
 # Poses, or rows of numbers in the layout of dlo_pose in the C header.
 Poses = Sequence[AnyPose] | FloatArray
 
-# Value of a quantity that there is not in the C header: nothing bends, no obstacle.
+# Value that the C solver gives where nothing bends, or where there is no obstacle.
 _NOTHING = 1e300
 # Argument types of the header's functions: a pointer, an int, a count (size_t).
 _TYPES = {"p": ctypes.c_void_p, "i": ctypes.c_int, "n": ctypes.c_size_t}

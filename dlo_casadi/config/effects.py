@@ -6,8 +6,9 @@ from dlo_casadi.config.options import DeclaredEffect, EffectParameter
 from dlo_casadi.config.problems import ConfigProblem, Place, did_you_mean
 from dlo_casadi.config.sections import Config
 from dlo_casadi.config.values import Range
-from dlo_casadi.effects import EFFECTS, CableData, Setup
+from dlo_casadi.effects import EFFECTS, CableData, Effect, Setup
 from dlo_casadi.effects.cable import Parameter, height_of
+from dlo_casadi.effects.end_spring import PinSpring
 from dlo_casadi.rod.chain import ELEMENTS_IN_SPACE
 
 
@@ -61,6 +62,19 @@ def wrong_effects(config: Config, *, known: bool = False) -> list[ConfigProblem]
             text = f"diagnosis.exclude: {_unknown(name)}"
             found.append(ConfigProblem(("diagnosis", "exclude", i), text))
     return found
+
+
+def wrong_limits(config: Config) -> list[ConfigProblem]:
+    """Find limits that are meaningless for this cable."""
+    given, ends = config.experiment, config.experiment.boundary
+    held = {ends.start, ends.end, *(clip.kind for x in given.poses for clip in x.clips)}
+    sprung = any(
+        issubclass(EFFECTS.get(item.name, Effect), PinSpring) for item in config.model.effects
+    )
+    avoided = any(one.touch == "avoided" for one in given.obstacles)
+    length, limits = config.cable.length, config.limits
+    found = limits.problems(sorted(held), sprung, given.in_space, length, avoided)
+    return [ConfigProblem(("limits", *place), text) for place, text in found]
 
 
 def _wrong(item: DeclaredEffect, at: Place, setup: Setup, kept: bool) -> Iterator[ConfigProblem]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.config.effects import declared_setup, wrong_effects
+from dlo_casadi.config.effects import declared_setup, wrong_effects, wrong_limits
 from dlo_casadi.config.problems import Arguments, ConfigProblem, did_you_mean, show
 from dlo_casadi.config.sections import Config
 from dlo_casadi.config.supports import undetermined
@@ -43,7 +43,7 @@ def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config,
             if getattr(cable, key) is None
         ),
         *(wrong_effects(config, known=True) or _without_values(config)),
-        *config.limit_problems,
+        *wrong_limits(config),
     ]
     values = np.zeros((1 + in_space, 0)) if rest is None else _curvatures(rest, 1 + in_space)
     text = ""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.effects import wrong_effects
+from dlo_casadi.config.effects import wrong_effects, wrong_limits
 from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.problems import ConfigProblem, Place, Source, kind_of, show
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
@@ -86,7 +86,7 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
             config.experiment.gravity,
             [pose.over for pose in config.experiment.poses],
         ),
-        *config.limit_problems,
+        *wrong_limits(config),
     ]:
         raise source.error(problems)
 

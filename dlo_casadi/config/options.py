@@ -134,12 +134,13 @@ class Limits(ConfigSection):
         return {name: value for name, value in values.items() if value is not None}
 
     def problems(
-        self, held: Sequence[str], twists: bool, length: float, avoided: bool
+        self, held: Sequence[str], sprung: bool, twists: bool, length: float, avoided: bool
     ) -> Iterator[ConfigProblem]:
         """Find limits that are meaningless for a cable.
 
-        `held`: kinds of its ends and clips; `length` [m]: of the cable; `twists`: whether it can
-        twist, in space; `avoided`: whether there are obstacles that it must not touch.
+        `held`: kinds of its ends and clips; `sprung`: whether a pin has a spring; `length` [m]: of
+        the cable; `twists`: whether it can twist, in space; `avoided`: whether there are obstacles
+        that it must not touch.
         """
         for name in ("bend_radius", "clearance"):
             value = self.given.get(name, 0.0)
@@ -155,8 +156,8 @@ class Limits(ConfigSection):
         if self.twist is not None and not twists:
             text = "limits.twist: a cable in a plane (two numbers of gravity) does not twist"
             yield ConfigProblem(("twist",), f"{text}. Try: leave it out")
-        if self.moment is not None and not {"clamped", "swivel"} & {*held}:
-            text = f"limits.moment: no end is clamped ({', '.join(held)}), none takes a moment"
+        if self.moment is not None and not (sprung or {"clamped", "swivel"} & {*held}):
+            text = f"limits.moment: nothing takes a moment, no end is clamped ({', '.join(held)})"
             yield ConfigProblem(("moment",), f"{text}. Try: leave it out")
 
 

@@ -434,15 +434,6 @@ class Config(ConfigSection):
         return self.path.read_text(encoding="utf-8-sig", errors="replace")
 
     @property
-    def limit_problems(self) -> list[ConfigProblem]:
-        """Find limits that are meaningless for this cable."""
-        given, ends = self.experiment, self.experiment.boundary
-        held = {ends.start, ends.end, *(clip.kind for x in given.poses for clip in x.clips)}
-        avoided = any(one.touch == "avoided" for one in given.obstacles)
-        found = self.limits.problems(sorted(held), given.in_space, self.cable.length, avoided)
-        return [ConfigProblem(("limits", *place), text) for place, text in found]
-
-    @property
     def measured_poses(self) -> tuple[Pose, ...]:
         """Poses with a measurement, in the order in which they were taken."""
         skipped = {pose.name for pose in self.skipped}

@@ -1,6 +1,6 @@
 """What the poses do not determine, and the measurement that would: hidden weight, next pose."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.selection import AddedEffect, HiddenWeight
 from dlo_casadi.effects import Load
-from dlo_casadi.equilibrium.curve import NodeCurve, Observed
+from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import displacements
 from dlo_casadi.errors import EstimationError
@@ -27,6 +27,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.thresholds import APART
 
 # Trial weights over the cable's own, in this order, until one does not fit.
@@ -159,13 +160,13 @@ class NextPose:
     difference : float [m]
         RMS difference of the two predictions.
     separation : float
-        The same in standard deviations of one measurement: sqrt(d^T C^-1 d) for the differences
-        d of the predicted measurements at the points of the nearest pose. C is the covariance of
-        the noise, of the fixtures, and of the parameters of both fits: what these leave open, new
-        fits could absorb.
+        The same in standard deviations of one measurement: sqrt(d^T (E / m + P)^-1 d), m = 1, for
+        the differences d of the predicted measurements at the points of the nearest pose. E is the
+        covariance of what differs from one measurement to the next: noise, fixtures and the cable's
+        own scatter. P is that of the parameters of both fits, which new fits could change.
     times : int or None
-        Number of measurements that separate them by APART standard deviations; their noise
-        averages, what the fits leave open does not. None if MOST_REPEATS do not.
+        Number m of measurements that separate them by APART standard deviations; None if
+        MOST_REPEATS do not.
     reading : NextReading
         Measurement of a sensor at a fixture that separates them best there.
     separates : tuple of str
@@ -232,8 +233,14 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     difference, pose, one, other = best
     end = np.array(pose.end)
     place = tuple(round(float(x), 4) for x in end)
-    ways = [_open_ways(fit, pose, found) for fit, found in ((first, one), (second, other))]
-    found = _separations(first, end, (one.curve, other.curve), ways)
+    s, item = _nearest_line(first, end)
+    moved, again = _displaced(first, pose, one, s)
+    open_too, _ = _displaced(second, pose, other, s)
+    gap = one.curve.at(s) - other.curve.at(s)
+    seen = item.whitening(first.noise, s) @ item.components(
+        one.curve, s, np.concatenate([gap[..., None], again, moved, open_too], axis=2)
+    )
+    found = _separations(*np.split(seen, [1, 1 + again.shape[2]], axis=1))
     times = next((m for m, apart in enumerate(found, 1) if apart >= APART), None)
     reading = next_reading(first, one.seen, other.seen)
     return NextPose(place, difference, float(found[0]), times, reading)
@@ -255,32 +262,35 @@ def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
     return max(found, key=lambda item: item.separation)
 
 
-def _open_ways(fit: Fit, pose: HeldPose, found: Prediction) -> Callable[[FloatArray], FloatArray]:
-    """Displacements (K, d, q) [m] of a prediction at arc lengths (K,) [m], see `displacements`."""
-    known = uncertainty_of(fit)
-    shape = (fit.model, fit.p, fit.rest_now, pose, found.equilibrium, known)
-    return lambda s: displacements(*shape, s)[1]
-
-
-def _separations(
-    fit: Fit,
-    end: FloatArray,
-    curves: tuple[NodeCurve, NodeCurve],
-    ways: Sequence[Callable[[FloatArray], FloatArray]] = (),
-) -> FloatArray:
-    """Difference of two curves in standard deviations of the mean of 1 to MOST_REPEATS lines.
-
-    The lines are like that of the nearest pose. `ways`: independent displacements of the curves at
-    arc lengths, one standard deviation each.
-    """
+def _nearest_line(fit: Fit, end: FloatArray) -> tuple[FloatArray, MeasuredPose]:
+    """Arc lengths (K,) [m] of the points of the fit pose whose end is nearest, and that pose."""
     problem = fit.problem
     ends = np.array([problem.measured[j].pose.end for j in problem.used])
     k = int(((ends - end) ** 2).sum(axis=1).argmin())
-    s, item = fit.point.projections[k], problem.measured[problem.used[k]]
-    gap = (curves[0].at(s) - curves[1].at(s))[..., None]
-    moved = np.concatenate([gap, *(way(s) for way in ways)], axis=2)
-    seen = item.whitening(fit.noise, s) @ item.components(curves[0], s, moved)
-    difference, unknown = seen[:, 0], seen[:, 1:]
-    variances, directions = np.linalg.eigh(unknown @ unknown.T)
-    repeats = np.arange(1, MOST_REPEATS + 1)[:, None]
-    return np.sqrt(((directions.T @ difference) ** 2 / (1 / repeats + variances)).sum(axis=1))
+    return fit.point.projections[k], problem.measured[problem.used[k]]
+
+
+def _displaced(
+    fit: Fit, pose: HeldPose, found: Prediction, s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`displacements` (K, d, q) [m] by the fit's parameters, and those that each repeat draws."""
+    known = uncertainty_of(fit)
+    shape = (fit.model, fit.p, fit.rest_now, pose, found.equilibrium, known)
+    _, moved = displacements(*shape, s)
+    causes = known.causes_in(fit.model)
+    kept = np.zeros(moved.shape[2], bool)
+    kept[: len(causes)] = [cause == "parameters" for cause in causes]
+    return moved[..., kept], moved[..., ~kept]
+
+
+def _separations(difference: FloatArray, again: FloatArray, kept: FloatArray) -> FloatArray:
+    """Difference of two predicted lines in standard deviations of the mean of 1 to MOST_REPEATS.
+
+    All in white noise of one std: the difference (n, 1), independent changes of one std that each
+    measurement draws again (n, q), and such that are the same in all of them (n, r).
+    """
+    drawn, fixed = np.eye(len(difference)) + again @ again.T, kept @ kept.T
+    covariances = (drawn / m + fixed for m in range(1, MOST_REPEATS + 1))
+    return np.sqrt(
+        [float((difference.T @ np.linalg.solve(c, difference))[0, 0]) for c in covariances]
+    )

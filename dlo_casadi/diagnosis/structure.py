@@ -7,7 +7,6 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtri
-from scipy.stats import rankdata
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.screening import sidak, survival
@@ -197,8 +196,14 @@ def _rank_score(a: FloatArray, b: FloatArray) -> float:
     """Spearman's rank correlation as a normal score."""
     if len(a) < 4 or np.ptp(b) == 0:
         return 0.0
-    rho = float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
+    rho = float(np.corrcoef(_ranks(a), _ranks(b))[0, 1])
     return float(np.clip(rho * np.sqrt(len(a) - 1), -LARGEST_SCORE, LARGEST_SCORE))
+
+
+def _ranks(x: FloatArray) -> FloatArray:
+    """Ranks from 1 on, of equal values their mean; importing scipy.stats for it takes 0.3 s."""
+    _, of, counts = np.unique(x, return_inverse=True, return_counts=True)
+    return (np.cumsum(counts) - (counts - 1) / 2)[of]
 
 
 def limiting_spread(fit: Fit) -> float | None:

@@ -12,7 +12,7 @@ from dlo_casadi.effects.effect import BoundaryEffect, Fitted, Params, Scan
 HEADINGS = (-1.2, -0.6, 0.0, 0.6, 1.2)
 
 
-class _PinSpring(BoundaryEffect):
+class PinSpring(BoundaryEffect):
     """A torsional spring between a pin and the cable.
 
         V = k (phi - heading)^2 / 2                                   [J]
@@ -64,14 +64,14 @@ class _PinSpring(BoundaryEffect):
         return params["stiffness"] * (heading - params["heading"]) ** 2 / 2
 
 
-class StartSpring(_PinSpring):
+class StartSpring(PinSpring):
     """A torsional spring at the start pin: V = k (phi(0) - heading)^2 / 2."""
 
     name = "start_spring"
     side = "start"
 
 
-class EndSpring(_PinSpring):
+class EndSpring(PinSpring):
     """A torsional spring at the end pin: V = k (phi(L) - heading)^2 / 2."""
 
     name = "end_spring"

@@ -22,7 +22,8 @@ class Registry(dict[str, type[Effect]]):
     Raises
     ------
     DloError
-        If a class is no effect, has another name, or lacks parameters or the law of its kind.
+        If a class is no effect, has another name, lacks parameters or the law of its kind, or if
+        one of its methods raises an error. `update` and `setdefault` do not check.
     """
 
     def __setitem__(self, name: str, kind: type[Effect]) -> None:
@@ -54,7 +55,13 @@ def _mistakes(name: str, kind: type[Effect]) -> Iterator[str]:
     if base is not ContactEffect and all(getattr(kind, x) is getattr(base, x) for x in laws):
         yield f"it has no law and would do nothing.\n  Try: a method {' or '.join(laws)}"
         return
-    yield from _wrong_values(kind)
+    try:
+        yield from _wrong_values(kind)
+    except Exception as error:
+        yield (
+            f"one of its methods fails, {type(error).__name__}: {error}.\n"
+            "  Try: parameters(self, cable) that declares each name which the laws use"
+        )
 
 
 def _wrong_values(kind: type[Effect]) -> Iterator[str]:

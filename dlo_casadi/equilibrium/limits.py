@@ -44,7 +44,7 @@ class Fixture(NamedTuple):
 
     name: str
     at: float
-    turns: bool
+    takes_moment: bool
 
 
 def fixtures_of(model: CableModel, pose: HeldPose, found: Equilibrium) -> list[Fixture]:
@@ -65,7 +65,7 @@ def places_of(
     """
     if quantity in ("force", "moment"):
         held = fixtures_of(model, pose, found)
-        own = [item for item in held if quantity == "force" or item.turns]
+        own = [item for item in held if quantity == "force" or item.takes_moment]
         return np.array([item.at for item in own]), [item.name for item in own]
     if quantity == "clearance":
         names, deep = _depths(model, found.points[None], found.x[None], given)

@@ -105,12 +105,12 @@ def profile_interval(fit: Fit, name: str = BENDING_STIFFNESS) -> Interval:
 
     The parameter is fixed and everything else refitted; its own prior does not count. The interval
     allows for a systematic error of a declared noise if the parameter is not identifiable with it:
-    then only averages far below the noise tell its value. The default `name` is the bending
+    its value then rests on averages far below the noise. The default `name` is the bending
     stiffness.
     """
     limit, allowing = threshold(fit, name), threshold(fit, name, systematic=True)
     found = _cut(fit, name, limit)
-    # In logarithms a wider interval grows like the roots of the limits; twice that is not reached.
+    # The logarithm of an interval's width grows about as the root of its limit.
     widest = np.log(found.high / found.low) if found.low and found.high else np.inf
     if 2 * np.sqrt(allowing / limit) * widest < np.log(IDENTIFIABLE):
         return found

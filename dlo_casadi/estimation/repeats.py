@@ -70,7 +70,8 @@ def _gaps(
 def _compared(group: Sequence[MeasuredPose], length: float) -> FloatArray:
     """Arc lengths (K,) [m] at which repeats are compared: where each of them was measured.
 
-    Those of the repeat with the fewest points if these are few: lines are straight between points.
+    Those of the repeat with the fewest points if these are few: between points a line is only
+    interpolated.
     """
     low, high = _measured_in_all(group, length)
     least = min((item.places(length) for item in group), key=len)
@@ -150,14 +151,19 @@ def _groups(measured: Sequence[MeasuredPose], model: CableModel) -> list[list[Me
 def _held_alike(measured: Sequence[MeasuredPose], model: CableModel) -> list[list[MeasuredPose]]:
     """Fit poses in groups, each of poses that are held like its first one."""
     groups: list[list[MeasuredPose]] = []
+    before: list[MeasuredPose] = []  # the group of the pose before
     for item in measured:
-        if item.readable and not item.held_out:
-            alike = (group for group in groups if _alike(item.pose, group[0].pose, model))
-            group = next(alike, None)
-            if group is None:
-                groups.append([item])
-            else:
-                group.append(item)
+        if not item.readable or item.held_out:
+            before = []
+            continue
+        pose, known = item.pose, groups
+        if pose.branch == "previous":  # on the branch of the pose before, whatever that is
+            known = [before] if before else []
+            pose = replace(pose, branch=before[0].pose.branch if before else pose.branch)
+        before = next((group for group in known if _alike(pose, group[0].pose, model)), [])
+        if not before:
+            groups.append(before)
+        before.append(item)
     return groups
 
 
@@ -172,9 +178,7 @@ def _alike(pose: HeldPose, other: HeldPose, model: CableModel) -> bool:
 
     def told(one: HeldPose) -> tuple[Any, ...]:
         clips = [(clip.kind, clip.at is None) for clip in one.clips]
-        # A pose after the first one may name the pose before it where the first names nothing.
-        named = None if one.branch == "previous" else one.branch
-        return one.turns, named, one.over, clips
+        return one.turns, one.branch, one.over, clips
 
     if told(pose) != told(other):
         return False

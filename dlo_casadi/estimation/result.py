@@ -50,6 +50,12 @@ class Fit:
         problem = replace(self.problem, noise=noise, priors=priors).weighed(self.point)
         return Fit(problem, problem.evaluate(self.point))
 
+    def weighed_as(self, other: Fit) -> Fit:
+        """The same point with noise, priors and weights of another fit of the same points."""
+        own = other.problem
+        problem = replace(self.problem, noise=own.noise, priors=own.priors, weights=own.weights)
+        return Fit(problem, problem.evaluate(self.point))
+
     @property
     def model(self) -> CableModel:
         """The model that was fitted."""

@@ -257,7 +257,7 @@ def separation_text(proposal: NextPose) -> str:
     """Difference of rivals in a proposed pose, and how often it has to be measured."""
     text = (
         f"they differ there by {millimetres(proposal.difference)} RMS, {proposal.separation:.2g} "
-        "standard deviations of one measured line, with what both fits leave open: "
+        "standard deviations of one measured line, its fixtures and what both fits leave open: "
     )
     if proposal.times is None:
         return text + f"even {MOST_REPEATS} measurements would not tell them apart."

@@ -153,13 +153,13 @@ def straight(model: CableModel) -> CableModel:
 
 
 def fit_declared(
-    config: Config, declared: Declared, measured: Sequence[MeasuredPose], n: int | None = None
+    config: Config, declared: Declared, measured: Sequence[MeasuredPose]
 ) -> tuple[Fit, float]:
     """Fit the declared model on a mesh that is fine enough; return the fit, mesh error in [m].
 
     The mesh is refined first because a coarse mesh looks like a missing effect.
     """
-    finest, first = config.model.n or n, first_mesh(declared.model)
+    finest, first = config.model.n, first_mesh(declared.model)
     model = declared.model.with_mesh(min(finest or first, first))
     if config.estimation.rest_curvature_coefficients is None:
         model = replace(model, n_rest=min(model.n_rest, carried_coefficients(model, measured)))

@@ -86,7 +86,7 @@ class Hypothesis(NamedTuple, Generic[T]):
     meant : T
         What to compare under this hypothesis.
     certain : bool
-        Whether nothing else explains what it does, such as a missing effect.
+        Whether no other cause, such as a missing effect, could explain the same.
     """
 
     said: str

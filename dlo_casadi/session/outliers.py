@@ -19,9 +19,9 @@ from dlo_casadi.sensing.sensors import line_or_markers
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import OUTLYING
 
-# Neighbours with which a point is compared, and the fewest points of a line: twice a point and its
-# neighbours. Seven simulated sessions that lack an effect, with all their points, with 14 to 20 on
-# a line and with 8 to 10, have no outlier.
+# Number of neighbours with which a point is compared; smallest number of points of a line that is
+# judged, twice a point with its neighbours. Seven simulated sessions that lack an effect have no
+# outlier, with all their points and with 14 to 20 on a line.
 NEIGHBOURS, LEAST_POINTS = 6, 14
 # Standard deviation of a normal distribution over its median absolute deviation.
 MAD = 1.4826
@@ -54,12 +54,11 @@ class Outliers:
     lines: int
 
     def __str__(self) -> str:
-        more = len(self.names) - NAMED
+        named, more = ", ".join(self.names[:NAMED]), len(self.names) - NAMED
         return (
             f"{counted(len(self.names), 'point')} up to {1e3 * self.farthest:.2g} mm off the "
-            f"neighbours on the line, from which points differ by {1e3 * self.std:.2g} mm as a "
-            f"rule: {', '.join(self.names[:NAMED])}{f' and {more} more' if more > 0 else ''} "
-            "(points are counted from the start)"
+            f"neighbours on the line (usual: {1e3 * self.std:.2g} mm): {named}"
+            f"{f' and {more} more' if more > 0 else ''} (points are counted from the start)"
         )
 
 
@@ -159,7 +158,7 @@ def _inliers(series: Sequence[FloatArray]) -> tuple[list[BoolArray], float]:
 def _beside(series: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Each point (K, c) minus the median of its neighbours, and their robust std (K, c).
 
-    That is large where a smooth series changes fast. Neighbours are among the points `kept`.
+    The std is large where a smooth series changes fast. Neighbours are among the points `kept`.
     """
     own = np.flatnonzero(kept)
     first = np.searchsorted(own, np.arange(len(series))) - NEIGHBOURS // 2

@@ -82,9 +82,9 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             predicted = max(stage.shapes[name].rmse or 0.0 for name in group)
             measured = max(shape.rmse for shape in group.values())
             lines.append(
-                f"stage {stage.name}: {', '.join(group)}: the predicted equilibrium is not the one "
-                f"that was measured, {_energy(group)}: up to {1e3 * predicted:.3g} mm off, on the "
-                f"measured branch {1e3 * measured:.3g} mm; {_cure(group)}"
+                f"stage {stage.name}: {', '.join(group)}: measured in another equilibrium than "
+                f"predicted, {_energy(group)}: the predicted one is up to {1e3 * predicted:.3g} mm "
+                f"off, the measured one {1e3 * measured:.3g} mm; {_cure(group)}"
             )
             if undecided := [name for name in group if stage.shapes[name].undecided]:
                 told = ", ".join(undecided)
@@ -93,8 +93,8 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
                     f"lower in {told}"
                 )
         lines += [
-            f"stage {stage.name}: {', '.join(group)}: the cable hangs on another side than the "
-            f"predicted one, {_energy(group)}; fit poses are compared where they hang, and a "
+            f"stage {stage.name}: {', '.join(group)}: the cable hangs on another side than "
+            f"predicted, {_energy(group)}; fit poses are compared where they hang, and a "
             f"prediction of the same ends needs `{next(iter(group.values())).chosen_by}`"
             for group in _by_choice(stage.measured_side)
         ]
@@ -110,16 +110,16 @@ def _by_choice(found: Mapping[str, BranchShape]) -> list[dict[str, BranchShape]]
 
 
 def _energy(group: Mapping[str, BranchShape]) -> str:
-    """By how much the energy of measured equilibria is above or below that of the predicted."""
+    """By how much the energy of measured equilibria is higher or lower than of the predicted."""
     most = max((shape.above for shape in group.values()), key=abs)
     which = f"{'up to ' if len(group) > 1 else ''}{abs(most):.2g} J"
-    return f"whose energy is {which} {'lower' if most < 0 else 'higher'}"
+    return f"with an energy {which} {'lower' if most < 0 else 'higher'}"
 
 
 def _cure(group: Mapping[str, BranchShape]) -> str:
     chosen_by = next(iter(group.values())).chosen_by
     if chosen_by is None:
-        return "no entry in a pose would choose it: measure again, or leave it out"
+        return "no value of `branch` or `turns` chooses it: measure the pose again, or leave it out"
     return f"`{chosen_by}` chooses it"
 
 
@@ -262,14 +262,14 @@ def fit_warnings(
 ) -> list[str]:
     """Limits of what a fit can promise.
 
-    `error` [m]: of its mesh. `declared` [m]: noise of the points. `poses`: as they were measured.
+    `error` [m]: of its mesh. `declared` [m]: noise of the points. `poses`: as they were measured,
+    those in which outliers are sought.
     """
     lines = []
     points, floor = fit.noise.of_points, noise_distance(fit.problem.history, fit.noise.std)
     if declared is not None and points.source == "estimated":
-        outliers = outliers_of(fit, poses) if poses else None
         cure = f"Try: std: {points.std:.2g}, or no std"
-        if outliers is not None and outliers.names:
+        if poses and (outliers := outliers_of(fit, poses)).names:
             cure = f"There are {outliers}. Try: estimation: {{robust: true}}"
         lines.append(
             f"the points scatter more about any shape that a cable could take than measurement.std "
@@ -367,8 +367,8 @@ def _beside(fit: Fit, floor: float) -> str:
     if fit.noise.source == "repeats":
         return (
             f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable, in "
-            f"place of measurement.std. With {DIFFERENT} poses or more that differ, or with a "
-            "declared rest_curvature_drift if the cable takes a set, it need not"
+            f"place of measurement.std. It would not with {DIFFERENT} poses or more that differ, "
+            "or with a declared rest_curvature_drift if the cable takes a set"
         )
     return f"noise alone gives {1e3 * floor:.2g} mm, and intervals from this session are too narrow"
 

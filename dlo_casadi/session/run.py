@@ -195,7 +195,9 @@ def judged(outcome: Outcome) -> Outcome:
     fit, stages, verdict = outcome.fit, outcome.stages, outcome.verdict
     doubts = remarks.doubts_of(stages, outcome.poses, fit)
     declared = outcome.config.experiment.measurement.std
-    said = remarks.fit_warnings(fit, outcome.mesh_error, declared, outcome.poses)
+    # With `robust` the outliers have been sought, and are left out.
+    poses = () if outcome.config.estimation.robust else outcome.poses
+    said = remarks.fit_warnings(fit, outcome.mesh_error, declared, poses)
     said += remarks.worse_than_simpler(stages)
     if outcome.hidden_weight is not None:
         said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))

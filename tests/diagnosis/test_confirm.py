@@ -117,3 +117,16 @@ def test_a_fit_that_loses_its_poses_starts_again_from_the_declared_model(base, m
     monkeypatch.setattr(refits, "_followed", first_lost)
     smaller = refit_without(larger, taper_of(base.model), base)
     assert smaller.point.objective == pytest.approx(lost[0].point.objective, rel=1e-6)
+
+
+def test_a_refit_beside_another_effect_has_the_weights_of_its_base(base, monkeypatch):
+    (screened,) = Screen(base, [taper_of(base.model)]).run(np.inf)
+    larger = refit_with(base, screened)
+    beside = larger.reweighed(replace(base.noise, std=3 * NOISE))
+    monkeypatch.setattr(refits, "refit_with", lambda *_: None)  # the base loses its poses
+    assert refits.confirm(base, screened) is None
+    found = refits.confirm(base, screened, beside=beside)
+    assert found.fit.problem.weights is base.problem.weights
+    assert found.gain == pytest.approx(
+        2 * (base.point.objective - larger.point.objective), rel=1e-6
+    )

@@ -5,29 +5,29 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis.next_measurement import _separations, next_reading
+from dlo_casadi.diagnosis.next_measurement import _displaced, _separations, next_reading
+from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.cable_model import Tolerances
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 
 LENGTH, POINTS, STD, GAP = 0.5, 40, 2e-4, 3e-4
+PLACES, REST = np.linspace(0.0, LENGTH, POINTS), np.zeros(8)
 
 
-def separation(noise, ways=()):
-    """Of two straight lines that lie a gap apart, measured at many points."""
-    x = np.linspace(0.0, LENGTH, 11)
-    lines = [NodeCurve(LENGTH, np.column_stack([x, 0 * x + y]), None) for y in (0.0, GAP)]
-    pose = HeldPose((0.0, 0.0), (LENGTH, 0.0))
-    measured = MeasuredPose.of_points(pose, np.zeros((POINTS, 2)))
-    fit = SimpleNamespace(
-        problem=SimpleNamespace(measured=(measured,), used=(0,)),
-        point=SimpleNamespace(projections=(np.linspace(0.0, LENGTH, POINTS),)),
-        noise=noise,
-    )
-    return _separations(fit, np.array([LENGTH, 0.1]), (lines[0], lines[1]), ways)
+def separation(noise, again=(), kept=()):
+    """Of two lines a gap apart in y; `again`, `kept`: common shifts of one std [m] in y."""
+    measured = MeasuredPose.of_points(HeldPose((0.0, 0.0), (LENGTH, 0.0)), np.zeros((POINTS, 2)))
+    curve = NodeCurve(LENGTH, np.column_stack([PLACES, 0 * PLACES]), None)
+    moved = np.zeros((POINTS, 2, 1 + len(again) + len(kept)))
+    moved[:, 1] = [GAP, *again, *kept]
+    seen = measured.whitening(noise, PLACES) @ measured.components(curve, PLACES, moved)
+    return _separations(*np.split(seen, [1, 1 + len(again)], axis=1))
 
 
 def test_a_line_averages_the_noise_of_its_points():
@@ -35,12 +35,35 @@ def test_a_line_averages_the_noise_of_its_points():
     assert separation(NoiseModel(STD))[0] == pytest.approx(GAP / STD * np.sqrt(POINTS))
 
 
-def test_what_the_fits_leave_open_separates_nothing():
-    """A common shift of one std, 3 mm, in m lines: d / sqrt(std^2 / (K m) + shift^2)."""
-    shift = 3e-3
-    open_ways = [lambda s: np.full((len(s), 2, 1), [[0.0], [shift]])]
-    expected = GAP / np.hypot(STD / np.sqrt(POINTS * np.arange(1, 21)), shift)
-    assert separation(NoiseModel(STD), open_ways) == pytest.approx(expected)
+def test_repeats_average_what_each_draws_again_not_what_the_fits_leave_open():
+    """Shifts of one std, a in each of m lines and b in all: d / sqrt((s^2/K + a^2)/m + b^2)."""
+    again, kept = 1e-4, 3e-3
+    drawn = np.hypot(STD / np.sqrt(POINTS), again) / np.sqrt(np.arange(1, 21))
+    found = separation(NoiseModel(STD), [again], [kept])
+    assert found == pytest.approx(GAP / np.hypot(drawn, kept))
+    assert separation(NoiseModel(STD), [again]) == pytest.approx(GAP / drawn)
+
+
+def test_only_parameters_are_the_same_in_all_repeats():
+    model, s = CableModel(CableData(LENGTH, 0.05, 0.008, 0.05), 8), np.linspace(0.01, 0.49, POINTS)
+    rng = np.random.default_rng(3)
+    poses = [HeldPose((0.0, 0.0), (x, y)) for x, y in ((0.4, 0.0), (0.3, 0.1), (0.35, -0.1))]
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=STD, size=(POINTS, 2)))
+        for pose, shape in zip(
+            poses, predict_poses(model, np.array([0.05]), REST, poses), strict=True
+        )
+    ]
+    fit = fit_model(model, measured, Tolerances(end=1e-3), STD)
+    (found,) = predict_poses(fit.model, fit.p, fit.rest, poses[:1])
+    kept, again = _displaced(fit, poses[0], found, np.array([0.0, LENGTH]))
+    assert kept.shape == (2, 2, len(fit.named_covariance[0]))
+    assert kept[1] == pytest.approx(0.0, abs=1e-9)  # no parameter moves the end
+    # The end's x and y, the rest curvature of each repeat, which is none here, and repeats as such.
+    assert again.shape == (2, 2, 2 + len(REST) + 2)
+    assert again[..., 2:] == pytest.approx(0.0, abs=1e-9)
+    ends = np.linalg.norm(again[1, :, :2], axis=0)
+    assert ends == pytest.approx(fit.problem.deviation_std, rel=1e-3)
 
 
 def test_noise_that_is_one_for_the_whole_line_does_not_average():

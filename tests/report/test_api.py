@@ -291,6 +291,7 @@ LINE = [[0.0, 0.0], [0.1, -0.1], [0.2, 0.0]]
     [
         ("pose_01.csv", "found 'pose_01.csv'. Try: file, for the name of a file"),
         (np.ma.masked_less(LINE, 0.0), "[0.1, nan] in place 2 is not finite; leave out the points"),
+        ([[0, 0], [1, None], [2, 0]], "[1.0, nan] in place 2 is not finite"),
     ],
 )
 def test_points_that_are_none_say_what_to_try(points, said):

@@ -113,10 +113,11 @@ def test_the_warning_of_a_contradicted_noise_names_outliers(tmp_path):
 def test_the_residual_of_a_missing_effect_has_no_outliers():
     """A hidden pull moves lines of 40 and of 15 points by many times their noise."""
     config, inputs = read_session(load_config(BENCH / "unknown_pull" / "session.yaml"))
+    config = config.changed(model={"n": 12})
     declared = declared_model(config)
     for every in (6, 16):
         poses = tuple(replace(item, points=item.points[::every], means=None) for item in inputs)
-        fit, _ = fit_declared(config, declared, measured_poses(config, poses), 12)
+        fit, _ = fit_declared(config, declared, measured_poses(config, poses))
         found = outliers_of(fit, poses)
         assert not explains(fit)
         assert found.lines == len(fit.problem.fitted)

@@ -1,5 +1,6 @@
 """Cables in a gripper with a free tip: of two ways to fall, which one, and what is said of it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -120,7 +121,11 @@ def judged(measured):
 def test_a_fit_pose_on_the_other_side_is_compared_there_and_named():
     stage, (said,) = judged(turned_over())
     assert {name: side.branch for name, side in stage.measured_side.items()} == {"-0.30": "ccw"}
-    assert said.startswith("stage batch: -0.30: the cable hangs on another side")
+    # Simulated as the cable turned over on the side where it is higher.
+    assert re.search(
+        r"^stage batch: -0.30: .* another side than predicted, with an energy [\d.e-]+ J higher;",
+        said,
+    )
     assert said.endswith("needs `branch: ccw`")
     assert stage.rmse_fit == stage.rmse_fit_measured_branch < 2 * STD
 

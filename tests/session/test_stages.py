@@ -65,15 +65,15 @@ def test_a_pose_measured_on_another_branch_is_named_with_its_error_there():
     assert stage.rmse_fit_measured_branch == pytest.approx(NOISE, rel=0.25)
     assert stage.rmse_held_out_measured_branch == pytest.approx(NOISE, rel=0.35)
     (said,) = branch_warnings([replace(stage, name="batch")])
-    assert said.startswith("stage batch: 0, 2: the predicted equilibrium is not")
-    assert re.search(r"whose energy is up to [\d.]+ J higher: .*`branch: cw` chooses it", said)
+    assert said.startswith("stage batch: 0, 2: measured in another equilibrium than predicted")
+    assert re.search(r"with an energy up to [\d.]+ J higher: .*`branch: cw` chooses it", said)
     lower = {
         name: replace(shape, measured_branch=replace(shape.measured_branch, above=-0.01))
         for name, shape in stage.shapes.items()
         if name == "0"
     }
     (said,) = branch_warnings([replace(stage, name="batch", shapes=lower)])
-    assert "whose energy is 0.01 J lower: " in said
+    assert "with an energy 0.01 J lower: " in said
     later = replace(stage, name="closed", shapes={})
     assert branch_warnings([replace(stage, name="batch"), later]) == []
     assert branch_warnings([stage]) == []  # of a first guess nobody expects the branch
