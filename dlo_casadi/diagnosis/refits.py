@@ -159,7 +159,7 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
         near, _ = from_data(base)
         fit = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start)).fit()
         if fit is not None:
-            fit = fit.weighed_as(base)
+            fit = fit.reweighed(base.noise, base.problem.priors)
             fits.append(_followed(fit, candidate.add_to(base.model), {}, MOST_STEPS))
     best = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     if best is None:
@@ -218,7 +218,7 @@ def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
     with suppress(EstimationError):
         fit = start.fit()
         if fit is not None and misfits(fit):
-            fit = descend(fit.weighed_as(base))
+            fit = descend(fit.reweighed(base.noise, base.problem.priors))
         if fit is not None and not misfits(fit):
             fit = _at_noise(fit, start.problem.noise)
         return Confirmed.of(start.screened, base, fit, start.beside)
@@ -309,7 +309,7 @@ def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
     item, screened = confirm_from_data(base, start), start.screened
     if item is None:
         return None
-    same = item.fit.weighed_as(base)
+    same = item.fit.reweighed(base.noise, base.problem.priors)
     fit = _followed(same, same.model, {}, MOST_STEPS) or same
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
     values = {name: item.fit.value(name) for name in screened.candidate.frees}
