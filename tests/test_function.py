@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import dlo_casadi as dlo
 from dlo_casadi.effects import (
     AxialStretch,
     BendingSoftening,
@@ -220,3 +221,38 @@ def test_what_is_unknown_is_refused(options, words):
 def test_a_pose_of_another_size_is_refused():
     with pytest.raises(DloError, match="pose: 6 numbers as in dlo_pose of the C header, found 15"):
         CasadiCable(*cable(False, plain=True)).initial(SPACE)
+
+
+@pytest.mark.parametrize("position", [0.3, 0.4, 0.405, 0.7])
+@pytest.mark.parametrize("name", ["lumped_mass", "tether"])
+@pytest.mark.parametrize("gravity", [(0, -9.81), (0, 0, -9.81)])
+def test_the_derivative_by_a_place_on_the_edge_of_an_element_is_exact(gravity, name, position):
+    """Of 40 elements of 20 mm all but 0.405 m are edges."""
+    d = len(gravity)
+    rope = dlo.Cable(
+        length=0.8,
+        mass=0.05,
+        diameter=0.005,
+        bending_stiffness=0.01,
+        torsional_stiffness=0.006 if d == 3 else None,
+    )
+    anchor = {f"anchor_{axis}": 0.2 for axis in "xyz"[:d]}
+    values = {"mass": 0.02} if name == "lumped_mass" else {"stiffness": 1.0} | anchor
+    effect = {"name": name, "parameters": values | {"position": position}}
+    held = {"gravity": gravity, "boundary": ("clamped", "clamped")}
+    cable = dlo.known_cable(rope, **held, model={"n": 40, "effects": [effect]})
+    F = cable.function(parameters=[f"{name}.position"])
+    plane, space = (
+        [0, 0, 0.5, 0.1, 0.3, -0.2],
+        [0, 0, 0, 0.5, 0.1, 0.1, 0, 0, 0, 1, 0, 0.1, 0.2, 0.97, 0],
+    )
+    pose, theta = np.array(plane if d == 2 else space, float), ca.MX.sym("theta")
+    slope = ca.Function("slope", [theta], [ca.jacobian(F(pose, theta)[1], theta)])
+
+    def force(at):
+        return np.array(F(pose, at)[1]).ravel()
+
+    step = 1e-5
+    expected = (force(position + step) - force(position - step)) / (2 * step)
+    # The force is smooth; its second derivative jumps at the edge, by a share of the step.
+    assert np.array(slope(position)).ravel() == pytest.approx(expected, rel=2e-3, abs=1e-4)

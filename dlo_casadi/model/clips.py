@@ -22,6 +22,9 @@ from dlo_casadi.rod.node import Heading, Node, quaternion_product
 # A swivel is a clamp in space in which the cable may roll about its axis.
 ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
 CLAMPS = ("clamped", "swivel")
+# Distance before the edge of a segment, as a share of its length, from which on a place counts as
+# beyond it. Rounding is smaller, so that just one segment has the derivatives by the place.
+BESIDE = 1e-9
 # Axes along which outputs of segment functions are derivatives by nodes and border.
 _BORDER_AXES = {
     "segment": ((), (2,), (2, 3)),
@@ -312,7 +315,7 @@ class Unheld:
         dimension = len(rows[-1])
         ends = rows if rows[0] else [[-1] * dimension, *rows[1:]]
         # A clip at a node counts in one segment only: derivatives by its arc length are one-sided.
-        inside = np.maximum((share >= 0).sum(axis=1)[:, nodes] - 1, 0)
+        inside = np.maximum((share >= -BESIDE).sum(axis=1)[:, nodes] - 1, 0)
         return cls((share > 0.5).astype(float), inside, np.array(ends))
 
     def evaluated(

@@ -30,7 +30,7 @@ from dlo_casadi.model.cable_model import (
     VIEWPOINT_SIZE,
     CableModel,
 )
-from dlo_casadi.model.clips import clip_size
+from dlo_casadi.model.clips import BESIDE, clip_size
 from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentInFrame
@@ -282,7 +282,12 @@ class Lagrangian:
         positions = [x.position for x in self.dead_forces] + [x.position for x in self.springs]
         if len(self.pulls) > self.model.n_springs:
             positions += ca.vertsplit(self.place[LAYOUT_SIZE:])
-        found = [ca.fmin(ca.fmax((s - start) / self.length, 0), 1) for s in positions]
+        last = start + self.length > self.model.cable.length - BESIDE * self.length
+        found = []
+        for s in positions:
+            share = (s - start) / self.length
+            inside = ca.logic_and(share >= -BESIDE, ca.logic_or(share < 1 - BESIDE, last))
+            found.append(ca.if_else(inside, share, share > 0.5))
         return ca.Function("shares", [self.p, self.place], [ca.vertcat(ca.SX.zeros(0), *found)])
 
     @property
