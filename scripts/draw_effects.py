@@ -40,7 +40,7 @@ class Shown:
     space: Mapping[str, float] = field(default_factory=dict)
     clamped: bool = False
     history: bool = False  # the third pose is the first one again
-    clipped: bool = False  # a pinned clip holds the middle
+    clip: ClipKind | None = None  # what holds the middle
     touching: bool = False  # the cable lies on a table
     level: bool = False  # all ends are at one height
 
@@ -82,9 +82,10 @@ SHOWN = {
     "clamp_compliance": Shown({"start": 6, "end": 0}, {"start": 6, "end": 0}, clamped=True),
     "end_offset": Shown({"dx": 0.06, "dy": -0.04}, {"dx": 0.06, "dy": 0.06, "dz": -0.04}),
     "clip_offset": Shown(
-        {"dx": 0.04, "dy": 0.03}, {"dx": 0.04, "dy": 0.04, "dz": 0.03}, clipped=True
+        {"dx": 0.04, "dy": 0.03}, {"dx": 0.04, "dy": 0.04, "dz": 0.03}, clip="pinned"
     ),
-    "clip_slip": Shown({"ds": 0.04}, {"ds": 0.04}, clipped=True),
+    "clip_slip": Shown({"ds": 0.04}, {"ds": 0.04}, clip="pinned"),
+    "clip_angle": Shown({"heading_error": 0.4}, {"y": 0.4, "z": 0.4}, clip="clamped"),
     "obstacle_offset": Shown({}, {"offset": 0.06}, touching=True),
     "contact_plane": Shown({}, {"height": -0.17}, level=True),
     "rest_curvature_drift": Shown({"rate": 0.6}, {"rate": 0.6}, history=True),
@@ -119,10 +120,13 @@ def poses_in_space() -> list[HeldPose]:
     ]
 
 
-def middle_clip(pose: HeldPose) -> HeldClip:
-    """A clip that holds the middle of the cable somewhat below the middle of its ends."""
-    place = (np.array(pose.start) + np.array(pose.end)) / 2
-    return HeldClip("pinned", (*place[:-1], place[-1] - 0.1), LENGTH / 2)
+def middle_clip(pose: HeldPose, kind: ClipKind) -> HeldClip:
+    """A clip that holds the middle of the cable below the middle of its ends, along the chord."""
+    start, end = np.array(pose.start), np.array(pose.end)
+    place = (start + end) / 2
+    turn = Rotation.align_vectors([np.append(end - start, 0.0)[:3]], [[1.0, 0.0, 0.0]])[0]
+    along = {"heading": turn.as_rotvec()[2]} if len(end) == 2 else {"orientation": turn.as_quat()}
+    return HeldClip(kind, (*place[:-1], place[-1] - 0.1), LENGTH / 2, **along)
 
 
 def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) -> list[FloatArray]:
@@ -130,7 +134,7 @@ def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) 
     cable = IN_SPACE if spatial else IN_PLANE
     held = "clamped" if spatial or shown.clamped else "pinned"
     gravity = (0.0, 0.0, -9.81) if spatial else (0.0, -9.81)
-    kinds: tuple[ClipKind, ...] = ("pinned",) if shown.clipped else ()
+    kinds: tuple[ClipKind, ...] = () if shown.clip is None else (shown.clip,)
     setup = Setup(cable, held, held, gravity, center=(0.4, -0.1), camera=True, clips=kinds)
     effects = (dlo.EFFECTS[name].made_for(setup),) if values else ()
     up = tuple(-g / 9.81 for g in gravity)
@@ -144,8 +148,8 @@ def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) 
     poses = poses_in_space() if spatial else poses_in_plane(shown.clamped)
     if shown.touching or shown.level:
         poses = [replace(pose, end=(*pose.end[:-1], 0.0)) for pose in poses]
-    if shown.clipped:
-        poses = [replace(pose, clips=(middle_clip(pose),)) for pose in poses]
+    if shown.clip is not None:
+        poses = [replace(pose, clips=(middle_clip(pose, shown.clip),)) for pose in poses]
     if shown.history:
         poses = [poses[0], replace(poses[1], end=TIGHT[: len(cable.axes)]), poses[0]]
     found = predict_poses(model, p, np.zeros(model.chain.n_rests), poses)

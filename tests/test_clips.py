@@ -10,17 +10,19 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import CableData, ClipOffset, ClipSlip
+from dlo_casadi.effects import CableData, ClipAngle, ClipOffset, ClipSlip
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import first_guesses
+from dlo_casadi.equilibrium.spread import tolerances_of
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip, clamped_nodes
 from dlo_casadi.model.whole_pose import potential
+from dlo_casadi.rod.node import Frame
 
 LENGTH, EI = 1.0, 0.02  # m, N m^2
 CABLE = CableData(LENGTH, mass=0.2, diameter=0.01, bending_stiffness=EI)
@@ -257,6 +259,51 @@ def test_effects_of_clips_and_their_derivatives(kind):
             (seen,) = equilibria.seen(there.shapes, p + h * np.eye(6)[k], rest)
             ends.append(seen.curve.numbers)
         assert change.curve[..., k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["plane", "clamped", "swivel"])
+def test_a_turned_saddle_and_its_derivatives(kind):
+    """It is a saddle declared so; the first derivatives are those of the turned equilibria."""
+    if kind == "plane":
+        clip, errors = HeldClip("clamped", (0.31, 0.05), 0.37, heading=0.3), np.array([0.05])
+        held = {"cable": CABLE, "n": 20}
+        pose = HeldPose((0.0, 0.0), (0.75, 0.1), clips=(clip,))
+        moved = replace(clip, heading=0.35)
+    else:
+        clip, errors = replace(IN_SPACE[0], kind=kind), np.array([0.04, -0.03])
+        held = {"cable": LOOM, "n": 16, "gravity": (0.0, 0.0, -9.81), "start": "clamped"}
+        pose = HeldPose(
+            (0.0, 0.0, 0.0), (0.7, 0.2, 0.1), clips=(clip,), start_orientation=turned(0, 0.2, 0.1)
+        )
+        own = Frame.moved(np.array(clip.orientation), np.array([0.0, *errors]))
+        moved = replace(clip, orientation=tuple(own))
+    model = CableModel(n_rest=0, clips=(clip.kind,), effects=(ClipAngle(),), **held)
+    size, rest = len(model.names), np.zeros(model.chain.n_rests)
+    first = size - len(errors)
+    p = model.nominal + np.array([*np.zeros(first), *errors])
+    eq = solve_equilibrium(model, p, rest, pose)
+    declared, there = replace(model, effects=()), replace(pose, clips=(moved,))
+    same = solve_equilibrium(declared, declared.nominal, rest, there)
+    assert eq.energy == pytest.approx(same.energy, rel=1e-9)
+    assert eq.clips[0].moment == pytest.approx(same.clips[0].moment, rel=1e-6, abs=1e-9)
+    equilibria, step = BatchEquilibrium(model, [pose]), 1e-6
+    along = equilibria.directions(eq.shapes, p, rest, np.eye(size), np.zeros((len(rest), size)))
+    ((_, change),) = equilibria.observe(eq.shapes, p, rest, along)
+    for k in range(first, size):
+        ends, lam = [], []
+        for h in (step, -step):
+            near = solve_equilibrium(model, p + h * np.eye(size)[k], rest, pose, x_init=eq.x)
+            (seen,) = equilibria.seen(near.shapes, p + h * np.eye(size)[k], rest)
+            ends.append(seen.curve.numbers)
+            lam.append(near.multipliers)
+        assert change.curve[..., k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
+        assert along.lam[0, :, k] == pytest.approx((lam[0] - lam[1]) / (2 * step), abs=1e-4)
+
+
+def test_the_tolerance_of_directions_is_of_saddles_too():
+    """Also between pins, where nothing else has a direction."""
+    model = CableModel(CABLE, n_rest=0, clips=("clamped", "pinned"), effects=(ClipAngle(),))
+    assert tolerances_of(model)["heading"] == ("clip_angle.heading_error",)
 
 
 def test_an_offset_brings_a_clip_within_reach():

@@ -59,7 +59,8 @@ UNITS = {"", "kg", "m", "N", "N/m", "1/N", "1/m", "1/m^2", "rad", "N m/rad", "ra
 EVERY = pytest.mark.parametrize("name", sorted(EFFECTS))
 ALL = pytest.mark.parametrize("element", ["quadratic", "arc", "link"])
 WHERE = (*(("plane", e) for e in ELEMENTS), *(("space", e) for e in ELEMENTS_IN_SPACE))
-CLIPPED, TOUCHING = {"clip_offset", "clip_slip"}, {"obstacle_offset", "contact_plane"}
+CLIPPED = {"clip_offset", "clip_slip", "clip_angle"}
+TOUCHING = {"obstacle_offset", "contact_plane"}
 OPTIONS = {"contact_plane": {"level": 0.3}}
 TABLES = {"plane": Plane((0.0, 0.3), (0.0, 1.0)), "space": Plane((0.0, 0.0, 0.3), (0.0, 0.0, 1.0))}
 CLIPS = {
@@ -86,7 +87,7 @@ def plain(name: str, where: str, element: str) -> CableModel:
     """Model without the effect, with the boundaries that it needs."""
     held = "pinned" if where == "plane" and not name.startswith("clamp_") else "clamped"
     cable = CABLE if where == "plane" else IN_SPACE
-    clips = ("pinned",) if name in CLIPPED else ()
+    clips = ("clamped" if name == "clip_angle" else "pinned",) if name in CLIPPED else ()
     obstacles = (TABLES[where],) if name in TOUCHING else ()
     between = {"clips": clips, "obstacles": obstacles}
     return CableModel(cable, 5, element, held, held, GRAVITY[where], **between)
@@ -127,7 +128,9 @@ def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[S
     given = Inputs.of(p, scale * any_rest(a)[0], pose[None])
     # Springs rest at the origin: their unknowns are those of no other model.
     lam = scale * shapes.lam * (np.arange(a.k) < model.n_conditions)
-    return Shapes.declared(shapes.x, lam, len(model.clips)), given
+    shapes = Shapes.declared(shapes.x, lam, len(model.clips))
+    # The node at a saddle is in its frame, as in all shapes.
+    return replace(shapes, x=a.clipped(shapes, given).held(shapes.x)), given
 
 
 def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[str, np.ndarray]:

@@ -69,6 +69,7 @@ PLANAR = {
     "end_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
     "clip_offset": {"dx": 0.01, "dy": -0.02, "dz": 0.0},
     "clip_slip": {"ds": 0.01},
+    "clip_angle": {"heading_error": 0.05, "y": 0.0, "z": 2 * np.tan(0.025)},
     "obstacle_offset": {"offset": 0.01},
     "contact_plane": {"height": -0.12},
     "rest_curvature_drift": {"rate": 0.3},
@@ -105,7 +106,8 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
     for cable, g in ((FLAT, gravity), (CABLE, (*gravity, 0.0))):
         effect = EFFECTS[name].made_for(Setup(cable, "clamped", "clamped", g))
         table = Plane((0.0, -0.12, 0.0)[: len(g)], (0.0, 1.0, 0.0)[: len(g)])
-        between = {"clips": ("pinned",), "obstacles": (table,) * (name == "obstacle_offset")}
+        kind = "clamped" if name == "clip_angle" else "pinned"
+        between = {"clips": (kind,), "obstacles": (table,) * (name == "obstacle_offset")}
         model = CableModel(cable, 10, "arc", "clamped", "clamped", g, (effect,), **between)
         p = model.nominal.copy()
         for q in effect.parameters(cable):
@@ -113,7 +115,11 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
         models.append(model)
         ps.append(p)
         rests.append(np.repeat([rest] if len(g) == 2 else [0.0, 0.0, rest], model.chain.n_cells))
-    clips = [HeldClip("pinned", place, 0.22) for place in ((0.2, 0.0), (0.2, 0.0, 0.0))]
+    along = 0.1, tuple(Rotation.from_rotvec([0, 0, 0.1]).as_quat())
+    clips = [
+        HeldClip(kind, (0.2, 0.0), 0.22, heading=along[0]),
+        HeldClip(kind, (0.2, 0.0, 0.0), 0.22, orientation=along[1]),
+    ]
     pose = HeldPose((0.0, 0.0), (0.5, -0.1), *headings, clips=(clips[0],))
     first, last = (tuple(Rotation.from_rotvec([0, 0, a]).as_quat()) for a in headings)
     same = HeldPose(

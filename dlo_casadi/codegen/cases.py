@@ -98,16 +98,18 @@ class Case:
     @property
     def holding(self) -> list[float]:
         """Declared length [m]; per clip the true minus the declared values; and each tether."""
-        length = self.model.cable.length
-        places, at = (
+        node, length = self.model.node, self.model.cable.length
+        own = np.array(node.identity)
+        places, at, turns = (
             np.array(x)
             for x in functions_of(self.model).true_clips(self.p, np.zeros(self.model.n_pose))
         )
-        clips: list[FloatArray] = [
-            np.array([s / length, *place, 0.0])
-            for s, place in zip(at.ravel(), places.T, strict=True)
+        clips = [
+            [s / length, *place, 0.0, *node.moved(own, turn)]
+            for s, place, turn in zip(at.ravel(), places.T, turns.T, strict=True)
         ]
-        return [length, *(float(x) for row in (*clips, *self.tethers) for x in row)]
+        tethers = [[*tether, *own] for tether in self.tethers]
+        return [length, *(float(x) for row in (*clips, *tethers) for x in row)]
 
     @property
     def example_clips(self) -> str:

@@ -6,7 +6,7 @@ from dlo_casadi.effects.bending_softening import BendingSoftening
 from dlo_casadi.effects.cable import CableData, Setup
 from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle, ClampCompliance, ClampRotation
-from dlo_casadi.effects.clips import ClipOffset, ClipSlip
+from dlo_casadi.effects.clips import ClipAngle, ClipOffset, ClipSlip
 from dlo_casadi.effects.contact import ContactPlane, ObstacleOffset
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
@@ -62,6 +62,7 @@ EFFECTS = Registry(
         EndOffset,
         ClipOffset,
         ClipSlip,
+        ClipAngle,
         ObstacleOffset,
         ContactPlane,
         RestCurvatureDrift,

@@ -1,4 +1,4 @@
-"""Clips that are not quite where, or do not hold the cable quite where, they are declared."""
+"""Clips that do not hold the cable quite where, or quite as, they are declared."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
@@ -7,6 +7,7 @@ import casadi as ca
 
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Params, vector
+from dlo_casadi.rod.ends import ClipConditions
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,14 @@ class _OfOneClip(BoundaryEffect):
         """One for each clip that may have it."""
         return tuple(cls(clip=k) for k in cls.numbers(setup))
 
-    def moved(self, place: ca.SX, at: ca.SX, params: Params) -> tuple[ca.SX, ca.SX]:
-        """Place (dimension,) and arc length of its clip, from the declared ones."""
+    def moved(self, clip: ClipConditions, params: Params) -> ClipConditions:
+        """Its clip, from the declared one."""
         raise NotImplementedError
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Move its clip."""
         clips = [
-            self.moved(*clip, params) if k == self.clip else clip
+            self.moved(clip, params) if k == self.clip else clip
             for k, clip in enumerate(ends.clips)
         ]
         return replace(ends, clips=tuple(clips))
@@ -72,9 +73,9 @@ class ClipOffset(_OfOneClip):
         names = (f"d{axis}" for axis in cable.axes)
         return Parameter.symmetric(names, "m", 0.002 * cable.length, 0.1 * cable.length)
 
-    def moved(self, place: ca.SX, at: ca.SX, params: Params) -> tuple[ca.SX, ca.SX]:
+    def moved(self, clip: ClipConditions, params: Params) -> ClipConditions:
         """Move its place."""
-        return place + vector(params, "d"), at
+        return clip._replace(place=clip.place + vector(params, "d"))
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,41 @@ class ClipSlip(_OfOneClip):
         """Declare the slip."""
         return Parameter.symmetric(["ds"], "m", 0.005 * cable.length, 0.1 * cable.length)
 
-    def moved(self, place: ca.SX, at: ca.SX, params: Params) -> tuple[ca.SX, ca.SX]:
+    def moved(self, clip: ClipConditions, params: Params) -> ClipConditions:
         """Move it along the cable."""
-        return place, at + params["ds"]
+        return clip._replace(at=clip.at + params["ds"])
+
+
+@dataclass(frozen=True)
+class ClipAngle(_OfOneClip):
+    """True minus declared direction of one clamped clip, the same in all poses.
+
+    In a plane heading' = heading + heading_error. In space R' = R exp(0, y, z), to second order,
+    about the clip's own axes across the cable.
+
+    Parameters
+    ----------
+    heading_error : scalar [rad]
+        Counter-clockwise; in a plane alone. Vanishes at 0.
+    y, z : scalar [rad]
+        In space alone. Vanish at 0.
+    """
+
+    name = "clip_angle"
+    tolerances: ClassVar = {"heading_error": "heading", "y": "rotation", "z": "rotation"}
+
+    @classmethod
+    def numbers(cls, setup: Setup) -> list[int]:
+        """The clamped ones, also those in which the cable may roll."""
+        return [k for k, kind in enumerate(setup.clips) if kind in ("clamped", "swivel")]
+
+    def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
+        """Declare the errors."""
+        names = ("heading_error",) if len(cable.axes) == 2 else ("y", "z")
+        return Parameter.symmetric(names, "rad", 0.05, 0.9)
+
+    def moved(self, clip: ClipConditions, params: Params) -> ClipConditions:
+        """Turn its frame."""
+        if "heading_error" in params:
+            return clip._replace(turn=clip.turn + params["heading_error"])
+        return clip._replace(turn=clip.turn + ca.vertcat(0, params["y"], params["z"]))

@@ -88,10 +88,11 @@ def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
     """All holders of the cable, from start to end; arc lengths relative to the declared length."""
     (start, end), clamps, _ = true_ends(model, p, pose)
     found = [_Holder(0.0, start, clamps[0])]
-    places, at = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
+    places, at, turns = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
     for k, clip in enumerate(pose.clips):
         s = None if clip.kind == "eyelet" else float(at[k, 0])
-        found.append(_Holder(s, places[:, k], clip.frame, clip.kind == "swivel"))
+        frame = None if clip.frame is None else model.node.moved(clip.frame, turns[:, k])
+        found.append(_Holder(s, places[:, k], frame, clip.kind == "swivel"))
     found.append(_Holder(model.cable.length, None if model.end == "free" else end, clamps[1]))
     return found
 

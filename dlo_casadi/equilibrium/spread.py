@@ -132,13 +132,15 @@ def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
     places = {"end": "end"} | {f"clip_{k}": "clip" for k in range(len(model.clips))}
     turned = model.node.tolerance
     named = [(places.get(cause_of(model, name), turned), name) for name in model.deviations]
-    of_ends = {tolerance for tolerance, _ in named}
+    # Directions of clips have no deviations.
+    covered = {(tolerance, tolerance == "clip") for tolerance, _ in named}
     for effect in model.effects:
         if not isinstance(effect, MeasurementEffect):
             named += [
                 (tolerance, f"{effect.label}.{name}")
                 for name, tolerance in effect.tolerances.items()
-                if tolerance not in of_ends and f"{effect.label}.{name}" in model.names
+                if (tolerance, effect.index == "clip") not in covered
+                and f"{effect.label}.{name}" in model.names
             ]
     named += [("roll", END_ROLL)] * (END_ROLL in model.names)
     return {key: tuple(x for name, x in named if name == key) for key, _ in named}

@@ -28,8 +28,8 @@ from dlo_casadi.model.stacked import Tangents as Tangents
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
 
-# Step of finite differences by slips of clips, relative to the length.
-_SLIP = 1e-6
+# Step of finite differences by slips of clips, relative to the length, and by their turns [rad].
+_STEP = 1e-6
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
 
@@ -104,15 +104,15 @@ class Assembly:
 
     def clipped(self, shapes: Shapes, given: Inputs) -> Clipped:
         """Where the clips are on the cable."""
-        kinds = self.model.clips
-        if not kinds:
+        if not (kinds := self.model.clips):
             return Clipped(self.chain, np.zeros((len(shapes.x), 0)), (), self.chain.places)
         declared = given.poses[:, given.poses.shape[1] - self.model.clip_numbers :]
         declared = declared.reshape((len(declared), len(kinds), clip_size(self.node)))
-        at = declared[..., -1] + given.p @ functions_of(self.model).slips.T
+        slips, turns = functions_of(self.model).clip_slopes
+        at = declared[..., -1] + given.p @ slips.T
         for k, row in self.model.sliding.items():
             at[:, k] = shapes.lam[:, row]
-        return Clipped.of(self.chain, kinds, declared, at, shapes.x)
+        return Clipped.of(self.chain, kinds, declared, at, given.p @ turns, shapes.x)
 
     def touching(self, shapes: Shapes, given: Inputs) -> Touching | None:
         """Which nodes touch obstacles; None without obstacles."""
@@ -243,12 +243,13 @@ class Assembly:
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         return BalanceSlopes(self, shapes, given, segments, ends)
 
-    def slipped(
+    def moved_clips(
         self, given: Inputs, along: Tangents
     ) -> Iterator[tuple[FloatArray, tuple[Inputs, Inputs]]]:
-        """Central differences by slips of clips: the rate (m, q) of each, and both inputs."""
-        step = _SLIP * self.chain.length
-        for k in np.flatnonzero(functions_of(self.model).slips.any(axis=0)):
+        """Central differences by slips and turns of clips: rates (m, q), and both inputs."""
+        slips, turns = functions_of(self.model).clip_slopes
+        for k in np.flatnonzero(slips.any(axis=0) | turns.any(axis=(0, 2))):
+            step = _STEP * (self.chain.length if slips[:, k].any() else 1.0)
             unit = step * np.eye(given.p.shape[1])[k]
             both = (replace(given, p=given.p + unit), replace(given, p=given.p - unit))
             if along.p[:, k].any():
@@ -297,7 +298,8 @@ class Assembly:
     ) -> list[FloatArray]:
         m, count = len(shapes.x), self.chain.n + 1
         places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
-        x = shapes.x[:, self.chain.layout.stations].reshape((m, count, -1))
+        nodes = self.clipped(shapes, given).held(shapes.x)
+        x = nodes[:, self.chain.layout.stations].reshape((m, count, -1))
         p, ends = repeated(given.p, count), repeated(given.poses, count)
         return self._mapped(name)(places, rates, x, p, ends)
 
@@ -307,8 +309,8 @@ class Assembly:
         rows, by_station, by_p = self._call_stations(
             "station_slopes", advance[..., 0], shapes, given
         )
-        even = self.clipped(shapes, given).evenly(rows)[..., 0]
-        return CurveSlopes(self, shapes, given, even, by_moving, by_others, by_station, by_p)
+        z = self.clipped(shapes, given).evenly(rows)[..., 0]
+        return CurveSlopes(self, shapes, given, z, by_moving, by_others, by_station, by_p)
 
     def reactions(self, shapes: Shapes, given: Inputs, name: str = "reactions") -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `reaction_rows`."""
@@ -406,10 +408,10 @@ class BalanceSlopes:
         total = a._added(changed, self.ends @ np.concatenate([d.p, d.deviation], axis=1))
         if touching := a.touching(shapes, given):
             total = touching.along(total, changed[:, :, a._pull], a._outwards @ d.p)
-        for slip, (more, less) in a.slipped(given, d):
-            change = a.imbalance(shapes, more) - a.imbalance(shapes, less)
-            total = total + Vector(change.x * slip[:, None, None], change.y * slip[:, None])
         clipped.hold(total, shapes.x, np.zeros(len(shapes.x)))
+        for rate, (more, less) in a.moved_clips(given, d):
+            change = a.imbalance(shapes, more) - a.imbalance(shapes, less)
+            total = total + Vector(change.x * rate[:, None, None], change.y * rate[:, None])
         return total
 
 
@@ -433,15 +435,16 @@ class CurveSlopes:
         by_nodes, by_lam = np.split(self.by_moving, [2 * a.b], axis=-1)
         touching = a.touching(self.shapes, self.given)
         lam = touching.lam_along(d.lam) if touching else d.lam[:, None]
-        steps: FloatArray = by_nodes @ a._both(d.x) + by_lam @ lam
+        x = clipped.unheld(d.x)  # frames of clips have moved in `moved_clips`
+        steps: FloatArray = by_nodes @ a._both(x) + by_lam @ lam
         steps = a.add_by_numbers(steps, self.by_others, d, clipped)
         start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
         places, rates = a._stations(steps, start)
         shape = (len(steps), a.chain.n + 1, 2 * a.b, steps.shape[3])
-        own = d.x[:, a.chain.layout.stations].reshape(shape)
+        own = x[:, a.chain.layout.stations].reshape(shape)
         moved = self.by_station @ np.concatenate([places, rates, own], axis=2)
         change = clipped.evenly(moved + self.by_p @ d.p[:, None])
-        for slip, (more, less) in a.slipped(self.given, d):
+        for rate, (more, less) in a.moved_clips(self.given, d):
             gap = a.curve(self.shapes, more) - a.curve(self.shapes, less)
-            change = change + gap[..., None] * slip[:, None, None]
+            change = change + gap[..., None] * rate[:, None, None]
         return np.asarray(change)

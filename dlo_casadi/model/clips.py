@@ -147,12 +147,13 @@ class Clipped:
         kinds: tuple[str, ...],
         declared: FloatArray,
         at: FloatArray,
+        turn: FloatArray,
         x: FloatArray,
     ) -> "Clipped":
         """Clips at the arc lengths `at` (m, k) [m] of shapes x (m, n_nodes, coordinates).
 
         `declared` (m, k, clip_size) determines the nearest node, which then stays the same while an
-        unknown slip changes.
+        unknown slip changes. `turn` (k, m, increment) [rad]: of frames from the declared ones.
         """
         node, rows = chain.kind.node, np.arange(len(x))
         places, clamps = np.tile(chain.places, (len(x), 1)), []
@@ -160,7 +161,7 @@ class Clipped:
             if kind not in CLAMPS:
                 continue
             index = np.rint(declared[:, k, -1] / chain.h).astype(np.intp).clip(1, chain.n - 1)
-            frame = declared[:, k, node.dimension : -1]
+            frame = node.moved(declared[:, k, node.dimension : -1], turn[k])
             held = np.ones(node.increment, dtype=bool)
             if kind == "swivel":
                 held[0] = False
@@ -185,6 +186,22 @@ class Clipped:
     def clamped_nodes(self, pose: int) -> list[int]:
         """Nodes of a pose that carry the frames of its clamped clips."""
         return [int(clamp.index[pose]) for clamp in self.clamps]
+
+    def held(self, x: FloatArray) -> FloatArray:
+        """Nodes (m, n_nodes, coordinates); clamped ones have the clips' frames."""
+        rows = np.arange(len(x))
+        x = x.copy() if self.clamps else x
+        for clamp in self.clamps:
+            x[rows, clamp.index] = _alike(clamp.frame, x[rows, clamp.index])
+        return x
+
+    def unheld(self, step: FloatArray) -> FloatArray:
+        """Increments (m, n_nodes, increment, q) of nodes without those that clips block."""
+        rows = np.arange(len(step))
+        step = step.copy() if self.clamps else step
+        for clamp in self.clamps:
+            step[rows, clamp.index] *= ~clamp.held[:, None]
+        return step
 
     def carried(self, both: FloatArray) -> FloatArray:
         """Nodes (m, n_segments, 2 coordinates) of segments; clamped ones have the clips' frames."""

@@ -359,22 +359,29 @@ class Functions:
 
     @cached_property
     def true_clips(self) -> ca.Function:
-        """(p, pose) -> true places (dimension, n_clips) and arc lengths (n_clips,) of clips [m].
+        """(p, pose) -> true places (dimension, n_clips), arc lengths [m] and turns [rad] of clips.
 
-        They exclude a pose's own deviations; the arc lengths of eyelets are zero.
+        The arc lengths are (n_clips,), those of eyelets zero. The turns (increment, n_clips) are of
+        clamped clips, from their declared frames. A pose's own deviations are excluded.
         """
         clips = self.terms.true_ends.clips
-        places = ca.horzcat(ca.SX(self.node.dimension, 0), *(place for place, _ in clips))
-        at = ca.vertcat(ca.SX(0, 1), *(s for _, s in clips))
+        places = ca.horzcat(ca.SX(self.node.dimension, 0), *(clip.place for clip in clips))
+        at = ca.vertcat(ca.SX(0, 1), *(clip.at for clip in clips))
+        turns = ca.horzcat(ca.SX(self.node.increment, 0), *(clip.turn for clip in clips))
         still = ca.SX.zeros(self.terms.deviation.shape)
-        outputs = ca.substitute([places, at], [self.terms.deviation], [still])
+        outputs = ca.substitute([places, at, turns], [self.terms.deviation], [still])
         return ca.Function("true_clips", [self.terms.p, self.terms.pose], outputs)
 
     @cached_property
-    def slips(self) -> FloatArray:
-        """Derivatives of clips' arc lengths by parameters (n_clips, n_parameters), as numbers."""
-        _, at = self.true_clips(self.terms.p, self.terms.pose)
-        return np.array(ca.evalf(ca.jacobian(at, self.terms.p)))
+    def clip_slopes(self) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of clips' arc lengths (n_clips, n_parameters) and turns, as numbers.
+
+        The turns' derivatives are (n_clips, n_parameters, increment).
+        """
+        p = self.terms.p
+        _, at, turns = self.true_clips(p, self.terms.pose)
+        slips, by_p = (np.array(ca.evalf(ca.jacobian(ca.vec(x), p))) for x in (at, turns))
+        return slips, by_p.reshape((-1, self.node.increment, p.numel())).swapaxes(1, 2)
 
     @cached_property
     def section_moment(self) -> ca.Function:

@@ -32,7 +32,7 @@ from dlo_casadi.model.cable_model import (
 )
 from dlo_casadi.model.clips import BESIDE, clip_size
 from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
-from dlo_casadi.rod.ends import EndConditions
+from dlo_casadi.rod.ends import ClipConditions, EndConditions
 from dlo_casadi.rod.in_frame import SegmentInFrame
 
 # Number of models whose expressions and functions are cached: a diagnosis compares about thirty.
@@ -129,11 +129,12 @@ class Lagrangian:
         return Viewpoint(start, ca.vertcat(x, y), inverse)
 
     @property
-    def declared_clips(self) -> tuple[tuple[ca.SX, ca.SX], ...]:
-        """Place and arc length of each clip as declared."""
+    def declared_clips(self) -> tuple[ClipConditions, ...]:
+        """Each clip as declared."""
         numbers, d = self.pose[self.model.n_pose - self.model.clip_numbers :], self.node.dimension
         rows = ca.vertsplit(numbers, clip_size(self.node)) if self.model.clips else []
-        return tuple((row[:d], row[-1]) for row in rows)
+        none = ca.SX.zeros(self.node.increment)
+        return tuple(ClipConditions(row[:d], row[-1], none) for row in rows)
 
     @property
     def moved(self) -> list[ca.SX]:
@@ -154,7 +155,8 @@ class Lagrangian:
         place, first, last, _, moved = ca.vertsplit(self.deviation, edges)
         declared = EndConditions.of(self.declared_ends, self.node)
         steps = ca.vertsplit(moved, d) if self.model.clips else []
-        clips = [(x + step, s) for (x, s), step in zip(self.declared_clips, steps, strict=True)]
+        pairs = zip(self.declared_clips, steps, strict=True)
+        clips = [clip._replace(place=clip.place + step) for clip, step in pairs]
         ends = replace(declared, end=declared.end + place, clips=tuple(clips)).turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
@@ -283,11 +285,9 @@ class Lagrangian:
         if len(self.pulls) > self.model.n_springs:
             positions += ca.vertsplit(self.place[LAYOUT_SIZE:])
         last = start + self.length > self.model.cable.length - BESIDE * self.length
-        found = []
-        for s in positions:
-            share = (s - start) / self.length
-            inside = ca.logic_and(share >= -BESIDE, ca.logic_or(share < 1 - BESIDE, last))
-            found.append(ca.if_else(inside, share, share > 0.5))
+        shares = [(s - start) / self.length for s in positions]
+        inside = [ca.logic_and(u >= -BESIDE, ca.logic_or(u < 1 - BESIDE, last)) for u in shares]
+        found = [ca.if_else(here, u, u > 0.5) for here, u in zip(inside, shares, strict=True)]
         return ca.Function("shares", [self.p, self.place], [ca.vertcat(ca.SX.zeros(0), *found)])
 
     @property
@@ -435,7 +435,7 @@ class Lagrangian:
         d, springs = self.node.dimension, self.model.pulls[: self.model.n_springs]
         places = [self.lam[[row - d for row in rows]] for rows in springs]  # before their pulls
         total += sum(k.energy(y) for k, y in zip(self.springs, places, strict=True))
-        places += [place for place, _ in true.clips]
+        places += [clip.place for clip in true.clips]
         for place, rows in zip(places, self.model.pulls, strict=True):
             total += ca.dot(self.lam[rows], true.start - place)
         return total - ca.dot(self.total_load, true.start)

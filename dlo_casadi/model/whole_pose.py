@@ -199,9 +199,10 @@ def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) ->
     """
     size, c, count = clip_size(model.node), model.node.coordinates, len(model.clips)
     held, frames = [k for k, kind in enumerate(model.clips) if kind in CLAMPS], []
+    turns = functions_of(model).true_clips(s.p, s.pose)[2]
     for k, node in zip(held, clamped, strict=True):
         last = model.n_pose - size * (count - k) + size - 1
-        frame = s.pose[last - c : last]
+        frame = model.node.moved(s.pose[last - c : last], ca.SX(turns[:, k]))
         if model.clips[k] == "swivel":
             x, y, z, w = parts = ca.vertsplit(frame)
             own = ca.vertsplit(s.x[_rows(model, node)])

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
+from typing import NamedTuple
 
 import casadi as ca
 
@@ -39,13 +40,25 @@ def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
     return tuple(f"{what}_{name}" for what, names in parts for name in names)
 
 
+class ClipConditions(NamedTuple):
+    """Where and how a clip holds the cable: symbols of one pose.
+
+    `place` (dimension,) [m]; `at` [m]: arc length; `turn` (increment,) [rad]: of a clamped clip
+    from its declared frame, see `Node.moved`.
+    """
+
+    place: ca.SX
+    at: ca.SX
+    turn: ca.SX
+
+
 @dataclass(frozen=True)
 class EndConditions:
     """Where and how the ends are held: symbols of one pose.
 
     `start`, `end` (dimension,) [m]; `start_frame`, `end_frame` (coordinates,): the clamps in the
-    form of a node, in a plane their headings [rad]. `node` is the kind of the nodes. `clips`:
-    places (dimension,) [m] and arc lengths [m] of the clips between the ends.
+    form of a node, in a plane their headings [rad]. `node` is the kind of the nodes. `clips`: those
+    between the ends.
     """
 
     start: ca.SX
@@ -53,7 +66,7 @@ class EndConditions:
     start_frame: ca.SX
     end_frame: ca.SX
     node: type[Node]
-    clips: tuple[tuple[ca.SX, ca.SX], ...] = ()
+    clips: tuple[ClipConditions, ...] = ()
 
     @staticmethod
     def size(node: type[Node]) -> int:

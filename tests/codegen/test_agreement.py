@@ -79,7 +79,7 @@ def test_every_effect_of_the_cable_has_values():
     in_plane = {n: e for n, e in EFFECTS.items() if 2 in e.dimensions}
     of_the_cable = {n for n, e in in_plane.items() if not issubclass(e, MeasurementEffect)}
     held = {n for n, e in EFFECTS.items() if issubclass(e, Load) and e.n_springs}
-    held |= {"clip_offset", "clip_slip"}  # see test_holds.py
+    held |= {"clip_offset", "clip_slip", "clip_angle"}  # see test_holds.py
     assert set(VALUES) == of_the_cable - held - {"obstacle_offset", "contact_plane"}
 
 

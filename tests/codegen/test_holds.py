@@ -16,6 +16,7 @@ from dlo_casadi.effects import (
     AxialStretch,
     CableData,
     ClampCompliance,
+    ClipAngle,
     ClipOffset,
     ClipSlip,
     Tether,
@@ -309,6 +310,25 @@ def test_a_tether_beside_a_clip_that_has_moved():
     values = TETHER | {"clip_offset.dx": 0.01, "clip_slip.ds": 0.02}
     solver, p, rest = compiled(model, values)
     pose = replace(POSE, clips=CLIPS[:1])
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+
+
+@pytest.mark.parametrize("where", ["plane", "space"])
+def test_a_saddle_that_is_turned(where):
+    if where == "plane":
+        clip = HeldClip("clamped", (0.31, 0.05), 0.37, heading=0.3)
+        values = {"heading_error": 0.2}
+        pose = HeldPose((0.0, 0.0), (0.75, 0.1), clips=(clip,))
+        cable, held = CableData(1.0, 0.2, 0.01, 0.02), {}
+    else:
+        turned = tuple(Rotation.from_rotvec([0.2, 0.1, 0.4]).as_quat())
+        clip = HeldClip("clamped", (0.3, 0.1, -0.05), 0.36, orientation=turned)
+        values = {"y": 0.2, "z": -0.15}
+        pose = HeldPose((0.0, 0.0, 0.0), (0.7, 0.2, 0.1), clips=(clip,))
+        cable = CableData(1.0, 0.2, 0.01, 0.02, torsional_stiffness=0.015)
+        held = {"gravity": (0.0, 0.0, -9.81)}
+    model = CableModel(cable, 12, n_rest=0, clips=("clamped",), effects=(ClipAngle(),), **held)
+    solver, p, rest = compiled(model, {f"clip_angle.{key}": x for key, x in values.items()})
     assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 

@@ -501,7 +501,7 @@ def test_the_rest_shape_that_a_pose_leaves_behind(name, where):
 
 def test_every_effect_meets_its_formula():
     # These are compared in tests/test_clips.py and tests/test_contact.py.
-    others = {"clip_offset", "clip_slip", "obstacle_offset", "contact_plane"}
+    others = {"clip_offset", "clip_slip", "clip_angle", "obstacle_offset", "contact_plane"}
     assert {*MECHANICAL, *IMAGES, *STATES, "sensor_bias", *others} == set(ALL)
 
 

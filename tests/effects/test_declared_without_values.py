@@ -52,6 +52,7 @@ STRONG = {
     "end_offset": {"dx": 0.04, "dy": -0.05, "dz": 0.03},
     "clip_offset": {"dx": 0.03, "dy": -0.02, "dz": 0.02},
     "clip_slip": {"ds": 0.03},
+    "clip_angle": {"heading_error": 0.3, "y": 0.2, "z": -0.3},
     "obstacle_offset": {"offset": 0.03},
     "contact_plane": {"height": -0.1},
     "rest_curvature_drift": {"rate": 0.4},
