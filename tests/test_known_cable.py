@@ -56,6 +56,42 @@ def test_a_stiff_cantilever_droops_by_its_weight_and_that_at_its_tip():
     assert droops == pytest.approx([own, own + more], rel=1e-4)  # slope: 0.007
 
 
+def test_two_masses_pull_like_two_forces_of_their_weights(tmp_path):
+    """Effects of one name are numbered, in the generated solver and in parameters.yaml as well."""
+    loads = ((0.01, 0.3), (0.02, 0.5))
+    masses = [effect("lumped_mass", mass=m, position=at) for m, at in loads]
+    forces = [effect("point_force", fx=0.0, fy=-9.81 * m, position=at) for m, at in loads]
+    two, pulled = (
+        dlo.known_cable(
+            ROPE, **PINNED, model={"n": 20, "effects": [one["effects"][0] for one in each]}
+        )
+        for each in (masses, forces)
+    )
+    assert two.model.names[1:] == (
+        *("lumped_mass.mass", "lumped_mass.position"),
+        *("lumped_mass_2.mass", "lumped_mass_2.position"),
+    )
+    force = pulled.solve(end=(0.5, 0.1)).end_force
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(two.metadata.document))
+    loaded = dlo.load(tmp_path)
+    # 1e-9: tolerance of the solver.
+    for cable in (two, loaded):
+        assert cable.solve(end=(0.5, 0.1)).end_force == pytest.approx(force, rel=1e-9)
+    row = [0.0, 0.0, 0.5, 0.1, 0.0, 0.0]
+    shapes, _ = loaded.compile().solve_many(np.array([row]))
+    assert shapes["end_force"][0] == pytest.approx(force, rel=1e-8)
+
+
+def test_a_second_effect_that_a_cable_cannot_have_is_refused():
+    error = effect("length_error", length_difference=0.01)["effects"]
+    with pytest.raises(
+        dlo.ConfigError, match=r"length_error: 2 such effects .* can have 1\. Try: "
+    ):
+        dlo.known_cable(ROPE, **PINNED, model={"effects": error * 2})
+    same = effect("lumped_mass", mass=0.01, position=0.4)["effects"]
+    assert len(dlo.known_cable(ROPE, **PINNED, model={"effects": same * 2}).model.effects) == 2
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
 def test_a_free_cable_has_its_rest_curvature(count):
     """A circle; and of a curvature that grows with the arc length a clothoid."""
