@@ -365,3 +365,17 @@ def test_declared_limits_are_checked():
     known = dlo.known_cable(ROPE, **PINNED, limits={"force": 0.3})
     (check,) = known.solve(end=(0.5, 0.1)).check()
     assert (check.quantity, check.limit, check.verdict) == ("force", 0.3, "pass")
+
+
+def test_a_heading_of_which_rounding_leaves_nothing_is_refused():
+    """In Python and in C alike; at 1e20 rad neighbouring doubles are 16384 rad apart."""
+    cable = dlo.known_cable(ROPE, **FREE, model={"n": 8})
+    rows = np.array([[0, 0, 0, 0, x, 0] for x in (1e6, 1.1e6, 1e20)])
+    shapes, statuses = cable.compile().solve_many(rows)
+    assert statuses.tolist() == [0, 6, 6]
+    assert not shapes["energy"][1:].any()
+    assert cable.solve(start_heading=1e6).stable
+    with pytest.raises(
+        dlo.DloError, match=r"start_heading: 1\.1e\+06 rad: .*1e\+06 rad is possible"
+    ):
+        cable.solve(start_heading=1.1e6)
