@@ -308,13 +308,23 @@ def test_a_file_that_cannot_be_read(tmp_path):
             "lumped_mass has no parameter 'masss'; did you mean 'mass'?",
         ),
         (
+            "model:\n  effects:\n    - length_error\n    - lumped_mass\n    - length_error",
+            19,
+            "length_error: 2 such effects declared, and this cable can have 1. Try: without this",
+        ),
+        (
+            "model:\n  effects:\n    - lumped_mass\n    - lumped_mass",
+            18,
+            "lumped_mass: declared twice with the same values, from which a fit cannot tell them",
+        ),
+        (
             "diagnosis:\n  exclude: [point_farce]",
             16,
             "diagnosis.exclude: no effect is called 'point_farce'; did you mean 'point_force'?",
         ),
     ],
 )
-def test_unknown_effects_are_named_with_their_line(tmp_path, options, line, message):
+def test_unknown_and_repeated_effects_are_named_with_their_line(tmp_path, options, line, message):
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, text=GOOD + options + "\n")
     assert caught.value.line == line

@@ -56,6 +56,42 @@ def test_a_stiff_cantilever_droops_by_its_weight_and_that_at_its_tip():
     assert droops == pytest.approx([own, own + more], rel=1e-4)  # slope: 0.007
 
 
+def test_two_masses_pull_like_two_forces_of_their_weights(tmp_path):
+    """Effects of one name are numbered, in the generated solver and in parameters.yaml as well."""
+    loads = ((0.01, 0.3), (0.02, 0.5))
+    masses = [effect("lumped_mass", mass=m, position=at) for m, at in loads]
+    forces = [effect("point_force", fx=0.0, fy=-9.81 * m, position=at) for m, at in loads]
+    two, pulled = (
+        dlo.known_cable(
+            ROPE, **PINNED, model={"n": 20, "effects": [one["effects"][0] for one in each]}
+        )
+        for each in (masses, forces)
+    )
+    assert two.model.names[1:] == (
+        *("lumped_mass.mass", "lumped_mass.position"),
+        *("lumped_mass_2.mass", "lumped_mass_2.position"),
+    )
+    force = pulled.solve(end=(0.5, 0.1)).end_force
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(two.metadata.document))
+    loaded = dlo.load(tmp_path)
+    # 1e-9: tolerance of the solver.
+    for cable in (two, loaded):
+        assert cable.solve(end=(0.5, 0.1)).end_force == pytest.approx(force, rel=1e-9)
+    row = [0.0, 0.0, 0.5, 0.1, 0.0, 0.0]
+    shapes, _ = loaded.compile().solve_many(np.array([row]))
+    assert shapes["end_force"][0] == pytest.approx(force, rel=1e-8)
+
+
+def test_a_second_effect_that_a_cable_cannot_have_is_refused():
+    error = effect("length_error", length_difference=0.01)["effects"]
+    with pytest.raises(
+        dlo.ConfigError, match=r"length_error: 2 such effects .* can have 1\. Try: "
+    ):
+        dlo.known_cable(ROPE, **PINNED, model={"effects": error * 2})
+    same = effect("lumped_mass", mass=0.01, position=0.4)["effects"]
+    assert len(dlo.known_cable(ROPE, **PINNED, model={"effects": same * 2}).model.effects) == 2
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
 def test_a_free_cable_has_its_rest_curvature(count):
     """A circle; and of a curvature that grows with the arc length a clothoid."""
@@ -329,3 +365,17 @@ def test_declared_limits_are_checked():
     known = dlo.known_cable(ROPE, **PINNED, limits={"force": 0.3})
     (check,) = known.solve(end=(0.5, 0.1)).check()
     assert (check.quantity, check.limit, check.verdict) == ("force", 0.3, "pass")
+
+
+def test_a_heading_of_which_rounding_leaves_nothing_is_refused():
+    """In Python and in C alike; at 1e20 rad neighbouring doubles are 16384 rad apart."""
+    cable = dlo.known_cable(ROPE, **FREE, model={"n": 8})
+    rows = np.array([[0, 0, 0, 0, x, 0] for x in (1e6, 1.1e6, 1e20)])
+    shapes, statuses = cable.compile().solve_many(rows)
+    assert statuses.tolist() == [0, 6, 6]
+    assert not shapes["energy"][1:].any()
+    assert cable.solve(start_heading=1e6).stable
+    with pytest.raises(
+        dlo.DloError, match=r"start_heading: 1\.1e\+06 rad: .*1e\+06 rad is possible"
+    ):
+        cable.solve(start_heading=1.1e6)

@@ -100,8 +100,10 @@ class FittedCable(EstimatedCable):
             In space: number of full turns to which the twist must be nearest, see `Pose`. A cable
             may lose two of them over a loop; that is an error.
         branch : "ccw" or "cw", optional
-            In a plane: direction in which the cable turns from start to end. Between two clamps
-            their headings fix it, and a branch that contradicts them is an error.
+            In a plane: direction in which the cable turns from start to end. Between two pins it
+            selects the first stable equilibrium found, as a rule that of its own arc, with a clamp
+            the lowest one. Between two clamps their headings fix the turn, and a branch that
+            contradicts them is an error; several equilibria may have that turn.
         clips : sequence of Clip or dict
             Supports between the ends, in order along the cable, see `Clip`; none by default, even
             if the session had clips.

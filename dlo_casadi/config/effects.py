@@ -1,5 +1,6 @@
 """Declared effects: which of them, and which of their values, are possible in a session."""
 
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 
 from dlo_casadi.config.options import DeclaredEffect, EffectParameter
@@ -9,6 +10,7 @@ from dlo_casadi.config.values import Range
 from dlo_casadi.effects import EFFECTS, CableData, Effect, Setup
 from dlo_casadi.effects.cable import Parameter, height_of
 from dlo_casadi.effects.end_spring import PinSpring
+from dlo_casadi.errors import counted
 from dlo_casadi.rod.chain import ELEMENTS_IN_SPACE
 
 
@@ -44,6 +46,14 @@ def declared_setup(config: Config) -> Setup:
     )
 
 
+def declared_effects(config: Config, setup: Setup) -> list[tuple[DeclaredEffect, Effect]]:
+    """Each declaration and its effect; those of one name are numbered in their order."""
+    items = config.model.effects
+    counts = Counter(item.name for item in items)
+    effects = {name: iter(EFFECTS[name].several(setup, n)) for name, n in counts.items()}
+    return [(item, next(effects[item.name])) for item in items]
+
+
 def wrong_effects(config: Config, *, known: bool = False) -> list[ConfigProblem]:
     """Find elements, effects and their parameters that do not exist or are impossible here.
 
@@ -57,6 +67,7 @@ def wrong_effects(config: Config, *, known: bool = False) -> list[ConfigProblem]
         found.append(ConfigProblem(("model", "element"), text))
     for i, item in enumerate(config.model.effects):
         found += _wrong(item, ("model", "effects", i), setup, known)
+    found += _too_many(config, setup, known)
     for i, name in enumerate(config.diagnosis.exclude):
         if name not in EFFECTS:
             text = f"diagnosis.exclude: {_unknown(name)}"
@@ -100,6 +111,29 @@ def _wrong(item: DeclaredEffect, at: Place, setup: Setup, kept: bool) -> Iterato
     as_declared = all(values.get(name) == item.parameters[name].value for name in item.parameters)
     if as_declared and (refusal := effect.refusal(setup, values)):
         yield ConfigProblem((*at, "name"), f"{said}: {refusal}")
+
+
+def _too_many(config: Config, setup: Setup, kept: bool) -> Iterator[ConfigProblem]:
+    """Find effects declared more often than a cable may have them, or twice alike for a fit."""
+    before = defaultdict[str, list[dict[str, float]]](list)
+    for i, item in enumerate(config.model.effects):
+        if item.name not in EFFECTS:
+            continue
+        kind, same = EFFECTS[item.name], before[item.name]
+        first, *others = kind.several(setup, len(same) + 1)
+        values = {q.name: q.nominal for q in first.parameters(setup.cable)}
+        values |= {name: declared.value for name, declared in item.parameters.items()}
+        text = ""
+        if len(same) > len(others):
+            text = f"{counted(len(same) + 1, 'such effect')} declared, and this cable can have "
+            text += f"{1 + len(others)}. Try: without this one"
+        elif not kept and kind.repeatable and values in same:
+            text = "declared twice with the same values, from which a fit cannot tell them apart. "
+            text += "Try: another position"
+        if text:
+            at = ("model", "effects", i, "name")
+            yield ConfigProblem(at, f"model.effects: {item.name}: {text}")
+        same.append(values)
 
 
 def _out_of_range(q: Parameter, declared: EffectParameter, kept: bool) -> str:

@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.config.effects import declared_setup, wrong_effects, wrong_limits
+from dlo_casadi.config.effects import declared_effects, declared_setup, wrong_effects, wrong_limits
 from dlo_casadi.config.problems import Arguments, ConfigProblem, did_you_mean, show
 from dlo_casadi.config.sections import Config
 from dlo_casadi.config.supports import undetermined
 from dlo_casadi.config.values import REST_COEFFICIENTS, plain
-from dlo_casadi.effects import EFFECTS
 from dlo_casadi.rod.chain import RestCurvature
 
 
@@ -66,8 +65,7 @@ def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config,
 def _without_values(config: Config) -> Iterator[ConfigProblem]:
     """Find effects whose declaration leaves values undetermined."""
     setup = declared_setup(config)
-    for item in config.model.effects:
-        effect = EFFECTS[item.name].made_for(setup)
+    for item, effect in declared_effects(config, setup):
         needed = [q for q in effect.parameters(setup.cable) if q.name not in item.parameters]
         if effect.kind == "state":
             text = "changes the rest shape from pose to pose. Try: rest_curvature as it is now"

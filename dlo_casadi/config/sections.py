@@ -30,6 +30,7 @@ from dlo_casadi.config.values import (
     ConfigSection,
     Force,
     Gravity,
+    Heading,
     Moment,
     Name,
     Number,
@@ -168,9 +169,9 @@ class Pose(ConfigSection):
     """Where the start is held [m]: [x, y], in space [x, y, z]."""
     end: Place | None = None
     """Where the end is held [m]: [x, y], in space [x, y, z]; a free end has none."""
-    start_heading: Number | None = None
+    start_heading: Heading | None = None
     """Direction of the cable in a clamped start, counter-clockwise from +x [rad]."""
-    end_heading: Number | None = None
+    end_heading: Heading | None = None
     """Direction of the cable in a clamped end, continuous along the cable [rad]."""
     start_orientation: Quaternion | None = None
     """Frame of a clamped start in space, a quaternion [qx, qy, qz, qw]; x forward along the

@@ -9,9 +9,9 @@ from dlo_casadi.config.values import (
     AXES,
     ConfigSection,
     Force,
+    Heading,
     Name,
     NonNegative,
-    Number,
     Place,
     Positive,
     Quaternion,
@@ -54,7 +54,7 @@ class Clip(ConfigSection):
     """Arc length from the start at which it holds the cable [m]; an eyelet has none."""
     place: Place
     """Where the cable is held [m]: [x, y], in space [x, y, z]."""
-    heading: Number | None = None
+    heading: Heading | None = None
     """Direction of the cable in a clamped clip in a plane, continuous along the cable [rad]."""
     orientation: Quaternion | None = None
     """Frame of a clamped clip in space, a quaternion [qx, qy, qz, qw]; x forward along the

@@ -73,6 +73,8 @@ STIFFNESS = Range(*STIFFNESS_BOUNDS, "N m^2")
 GRAVITY = Range(0.0, 1.0e4, "m/s^2")
 # Only map frames have an origin farther away; at 1e3 m doubles resolve 1e-13 m.
 COORDINATE = Range(-1.0e3, 1.0e3, "m")
+# Beyond it rounding exceeds 1e-10 rad, and at 1e9 rad no equilibrium is found. As in the C solver.
+HEADING = Range(-1.0e6, 1.0e6, "rad")
 # The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; tension adds to it. Moments: at a metre's arm.
 FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
 # A joint needs two elements; 2000 elements on a metre have half a millimetre each, less than a
@@ -352,6 +354,7 @@ def _moment(value: object) -> object:
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Heading = Annotated[Number, within(HEADING)]
 Positive = Annotated[Number, Field(gt=0.0)]
 NonNegative = Annotated[Number, Field(ge=0.0)]
 Count = Annotated[int, Field(strict=True)]

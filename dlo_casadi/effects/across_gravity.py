@@ -51,8 +51,8 @@ class SideLoad(LoadAcrossGravity):
     Parameters
     ----------
     force_per_length : scalar [N/m]
-        In space two, force_per_length_x and force_per_length_y.
-        Vanish at 0; estimated up to half the cable's weight on Earth.
+        In space two, force_per_length_x and force_per_length_y; per declared length, also with
+        `length_error` or stretch. Vanish at 0; estimated up to half the cable's weight on Earth.
     """
 
     name = "side_load"

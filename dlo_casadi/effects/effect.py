@@ -7,7 +7,7 @@ has defaults: most effects declare only `name`, `parameters` and their law.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import casadi as ca
@@ -90,7 +90,8 @@ class Effect:
     Parameters
     ----------
     label : str, optional
-        Prefix of the parameters' names: the effect's name, for the second clip or obstacle with _2.
+        Prefix of the parameters' names: the effect's name, with _2 for the second one of that name
+        and for the second clip or obstacle.
     """
 
     name: ClassVar[str]
@@ -109,6 +110,9 @@ class Effect:
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
     # Whether derivatives taken where the effect vanishes reveal it.
     gradual: ClassVar[bool] = True
+
+    # Whether a cable may have any number of them, at different places.
+    repeatable: ClassVar[bool] = False
 
     # Name of its field, if it has one, with the index of the clip or obstacle that it is of.
     index: ClassVar[str] = ""
@@ -159,6 +163,15 @@ class Effect:
     def each_for(cls, setup: Setup) -> tuple[Self, ...]:
         """All such effects that a setup may have at once, with different labels."""
         return (cls.made_for(setup),)
+
+    @classmethod
+    def several(cls, setup: Setup, count: int) -> tuple[Self, ...]:
+        """The first `count` that a cable may have, with different labels; fewer if it has fewer."""
+        first = cls.made_for(setup)
+        if cls.repeatable:
+            labels = (f"{cls.name}_{k}" for k in range(2, count + 1))
+            return (first, *(replace(first, label=label) for label in labels))
+        return (first, *cls.each_for(setup)[1:count])
 
     def refusal(self, setup: Setup, values: Mapping[str, float]) -> str:
         """Why it cannot be declared with these values, and what to try; empty if it can be."""
@@ -292,6 +305,8 @@ class Load(Effect):
 
 class PointLoad(Load):
     """A load at one place of the cable, its parameter `position` [m]."""
+
+    repeatable = True
 
     def position(self, cable: CableData) -> Parameter:
         """Parameter `position`: arc length of the place from the start fixture."""

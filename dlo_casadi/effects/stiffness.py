@@ -49,6 +49,7 @@ class StiffSection(SectionLaw):
     """
 
     name = "stiff_section"
+    repeatable = True
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the section's ends and its factor."""

@@ -61,10 +61,10 @@ def solve_equilibrium(
 
     Among the equilibria reached from the first guesses (see `guesses`), the stable one of lowest
     energy is returned, or an unstable one if no other is found. If the pose names its branch, the
-    result is on that branch, or an error; between two clamps the headings fix the branch, between
-    two pins it is the first stable one, as a rule that of the branch's own arc. If it names sides
-    of bars, the cable passes them there. With `x_init` it is the equilibrium reached from there, on
-    any branch or side.
+    result is on that branch, or an error. Between two clamps the headings fix the turn, so a branch
+    is no choice; between two pins the result is the first stable one, as a rule that of the
+    branch's own arc. If it names sides of bars, the cable passes them there. With `x_init` it is
+    the equilibrium reached from there, on any branch or side.
 
     Parameters
     ----------

@@ -93,8 +93,8 @@ class CasadiCable:
             `parameters` (SI), in the order of `model.names` or of the names, in place of the fitted
             values.
         branch : "ccw" or "cw", optional
-            In a plane, which way the cable turns from start to end; between two clamps their
-            headings fix it.
+            In a plane, which way the cable turns from start to end. Between two clamps their
+            headings fix the turn but not the equilibrium: the lowest one may jump.
         search : casadi.Function, optional
             Function that finds equilibria in place of Python: `casadi.external("dlo_equilibrium",
             library)`, or `dlo_equilibrium_ccw`, `_cw`, of this cable's generated C, compiled into a

@@ -9,7 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.config import Config, EstimationOptions, declared_setup, wrong_effects
+from dlo_casadi.config import (
+    Config,
+    EstimationOptions,
+    declared_effects,
+    declared_setup,
+    wrong_effects,
+)
 from dlo_casadi.diagnosis.candidates import setup_of
 from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.equilibrium.equilibrium import NEARBY
@@ -131,19 +137,20 @@ def declared_model(
     )
     if END_ROLL in model.names and not known:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})
-    for item in options.effects:
-        model = model.with_effect(EFFECTS[item.name].made_for(setup))
+    declared = declared_effects(config, setup)
+    for _, effect in declared:
+        model = model.with_effect(effect)
     if config.cable.mass is None:
         model = model.with_effect(UNKNOWN_MASS())
     tolerances = Tolerances(**setup.tolerances)
     if not known:
         model = nuisances(model, tolerances, pixel, setup.readings)
     start, free = model.nominal.copy(), list(model.names)
-    for item in options.effects:
+    for item, effect in declared:
         for name, parameter in item.parameters.items():
-            start[model.names.index(f"{item.name}.{name}")] = parameter.value
+            start[model.names.index(f"{effect.label}.{name}")] = parameter.value
             if parameter.fixed:
-                free.remove(f"{item.name}.{name}")
+                free.remove(f"{effect.label}.{name}")
     return Declared(model, start, free, tolerances)
 
 

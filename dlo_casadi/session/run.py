@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dlo_casadi.config import Config
+from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
@@ -136,7 +136,8 @@ def fit_session(
     step("fit the declared model", 1, 1)
 
     step("compare with simpler fits", 0, 1)
-    reported = _parameters_of({item.name for item in config.model.effects}, fit.model)
+    effects = declared_effects(config, declared_setup(config))
+    reported = _parameters_of({effect.label for _, effect in effects}, fit.model)
     diagnosed = config.diagnosis.enabled
 
     def staged(fit: Fit) -> Stage:

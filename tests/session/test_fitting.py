@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import dlo_casadi as dlo
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -129,3 +130,32 @@ def test_lines_of_few_points_have_no_outliers_and_robust_says_so(tmp_path):
     outcome = run_session(config)
     (said,) = [text for text in outcome.warnings if "estimation.robust" in text]
     assert "no line has the 14 points" in said
+
+
+def test_two_declared_masses_are_told_apart(tmp_path):
+    """True masses and places within four standard deviations; the page shows both."""
+    given = {"length": 0.8, "mass": 0.05, "diameter": 0.005, "bending_stiffness": 0.01}
+    held = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
+
+    def loaded(*values):
+        each = ({"mass": mass, "position": position} for mass, position in values)
+        effects = [{"name": "lumped_mass", "parameters": one} for one in each]
+        return {"n": 20, "effects": effects}
+
+    true = dlo.known_cable(dlo.Cable(**given), **held, model=loaded((0.01, 0.3), (0.02, 0.5)))
+    rng, poses = np.random.default_rng(0), []
+    for end in ((0.5, 0.1), (0.3, -0.2), (0.6, -0.1)):
+        shape = true.solve(end=end)
+        points = shape.points + rng.normal(scale=2e-4, size=shape.points.shape)
+        poses.append(dlo.Pose((0, 0), end, points=points, end_force=shape.end_force))
+    cable = dlo.Cable(**{**given, "rest_shape": "straight"})
+    options = {"estimation": {"algorithm1": False}, "diagnosis": {"enabled": False}}
+    model = loaded((0.005, 0.25), (0.005, 0.55))
+    result = dlo.Session(cable, poses, std=2e-4, **held, model=model, **options).fit()
+    for name in true.model.names:
+        found = result.params[name]
+        assert abs(found.value - true.params[name].value) < 4 * found.std, name
+    result.write(tmp_path / "results")
+    page = (tmp_path / "results" / "report.html").read_text().replace("<wbr>", "")
+    assert all(name in page for name in ("lumped_mass.mass", "lumped_mass_2.mass"))
+    assert dlo.load(tmp_path / "results").model == result.fit.model
