@@ -88,8 +88,7 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
     Parameters
     ----------
     model : CableModel
-        Includes its nuisances. An effect that it has without a prior is no candidate any more; a
-        second lumped mass is.
+        Includes its nuisances. An effect that it has without a prior is no candidate any more.
     exclude : sequence of str
         Effects that the user excludes.
     """
