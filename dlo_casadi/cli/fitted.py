@@ -49,8 +49,8 @@ LIMITS = (
         "--tolerances",
         nargs="+",
         metavar="NAME=VALUE",
-        help="of other fixtures than the session's: end, length, clip, slip [m], heading, "
-        "rotation, roll [rad]",
+        help="of other fixtures than the session's: end, length, clip, slip, obstacle [m], "
+        "heading, rotation, roll [rad]",
     ),
 )
 POSE = (

@@ -1,7 +1,7 @@
 """Uncertainty of a prediction: the spread of new repeats of a pose, and the side it takes."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.effects import EFFECTS, MeasurementEffect, Setup
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -142,6 +142,30 @@ def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
             ]
     named += [("roll", END_ROLL)] * (END_ROLL in model.names)
     return {key: tuple(x for name, x in named if name == key) for key, _ in named}
+
+
+def with_tolerances(model: CableModel, names: Collection[str]) -> CableModel:
+    """Return the model with all effects that carry tolerances of these names, added at zero.
+
+    Deviations carry the tolerances of ends and clips; those of measurements matter to no shape.
+    """
+    carried = {x for x, of in tolerances_of(model).items() if {*of} & {*model.deviations}}
+    wanted, present = {*names} - carried, {effect.label for effect in model.effects}
+    setup = Setup(
+        model.cable,
+        model.start,
+        model.end,
+        model.gravity,
+        clips=model.clips,
+        obstacles=len(model.obstacles),
+    )
+    for kind in EFFECTS.values():
+        if issubclass(kind, MeasurementEffect) or kind.impossible(setup):
+            continue
+        for effect in kind.each_for(setup):
+            if wanted & {*effect.tolerances.values()} and effect.label not in present:
+                model = model.with_effect(effect)
+    return model
 
 
 def displacements(
