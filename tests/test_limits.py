@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from dlo_casadi.cable.limits import LimitCheck, limit_checks
 from dlo_casadi.cli import main
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Limits, dump_yaml, load_config, read_yaml
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import CableData, ClipSlip, ObstacleOffset
 from dlo_casadi.equilibrium.limits import _counted, _crossing
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -312,6 +313,81 @@ def test_a_tolerance_of_clips_is_about_their_places_that_of_headings_is_not(fitt
         shape.check({"force": 1.0}, tolerances={"clip": 2.0})
     with pytest.raises(DloError, match="does not depend on it"):  # of pins and a pinned clip
         shape.check({"force": 1.0}, tolerances={"heading": 0.01})
+
+
+ROPE = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+HOOKS = [
+    {"kind": "pinned", "at": 0.25, "place": [0.2, -0.1]},
+    {"kind": "pinned", "at": 0.5, "place": [0.4, -0.1]},
+]
+TABLE = {"kind": "plane", "point": [0, -0.15], "normal": [0, 1]}
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "around", "effects", "words", "near"),
+    [
+        ("slip", {"clips": HOOKS}, [ClipSlip(), ClipSlip(clip=1)], "5 mm along a clip", 0.01),
+        (
+            "obstacle",
+            {"obstacles": [TABLE]},
+            [ObstacleOffset()],
+            "5 mm of an obstacle's surface",
+            0.2,
+        ),
+    ],
+)
+def test_a_known_cable_has_tolerances_of_its_clips_and_obstacles(
+    tolerance, around, effects, words, near
+):
+    """The same numbers as with the effects declared at zero, and the slopes of solved shapes.
+
+    Repeats rest on softer obstacles, which takes 18 % of the slope of this force.
+    """
+    known = dlo.known_cable(ROPE, gravity=(0, -9.81), boundary=("pinned", "pinned"))
+    shape, end = known.solve((0.6, 0.0), **around), (0.6, 0.0)
+    model = shape.cable.model
+    for effect in effects:
+        model = model.with_effect(effect)
+    p = np.append(shape.cable.p, np.zeros(len(effects)))
+    declared = replace(shape, cable=replace(shape.cable, model=model, p=p))
+    limits, tolerances = {"bend_radius": 0.05, "force": 1.0}, {tolerance: 5e-3}
+    checks = shape.check(limits, tolerances=tolerances)
+    for found, same in zip(checks, declared.check(limits, tolerances=tolerances), strict=True):
+        assert found.as_dict() == same.as_dict()
+    (sure,) = shape.check({"force": 1.0})
+    force = checks[1]
+    assert (force.value, sure.method) == (pytest.approx(sure.value, rel=1e-9), "exact")
+    assert force.decided_by.startswith(words)
+    slopes = []
+    for k in range(len(effects)):
+        forces = []
+        for d in (-1e-4, 1e-4):
+            clips = [x | {"at": x["at"] + d * (i == k)} for i, x in enumerate(HOOKS)]
+            moved = {"clips": clips, "obstacles": [TABLE | {"point": [0, -0.15 + d]}]}
+            other = known.solve(end, **{key: moved[key] for key in around})
+            holders = {"start": other.start_force, "end": other.end_force}
+            holders |= {name: load.force for name, load in other.clips.items()}
+            forces.append(np.linalg.norm(holders[force.holder]))
+        slopes.append((forces[1] - forces[0]) / 2e-4)
+    assert force.std == pytest.approx(5e-3 * np.linalg.norm(slopes), rel=near)
+    with pytest.raises(DloError, match="does not depend on it"):
+        known.solve(end).check(limits, tolerances=tolerances)
+
+
+def test_a_known_cable_has_a_tolerance_of_its_length(fitted):
+    held = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
+    zero = {"name": "length_error", "parameters": {"length_difference": 0.0}}
+    pair = [dlo.known_cable(ROPE, **held, model={"effects": list(x)}) for x in ((), (zero,))]
+    checks = [
+        x.solve((0.6, 0.0)).check({"force": 0.2487}, tolerances={"length": 0.01}) for x in pair
+    ]
+    assert checks[0][0].as_dict() == checks[1][0].as_dict()
+    assert (checks[0][0].verdict, checks[0][0].decided_by) == ("risk", "10 mm of length (100 %)")
+    # A fitted cable whose session had no clips.
+    shape = dlo.load(fitted).solve((0.4, -0.05), clips=[HOOKS[0]])
+    near, loose = (shape.check({"force": 1.0}, tolerances={"slip": x})[0] for x in (1e-5, 0.02))
+    assert loose.std > 1.3 * near.std
+    assert loose.decided_by.startswith("20 mm along a clip")
 
 
 def test_from_python_limits_are_a_mapping(fitted):

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi import predict
 from dlo_casadi.cable.file import load, parameters_hash
 from dlo_casadi.cli import main
-from dlo_casadi.config import dump_yaml, load_config
+from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.report.documents import fit_dict, shared_fixtures
@@ -174,6 +174,20 @@ def test_what_a_fit_has_found_of_the_fixtures_is_told(pinned):
     x, y = shape.points[-1]
     assert (x, y) != (0.3, -0.1)  # the fitted end_offset
     assert f"end of the cable: ({x:.5f}, {y:.5f}) m: fixture errors of the fit" in str(shape)
+
+
+@pytest.mark.parametrize("tolerance", [None, 5e-4])
+def test_a_found_offset_of_an_obstacle_is_told_to_be_unused(pinned, tmp_path, capsys, tolerance):
+    """Not one within its tolerance, which every session with obstacles has."""
+    document = read_yaml(pinned)
+    document["effects"].append({"name": "obstacle_offset", "label": "obstacle_offset"})
+    row = {"value": 0.004, "std": 4e-5, "unit": "m", "fitted": True, "tolerance": tolerance}
+    document["parameters"]["obstacle_offset.offset"] = row
+    (tmp_path / "parameters.yaml").write_text(dump_yaml(document))
+    assert main(["predict", str(tmp_path), "--end", "0.3", "-0.1"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    said = "the fit has obstacle_offset.offset 0.004000 ± 0.000040 m; a prediction uses neither"
+    assert (said in text) is (tolerance is None)
 
 
 def test_folders_of_results_are_suggested_not_configurations(pinned, tmp_path):

@@ -332,7 +332,7 @@ class Shape:
         """Check whether a new repeat of the pose keeps limits, by default the session's.
 
         `tolerances`: standard deviations of fixtures other than the session's, by key: `end`,
-        `length`, `clip`, `slip` [m], `heading`, `rotation`, `roll` [rad].
+        `length`, `clip`, `slip`, `obstacle` [m], `heading`, `rotation`, `roll` [rad].
 
         Raises
         ------

@@ -1,8 +1,10 @@
 """Check a shape against limits: value, probability, tightest place, main cause of uncertainty."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, TypeVar
+
+import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Metadata
@@ -17,7 +19,7 @@ from dlo_casadi.equilibrium.limits import (
     sizes_of,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spread import Uncertainty, cause_of, tolerances_of
+from dlo_casadi.equilibrium.spread import Uncertainty, cause_of, tolerances_of, with_tolerances
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.assembly import Inputs
@@ -196,21 +198,29 @@ def check_limits(
     limits: Asked = None,
     tolerances: Asked = None,
 ) -> tuple[LimitCheck, ...]:
-    """Check a fitted cable's shape, see `Shape.check`."""
+    """Check a fitted cable's shape, see `Shape.check`.
+
+    Effects that carry a given tolerance are added to the model at zero: the shape stays.
+    """
     asked = asked_limits(cable.model, known, limits)
     beside = _given(DeclaredTolerances, tolerances, "tolerances={'end': 2e-3} [m]")
     stds = {} if beside is None else beside.model_dump(exclude_unset=True)
-    possible = tolerances_of(cable.model)
+    possible = tolerances_of(with_tolerances(cable.model, DeclaredTolerances.model_fields))
     if strange := [name for name in stds if name not in possible]:
         text = f"tolerances.{strange[0]}: the shape of this cable does not depend on it"
         raise DloError(f"{text}.\n  Try: {', '.join(possible)}")
     length = cable.model.cable.length
     if large := [
-        x for x in ("end", "length", "clip", "slip") if stds.get(x, 0.0) > _LOOSE * length
+        x
+        for x in ("end", "length", "clip", "slip", "obstacle")
+        if stds.get(x, 0.0) > _LOOSE * length
     ]:
         text = f"tolerances.{large[0]}: {stds[large[0]]:g} m for a cable of {length:g} m"
         raise DloError(f"{text}.\n  Try: metres, such as {stds[large[0]] / 1e3:g}")
-    uncertainty = known.uncertainty.installed(cable.model, stds)
+    model = with_tolerances(cable.model, stds)
+    added = model.nominal[len(cable.p) :]
+    cable = replace(cable, model=model, p=np.concatenate([cable.p, added]))
+    uncertainty = known.uncertainty.installed(model, stds)
     return limit_checks(cable, known.coefficients, pose, found, uncertainty, asked)
 
 
@@ -354,6 +364,7 @@ def _main_cause(model: CableModel, known: Uncertainty, chance: Exceedance) -> st
         "length": f"{millimetres(size)} of length",
         "clip": f"{millimetres(size)} at a clip",
         "slip": f"{millimetres(size)} along a clip",
+        "obstacle": f"{millimetres(size)} of an obstacle's surface",
         "roll": f"{size:.2g} rad of roll",
         "heading": f"{size:.2g} rad of the {cause.partition('_')[0]}'s heading",
         "rotation": f"{size:.2g} rad of the {cause.partition('_')[0]}'s orientation",

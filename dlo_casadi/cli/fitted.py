@@ -23,6 +23,7 @@ from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
 from dlo_casadi.config import read_yaml
+from dlo_casadi.effects import ContactEffect
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_table import COLUMNS, Grid, Plan, PoseList
@@ -41,7 +42,10 @@ MESH = (
 )
 _LIMITS = "bend_radius, clearance [m], force [N], moment [N m], twist [1/m]; the session's without"
 OBSTACLES = option(
-    "--obstacles", type=Path, metavar="FILE", help="YAML: a list, as in an experiment"
+    "--obstacles",
+    type=Path,
+    metavar="FILE",
+    help="YAML: a list, as in an experiment; the session's are not used",
 )
 LIMITS = (
     option("--limits", nargs="*", metavar="NAME=VALUE", help=f"check limits: {_LIMITS}"),
@@ -49,8 +53,8 @@ LIMITS = (
         "--tolerances",
         nargs="+",
         metavar="NAME=VALUE",
-        help="of other fixtures than the session's: end, length, clip, slip [m], heading, "
-        "rotation, roll [rad]",
+        help="of other fixtures than the session's: end, length, clip, slip, obstacle [m], "
+        "heading, rotation, roll [rad]",
     ),
 )
 POSE = (
@@ -128,6 +132,11 @@ def predict(chosen: argparse.Namespace) -> None:
             "note: the shapes did not determine the bending stiffness; the shape is more certain "
             "than forces and energy"
         )
+    if moved := _found_offsets(shape.cable):
+        notes.append(
+            f"note: the fit has {moved}; a prediction uses neither the session's obstacles nor "
+            "these offsets. --obstacles stay where their file declares them"
+        )
     page, found = Page(chosen), shape.as_dict()
     asked_for = (chosen.limits, chosen.tolerances) != (None, None)
     checks = _checked(shape, chosen) if asked_for else None
@@ -139,6 +148,20 @@ def predict(chosen: argparse.Namespace) -> None:
         page.print(limits_table(shape.cable.name, checks))
     if chosen.figure is not None:
         page.say(f"Figure: {chosen.figure}")
+
+
+def _found_offsets(cable: FittedCable) -> str:
+    """Offsets of the session's obstacles beyond their tolerances, as text; empty without any."""
+    model = cable.model
+    effects = [x for x in model.effects if isinstance(x, ContactEffect)]
+    names = [
+        f"{effect.label}.{q.name}"
+        for effect in effects
+        if effect.surface(model.gravity) is None
+        for q in effect.parameters(model.cable)
+    ]
+    found = [f"{name} {cable.params[name]}" for name in names if name not in model.priors]
+    return " and ".join(found)
 
 
 def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:

@@ -1,7 +1,7 @@
 """Uncertainty of a prediction: the spread of new repeats of a pose, and the side it takes."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.effects import EFFECTS, Effect, MeasurementEffect, Setup
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -129,21 +129,56 @@ def cause_of(model: CableModel, deviation: str) -> str:
 
 def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
     """Deviations or parameters of a model that each tolerance covers, by the tolerance's name."""
-    places = {"end": "end"} | {f"clip_{k}": "clip" for k in range(len(model.clips))}
-    turned = model.node.tolerance
-    named = [(places.get(cause_of(model, name), turned), name) for name in model.deviations]
-    # Directions of clips have no deviations.
-    covered = {(tolerance, tolerance == "clip") for tolerance, _ in named}
+    deviations = _of_deviations(model)
+    named = [*deviations]
     for effect in model.effects:
         if not isinstance(effect, MeasurementEffect):
-            named += [
-                (tolerance, f"{effect.label}.{name}")
-                for name, tolerance in effect.tolerances.items()
-                if (tolerance, effect.index == "clip") not in covered
-                and f"{effect.label}.{name}" in model.names
-            ]
+            carried = _carried_beside(effect, deviations)
+            own = ((tolerance, f"{effect.label}.{name}") for name, tolerance in carried.items())
+            named += [(tolerance, name) for tolerance, name in own if name in model.names]
     named += [("roll", END_ROLL)] * (END_ROLL in model.names)
     return {key: tuple(x for name, x in named if name == key) for key, _ in named}
+
+
+def with_tolerances(model: CableModel, names: Collection[str]) -> CableModel:
+    """Return the model with all effects that carry tolerances of these names, added at zero.
+
+    Those of measurements matter to no shape.
+    """
+    deviations, present = _of_deviations(model), {effect.label for effect in model.effects}
+    setup = Setup(
+        model.cable,
+        model.start,
+        model.end,
+        model.gravity,
+        clips=model.clips,
+        obstacles=len(model.obstacles),
+    )
+    for kind in EFFECTS.values():
+        if issubclass(kind, MeasurementEffect) or kind.impossible(setup):
+            continue
+        for effect in kind.each_for(setup):
+            carried = {*_carried_beside(effect, deviations).values()}
+            if carried & {*names} and effect.label not in present:
+                model = model.with_effect(effect)
+    return model
+
+
+def _of_deviations(model: CableModel) -> list[tuple[str, str]]:
+    """The tolerance that each deviation of a pose covers, and the deviation."""
+    places = {"end": "end"} | {f"clip_{k}": "clip" for k in range(len(model.clips))}
+    turned = model.node.tolerance
+    return [(places.get(cause_of(model, name), turned), name) for name in model.deviations]
+
+
+def _carried_beside(effect: Effect, deviations: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Tolerances of an effect's parameters that no deviation covers.
+
+    Deviations are of the places of ends and clips, and of the directions of ends alone.
+    """
+    covered = {(tolerance, tolerance == "clip") for tolerance, _ in deviations}
+    of_clip = effect.index == "clip"
+    return {k: x for k, x in effect.tolerances.items() if (x, of_clip) not in covered}
 
 
 def displacements(

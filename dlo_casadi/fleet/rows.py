@@ -88,7 +88,7 @@ def row_of(key: str, digest: str, cable: str, report: dict[str, Any], seconds: f
     measurement, mesh = report["measurement"], report["discretization"]
     pull = report["unexplained"] or {}
     force = pull.get("force") or ()
-    kept = ("name", "p_value", "rmse_cross_validated_before", "rmse_cross_validated_after")
+    kept = ("name", "label", "p_value", "rmse_cross_validated_before", "rmse_cross_validated_after")
     return empty_row(key, digest, "done", "", seconds) | {
         "cable": cable,
         "verdict": report["verdict"],
@@ -172,6 +172,7 @@ def arrow_schema() -> pyarrow.Schema:
     parameters = pa.list_(pa.struct(values.items()))
     effect = {
         "name": text,
+        "label": text,
         "p_value": number,
         "rmse_cross_validated_before": number,
         "rmse_cross_validated_after": number,

@@ -77,7 +77,7 @@ def compared(outcome: Outcome) -> list[ComparedStage]:
 def label_of(stage: Stage, outcome: Outcome) -> str:
     """Label of a stage."""
     if stage.name == "closed" and outcome.effects:
-        return "with " + " and ".join(effect.name for effect in outcome.effects)
+        return "with " + " and ".join(map(str, outcome.effects))
     return STAGE_LABELS[stage.name]
 
 
@@ -186,7 +186,7 @@ def conclusion_of(outcome: Outcome) -> Conclusion:
         return Conclusion(word, f"{sentence(outcome.doubts[0])}.")
     if outcome.verdict is None:
         return Conclusion("not diagnosed", "Nothing was looked for in the residual.")
-    names = " and ".join(effect.name for effect in outcome.effects)
+    names = " and ".join(map(str, outcome.effects))
     if outcome.verdict == "unexplained":
         after = outcome.structure[1] if outcome.structure else None
         if names and after and after.p_value >= outcome.config.diagnosis.significance:
@@ -245,7 +245,7 @@ def structure_lines(outcome: Outcome) -> list[str]:
 
 def _effect_lines(effect: FoundEffect) -> list[str]:
     values = [f"{name} {found}" for name, found in effect.parameters.items()]
-    line = f"  {effect.name}: {', '.join(values)}"
+    line = f"  {effect}: {', '.join(values)}"
     if effect.p_value is not None:
         # It underflows: below the smallest double.
         line += f" (p = {effect.p_value:.1g})" if effect.p_value > 0 else " (p < 1e-307)"
@@ -282,11 +282,11 @@ def reading_text(reading: NextReading) -> str:
 
 def finding_of(outcome: Outcome, row: Ranked) -> tuple[str, str]:
     """Status of a candidate, "added", "tied" or empty, and a sentence on it."""
+    if own := [str(effect) for effect in outcome.effects if effect.name == row.name]:
+        return "added", "added to the model" + (own != [row.name]) * f": {' and '.join(own)}"
     for effect in outcome.effects:
-        if row.name == effect.name:
-            return "added", "added to the model"
         if row.name in effect.indistinguishable_from:
-            return "tied", f"cannot be told apart from {effect.name}"
+            return "tied", f"cannot be told apart from {effect}"
     if row.reason:
         return "", row.reason
     if row.rmse_cross_validated is None:

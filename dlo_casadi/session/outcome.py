@@ -265,6 +265,10 @@ class FoundEffect:
     Parameters
     ----------
     name : str
+    label : str
+        Prefix of its parameters' names in the model, see `Effect`.
+    of : str or None
+        Name of its clip or obstacle, if it is of one; that of the first fitted pose.
     parameters : dict of Estimate
     p_value : float or None
         See `AddedEffect`.
@@ -275,11 +279,16 @@ class FoundEffect:
     """
 
     name: str
+    label: str
+    of: str | None
     parameters: dict[str, Estimate]
     p_value: float | None
     rmse_cross_validated_before: float | None
     rmse_cross_validated_after: float | None
     indistinguishable_from: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.label} of {self.of}" if self.of else self.label
 
 
 def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
@@ -287,6 +296,8 @@ def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
     return tuple(
         FoundEffect(
             name=item.candidate.name,
+            label=item.candidate.effect.label,
+            of=_support(diagnosis.after, item.candidate.effect),
             parameters=effect_parameters(diagnosis.after, item.candidate.effect),
             p_value=item.p_value,
             rmse_cross_validated_before=item.before.rmse if item.before.complete else None,
@@ -297,6 +308,13 @@ def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
         )
         for item in diagnosis.added
     )
+
+
+def _support(fit: Fit, effect: Effect) -> str | None:
+    """Name of the clip or obstacle that an effect is of; None if it is of none."""
+    first = fit.problem.measured[fit.problem.used[0]].pose
+    known = {"clip": first.clips, "obstacle": fit.model.obstacles}.get(effect.index)
+    return known[getattr(effect, effect.index)].name if known else None
 
 
 def effect_parameters(fit: Fit, effect: Effect) -> dict[str, Estimate]:

@@ -29,6 +29,8 @@ CANDIDATES = tuple(
 )
 EFFECT = FoundEffect(
     name="lumped_mass",
+    label="lumped_mass",
+    of=None,
     parameters={"mass": Estimate(0.05, 0.002, "kg")},
     p_value=1e-9,
     rmse_cross_validated_before=5e-4,

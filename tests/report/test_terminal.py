@@ -9,13 +9,14 @@ from test_figures import EFFECT, LOAD
 from test_page import PROPOSAL
 
 from dlo_casadi.cable.estimate import Estimate
+from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
 from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.tables import describe, stage_rows, unidentified
 from dlo_casadi.report.terminal import print_summary
-from dlo_casadi.report.words import separation_text, structure_lines
+from dlo_casadi.report.words import finding_of, separation_text, structure_lines
 from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.show.text import plus_minus
 
@@ -84,6 +85,30 @@ def test_a_parameter_on_its_bound_says_so(outcome):
     estimate = Estimate(0.0, 0.1, "kg", at_bound=True)
 
     assert describe(estimate)[2] == "at a bound"
+
+
+def test_an_added_effect_is_told_with_its_clip(outcome):
+    """Of two clips the second: its label and its name stand in words, tables and report.json."""
+    slips = replace(EFFECT, name="clip_slip", label="clip_slip_2", of="hook")
+    closed = replace(outcome.stage("batch"), name="closed")
+    found = replace(
+        outcome,
+        stages=(*outcome.stages, closed),
+        effects=(replace(slips, indistinguishable_from=("end_offset",)),),
+        candidates=tuple(Ranked(name, 1.0, 0.1, None) for name in ("clip_slip", "end_offset")),
+        verdict="effect_found",
+    )
+    text = said(found)
+
+    assert "lacked clip_slip_2 of hook; with it the" in text
+    assert "clip_slip_2 of hook: mass" in text
+    assert "with clip_slip_2 of hook" in text
+    assert [finding_of(found, row)[1] for row in found.candidates] == [
+        "added to the model: clip_slip_2 of hook",
+        "cannot be told apart from clip_slip_2 of hook",
+    ]
+    (row,) = report_dict(found)["effects"]
+    assert (row["name"], row["label"], row["of"]) == ("clip_slip", "clip_slip_2", "hook")
 
 
 def test_an_added_effect_is_told_with_its_rivals(outcome):
