@@ -106,7 +106,7 @@ class Assembly:
         """Where the clips are on the cable."""
         kinds = self.model.clips
         if not kinds:
-            return Clipped(self.chain, np.zeros((len(shapes.x), 0)), (), self.chain.places)
+            return Clipped.none(self.chain, len(shapes.x))
         declared = given.poses[:, given.poses.shape[1] - self.model.clip_numbers :]
         declared = declared.reshape((len(declared), len(kinds), clip_size(self.node)))
         at = declared[..., -1] + given.p @ functions_of(self.model).slips.T
@@ -189,7 +189,7 @@ class Assembly:
         _, end_gradient, _ = self._call_ends("at_ends", shapes, given)
         by_turns = self._added(gradient, end_gradient).x[..., 0]
         forces = shapes.lam[:, self.model.pulls[self.model.n_springs :]]
-        return self.clipped(shapes, given).loads(self.model.clips, forces, by_turns)
+        return self.clipped(shapes, given).loads(forces, by_turns)
 
     def _held(self, matrix: BandMatrix, given: Inputs) -> BandMatrix:
         """For cables free to roll about their axis, add a stiffness against roll of the first node.

@@ -126,6 +126,7 @@ class Clipped:
 
     Parameters
     ----------
+    kinds : (k,) str
     at : (m, k) [m]
         Arc lengths of the clips.
     places : (m, n + 1) [m]
@@ -133,6 +134,7 @@ class Clipped:
     """
 
     chain: Chain
+    kinds: tuple[str, ...]
     at: FloatArray
     clamps: tuple[ClampNode, ...]
     places: FloatArray
@@ -164,7 +166,12 @@ class Clipped:
                 frame = _rolled_with(frame, x[rows, index])
             places[rows, index] = at[:, k]
             clamps.append(ClampNode(index, frame, held))
-        return cls(chain, at, tuple(clamps), places)
+        return cls(chain, kinds, at, tuple(clamps), places)
+
+    @classmethod
+    def none(cls, chain: Chain, count: int) -> "Clipped":
+        """Cables of `count` poses without clips."""
+        return cls(chain, (), np.zeros((count, 0)), (), np.tile(chain.places, (count, 1)))
 
     @property
     def in_order(self) -> BoolArray:
@@ -179,9 +186,29 @@ class Clipped:
             return np.stack([self.places[:, :-1], self.places[:, 1:]], axis=2)
         return np.broadcast_to(self.chain.cells, (len(self.at), *self.chain.cells.shape))
 
-    def clamped_nodes(self, pose: int) -> list[int]:
-        """Nodes of a pose that carry the frames of its clamped clips."""
-        return [int(clamp.index[pose]) for clamp in self.clamps]
+    @property
+    def clamped(self) -> IntArray:
+        """Nodes (m, number of clamped clips) that carry the frames of clamped clips."""
+        own = [clamp.index for clamp in self.clamps]
+        return np.array(own, dtype=np.intp).reshape((len(own), len(self.at))).T
+
+    @property
+    def kinks(self) -> tuple[FloatArray, IntArray]:
+        """Where the curvature jumps or has a kink: arc lengths (m, K) [m], and the cells there.
+
+        These are both ends, both sides of each clamped clip, and the other clips.
+        """
+        cells, nodes = self.cells, iter(self.clamped.T)
+        found = [(cells[:, 0, 0], np.zeros(len(cells), dtype=np.intp))]
+        for kind, at in zip(self.kinds, self.at.T, strict=True):
+            if kind in CLAMPS:
+                node = next(nodes)
+                found += [(at, node - 1), (at, node)]
+            else:
+                found.append((at, np.maximum((cells[:, :, 0] <= at[:, None]).sum(axis=1) - 1, 0)))
+        found.append((cells[:, -1, 1], np.full(len(cells), cells.shape[1] - 1)))
+        at, beside = zip(*found, strict=True)
+        return np.stack(at, axis=1), np.stack(beside, axis=1)
 
     def carried(self, both: FloatArray) -> FloatArray:
         """Nodes (m, n_segments, 2 coordinates) of segments; clamped ones have the clips' frames."""
@@ -243,16 +270,14 @@ class Clipped:
             matrix.upper[rows, i] *= free[:, None]
             matrix.border[rows, i] *= free[:, None]
 
-    def loads(
-        self, kinds: Sequence[str], forces: FloatArray, by_turns: FloatArray
-    ) -> list[tuple[ClipLoad, ...]]:
+    def loads(self, forces: FloatArray, by_turns: FloatArray) -> list[tuple[ClipLoad, ...]]:
         """Loads on the clips of each pose: forces (m, k, dimension) [N], and moments.
 
         `by_turns` (m, n_nodes, increment): derivatives of the energy by rotations of the nodes.
         """
         node, rows = self.chain.kind.node, np.arange(len(forces))
         moments = np.zeros((*forces.shape[:2], node.increment))
-        clamped = [k for k, kind in enumerate(kinds) if kind in CLAMPS]
+        clamped = [k for k, kind in enumerate(self.kinds) if kind in CLAMPS]
         for k, clamp in zip(clamped, self.clamps, strict=True):
             own = -by_turns[rows, clamp.index] * clamp.held
             moments[:, k] = node.to_world(clamp.frame, own)
