@@ -12,6 +12,7 @@ from scipy.special import ellipe, ellipk
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, ClipAngle, ClipOffset, ClipSlip
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -48,6 +49,40 @@ def test_a_beam_on_three_supports():
     assert eq.stable
     assert eq.clips[0].force == pytest.approx([0.0, -middle], rel=2e-4, abs=1e-5)
     assert [load.at for load in eq.clips] == pytest.approx([span, 2 * span], abs=1e-5)
+
+
+def test_the_sharpest_bend_over_a_support_is_measured_there():
+    """M1 = w (l^2 - o^2) / 8; the curvature has a kink there. To the second order of the mesh."""
+    span, over, stiff = 0.45, 0.1, replace(CABLE, bending_stiffness=200.0)
+    radius = 8 * 200.0 * LENGTH / (9.81 * CABLE.mass * (span**2 - over**2))
+    supports = [HeldClip("eyelet", (span, 0.0)), HeldClip("eyelet", (2 * span, 0.0))]
+    errors = []
+    for n in (20, 40, 80):
+        model, pose, eq = solved(supports, None, n, cable=stiff, end="free")
+        given = Inputs.of(model.nominal, np.zeros(n), pose.vector[None])
+        sizes = sizes_of(model, eq.shapes, given, "curvature")[0]
+        places, _ = places_of(model, pose, eq, given, "curvature")
+        assert places[sizes.argmax()] == pytest.approx(eq.clips[0].at, abs=1e-12)
+        assert 1 / sizes.max() == pytest.approx(eq.min_bend_radius, rel=1e-12)
+        errors.append(abs(eq.min_bend_radius / radius - 1))
+    assert errors[0] < 0.04
+    assert errors[1] < errors[0] / 3.5
+    assert errors[2] < errors[1] / 3.5
+
+
+@pytest.mark.parametrize("at", [0.45, 0.475])
+def test_the_bend_at_a_clip_is_smooth_in_its_arc_length(at):
+    """At a node and in the middle of an element, where other cells begin to count."""
+
+    def bend(s):
+        model, pose, eq = solved([HeldClip("pinned", (0.4, 0.0), s)], (0.75, 0.0), 20)
+        given = Inputs.of(model.nominal, np.zeros(20), pose.vector[None])
+        assert places_of(model, pose, eq, given, "curvature")[0][21] == s
+        return sizes_of(model, eq.shapes, given, "curvature")[0, 21]
+
+    step = 1e-5
+    before, here, after = (bend(at + k * step) for k in (-1, 0, 1))
+    assert (after - here) / (here - before) == pytest.approx(1.0, abs=0.01)
 
 
 def test_an_elastica_pinned_at_mid_span_converges_to_two_half_waves():

@@ -130,7 +130,7 @@ def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[S
     lam = scale * shapes.lam * (np.arange(a.k) < model.n_conditions)
     shapes = Shapes.declared(shapes.x, lam, len(model.clips))
     # The node at a saddle is in its frame, as in all shapes.
-    return replace(shapes, x=a.clipped(shapes, given).held(shapes.x)), given
+    return replace(shapes, x=a.clipped(shapes, given).in_frames(shapes.x)), given
 
 
 def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[str, np.ndarray]:

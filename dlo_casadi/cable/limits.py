@@ -303,8 +303,9 @@ class Resolved:
                 value = 1 / max(value, 1e-300)
             elif quantity == "clearance":
                 value, used = -value, 2 - used
-            where = float(places[tight]), holders[tight], places
-            out.append(LimitUse(self.pose.name, quantity, limit, float(value), *where, used))
+            where, along = (float(places[tight]), holders[tight]), places.argsort(kind="stable")
+            both = places[along], used[along]
+            out.append(LimitUse(self.pose.name, quantity, limit, float(value), *where, *both))
         return tuple(out)
 
 

@@ -1,8 +1,6 @@
 """The equilibrium of a cable in one pose: its shape, forces, energy and stability."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -10,7 +8,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.pose import SIGNS, Branch
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipLoad
+from dlo_casadi.model.clips import ClipLoad, Clipped
 from dlo_casadi.model.contact import Contact
 from dlo_casadi.rod.ends import reaction_rows
 
@@ -54,7 +52,8 @@ class Equilibrium:
         Mean twist of each cell; zero in a plane.
     min_bend_radius : float [m]
         Smallest radius of curvature along the cable, from the cells' mean curvatures, continued
-        linearly to both ends and to clamped clips. Its error is of second order in the cell length.
+        linearly to both ends and to all clips, see `continued`. Its error is of second order in the
+        cell length.
     residual : float
         Largest violation of an end condition [m or rad].
     stable : bool
@@ -107,38 +106,58 @@ class Equilibrium:
         return branch is None or SIGNS[branch] * self.turn > -NO_TURN
 
 
-def places_along(cells: FloatArray, clamped: Sequence[int] = ()) -> FloatArray:
-    """Arc lengths (K,) [m] of `curvatures_along` of cells (n_cells, 2) [m]."""
-    own = [cells[stretch] for stretch in _stretches(len(cells), clamped)]
-    return np.concatenate([[x[0, 0], *x.mean(axis=1), x[-1, 1]] for x in own])
+def places_along(clipped: Clipped) -> FloatArray:
+    """Arc lengths (m, K) [m] of `curvatures_along`."""
+    return np.concatenate([clipped.cells.mean(axis=2), clipped.kinks[0]], axis=1)
 
 
-def curvatures_along(
-    curvature: FloatArray, cells: FloatArray, clamped: Sequence[int] = ()
-) -> FloatArray:
-    """Sizes (..., K) [1/m] of curvatures (..., axes n_cells) that are means over cells.
+def curvatures_along(curvature: FloatArray, clipped: Clipped) -> FloatArray:
+    """Sizes (m, K) [1/m] of curvatures (m, axes, n_cells) that are means over cells.
 
-    They are continued linearly to both ends of each stretch, see `Equilibrium.min_bend_radius`; the
-    curvature jumps at clamped clips. `cells` (..., n_cells, 2) [m]. `clamped`: indices of the cells
-    that start at clamped clips.
+    First those of the cells, then those at `Clipped.kinks`, see `continued`.
     """
-    widths = np.diff(cells, axis=-1)[..., 0]
-    inner = curvature.reshape((*curvature.shape[:-1], -1, widths.shape[-1]))
-    known = inner[..., 0, :] if inner.shape[-2] == 1 else np.linalg.norm(inner, axis=-2)
-    parts = []
-    for stretch in _stretches(widths.shape[-1], clamped):
-        own, width = known[..., stretch], widths[..., stretch]
-        ends = []
-        for outer, beside in ((0, 1), (-1, -2)) if own.shape[-1] > 1 else ((0, 0), (-1, -1)):
-            share = width[..., [outer]] / (width[..., [outer]] + width[..., [beside]])
-            ends.append(own[..., [outer]] + share * (own[..., [outer]] - own[..., [beside]]))
-        parts += [ends[0], own, ends[1]]
-    return np.abs(np.concatenate(parts, axis=-1))
+    known = curvature[:, 0] if curvature.shape[1] == 1 else np.linalg.norm(curvature, axis=1)
+    cells, weights = continued(clipped)
+    beside = known[np.arange(len(known))[:, None, None], cells]
+    return np.abs(np.concatenate([known, (weights * beside).sum(axis=2)], axis=1))
 
 
-def _stretches(n_cells: int, clamped: Sequence[int]) -> list[slice]:
-    """Cells between clamped clips."""
-    return [slice(*both) for both in pairwise((0, *clamped, n_cells))]
+def continued(clipped: Clipped) -> tuple[IntArray, FloatArray]:
+    """Cells (m, K, 5) and weights by which their mean curvatures give those at `Clipped.kinks`.
+
+    The curvature k at the place s inside a cell c is linear from the middles of the cells beside c
+    to s. Its mean over c is known; with the pieces a_i of c on both sides of s, c's width w and the
+    distances d_i from s to these middles,
+
+        k = (K_c - sum_i A_i K_i) / (1 - sum_i A_i),    A_i = a_i^2 / (2 w d_i)
+
+    At an end of a cell this is the line through the means of c and the cell before. Towards that
+    end, half the line through the two cells beyond is blended in: k is smooth in s. There is no
+    cell beyond an end or a clamped clip, where the curvature jumps.
+    """
+    (at, own), cells = clipped.kinks, clipped.cells
+    nodes, count = clipped.clamped[:, None], cells.shape[1]
+    first = np.where(nodes <= own[..., None], nodes, 0).max(axis=2, initial=0)[..., None]
+    last = np.where(nodes > own[..., None], nodes, count).min(axis=2, initial=count)[..., None]
+    index = own[..., None] + np.arange(-2, 3)
+    exists, index = (index >= first) & (index < last), index.clip(0, count - 1)
+    low, high = np.moveaxis(cells[np.arange(len(cells))[:, None, None], index], -1, 0)
+    middle, width = (low + high) / 2, (high - low)[..., 2]
+    x = ((at - low[..., 2]) / width).clip(0.0, 1.0)
+    s = low[..., 2] + x * width
+    inside, beyond = np.zeros(index.shape), np.zeros(index.shape)
+    inside[..., 2] = 1.0
+    for share, near, far in ((x, 1, 0), (1 - x, 3, 4)):
+        away = np.where(exists[..., near], np.abs(s - middle[..., near]), np.inf)
+        apart = np.where(exists[..., far], np.abs(middle[..., far] - middle[..., near]), np.inf)
+        inside[..., near] = -(share**2) * width / (2 * away)
+        u = np.maximum(1 - 2 * share, 0.0)
+        half = np.where(exists[..., far], u * u * (3 - 2 * u) / 2, 0.0)
+        ratio = np.where(exists[..., far], away, 0.0) / apart
+        beyond[..., near] = half * (1 + ratio)
+        beyond[..., far] = -half * ratio
+    inside *= ((1 - beyond.sum(axis=2)) / inside.sum(axis=2))[..., None]
+    return index, inside + beyond
 
 
 def equilibria_of(
@@ -168,14 +187,13 @@ def equilibria_of(
     strains = assembly.strain(shapes, given)
     on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(node)
     points = assembly.nodes(shapes, given)
-    clipped = assembly.clipped(shapes, given)
+    curvatures = chain.curvatures(strains)
+    sizes = curvatures_along(curvatures, assembly.clipped(shapes, given)).max(axis=1)
     on_clips, contacts = assembly.clip_loads(shapes, given), assembly.contacts(shapes, given)
     if bound_multipliers is None:
         bound_multipliers = np.zeros((len(shapes.x), chain.n_nodes - 1))
     out = []
     for j in range(len(shapes.x)):
-        curvature = chain.curvatures(strains[j]).ravel()
-        sizes = curvatures_along(curvature, clipped.cells[j], clipped.clamped_nodes(j))
         moments = [on_fixtures[j, rows[f"{side}_moment"]] for side in ("start", "end")]
         twisted = "twist" in node.strains
         out.append(
@@ -188,9 +206,9 @@ def equilibria_of(
                 moments=np.squeeze(np.array(moments)),
                 multipliers=shapes.lam[j],
                 bound_multipliers=bound_multipliers[j],
-                curvature=curvature,
+                curvature=curvatures[j].ravel(),
                 twist=strains[j, : chain.n_cells] if twisted else np.zeros(chain.n_cells),
-                min_bend_radius=1 / max(float(sizes.max()), 1e-300),
+                min_bend_radius=1 / max(float(sizes[j]), 1e-300),
                 residual=float(residuals[j]),
                 stable=bool(stable[j]),
                 iterations=int(iterations[j]),

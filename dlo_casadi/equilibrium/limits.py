@@ -72,8 +72,8 @@ def places_of(
         along = np.linspace(0.0, model.cable.length, deep.shape[2])
         return along, [names[k] for k in deep[:, 0].argmax(axis=0)]
     clipped = assembly_of(model).clipped(found.shapes, given)
-    cells, clamped = clipped.cells[0], clipped.clamped_nodes(0)
-    places = places_along(cells, clamped) if quantity == "curvature" else cells.mean(axis=1)
+    bends = quantity == "curvature"
+    places = places_along(clipped)[0] if bends else clipped.cells[0].mean(axis=1)
     return places, [""] * len(places)
 
 
@@ -90,9 +90,7 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
         strain = assembly.strain(shapes, given)
         if quantity == "twist":
             return np.abs(strain[:, : chain.n_cells])  # the first strain in space
-        bends, clipped = chain.curvatures(strain), assembly.clipped(shapes, given)
-        clamped = clipped.clamped_nodes(0)  # of one pose
-        return curvatures_along(bends.reshape((len(bends), -1)), clipped.cells, clamped)
+        return curvatures_along(chain.curvatures(strain), assembly.clipped(shapes, given))
     found, loads = assembly.reactions(shapes, given), assembly.clip_loads(shapes, given)
     known = ("pinned", "eyelet", *CLAMPS) if quantity == "force" else CLAMPS
     held = tuple(side for side in ("start", "end") if getattr(model, side) != "free")

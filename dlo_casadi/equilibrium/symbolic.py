@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.equilibrium import continued
 from dlo_casadi.equilibrium.implicit import (
     chord,
     detached,
@@ -23,7 +24,7 @@ from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipKind
+from dlo_casadi.model.clips import ClipKind, Clipped
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, shape
 from dlo_casadi.rod.node import STRAIGHT
 
@@ -293,13 +294,11 @@ def _outputs(model: CableModel, symbols: PoseSymbols) -> dict[str, Any]:
 @lru_cache
 def _curvature(model: CableModel) -> ca.Function:
     """(strains) -> curvatures (n_cells + 2,) of cells and both ends, see `curvatures_along`."""
-    widths = np.diff(model.chain.cells, axis=1).ravel()
-    strains = ca.SX.sym("strains", len(model.node.strains), len(widths))
-    bends = strains[-len(model.node.curvatures) :, :]
-    in_cells = model.node.bend(bends)
-    ends = []
-    for outer, inner in ((0, 1), (-1, -2)) if len(widths) > 1 else ((0, 0), (-1, -1)):
-        share = widths[outer] / (widths[outer] + widths[inner])
-        ends.append(in_cells[outer] + share * (in_cells[outer] - in_cells[inner]))
-    signed = ca.vertcat(*ends[:1], in_cells.T, *ends[1:])
+    cells, weights = continued(Clipped.none(model.chain, 1))
+    to_ends = np.zeros((cells.shape[1], model.chain.n_cells))
+    np.add.at(to_ends, (np.arange(len(to_ends))[:, None], cells[0]), weights[0])
+    strains = ca.SX.sym("strains", len(model.node.strains), model.chain.n_cells)
+    in_cells = model.node.bend(strains[-len(model.node.curvatures) :, :]).T
+    start, end = ca.vertsplit(ca.mtimes(ca.sparsify(ca.DM(to_ends)), in_cells))
+    signed = ca.vertcat(start, in_cells, end)
     return ca.Function("curvature", [strains], [ca.sqrt(signed**2 + STRAIGHT**2)])

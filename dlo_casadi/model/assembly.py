@@ -17,7 +17,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipLoad, Clipped, Unheld, clip_size, tangents
+from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
@@ -25,6 +25,7 @@ from dlo_casadi.model.stacked import Inputs as Inputs
 from dlo_casadi.model.stacked import Mapped, repeated
 from dlo_casadi.model.stacked import Shapes as Shapes
 from dlo_casadi.model.stacked import Tangents as Tangents
+from dlo_casadi.model.unheld import Unheld
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
 
@@ -105,7 +106,7 @@ class Assembly:
     def clipped(self, shapes: Shapes, given: Inputs) -> Clipped:
         """Where the clips are on the cable."""
         if not (kinds := self.model.clips):
-            return Clipped(self.chain, np.zeros((len(shapes.x), 0)), (), self.chain.places)
+            return Clipped.none(self.chain, len(shapes.x))
         declared = given.poses[:, given.poses.shape[1] - self.model.clip_numbers :]
         declared = declared.reshape((len(declared), len(kinds), clip_size(self.node)))
         slips, turns = functions_of(self.model).clip_slopes
@@ -189,7 +190,7 @@ class Assembly:
         _, end_gradient, _ = self._call_ends("at_ends", shapes, given)
         by_turns = self._added(gradient, end_gradient).x[..., 0]
         forces = shapes.lam[:, self.model.pulls[self.model.n_springs :]]
-        return self.clipped(shapes, given).loads(self.model.clips, forces, by_turns)
+        return self.clipped(shapes, given).loads(forces, by_turns)
 
     def _held(self, matrix: BandMatrix, given: Inputs) -> BandMatrix:
         """For cables free to roll about their axis, add a stiffness against roll of the first node.
@@ -283,9 +284,8 @@ class Assembly:
         places, rates = self._stations(advance[..., 0], start)
         if not clipped.clamps:
             return places
-        ahead = rates[..., :1] * tangents(self.node, shapes.x)
-        moved = np.concatenate([places, ahead], axis=2)[..., None]
-        return clipped.evenly(moved)[:, :, : self.node.dimension, 0]
+        moved = np.concatenate([places, rates[..., :1] * tangents(self.node, shapes.x)], axis=2)
+        return clipped.evenly(moved[..., None])[:, :, : self.node.dimension, 0]
 
     def curve(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Measured places (m, n + 1, d), for smooth elements with dr/ds (m, n + 1, 2 d)."""
@@ -298,7 +298,7 @@ class Assembly:
     ) -> list[FloatArray]:
         m, count = len(shapes.x), self.chain.n + 1
         places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
-        nodes = self.clipped(shapes, given).held(shapes.x)
+        nodes = self.clipped(shapes, given).in_frames(shapes.x)
         x = nodes[:, self.chain.layout.stations].reshape((m, count, -1))
         p, ends = repeated(given.p, count), repeated(given.poses, count)
         return self._mapped(name)(places, rates, x, p, ends)
@@ -435,7 +435,7 @@ class CurveSlopes:
         by_nodes, by_lam = np.split(self.by_moving, [2 * a.b], axis=-1)
         touching = a.touching(self.shapes, self.given)
         lam = touching.lam_along(d.lam) if touching else d.lam[:, None]
-        x = clipped.unheld(d.x)  # frames of clips have moved in `moved_clips`
+        x = clipped.free(d.x)  # frames of clips have moved in `moved_clips`
         steps: FloatArray = by_nodes @ a._both(x) + by_lam @ lam
         steps = a.add_by_numbers(steps, self.by_others, d, clipped)
         start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))

@@ -7,7 +7,7 @@ cable. A clamped clip bends the cable by a moment. The nearest node is moved to 
 frame, so that the curvature does not jump inside an element.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -25,13 +25,6 @@ CLAMPS = ("clamped", "swivel")
 # Distance before the edge of a segment, as a share of its length, from which on a place counts as
 # beyond it. Rounding is smaller, so that just one segment has the derivatives by the place.
 BESIDE = 1e-9
-# Axes along which outputs of segment functions are derivatives by nodes and border.
-_BORDER_AXES = {
-    "segment": ((), (2,), (2, 3)),
-    "segment_slope": ((2,),),
-    "segment_sensitivity": ((2,),),
-    "segment_curve_slopes": ((), (3,), ()),
-}
 
 
 @dataclass(frozen=True)
@@ -129,6 +122,7 @@ class Clipped:
 
     Parameters
     ----------
+    kinds : (k,) str
     at : (m, k) [m]
         Arc lengths of the clips.
     places : (m, n + 1) [m]
@@ -136,6 +130,7 @@ class Clipped:
     """
 
     chain: Chain
+    kinds: tuple[str, ...]
     at: FloatArray
     clamps: tuple[ClampNode, ...]
     places: FloatArray
@@ -168,7 +163,12 @@ class Clipped:
                 frame = _rolled_with(frame, x[rows, index])
             places[rows, index] = at[:, k]
             clamps.append(ClampNode(index, frame, held))
-        return cls(chain, at, tuple(clamps), places)
+        return cls(chain, kinds, at, tuple(clamps), places)
+
+    @classmethod
+    def none(cls, chain: Chain, count: int) -> "Clipped":
+        """Cables of `count` poses without clips."""
+        return cls(chain, (), np.zeros((count, 0)), (), np.tile(chain.places, (count, 1)))
 
     @property
     def in_order(self) -> BoolArray:
@@ -183,11 +183,31 @@ class Clipped:
             return np.stack([self.places[:, :-1], self.places[:, 1:]], axis=2)
         return np.broadcast_to(self.chain.cells, (len(self.at), *self.chain.cells.shape))
 
-    def clamped_nodes(self, pose: int) -> list[int]:
-        """Nodes of a pose that carry the frames of its clamped clips."""
-        return [int(clamp.index[pose]) for clamp in self.clamps]
+    @property
+    def clamped(self) -> IntArray:
+        """Nodes (m, number of clamped clips) that carry the frames of clamped clips."""
+        own = [clamp.index for clamp in self.clamps]
+        return np.array(own, dtype=np.intp).reshape((len(own), len(self.at))).T
 
-    def held(self, x: FloatArray) -> FloatArray:
+    @property
+    def kinks(self) -> tuple[FloatArray, IntArray]:
+        """Where the curvature jumps or has a kink: arc lengths (m, K) [m], and the cells there.
+
+        These are both ends, both sides of each clamped clip, and the other clips.
+        """
+        cells, nodes = self.cells, iter(self.clamped.T)
+        found = [(cells[:, 0, 0], np.zeros(len(cells), dtype=np.intp))]
+        for kind, at in zip(self.kinds, self.at.T, strict=True):
+            if kind in CLAMPS:
+                node = next(nodes)
+                found += [(at, node - 1), (at, node)]
+            else:
+                found.append((at, np.maximum((cells[:, :, 0] <= at[:, None]).sum(axis=1) - 1, 0)))
+        found.append((cells[:, -1, 1], np.full(len(cells), cells.shape[1] - 1)))
+        at, beside = zip(*found, strict=True)
+        return np.stack(at, axis=1), np.stack(beside, axis=1)
+
+    def in_frames(self, x: FloatArray) -> FloatArray:
         """Nodes (m, n_nodes, coordinates); clamped ones have the clips' frames."""
         rows = np.arange(len(x))
         x = x.copy() if self.clamps else x
@@ -195,7 +215,7 @@ class Clipped:
             x[rows, clamp.index] = _alike(clamp.frame, x[rows, clamp.index])
         return x
 
-    def unheld(self, step: FloatArray) -> FloatArray:
+    def free(self, step: FloatArray) -> FloatArray:
         """Increments (m, n_nodes, increment, q) of nodes without those that clips block."""
         rows = np.arange(len(step))
         step = step.copy() if self.clamps else step
@@ -263,16 +283,14 @@ class Clipped:
             matrix.upper[rows, i] *= free[:, None]
             matrix.border[rows, i] *= free[:, None]
 
-    def loads(
-        self, kinds: Sequence[str], forces: FloatArray, by_turns: FloatArray
-    ) -> list[tuple[ClipLoad, ...]]:
+    def loads(self, forces: FloatArray, by_turns: FloatArray) -> list[tuple[ClipLoad, ...]]:
         """Loads on the clips of each pose: forces (m, k, dimension) [N], and moments.
 
         `by_turns` (m, n_nodes, increment): derivatives of the energy by rotations of the nodes.
         """
         node, rows = self.chain.kind.node, np.arange(len(forces))
         moments = np.zeros((*forces.shape[:2], node.increment))
-        clamped = [k for k, kind in enumerate(kinds) if kind in CLAMPS]
+        clamped = [k for k, kind in enumerate(self.kinds) if kind in CLAMPS]
         for k, clamp in zip(clamped, self.clamps, strict=True):
             own = -by_turns[rows, clamp.index] * clamp.held
             moments[:, k] = node.to_world(clamp.frame, own)
@@ -299,85 +317,6 @@ class Clipped:
             slope = 6 * u * v * chord / width + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1
             out[rows, clamp.index] = np.concatenate([place, slope], axis=1)
         return out
-
-
-@dataclass(frozen=True)
-class Unheld:
-    """Segments with no clip inside; all forces beyond them act like one force at their end.
-
-    Functions of a segment take several times as long with clips inside as without.
-
-    Parameters
-    ----------
-    beyond : (m, n_segments, k)
-        1 if a segment lies before a clip, else 0; arbitrary for segments with the clip inside.
-    inside : (m, j)
-        Segments that contain the j clips that hold no node.
-    rows : (1 + k, dimension)
-        Border rows of the forces on the end's holder (-1 for a free end) and on the clips.
-    """
-
-    beyond: FloatArray
-    inside: IntArray
-    rows: IntArray
-
-    @classmethod
-    def of(
-        cls, table: FloatArray, kinds: Sequence[str], rows: list[list[int]], width: float | None
-    ) -> "Unheld":
-        """From rows of `Clipped.segments`; `width` [m] of the segments, if all have the same."""
-        count = len(kinds)
-        share = (table[..., -count:] - table[..., :1]) / (width or table[..., 1:2])
-        nodes = [k for k, kind in enumerate(kinds) if kind not in CLAMPS]
-        dimension = len(rows[-1])
-        ends = rows if rows[0] else [[-1] * dimension, *rows[1:]]
-        # A clip at a node counts in one segment only: derivatives by its arc length are one-sided.
-        inside = np.maximum((share >= -BESIDE).sum(axis=1)[:, nodes] - 1, 0)
-        return cls((share > 0.5).astype(float), inside, np.array(ends))
-
-    def evaluated(
-        self,
-        name: str,
-        mapped: Callable[[str, bool], Callable[..., list[FloatArray]]],
-        arguments: Sequence[FloatArray],
-        first: int,
-    ) -> list[FloatArray]:
-        """Outputs (m, n_segments, rows, columns) of a function of segments.
-
-        `mapped` (name, unheld) -> the function. Its second argument is the border, whose rows start
-        at `first` in outputs that have them.
-        """
-        both, lam, *others = arguments
-        found = mapped(name, True)(both, self.summed(lam), *others)
-        for out, axes in zip(found, _BORDER_AXES.get(name, ((),) * len(found)), strict=True):
-            for axis in axes:
-                self._spread(out, axis, first)
-        if self.inside.size:
-            here = np.arange(len(lam))[:, None], self.inside
-            held = mapped(name, False)(*(one[here] for one in arguments))
-            for out, one in zip(found, held, strict=True):
-                out[here] = one
-        return found
-
-    def summed(self, lam: FloatArray) -> FloatArray:
-        """Border (m, n_segments, n_lam) with the sum of all forces beyond as first clip's force."""
-        own, (end, *clips) = lam.copy(), self.rows
-        total = np.zeros(lam.shape[:2] + end.shape) if end[0] < 0 else lam[..., end]
-        for k, rows in enumerate(clips):
-            total = total + self.beyond[..., [k]] * lam[..., rows]
-        own[..., clips[0]] = total
-        return own
-
-    def _spread(self, out: FloatArray, axis: int, first: int) -> None:
-        """Expand derivatives by that sum, from row `first` of an axis, to those by each force."""
-        rows = np.moveaxis(out, axis, 0)
-        end, *clips = first + self.rows
-        total = rows[clips[0]].copy()
-        shape = (*self.beyond.shape[:2], *(1,) * (out.ndim - 3))
-        if self.rows[0, 0] >= 0:
-            rows[end] = total
-        for k, own in enumerate(clips):
-            rows[own] = total * self.beyond[..., k].reshape(shape)
 
 
 def _within(mean: Any, a: Any, c: Any, x: Any, w: Any) -> tuple[Any, Any, Any]:

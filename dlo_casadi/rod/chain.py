@@ -132,8 +132,9 @@ class Chain:
 
     def curvatures(self, means: FloatArray) -> FloatArray:
         """Curvatures (..., axes, n_cells) among strains (..., n_rests) of the cells."""
-        by_strain = means.reshape((*means.shape[:-1], -1, self.n_cells))
-        return by_strain[..., -len(self.kind.node.curvatures) :, :]
+        node = self.kind.node
+        by_strain = means.reshape((*means.shape[:-1], len(node.strains), self.n_cells))
+        return by_strain[..., -len(node.curvatures) :, :]
 
 
 _DEGREE = 3

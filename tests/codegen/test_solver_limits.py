@@ -24,6 +24,7 @@ from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.assembly import Inputs
+from dlo_casadi.model.clips import HeldClip
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
@@ -41,6 +42,8 @@ def in_space(*clips, **held):
 CASES = {
     "plane": lambda: flat(),
     "links": lambda: flat(element="link"),
+    "plane, bent most at an eyelet": lambda: flat(HeldClip("eyelet", (0.35, 0.35))),
+    "plane, bent most at a pinned clip": lambda: flat(HeldClip("pinned", (0.35, 0.35), 0.59)),
     "plane, saddle and eyelet": lambda: flat(FLAT_SADDLE, FLAT_EYELET),
     "plane, saddle near the start": lambda: flat(
         replace(FLAT_SADDLE, at=0.17, place=(0.15, 0.045)), end="free"
@@ -78,6 +81,8 @@ def test_values_and_places_are_those_of_python(case):
         expected = 1 / sizes[tight] if name == "bend_radius" else sizes[tight]
         assert own.value == pytest.approx(expected, rel=1e-9), name
         assert own.at == pytest.approx(places[tight], abs=1e-9), name
+        if name == "bend_radius" and "bent most" in case:
+            assert own.at == pytest.approx(found.clips[0].at, abs=1e-9)
         used = limit * sizes[tight] if name == "bend_radius" else sizes[tight] / limit
         assert own.margin == pytest.approx(1 - used, rel=1e-8), name
         if name in ("force", "moment"):
@@ -104,7 +109,14 @@ def test_a_clearance_is_that_of_dlo_clearance():
 
 
 @pytest.mark.parametrize(
-    "case", ["plane, saddle and eyelet", "space, saddle and pinned", "space, swivel and eyelet"]
+    "case",
+    [
+        "plane, saddle and eyelet",
+        "plane, bent most at an eyelet",
+        "plane, bent most at a pinned clip",
+        "space, saddle and pinned",
+        "space, swivel and eyelet",
+    ],
 )
 def test_gradients_are_differences(case):
     """Central differences of 1e-5 m, whose error is about 1e-7 of the second derivative."""
