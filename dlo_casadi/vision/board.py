@@ -14,7 +14,12 @@ from dlo_casadi.vision.image import spoilt
 
 MAX_ERROR_PX = 2.0  # largest error of a marker at its declared place
 LEAST_MARKERS = 3  # fewest markers for a camera's pose: two define only a line
+_LEAST_IN_PLANE = 2  # the same for a plane: with one marker a rendered cable was 13 mm off
 CORNERS_THAT_SHARE = 4  # corners of a marker share an error (light, blur, print): they count as one
+# Shift of the edges of black squares by gamma and blur [px]: 0.4 in sharp rendered pictures, 1 in
+# blurred ones. It is bounded by the largest error of a marker; beyond, a square has another size.
+_EDGE_SHIFT_PX = 0.5
+_CORNER_PX = 0.1  # typical error of a corner beside it
 _BEST_CORNER_PX = 0.05  # smallest error of a corner, from sampling and rounding to grey levels
 _RESIZED = 20.0  # largest factor by which a picture may have been resized
 
@@ -62,7 +67,7 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
     Raises
     ------
     VisionError
-        If no marker of the board is found, if the markers found contradict their declared
+        If fewer than two of the board's markers are seen, if those contradict their declared
         places, or if a standoff is given without a camera.
     """
     if camera is None and board.standoff != 0.0:
@@ -70,7 +75,7 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
             f"a standoff of {board.standoff:g} m needs a camera: without one only the board's own "
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
-    fit, seen = _located(image, board, camera)
+    fit, seen = _located(image, board, camera, _LEAST_IN_PLANE)
     normal = np.cross(fit.plane[:, 0], fit.plane[:, 1])
     cable = fit.plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0])
     return View(homography=cable, camera=camera, **seen)
@@ -92,16 +97,18 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> CameraPose:
     rotation = np.column_stack([one, other, np.cross(one, other)])
     at = np.vstack([board.corners(n) for n in fit.found]) @ rotation[:, :2].T + shift
     # Corners of a marker share an error: 4 (J^T J)^-1 s^2 with the corners' scatter s^2 = sum /
-    # (2 K - 6). On rendered boards the error of poses is up to five times that of sixteen
-    # independent corners.
+    # (2 K - 7), J by the pose and the shift of edges. On rendered boards the error of poses is up
+    # to five times that of sixteen independent corners.
     by_shift = camera.project(at)[1]
-    J = np.concatenate([np.cross(at[:, None, :], by_shift), by_shift], axis=2).reshape(-1, 6)
-    scatter = max(fit.rms**2 * len(at) / (2 * len(at) - 6), _BEST_CORNER_PX**2)
+    edges = np.vstack([_outwards(quad) for quad in fit.found.values()])
+    J = np.concatenate([np.cross(at[:, None, :], by_shift), by_shift, edges[..., None]], axis=2)
+    J = J.reshape(-1, 7)
+    scatter = max(fit.rms**2 * len(at) / (2 * len(at) - 7), _BEST_CORNER_PX**2)
     return CameraPose(
         camera=camera,
         rotation=rotation,
         translation=shift,
-        covariance=np.linalg.inv(J.T @ J) * scatter * CORNERS_THAT_SHARE,
+        covariance=np.linalg.inv(J.T @ J)[:6, :6] * scatter * CORNERS_THAT_SHARE,
         **seen,
     )
 
@@ -120,7 +127,7 @@ class _Fit:
 
 
 def _located(
-    image: Picture, board: Board, camera: Camera | None, least: int = 0
+    image: Picture, board: Board, camera: Camera | None, least: int
 ) -> tuple[_Fit, dict[str, Any]]:
     """Fit of the markers that agree with their declared places, with the fields of a Photograph."""
     seen, repeated = detect_markers(image, board)
@@ -135,10 +142,6 @@ def _located(
             "Try: a photograph with the whole board in it, sharp and not covered."
             + spoilt(image)
             + "".join(f" The {copy}" for copy in copies)
-        )
-    if not seen:
-        raise VisionError(
-            "every marker of the board is seen more than once. Try: cover or remove the copies."
         )
     height, width = image.shape[:2]
     fit = _fit(seen, board, camera)
@@ -171,26 +174,58 @@ def _located(
 
 
 def _fit(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> _Fit:
-    """Fit the board's plane to markers; of the two poses that fit a plane, return the better."""
+    """Fit the board's plane to markers, and the shift e [px] of all their edges inwards.
+
+    Light and blur make black squares smaller in the picture, which would tilt the plane. With
+    the errors r(e) = r_0 + e d of the corners moved outwards again, which are nearly linear, and
+    the standard deviations s of e and c of corners, of which those of a marker count as one,
+
+        e = -(r_0 . d) / (d . d + 4 c^2 / s^2)
+    """
+    plane, as_seen = _fit_plane(found, board, camera)
+
+    def moved(shift: float) -> tuple[FloatArray, FloatArray]:
+        outer = {n: quad + shift * _outwards(quad) for n, quad in found.items()}
+        return _fit_plane(outer, board, camera)
+
+    slope = moved(1.0)[1] - as_seen
+    known = CORNERS_THAT_SHARE * (_CORNER_PX / _EDGE_SHIFT_PX) ** 2
+    shift = -float(np.sum(as_seen * slope) / (np.sum(slope**2) + known))
+    other = moved(float(np.clip(shift, -MAX_ERROR_PX, MAX_ERROR_PX)))
+    # Of two poses from few corners the other one may follow; its errors are then larger.
+    plane, off = min((plane, as_seen), other, key=lambda fit: float(np.sum(fit[1] ** 2)))
+    return _Fit(found, plane, np.sqrt(np.sum(off**2, axis=1).reshape(-1, 4).mean(axis=1)))
+
+
+def _outwards(quad: FloatArray) -> FloatArray:
+    """Steps (4, 2) of the corners of a square that move all its sides outwards by 1."""
+    along = np.roll(quad, -1, axis=0) - quad
+    normal = np.column_stack([along[:, 1], -along[:, 0]])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    before = np.roll(normal, 1, axis=0)
+    return np.asarray((normal + before) / (1 + np.sum(normal * before, axis=1, keepdims=True)))
+
+
+def _fit_plane(
+    found: dict[int, FloatArray], board: Board, camera: Camera | None
+) -> tuple[FloatArray, FloatArray]:
+    """Board's plane, the better of the two poses that fit, and errors of corners (4 n, 2) [px]."""
     pixels = np.vstack(list(found.values()))
     points = np.vstack([board.corners(marker) for marker in found])
     if camera is None:
         plane, _ = cv2.findHomography(points, pixels)
-        projected = View(homography=plane, shape=(1, 1)).to_pixels(points)
-    else:
-        solid = np.column_stack([points, np.zeros(len(points))])
-        lens = camera.matrix, camera.distortion
-        _, *poses, _ = cv2.solvePnPGeneric(solid, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
-        trials = []
-        for rotation, shift in zip(*poses, strict=True):
-            pose = cv2.solvePnPRefineLM(solid, pixels, *lens, rotation.copy(), shift.copy())
-            trials.append((*pose, cv2.projectPoints(solid, *pose, *lens)[0][:, 0]))
-        if not trials:
-            raise VisionError("the pose of the board cannot be solved from its markers.")
-        rotation, shift, projected = min(trials, key=lambda t: np.mean((t[2] - pixels) ** 2))
-        plane = np.column_stack([cv2.Rodrigues(rotation)[0][:, :2], shift.ravel()])
-    miss = np.sum((projected - pixels) ** 2, axis=1).reshape(-1, 4)
-    return _Fit(found, plane, np.sqrt(miss.mean(axis=1)))
+        return plane, View(homography=plane, shape=(1, 1)).to_pixels(points) - pixels
+    solid = np.column_stack([points, np.zeros(len(points))])
+    lens = camera.matrix, camera.distortion
+    _, *poses, _ = cv2.solvePnPGeneric(solid, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
+    trials = []
+    for rotation, shift in zip(*poses, strict=True):
+        pose = cv2.solvePnPRefineLM(solid, pixels, *lens, rotation.copy(), shift.copy())
+        trials.append((*pose, cv2.projectPoints(solid, *pose, *lens)[0][:, 0] - pixels))
+    if not trials:
+        raise VisionError("the pose of the board cannot be solved from its markers.")
+    rotation, shift, off = min(trials, key=lambda trial: np.sum(trial[2] ** 2))
+    return np.column_stack([cv2.Rodrigues(rotation)[0][:, :2], shift.ravel()]), off
 
 
 def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, int]) -> str:
