@@ -174,27 +174,34 @@ def _located(
 
 
 def _fit(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> _Fit:
-    """Fit the board's plane to markers, and the shift e [px] of all their edges inwards.
+    """Fit the board's plane to markers with the edges where they are without gamma and blur."""
+    plane, off = _fit_plane(widened(found, board, camera), board, camera)
+    return _Fit(found, plane, np.sqrt(np.sum(off**2, axis=1).reshape(-1, 4).mean(axis=1)))
 
-    Light and blur make black squares smaller in the picture, which would tilt the plane. With
-    the errors r(e) = r_0 + e d of the corners moved outwards again, which are nearly linear, and
-    the standard deviations s of e and c of corners, of which those of a marker count as one,
+
+def widened(
+    found: dict[int, FloatArray], board: Board, camera: Camera | None
+) -> dict[int, FloatArray]:
+    """Corners of markers, moved outwards by the shift e [px] of all edges in this picture.
+
+    Light and blur make black squares smaller, which would tilt the plane. With the errors
+    r(e) = r_0 + e d of the corners after the fit of the plane, nearly linear, and the standard
+    deviations s of e and c of corners, of which those of a marker count as one,
 
         e = -(r_0 . d) / (d . d + 4 c^2 / s^2)
     """
-    plane, as_seen = _fit_plane(found, board, camera)
 
-    def moved(shift: float) -> tuple[FloatArray, FloatArray]:
+    def moved(shift: float) -> tuple[dict[int, FloatArray], FloatArray]:
         outer = {n: quad + shift * _outwards(quad) for n, quad in found.items()}
-        return _fit_plane(outer, board, camera)
+        return outer, _fit_plane(outer, board, camera)[1]
 
-    slope = moved(1.0)[1] - as_seen
+    as_seen = moved(0.0)
+    slope = moved(1.0)[1] - as_seen[1]
     known = CORNERS_THAT_SHARE * (_CORNER_PX / _EDGE_SHIFT_PX) ** 2
-    shift = -float(np.sum(as_seen * slope) / (np.sum(slope**2) + known))
+    shift = -float(np.sum(as_seen[1] * slope) / (np.sum(slope**2) + known))
     other = moved(float(np.clip(shift, -MAX_ERROR_PX, MAX_ERROR_PX)))
     # Of two poses from few corners the other one may follow; its errors are then larger.
-    plane, off = min((plane, as_seen), other, key=lambda fit: float(np.sum(fit[1] ** 2)))
-    return _Fit(found, plane, np.sqrt(np.sum(off**2, axis=1).reshape(-1, 4).mean(axis=1)))
+    return min(as_seen, other, key=lambda trial: float(np.sum(trial[1] ** 2)))[0]
 
 
 def _outwards(quad: FloatArray) -> FloatArray:
