@@ -160,6 +160,15 @@ def test_two_cables_are_refused():
         extract(draw(CABLE, onto=draw(other)), CABLE)
 
 
+@pytest.mark.parametrize("look", [{"width_px": 4.0}, {"cable": (190, 70, 20)}])
+def test_a_wire_of_another_width_or_colour_is_no_second_cable(look):
+    across = np.column_stack([np.linspace(0.05, 1.0, 200), np.linspace(-0.05, -0.5, 200)])
+    wire = draw(across, **{"width_px": 5.4, "cable": (150, 60, 20), **look})
+    line = extract(draw(CABLE, onto=wire), CABLE)
+    assert normal_distance_px(line.points, CABLE).max() < 1.0
+    assert line.messages == ()
+
+
 def test_no_cable_dark_and_overexposed_pictures_say_so():
     empty = np.full((420, 560, 3), 185, np.uint8)
     with pytest.raises(VisionError, match=r"no cable found: the best chain .* background"):
