@@ -1,11 +1,13 @@
 """Find the board's ArUco markers, and the pose of the camera from them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import VisionError, counted
@@ -154,7 +156,7 @@ def _located(
         raise VisionError(
             f"the markers {sorted(fit.found)} are {fit.rms:.1f} px RMS off their declared places. "
             "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
-            f"The picture is {width} x {height} px.{_other_axes(seen, board, camera)}"
+            f"The picture is {width} x {height} px.{_other_board(seen, board, camera)}"
         )
     if len(fit.found) < least:
         raise VisionError(
@@ -242,37 +244,73 @@ def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, in
     """
     width, height = shape
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
-    size = float(np.sqrt(4 * abs(cx * cy) / (width * height)))
-    same = f"pictures of the size that it was calibrated with, or fx, fy, cx, cy over {size:.3g}."
     turn = "turn it back, as the pictures that it was calibrated with; was its EXIF tag lost?"
-    others = [
-        ("turned by 90 degrees", turn, (fy, fx, cy, height - 1 - cx)),
-        ("turned by -90 degrees", turn, (fy, fx, width - 1 - cy, cx)),
-        ("turned by 180 degrees", turn, (fx, fy, width - 1 - cx, height - 1 - cy)),
-    ]
-    if 1 / _RESIZED < size < _RESIZED:
-        scaled = (fx / size, fy / size, cx / size, cy / size)
-        others.insert(0, (f"divided by {size:.3g}", same, scaled))
-    matrices = [np.array([[a, 0, u], [0, b, v], [0, 0, 1]]) for *_, (a, b, u, v) in others]
-    errors = [_fit(fit.found, board, Camera(m, camera.distortion)).rms for m in matrices]
-    how, cure, _ = others[int(np.argmin(errors))]
-    if max(min(errors), _BEST_CORNER_PX) > fit.rms / 2:
+    turned = {
+        "turned by 90 degrees": (fy, fx, cy, height - 1 - cx),
+        "turned by -90 degrees": (fy, fx, width - 1 - cy, cx),
+        "turned by 180 degrees": (fx, fy, width - 1 - cx, height - 1 - cy),
+    }
+
+    def error(numbers: tuple[float, float, float, float]) -> float:
+        """RMS [px] of the markers with other fx, fy, cx, cy."""
+        a, b, u, v = numbers
+        matrix = np.array([[a, 0, u], [0, b, v], [0, 0, 1]])
+        return _fit(fit.found, board, Camera(matrix, camera.distortion)).rms
+
+    def resized(factor: float) -> float:
+        return error((fx / factor, fy / factor, cx / factor, cy / factor))
+
+    off, how = min((error(numbers), how) for how, numbers in turned.items())
+    cure = turn
+    size = float(np.sqrt(4 * abs(cx * cy) / (width * height)))
+    if 1 / _RESIZED < size < _RESIZED and resized(size) < min(off, fit.rms / 2):
+        size, off = _least(resized, size, 1.1)
+        how = f"divided by {size:.3g}"
+        cure = (
+            f"pictures of the size that it was calibrated with, or fx, fy, cx, cy over {size:.3g}."
+        )
+    if max(off, _BEST_CORNER_PX) > fit.rms / 2:
         return ""
     return (
         f"camera.matrix, with its principal point at ({cx:g}, {cy:g}) px, is not that of this "
         f"picture of {width} x {height} px: the markers are {fit.rms:.2g} px RMS off their "
-        f"declared places, but {min(errors):.2g} px with the matrix {how}. Try: {cure}"
+        f"declared places, but {off:.2g} px with the matrix {how}. Try: {cure}"
     )
 
 
-def _other_axes(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> str:
-    """Sentence on other axes for which the declared places would fit, if there are any."""
+def _least(error: Callable[[float], float], about: float, factor: float) -> tuple[float, float]:
+    """Positive number of least error, within a factor of `about`, and that error."""
+    ends = np.log(about) + np.array([-1.0, 1.0]) * np.log(factor)
+    best = minimize_scalar(lambda z: error(np.exp(z)), bounds=ends, options={"xatol": 1e-3})
+    return float(np.exp(best.x)), float(best.fun)
+
+
+def _other_board(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> str:
+    """Sentence on other axes, places or sizes of markers that would fit, if there are any."""
+
+    def fits(**changes: Any) -> bool:
+        trial = replace(board, **changes)
+        return len(found) > 1 and _fit(found, trial, camera).errors.max() < MAX_ERROR_PX
+
+    places = board.marker_centers
     for what, axes in _AXES.items():
-        centers = {n: np.array(axes) @ np.array(board.marker_centers[n], float) for n in found}
-        fit = _fit(found, replace(board, marker_centers=centers), camera)
-        if len(found) > 1 and fit.errors.max() < MAX_ERROR_PX:
+        if fits(marker_centers={n: np.array(axes) @ np.array(places[n], float) for n in found}):
             return f" With {what} in marker_centers they fit."
-    return ""
+    numbers = sorted(places)
+    swaps = [{a: b, b: a} for a, b in combinations(numbers, 2)]
+    cycles = [
+        dict(zip(numbers, numbers[k:] + numbers[:k], strict=True)) for k in range(1, len(numbers))
+    ]
+    for moved in swaps + cycles:
+        if fits(marker_centers={n: places[moved.get(n, n)] for n in found}):
+            text = ", ".join(f"{n} at the place of {m}" for n, m in moved.items())
+            return f" With {text} in marker_centers they fit."
+
+    def off(size: float) -> float:
+        return float(np.sum(_fit_plane(found, replace(board, marker_size=size), camera)[1] ** 2))
+
+    size, _ = _least(off, board.marker_size, 5.0)
+    return f" With a marker_size of about {size:.2g} m they fit." if fits(marker_size=size) else ""
 
 
 def detect_markers(image: Picture, board: Board) -> tuple[dict[int, FloatArray], set[int]]:

@@ -201,8 +201,21 @@ def test_a_missing_board_names_what_was_found(picture):
 
 def test_markers_at_other_places_than_declared_are_refused(picture):
     swapped = a_board(marker_centers={**CENTERS, 0: CENTERS[2], 2: CENTERS[0]})
-    with pytest.raises(VisionError, match="off their declared places"):
+    with pytest.raises(VisionError, match=r"off .* With 0 at the place of 2, 2 at the place of 0"):
         locate_board(picture, swapped, CAMERA)
+    cycled = a_board(marker_centers={n: CENTERS[(n + 1) % 4] for n in CENTERS})
+    with pytest.raises(VisionError, match=r"With 0 at the place of 3, .* 3 at the place of 2 in"):
+        locate_board(picture, cycled, CAMERA)
+    with pytest.raises(VisionError, match=r"With a marker_size of about 0\.08 m they fit"):
+        locate_board(picture, a_board(marker_size=0.1), CAMERA)
+
+
+def test_a_matrix_of_pictures_of_twice_the_size_is_recognised(picture):
+    """By its principal point alone it would be 1.99 times the size."""
+    twice = Camera(np.diag([2, 2, 1]) @ MATRIX, DISTORTION)
+    message = r"but 0\.\d+ px with the matrix divided by 2\. Try"
+    with pytest.raises(VisionError, match=message):
+        locate_board(picture, a_board(), twice)
 
 
 def test_one_displaced_marker_of_four_is_left_out(picture):
