@@ -1,11 +1,13 @@
 """Find the board's ArUco markers, and the pose of the camera from them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import VisionError, counted
@@ -14,7 +16,12 @@ from dlo_casadi.vision.image import spoilt
 
 MAX_ERROR_PX = 2.0  # largest error of a marker at its declared place
 LEAST_MARKERS = 3  # fewest markers for a camera's pose: two define only a line
+_LEAST_IN_PLANE = 2  # the same for a plane: with one marker a rendered cable was 13 mm off
 CORNERS_THAT_SHARE = 4  # corners of a marker share an error (light, blur, print): they count as one
+# Shift of the edges of black squares by gamma and blur [px]: 0.4 in sharp rendered pictures, 1 in
+# blurred ones. It is bounded by the largest error of a marker; beyond, a square has another size.
+_EDGE_SHIFT_PX = 0.5
+_CORNER_PX = 0.1  # typical error of a corner beside it
 _BEST_CORNER_PX = 0.05  # smallest error of a corner, from sampling and rounding to grey levels
 _RESIZED = 20.0  # largest factor by which a picture may have been resized
 
@@ -62,7 +69,7 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
     Raises
     ------
     VisionError
-        If no marker of the board is found, if the markers found contradict their declared
+        If fewer than two of the board's markers are seen, if those contradict their declared
         places, or if a standoff is given without a camera.
     """
     if camera is None and board.standoff != 0.0:
@@ -70,7 +77,7 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
             f"a standoff of {board.standoff:g} m needs a camera: without one only the board's own "
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
-    fit, seen = _located(image, board, camera)
+    fit, seen = _located(image, board, camera, _LEAST_IN_PLANE)
     normal = np.cross(fit.plane[:, 0], fit.plane[:, 1])
     cable = fit.plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0])
     return View(homography=cable, camera=camera, **seen)
@@ -92,16 +99,18 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> CameraPose:
     rotation = np.column_stack([one, other, np.cross(one, other)])
     at = np.vstack([board.corners(n) for n in fit.found]) @ rotation[:, :2].T + shift
     # Corners of a marker share an error: 4 (J^T J)^-1 s^2 with the corners' scatter s^2 = sum /
-    # (2 K - 6). On rendered boards the error of poses is up to five times that of sixteen
-    # independent corners.
+    # (2 K - 7), J by the pose and the shift of edges. On rendered boards the error of poses is up
+    # to five times that of sixteen independent corners.
     by_shift = camera.project(at)[1]
-    J = np.concatenate([np.cross(at[:, None, :], by_shift), by_shift], axis=2).reshape(-1, 6)
-    scatter = max(fit.rms**2 * len(at) / (2 * len(at) - 6), _BEST_CORNER_PX**2)
+    edges = np.vstack([_outwards(quad) for quad in fit.found.values()])
+    J = np.concatenate([np.cross(at[:, None, :], by_shift), by_shift, edges[..., None]], axis=2)
+    J = J.reshape(-1, 7)
+    scatter = max(fit.rms**2 * len(at) / (2 * len(at) - 7), _BEST_CORNER_PX**2)
     return CameraPose(
         camera=camera,
         rotation=rotation,
         translation=shift,
-        covariance=np.linalg.inv(J.T @ J) * scatter * CORNERS_THAT_SHARE,
+        covariance=np.linalg.inv(J.T @ J)[:6, :6] * scatter * CORNERS_THAT_SHARE,
         **seen,
     )
 
@@ -120,7 +129,7 @@ class _Fit:
 
 
 def _located(
-    image: Picture, board: Board, camera: Camera | None, least: int = 0
+    image: Picture, board: Board, camera: Camera | None, least: int
 ) -> tuple[_Fit, dict[str, Any]]:
     """Fit of the markers that agree with their declared places, with the fields of a Photograph."""
     seen, repeated = detect_markers(image, board)
@@ -136,10 +145,6 @@ def _located(
             + spoilt(image)
             + "".join(f" The {copy}" for copy in copies)
         )
-    if not seen:
-        raise VisionError(
-            "every marker of the board is seen more than once. Try: cover or remove the copies."
-        )
     height, width = image.shape[:2]
     fit = _fit(seen, board, camera)
     if camera is not None and (text := _other_picture(fit, board, camera, (width, height))):
@@ -151,7 +156,7 @@ def _located(
         raise VisionError(
             f"the markers {sorted(fit.found)} are {fit.rms:.1f} px RMS off their declared places. "
             "Try: marker_centers and marker_size in metres? camera.matrix of this picture size? "
-            f"The picture is {width} x {height} px.{_other_axes(seen, board, camera)}"
+            f"The picture is {width} x {height} px.{_other_board(seen, board, camera)}"
         )
     if len(fit.found) < least:
         raise VisionError(
@@ -171,26 +176,65 @@ def _located(
 
 
 def _fit(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> _Fit:
-    """Fit the board's plane to markers; of the two poses that fit a plane, return the better."""
+    """Fit the board's plane to markers with the edges where they are without gamma and blur."""
+    plane, off = _fit_plane(widened(found, board, camera), board, camera)
+    return _Fit(found, plane, np.sqrt(np.sum(off**2, axis=1).reshape(-1, 4).mean(axis=1)))
+
+
+def widened(
+    found: dict[int, FloatArray], board: Board, camera: Camera | None
+) -> dict[int, FloatArray]:
+    """Corners of markers, moved outwards by the shift e [px] of all edges in this picture.
+
+    Light and blur make black squares smaller, which would tilt the plane. With the errors
+    r(e) = r_0 + e d of the corners after the fit of the plane, nearly linear, and the standard
+    deviations s of e and c of corners, of which those of a marker count as one,
+
+        e = -(r_0 . d) / (d . d + 4 c^2 / s^2)
+    """
+
+    def moved(shift: float) -> tuple[dict[int, FloatArray], FloatArray]:
+        outer = {n: quad + shift * _outwards(quad) for n, quad in found.items()}
+        return outer, _fit_plane(outer, board, camera)[1]
+
+    as_seen = moved(0.0)
+    slope = moved(1.0)[1] - as_seen[1]
+    known = CORNERS_THAT_SHARE * (_CORNER_PX / _EDGE_SHIFT_PX) ** 2
+    shift = -float(np.sum(as_seen[1] * slope) / (np.sum(slope**2) + known))
+    other = moved(float(np.clip(shift, -MAX_ERROR_PX, MAX_ERROR_PX)))
+    # Of two poses from few corners the other one may follow; its errors are then larger.
+    return min(as_seen, other, key=lambda trial: float(np.sum(trial[1] ** 2)))[0]
+
+
+def _outwards(quad: FloatArray) -> FloatArray:
+    """Steps (4, 2) of the corners of a square that move all its sides outwards by 1."""
+    along = np.roll(quad, -1, axis=0) - quad
+    normal = np.column_stack([along[:, 1], -along[:, 0]])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    before = np.roll(normal, 1, axis=0)
+    return np.asarray((normal + before) / (1 + np.sum(normal * before, axis=1, keepdims=True)))
+
+
+def _fit_plane(
+    found: dict[int, FloatArray], board: Board, camera: Camera | None
+) -> tuple[FloatArray, FloatArray]:
+    """Board's plane, the better of the two poses that fit, and errors of corners (4 n, 2) [px]."""
     pixels = np.vstack(list(found.values()))
     points = np.vstack([board.corners(marker) for marker in found])
     if camera is None:
         plane, _ = cv2.findHomography(points, pixels)
-        projected = View(homography=plane, shape=(1, 1)).to_pixels(points)
-    else:
-        solid = np.column_stack([points, np.zeros(len(points))])
-        lens = camera.matrix, camera.distortion
-        _, *poses, _ = cv2.solvePnPGeneric(solid, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
-        trials = []
-        for rotation, shift in zip(*poses, strict=True):
-            pose = cv2.solvePnPRefineLM(solid, pixels, *lens, rotation.copy(), shift.copy())
-            trials.append((*pose, cv2.projectPoints(solid, *pose, *lens)[0][:, 0]))
-        if not trials:
-            raise VisionError("the pose of the board cannot be solved from its markers.")
-        rotation, shift, projected = min(trials, key=lambda t: np.mean((t[2] - pixels) ** 2))
-        plane = np.column_stack([cv2.Rodrigues(rotation)[0][:, :2], shift.ravel()])
-    miss = np.sum((projected - pixels) ** 2, axis=1).reshape(-1, 4)
-    return _Fit(found, plane, np.sqrt(miss.mean(axis=1)))
+        return plane, View(homography=plane, shape=(1, 1)).to_pixels(points) - pixels
+    solid = np.column_stack([points, np.zeros(len(points))])
+    lens = camera.matrix, camera.distortion
+    _, *poses, _ = cv2.solvePnPGeneric(solid, pixels, *lens, flags=cv2.SOLVEPNP_IPPE)
+    trials = []
+    for rotation, shift in zip(*poses, strict=True):
+        pose = cv2.solvePnPRefineLM(solid, pixels, *lens, rotation.copy(), shift.copy())
+        trials.append((*pose, cv2.projectPoints(solid, *pose, *lens)[0][:, 0] - pixels))
+    if not trials:
+        raise VisionError("the pose of the board cannot be solved from its markers.")
+    rotation, shift, off = min(trials, key=lambda trial: np.sum(trial[2] ** 2))
+    return np.column_stack([cv2.Rodrigues(rotation)[0][:, :2], shift.ravel()]), off
 
 
 def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, int]) -> str:
@@ -200,37 +244,73 @@ def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, in
     """
     width, height = shape
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
-    size = float(np.sqrt(4 * abs(cx * cy) / (width * height)))
-    same = f"pictures of the size that it was calibrated with, or fx, fy, cx, cy over {size:.3g}."
     turn = "turn it back, as the pictures that it was calibrated with; was its EXIF tag lost?"
-    others = [
-        ("turned by 90 degrees", turn, (fy, fx, cy, height - 1 - cx)),
-        ("turned by -90 degrees", turn, (fy, fx, width - 1 - cy, cx)),
-        ("turned by 180 degrees", turn, (fx, fy, width - 1 - cx, height - 1 - cy)),
-    ]
-    if 1 / _RESIZED < size < _RESIZED:
-        scaled = (fx / size, fy / size, cx / size, cy / size)
-        others.insert(0, (f"divided by {size:.3g}", same, scaled))
-    matrices = [np.array([[a, 0, u], [0, b, v], [0, 0, 1]]) for *_, (a, b, u, v) in others]
-    errors = [_fit(fit.found, board, Camera(m, camera.distortion)).rms for m in matrices]
-    how, cure, _ = others[int(np.argmin(errors))]
-    if max(min(errors), _BEST_CORNER_PX) > fit.rms / 2:
+    turned = {
+        "turned by 90 degrees": (fy, fx, cy, height - 1 - cx),
+        "turned by -90 degrees": (fy, fx, width - 1 - cy, cx),
+        "turned by 180 degrees": (fx, fy, width - 1 - cx, height - 1 - cy),
+    }
+
+    def error(numbers: tuple[float, float, float, float]) -> float:
+        """RMS [px] of the markers with other fx, fy, cx, cy."""
+        a, b, u, v = numbers
+        matrix = np.array([[a, 0, u], [0, b, v], [0, 0, 1]])
+        return _fit(fit.found, board, Camera(matrix, camera.distortion)).rms
+
+    def resized(factor: float) -> float:
+        return error((fx / factor, fy / factor, cx / factor, cy / factor))
+
+    off, how = min((error(numbers), how) for how, numbers in turned.items())
+    cure = turn
+    size = float(np.sqrt(4 * abs(cx * cy) / (width * height)))
+    if 1 / _RESIZED < size < _RESIZED and resized(size) < min(off, fit.rms / 2):
+        size, off = _least(resized, size, 1.1)
+        how = f"divided by {size:.3g}"
+        cure = (
+            f"pictures of the size that it was calibrated with, or fx, fy, cx, cy over {size:.3g}."
+        )
+    if max(off, _BEST_CORNER_PX) > fit.rms / 2:
         return ""
     return (
         f"camera.matrix, with its principal point at ({cx:g}, {cy:g}) px, is not that of this "
         f"picture of {width} x {height} px: the markers are {fit.rms:.2g} px RMS off their "
-        f"declared places, but {min(errors):.2g} px with the matrix {how}. Try: {cure}"
+        f"declared places, but {off:.2g} px with the matrix {how}. Try: {cure}"
     )
 
 
-def _other_axes(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> str:
-    """Sentence on other axes for which the declared places would fit, if there are any."""
+def _least(error: Callable[[float], float], about: float, factor: float) -> tuple[float, float]:
+    """Positive number of least error, within a factor of `about`, and that error."""
+    ends = np.log(about) + np.array([-1.0, 1.0]) * np.log(factor)
+    best = minimize_scalar(lambda z: error(np.exp(z)), bounds=ends, options={"xatol": 1e-3})
+    return float(np.exp(best.x)), float(best.fun)
+
+
+def _other_board(found: dict[int, FloatArray], board: Board, camera: Camera | None) -> str:
+    """Sentence on other axes, places or sizes of markers that would fit, if there are any."""
+
+    def fits(**changes: Any) -> bool:
+        trial = replace(board, **changes)
+        return len(found) > 1 and _fit(found, trial, camera).errors.max() < MAX_ERROR_PX
+
+    places = board.marker_centers
     for what, axes in _AXES.items():
-        centers = {n: np.array(axes) @ np.array(board.marker_centers[n], float) for n in found}
-        fit = _fit(found, replace(board, marker_centers=centers), camera)
-        if len(found) > 1 and fit.errors.max() < MAX_ERROR_PX:
+        if fits(marker_centers={n: np.array(axes) @ np.array(places[n], float) for n in found}):
             return f" With {what} in marker_centers they fit."
-    return ""
+    numbers = sorted(places)
+    swaps = [{a: b, b: a} for a, b in combinations(numbers, 2)]
+    cycles = [
+        dict(zip(numbers, numbers[k:] + numbers[:k], strict=True)) for k in range(1, len(numbers))
+    ]
+    for moved in swaps + cycles:
+        if fits(marker_centers={n: places[moved.get(n, n)] for n in found}):
+            text = ", ".join(f"{n} at the place of {m}" for n, m in moved.items())
+            return f" With {text} in marker_centers they fit."
+
+    def off(size: float) -> float:
+        return float(np.sum(_fit_plane(found, replace(board, marker_size=size), camera)[1] ** 2))
+
+    size, _ = _least(off, board.marker_size, 5.0)
+    return f" With a marker_size of about {size:.2g} m they fit." if fits(marker_size=size) else ""
 
 
 def detect_markers(image: Picture, board: Board) -> tuple[dict[int, FloatArray], set[int]]:

@@ -305,8 +305,8 @@ def _refuse_twins(
     width = float(np.median([strand.width for strand in ours]))
     near, far = 0.0, 0.0
     strands = _strands(rest > 0, candidate, contrast, expected)
-    for strand in _of_one_colour(strands, ours) if expected.scene.varied else strands:
-        alike = strand.level > _TWIN_CONTRAST * level and 0.6 < strand.width / width < 1.6
+    for strand in _of_one_colour(strands, ours):
+        alike = strand.level > _TWIN_CONTRAST * level and 0.7 < strand.width / width < 1.4
         if not alike or strand.length < 5 * diameter:
             continue
         columns, rows = plane.to_pixels(strand.points).round().astype(int).T

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from drawing import SCALE, arc, draw, normal_distance_px, square_view, to_pixels
+from drawing import SCALE, arc, distance, draw, normal_distance_px, square_view, to_pixels
 
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision import KnownCable, extract_centerline
@@ -44,6 +44,28 @@ def test_a_drawn_cable_is_found_whatever_it_looks_like(look):
     assert line.coverage > 0.97
     assert line.gaps == ()
     assert np.all(np.sum(np.diff(line.points, axis=0) * np.diff(CABLE[::3], axis=0)[0], 1)[:5] > 0)
+
+
+def glossy(strength):
+    """Thick yellow cable on dark green, lit from one side, with a wide highlight aside."""
+    width_px, steps = 16.0, np.gradient(CABLE, axis=0)
+    normal = steps[:, ::-1] * [-1, 1] / np.linalg.norm(steps, axis=1, keepdims=True)
+    image = draw(
+        CABLE, width_px=width_px, cable=(30, 110, 140), board=(45, 60, 35), shadow=0.5, blur=1.0
+    )
+    body = distance(CABLE, image.shape[:2], width_px) < width_px / 2 - 1
+    aside = distance(CABLE + 0.25 * width_px / SCALE * normal, image.shape[:2], 2 * width_px)
+    light = strength * body * np.exp(-((aside / (0.3 * width_px)) ** 2))
+    return np.clip(image + light[..., None] * [0.6, 0.9, 1.0], 0, 255).astype(np.uint8)
+
+
+def test_a_highlight_aside_is_not_taken_for_the_cable():
+    """Its level counts in part, a twelfth of the width; as the cable itself it is a quarter."""
+    line = extract(glossy(90), CABLE, 16.0)
+    assert np.sqrt(np.mean(normal_distance_px(line.points, CABLE) ** 2)) < 16 / 11
+    assert line.messages == ()
+    with pytest.raises(VisionError, match=r"it is 1\d\.. mm wide .* 32.0 mm.*if it is glossy"):
+        extract(glossy(200), CABLE, 16.0)
 
 
 def test_the_result_is_ordered_spaced_and_consistent():
@@ -136,6 +158,15 @@ def test_two_cables_are_refused():
     other = arc(start=(0.25, -0.1))
     with pytest.raises(VisionError, match=r"two cables: .* leave one cable in the picture"):
         extract(draw(CABLE, onto=draw(other)), CABLE)
+
+
+@pytest.mark.parametrize("look", [{"width_px": 4.0}, {"cable": (190, 70, 20)}])
+def test_a_wire_of_another_width_or_colour_is_no_second_cable(look):
+    across = np.column_stack([np.linspace(0.05, 1.0, 200), np.linspace(-0.05, -0.5, 200)])
+    wire = draw(across, **{"width_px": 5.4, "cable": (150, 60, 20), **look})
+    line = extract(draw(CABLE, onto=wire), CABLE)
+    assert normal_distance_px(line.points, CABLE).max() < 1.0
+    assert line.messages == ()
 
 
 def test_no_cable_dark_and_overexposed_pictures_say_so():
