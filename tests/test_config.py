@@ -401,6 +401,8 @@ def test_a_value_that_is_kept_may_be_more_than_a_fit_searches_for(tmp_path):
 
 def load_for_all(folder: Path, options: str, *, clamped: bool) -> Config:
     """Load a session in which every effect of pins, or of clamps, can act."""
+    pin = "{kind: pinned, at: 0.4, place: [0.2, -0.1]}"
+    saddle = "{kind: clamped, at: 0.6, place: [0.3, -0.05], heading: 0}"
     clamps = (
         ("{start: pinned, end: pinned}", "{start: clamped, end: clamped}"),
         ("start: [0, 0]", "start: [0, 0], start_heading: 0, end_heading: 0"),
@@ -408,7 +410,7 @@ def load_for_all(folder: Path, options: str, *, clamped: bool) -> Config:
     return load(
         folder,
         *clamps * clamped,
-        ("role:", "clips: [{kind: pinned, at: 0.4, place: [0.2, -0.1]}], role:"),
+        ("role:", f"clips: [{pin}, {saddle}], role:"),
         ("  poses:", "  obstacles:\n    - {kind: plane, point: [0, -1], normal: [0, 1]}\n  poses:"),
         ("{kind: centerlines, std: 3e-4}", f"{{kind: images, {CAMERA}, {BOARD}}}"),
         (".csv", ".jpg"),

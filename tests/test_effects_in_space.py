@@ -329,7 +329,7 @@ ONLY = {
     "space": {"bending_anisotropy", "camera_frame", "clamp_rotation"},
 }
 FULL = {"curved": True, "n_poses": 3, "center": (0.0, 0.0), "camera": True, "readings": True}
-FULL |= {"clips": ("pinned",), "obstacles": 1}
+FULL |= {"clips": ("pinned", "clamped"), "obstacles": 1}
 
 
 def applied(where):

@@ -110,7 +110,7 @@ def test_a_spring_at_a_pin_holds_a_moment():
     expected = np.array([0.05 * (eq.phi[0] - 0.4), 0.0])
     np.testing.assert_allclose(found[[2, 5]], expected, atol=1e-12)
     np.testing.assert_allclose(eq.moments, expected, atol=1e-12)
-    assert [x.name for x in fixtures_of(model, pose, eq) if x.turns] == ["start"]
+    assert [x.name for x in fixtures_of(model, pose, eq) if x.takes_moment] == ["start"]
     sizes = sizes_of(model, eq.shapes, Inputs.of(p, rest, pose.vector[None]), "moment")
     np.testing.assert_allclose(sizes, [np.abs(expected[:1])], atol=1e-12)
 
