@@ -98,7 +98,7 @@ def compare(name: str, outcome: Outcome) -> dict:
     for effect in outcome.effects:
         for key, true in true_effects(name).get(effect.name, {}).items():
             found = effect.parameters[key]
-            row["parameters"][f"{effect.name}.{key}"] = {
+            row["parameters"][f"{effect.label}.{key}"] = {
                 "true": true,
                 "value": found.value,
                 "std": found.std,

@@ -339,6 +339,8 @@ def test_the_tolerance_of_directions_is_of_saddles_too():
     """Also between pins, where nothing else has a direction."""
     model = CableModel(CABLE, n_rest=0, clips=("clamped", "pinned"), effects=(ClipAngle(),))
     assert tolerances_of(model)["heading"] == ("clip_angle.heading_error",)
+    other = replace(model, clips=("pinned", "clamped"))
+    assert "heading" not in tolerances_of(other)  # the first clip turns nothing any more
 
 
 def test_an_offset_brings_a_clip_within_reach():

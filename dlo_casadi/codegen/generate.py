@@ -115,7 +115,7 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
 def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[str, int | str]:
     """Values of the templates' marks for any cable."""
     model, node, kind = case.model, case.model.node, case.model.chain.kind
-    effects = comment(", ".join(effect.name for effect in model.effects)) or "none"
+    effects = comment(", ".join(effect.label for effect in model.effects)) or "none"
     contact = obstacles.values(model)
     ends = f"start {model.start}, end {model.end}"
     held = [*model.clips, *["pinned"] * len(case.tethers)]
@@ -256,6 +256,12 @@ def generate(
     among = Obstacles.of(model, p, obstacles)
     bare, p = replace(model, obstacles=()).without_kind(ContactEffect, p)
     case = case_of(bare, p, rest, inline, among.most)
+    elements = sorted(int(tether[0] * bare.n) for tether in case.tethers)
+    if len({*elements}) < len(elements):
+        raise DloError(
+            f"two tethers are in one of the {bare.n} elements: no solver can be generated\n"
+            "  Try: a finer mesh, --n, or one tether in place of both"
+        )
     values = {
         mark: value if isinstance(value, str) else str(int(value))
         for mark, value in _values(case, among, prefix, digest).items()

@@ -117,7 +117,7 @@ def _too_many(config: Config, setup: Setup, kept: bool) -> Iterator[ConfigProble
     """Find effects declared more often than a cable may have them, or twice alike for a fit."""
     before = defaultdict[str, list[dict[str, float]]](list)
     for i, item in enumerate(config.model.effects):
-        if item.name not in EFFECTS:
+        if item.name not in EFFECTS or EFFECTS[item.name].impossible(setup):
             continue
         kind, same = EFFECTS[item.name], before[item.name]
         first, *others = kind.several(setup, len(same) + 1)

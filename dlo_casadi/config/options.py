@@ -314,9 +314,9 @@ class DeclaredTolerances(ConfigSection):
     end: Positive = _STANDARD.end
     """Of a coordinate of a fixture [m]."""
     heading: Positive = _STANDARD.heading
-    """Of a clamp's heading in a plane [rad]."""
+    """Of the heading of a clamp or saddle in a plane [rad]."""
     rotation: Positive = _STANDARD.rotation
-    """Of a clamp's orientation in space, about each of its axes [rad]."""
+    """Of a clamp's orientation in space, about each of its axes, of a saddle's across [rad]."""
     roll: Positive = _STANDARD.roll
     """Of the roll of a cable in its end clamp, about itself [rad]."""
     clip: Positive = _STANDARD.clip

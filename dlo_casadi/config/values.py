@@ -322,7 +322,7 @@ def _table(words: str, *columns: int) -> BeforeValidator:
         except ValueError:  # rows of different lengths
             array = np.zeros(0, object)
         # What is masked, or empty in a table, is None.
-        if all(item is None or type(item) in (int, float) for item in array.ravel()):
+        if all(item is None or isinstance(item, float) or type(item) is int for item in array.flat):
             array = array.astype(float)
         if array.dtype.kind not in "fiu" or not array.size or not isinstance(value, list | tuple):
             file = ". Try: file, for the name of a file" if isinstance(value, str) else ""

@@ -90,8 +90,8 @@ class Effect:
     Parameters
     ----------
     label : str, optional
-        Prefix of the parameters' names: the effect's name, with _2 for the second one of that name
-        and for the second clip or obstacle.
+        Prefix of the parameters' names: the effect's name, with _2 for the second one of that name;
+        of a clip or obstacle with the number of that.
     """
 
     name: ClassVar[str]

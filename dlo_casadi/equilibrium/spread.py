@@ -129,10 +129,10 @@ def cause_of(model: CableModel, deviation: str) -> str:
 
 def tolerances_of(model: CableModel) -> dict[str, tuple[str, ...]]:
     """Deviations or parameters of a model that each tolerance covers, by the tolerance's name."""
-    deviations = _of_deviations(model)
+    deviations, setup = _of_deviations(model), _setup(model)
     named = [*deviations]
     for effect in model.effects:
-        if not isinstance(effect, MeasurementEffect):
+        if not isinstance(effect, MeasurementEffect) and _acts(effect, setup):
             carried = _carried_beside(effect, deviations)
             own = ((tolerance, f"{effect.label}.{name}") for name, tolerance in carried.items())
             named += [(tolerance, name) for tolerance, name in own if name in model.names]
@@ -145,15 +145,8 @@ def with_tolerances(model: CableModel, names: Collection[str]) -> CableModel:
 
     Those of measurements matter to no shape.
     """
-    deviations, present = _of_deviations(model), {effect.label for effect in model.effects}
-    setup = Setup(
-        model.cable,
-        model.start,
-        model.end,
-        model.gravity,
-        clips=model.clips,
-        obstacles=len(model.obstacles),
-    )
+    deviations, setup = _of_deviations(model), _setup(model)
+    present = {effect.label for effect in model.effects}
     for kind in EFFECTS.values():
         if issubclass(kind, MeasurementEffect) or kind.impossible(setup):
             continue
@@ -162,6 +155,17 @@ def with_tolerances(model: CableModel, names: Collection[str]) -> CableModel:
             if carried & {*names} and effect.label not in present:
                 model = model.with_effect(effect)
     return model
+
+
+def _setup(model: CableModel) -> Setup:
+    held = model.start, model.end, model.gravity
+    return Setup(model.cable, *held, clips=model.clips, obstacles=len(model.obstacles))
+
+
+def _acts(effect: Effect, setup: Setup) -> bool:
+    """Whether the clip or obstacle that an effect is of is there, and of a kind that has it."""
+    own = effect.index
+    return not own or getattr(effect, own) in {getattr(x, own) for x in effect.each_for(setup)}
 
 
 def _of_deviations(model: CableModel) -> list[tuple[str, str]]:

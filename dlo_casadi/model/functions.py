@@ -362,7 +362,8 @@ class Functions:
         """(p, pose) -> true places (dimension, n_clips), arc lengths [m] and turns [rad] of clips.
 
         The arc lengths are (n_clips,), those of eyelets zero. The turns (increment, n_clips) are of
-        clamped clips, from their declared frames. A pose's own deviations are excluded.
+        clamped clips, from their declared frames, and mean nothing for others. A pose's own
+        deviations are excluded.
         """
         clips = self.terms.true_ends.clips
         places = ca.horzcat(ca.SX(self.node.dimension, 0), *(clip.place for clip in clips))

@@ -23,6 +23,7 @@ CORNERS_THAT_SHARE = 4  # corners of a marker share an error (light, blur, print
 _EDGE_SHIFT_PX = 0.5
 _CORNER_PX = 0.1  # typical error of a corner beside it
 _BEST_CORNER_PX = 0.05  # smallest error of a corner, from sampling and rounding to grey levels
+_FEW = 8  # most markers of which exchanges are tried: 35 fits of the plane
 _RESIZED = 20.0  # largest factor by which a picture may have been resized
 
 # Mistakes in marker_centers: axes as written -> the board's axes, x right and y up.
@@ -77,7 +78,7 @@ def locate_board(image: Picture, board: Board, camera: Camera | None = None) -> 
             f"a standoff of {board.standoff:g} m needs a camera: without one only the board's own "
             "plane can be measured. Try: give camera.matrix, or standoff: 0."
         )
-    fit, seen = _located(image, board, camera, _LEAST_IN_PLANE)
+    fit, seen = _located(image, board, camera, _LEAST_IN_PLANE, "board")
     normal = np.cross(fit.plane[:, 0], fit.plane[:, 1])
     cable = fit.plane + board.standoff * np.outer(normal, [0.0, 0.0, 1.0])
     return View(homography=cable, camera=camera, **seen)
@@ -94,7 +95,7 @@ def locate_camera(image: Picture, board: Board, camera: Camera) -> CameraPose:
     VisionError
         If fewer than three of the board's markers are seen where they are declared.
     """
-    fit, seen = _located(image, board, camera, LEAST_MARKERS)
+    fit, seen = _located(image, board, camera, LEAST_MARKERS, "camera")
     one, other, shift = fit.plane.T
     rotation = np.column_stack([one, other, np.cross(one, other)])
     at = np.vstack([board.corners(n) for n in fit.found]) @ rotation[:, :2].T + shift
@@ -129,9 +130,12 @@ class _Fit:
 
 
 def _located(
-    image: Picture, board: Board, camera: Camera | None, least: int
+    image: Picture, board: Board, camera: Camera | None, least: int, sought: str
 ) -> tuple[_Fit, dict[str, Any]]:
-    """Fit of the markers that agree with their declared places, with the fields of a Photograph."""
+    """Fit of the markers that agree with their declared places, with the fields of a Photograph.
+
+    `least`: number of markers that the place of what is `sought` needs.
+    """
     seen, repeated = detect_markers(image, board)
     copies = [
         f"marker {n} is seen more than once and not used. Try: cover or remove the copy."
@@ -139,7 +143,7 @@ def _located(
     ]
     if len(seen) < least:
         raise VisionError(
-            f"the camera's place needs {counted(least, 'marker')} of the board, and "
+            f"the {sought}'s place needs {counted(least, 'marker')} of the board, and "
             f"{'only ' if seen else ''}{sorted(seen)} of {sorted(board.marker_centers)} are seen. "
             "Try: a photograph with the whole board in it, sharp and not covered."
             + spoilt(image)
@@ -160,7 +164,7 @@ def _located(
         )
     if len(fit.found) < least:
         raise VisionError(
-            f"the camera's place needs {counted(least, 'marker')} of the board where they are "
+            f"the {sought}'s place needs {counted(least, 'marker')} of the board where they are "
             f"declared, and only {sorted(fit.found)} of {sorted(seen)} are. Try: marker_centers?"
         )
     used = f"{len(fit.found)} of {len(board.marker_centers)} are used"
@@ -297,10 +301,12 @@ def _other_board(found: dict[int, FloatArray], board: Board, camera: Camera | No
         if fits(marker_centers={n: np.array(axes) @ np.array(places[n], float) for n in found}):
             return f" With {what} in marker_centers they fit."
     numbers = sorted(places)
-    swaps = [{a: b, b: a} for a, b in combinations(numbers, 2)]
+    swaps = [{a: b, b: a} for a, b in combinations(numbers, 2) if a in found or b in found]
     cycles = [
         dict(zip(numbers, numbers[k:] + numbers[:k], strict=True)) for k in range(1, len(numbers))
     ]
+    if len(numbers) > _FEW:
+        swaps, cycles = [], []
     for moved in swaps + cycles:
         if fits(marker_centers={n: places[moved.get(n, n)] for n in found}):
             text = ", ".join(f"{n} at the place of {m}" for n, m in moved.items())

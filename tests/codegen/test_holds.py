@@ -313,7 +313,16 @@ def test_a_tether_beside_a_clip_that_has_moved():
     assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
-@pytest.mark.parametrize("where", ["plane", "space"])
+def test_two_tethers_in_one_element_are_refused():
+    """Python solves such a cable; the solver's table has a row for one."""
+    tethers = (Tether(), Tether(label="tether_2"))
+    model = loom(0, tethers)
+    values = TETHER | {name.replace("tether.", "tether_2."): x for name, x in TETHER.items()}
+    with pytest.raises(DloError, match="two tethers are in one of the .* elements"):
+        compiled(model, values)
+
+
+@pytest.mark.parametrize("where", ["plane", "clamped", "swivel"])
 def test_a_saddle_that_is_turned(where):
     if where == "plane":
         clip = HeldClip("clamped", (0.31, 0.05), 0.37, heading=0.3)
@@ -322,12 +331,12 @@ def test_a_saddle_that_is_turned(where):
         cable, held = CableData(1.0, 0.2, 0.01, 0.02), {}
     else:
         turned = tuple(Rotation.from_rotvec([0.2, 0.1, 0.4]).as_quat())
-        clip = HeldClip("clamped", (0.3, 0.1, -0.05), 0.36, orientation=turned)
+        clip = HeldClip(where, (0.3, 0.1, -0.05), 0.36, orientation=turned)
         values = {"y": 0.2, "z": -0.15}
         pose = HeldPose((0.0, 0.0, 0.0), (0.7, 0.2, 0.1), clips=(clip,))
         cable = CableData(1.0, 0.2, 0.01, 0.02, torsional_stiffness=0.015)
         held = {"gravity": (0.0, 0.0, -9.81)}
-    model = CableModel(cable, 12, n_rest=0, clips=("clamped",), effects=(ClipAngle(),), **held)
+    model = CableModel(cable, 12, n_rest=0, clips=(clip.kind,), effects=(ClipAngle(),), **held)
     solver, p, rest = compiled(model, {f"clip_angle.{key}": x for key, x in values.items()})
     assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
