@@ -223,10 +223,11 @@ def test_a_pose_of_another_size_is_refused():
         CasadiCable(*cable(False, plain=True)).initial(SPACE)
 
 
-@pytest.mark.parametrize("position", [0.3, 0.4, 0.405, 0.7])
-@pytest.mark.parametrize("name", ["lumped_mass", "tether"])
-@pytest.mark.parametrize("gravity", [(0, -9.81), (0, 0, -9.81)])
-def test_the_derivative_by_a_place_on_the_edge_of_an_element_is_exact(gravity, name, position):
+@pytest.mark.parametrize("position", [0.3, 0.4, 0.405])
+@pytest.mark.parametrize(
+    ("name", "gravity"), [("lumped_mass", (0, -9.81)), ("tether", (0, 0, -9.81))]
+)
+def test_the_derivative_by_a_place_on_the_edge_of_an_element_is_exact(name, gravity, position):
     """Of 40 elements of 20 mm all but 0.405 m are edges."""
     d = len(gravity)
     rope = dlo.Cable(

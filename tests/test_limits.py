@@ -327,12 +327,13 @@ TABLE = {"kind": "plane", "point": [0, -0.15], "normal": [0, 1]}
     ("tolerance", "around", "effects", "words", "near"),
     [
         ("slip", {"clips": HOOKS}, [ClipSlip(), ClipSlip(clip=1)], "5 mm along a clip", 0.01),
-        (
+        pytest.param(
             "obstacle",
             {"obstacles": [TABLE]},
             [ObstacleOffset()],
             "5 mm of an obstacle's surface",
             0.2,
+            marks=pytest.mark.long,
         ),
     ],
 )

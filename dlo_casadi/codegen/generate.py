@@ -259,7 +259,7 @@ def generate(
     elements = sorted(int(tether[0] * bare.n) for tether in case.tethers)
     if len({*elements}) < len(elements):
         raise DloError(
-            f"two tethers are in one of the {bare.n} elements: no solver can be generated\n"
+            f"two tethers are in one of the {counted(bare.n, 'element')}: no solver can be made\n"
             "  Try: a finer mesh, --n, or one tether in place of both"
         )
     values = {

@@ -318,7 +318,7 @@ def test_two_tethers_in_one_element_are_refused():
     tethers = (Tether(), Tether(label="tether_2"))
     model = loom(0, tethers)
     values = TETHER | {name.replace("tether.", "tether_2."): x for name, x in TETHER.items()}
-    with pytest.raises(DloError, match="two tethers are in one of the .* elements"):
+    with pytest.raises(DloError, match=r"two tethers are in one of the .* elements"):
         compiled(model, values)
 
 

@@ -41,7 +41,7 @@ def session(name, n):
     for key, numbers in truth["effects"].items():
         values = np.atleast_1d(numbers)
         if key == "clamp_error":
-            effect = ClampAngle(model.start == "clamped", model.end == "clamped")
+            effect = ClampAngle(start=model.start == "clamped", end=model.end == "clamped")
             values = [
                 v for v, s in zip(values, (model.start, model.end), strict=True) if s == "clamped"
             ]
