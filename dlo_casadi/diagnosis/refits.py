@@ -40,7 +40,7 @@ from dlo_casadi.diagnosis.screening import (
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, places_in, start_from
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.descent import descend, refit
+from dlo_casadi.estimation.descent import NEARLY, descend, refit
 from dlo_casadi.estimation.fit import explains, misfits
 from dlo_casadi.estimation.problem import Priors
 from dlo_casadi.estimation.result import Fit
@@ -218,7 +218,7 @@ def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
     with suppress(EstimationError):
         fit = start.fit()
         if fit is not None and misfits(fit):
-            fit = descend(fit.reweighed(base.noise, base.problem.priors))
+            fit = descend(fit.reweighed(base.noise, base.problem.priors), tolerance=NEARLY)
         if fit is not None and not misfits(fit):
             fit = _at_noise(fit, start.problem.noise)
         return Confirmed.of(start.screened, base, fit, start.beside)
@@ -326,7 +326,7 @@ def _followed(
 ) -> Fit | None:
     """Refit of a model with new parameters at these values; None without equilibria."""
     with suppress(EstimationError):
-        return refit(start, model, values=values, steps=steps, ceiling=ceiling)
+        return refit(start, model, values=values, steps=steps, tolerance=NEARLY, ceiling=ceiling)
     return None
 
 

@@ -3,13 +3,14 @@
 from typing import ClassVar
 
 import casadi as ca
-import numpy as np
+from scipy.special import roots_jacobi
 
 from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Params, SectionLaw
 
-# Gauss-Legendre on [0, 1]; ten points integrate the law to 1e-9 for |k|/c up to 5.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
+# Gauss-Jacobi on [0, 1] with the weight 2 t: seven points integrate the law to 1e-11 for |k|/c = 1,
+# 5e-9 for 2 and 2e-6 for 5. Every point costs 2300 operations in the derivatives of a segment.
+_NODES, _WEIGHTS = roots_jacobi(7, 0.0, 1.0)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 # |k| is rounded to sqrt(k^2 + d^2) - d over this share of one turn per length.
 _ROUNDING = 1e-3
@@ -49,7 +50,7 @@ class BendingSoftening(SectionLaw):
     def of_bend(self, square: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Energy over EI k^2 / 2: 2 int_0^1 t / (1 + t |k|/c) dt, by quadrature in t."""
         ratio = self._ratio(square, cable, params)
-        terms = [2 * w * t / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)]
+        terms = [w / (1 + t * ratio) for t, w in zip(_NODES, _WEIGHTS, strict=True)]
         return sum(terms, start=ca.SX(0))
 
     def tangent(self, square: ca.SX, cable: CableData, params: Params) -> ca.SX:

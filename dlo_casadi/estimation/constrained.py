@@ -21,7 +21,7 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import energy_slope
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.point import Point
 from dlo_casadi.estimation.prediction import Prediction, measured_elsewhere, predict_poses
 from dlo_casadi.estimation.result import Fit
@@ -229,7 +229,7 @@ class _Profile:
         for theta in (self._along(place, near), near.point.theta):
             point = problem.balanced(replace(near.point, theta=theta))
             if point is not None:
-                found = descend(Fit(problem, point), tolerance=1e-2)
+                found = descend(Fit(problem, point), tolerance=NEARLY)
                 return _Refit(place, found.point, 2 * found.point.objective - base)
         return None
 

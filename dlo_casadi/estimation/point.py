@@ -101,10 +101,21 @@ class Normal:
             out.append(inverse + arm @ covariance @ arm.T)
         return out
 
-    @property
-    def promised(self) -> float:
-        """Decrease of the objective predicted for an undamped step, deviations included."""
-        matrix = self.hessian + NO_INFORMATION * np.eye(len(self.hessian))
-        shared = self.gradient @ np.linalg.solve(matrix, self.gradient)
+    def promised(self, damping: float = 0.0) -> float:
+        """Decrease of the objective predicted for a damped step, deviations included."""
+        step = np.linalg.solve(self.damped(damping), self.gradient)
+        held = damping * self.scale @ step**2
         own = (slope @ np.linalg.solve(block, slope) for block, _, slope in self.inner)
-        return float(shared) / 2 + float(sum(own)) / 2
+        return float(self.gradient @ step + held) / 2 + float(sum(own)) / 2
+
+    @property
+    def scale(self) -> FloatArray:
+        """Diagonal of the Hessian, positive."""
+        return np.maximum(np.diag(self.hessian), 1e-12)
+
+    def damped(self, damping: float) -> FloatArray:
+        """Hessian for damped steps; directions without information do not move.
+
+        Such a direction is the place of a mass of zero.
+        """
+        return self.hessian + np.diag(damping * self.scale + NO_INFORMATION)

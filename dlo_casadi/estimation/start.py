@@ -13,7 +13,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.estimation.continuation import loosened, relaxed, with_springs_in_place
-from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_each
@@ -180,7 +180,7 @@ def fit_from(
     values = relaxed(problem, begun if followed is None else followed, softness, fixed)
     values = retry_outlying_poses(problem, begun, values, SOFTNESS[-1], fixed)
     point = problem.balanced(_retried_from_first_shapes(problem, begun, values), max_iterations=40)
-    return None if point is None else descend(Fit(problem, point), tolerance=1e-2)
+    return None if point is None else descend(Fit(problem, point), tolerance=NEARLY)
 
 
 def retry_outlying_poses(

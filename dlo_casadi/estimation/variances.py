@@ -7,7 +7,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EstimationError, counted
-from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.scatter_likelihood import (
@@ -62,7 +62,7 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
     """
     repeats = fit.problem.priors.pose_scatter.std == 0 and not first
     rough, estimated = first and SearchSettings.of(fit.model).converged_first, not fit.noise.known
-    near = descend(fit, tolerance=1e-2)
+    near = descend(fit, tolerance=NEARLY)
     fit = near if near.converged or not rough else replace(fit, converged=False)
     for round_ in range(rounds):
         priors, noise = fit.problem.priors, fit.noise

@@ -97,9 +97,9 @@ def repeated(rows: FloatArray, count: int) -> FloatArray:
 # those that fill up a block included; one of CasADi's scalar interpreter 2 to 4 ns per segment.
 BLOCK = 64
 # Smallest calls that are vectorised: number of segments, and of instructions over all segments,
-# which take the interpreter 0.1 ms. The conversion takes 10 us per instruction, which has paid
+# which take the interpreter 0.1 ms. The conversion takes 4 us per instruction, which has paid
 # after that number of segments.
-FEWEST, WORTH, PAID = 8, 3e4, 5000
+FEWEST, WORTH, PAID = 8, 3e4, 1400
 
 
 class Mapped:
@@ -144,8 +144,7 @@ class Mapped:
     @cached_property
     def _inlined(self) -> bool:
         """Whether the function calls no others, as one of a user's effect may: not `vectorised`."""
-        count = self._function.n_instructions()
-        return ca.OP_CALL not in map(self._function.instruction_id, range(count))
+        return not self._function.find_functions(0)
 
     def _one_by_one(self, arguments: Sequence[FloatArray]) -> list[FloatArray]:
         """Arguments (segments, rows) -> outputs (segments, size)."""
