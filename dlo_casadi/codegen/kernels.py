@@ -14,8 +14,9 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.framed import SegmentNumbers, in_frame
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.model.lagrangian import SegmentNumbers, lagrangian_of
+from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentDerivatives
 
@@ -334,7 +335,7 @@ def _derivatives(
     """
     if model.node.increment > 1:
         forces = ca.reshape(lam, 3, lam.numel() // 3)
-        found = lagrangian_of(model).in_frame(x, forces, numbers).derivatives()
+        found = in_frame(lagrangian_of(model), x, forces, numbers).derivatives()
         return found.about(found.turn, found.turn)
     # At a free end lam is zero, but the derivative with respect to it is still the advance.
     free = model.end == "free"

@@ -8,9 +8,9 @@ from scipy.special import roots_jacobi
 from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import Params, SectionLaw
 
-# Gauss-Jacobi on [0, 1] with the weight 2 t: seven points integrate the law to 1e-11 for |k|/c = 1,
-# 5e-9 for 2 and 2e-6 for 5. Every point costs 2300 operations in the derivatives of a segment.
-_NODES, _WEIGHTS = roots_jacobi(7, 0.0, 1.0)
+# Gauss-Jacobi on [0, 1] with the weight 2 t: ten points integrate the law to 1e-12 for |k|/c up to
+# 2, and to 1e-8 for 5.
+_NODES, _WEIGHTS = roots_jacobi(10, 0.0, 1.0)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 # |k| is rounded to sqrt(k^2 + d^2) - d over this share of one turn per length.
 _ROUNDING = 1e-3

@@ -12,11 +12,13 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.lagrangian import MODELS, SegmentNumbers, lagrangian_of
+from dlo_casadi.model.framed import SegmentNumbers, in_frame
+from dlo_casadi.model.lagrangian import MODELS, lagrangian_of
 from dlo_casadi.model.stacked import Mapped
-from dlo_casadi.rod.element import LAYOUT_SIZE, Cell, Segment
+from dlo_casadi.rod.element import LAYOUT_SIZE, Segment
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
+from dlo_casadi.rod.section import Cell
 
 
 class Functions:
@@ -57,7 +59,8 @@ class Functions:
         still = ca.SX.zeros(delta.shape)
         # The question takes a tenth of the time of the answer.
         found = [ca.substitute(x, delta, still) if ca.depends_on(x, delta) else x for x in outputs]
-        return ca.Function(name, arguments, [ca.densify(one) for one in found])
+        # Derivatives taken one after the other repeat operations, half of them with section laws.
+        return ca.Function(name, arguments, ca.cse([ca.densify(one) for one in found]))
 
     def _of_segment(self, name: str, *outputs: ca.SX) -> ca.Function:
         return self._here(name, self._segment_arguments, list(outputs))
@@ -133,7 +136,7 @@ class Functions:
         multipliers = [ca.SX.zeros(3)] * free + [lam[rows] for rows in self._force_rows]
         _, _, p, rest, place, deviation = self._segment_arguments
         numbers = SegmentNumbers(p, rest, place, deviation, ca.SX(self.terms.shares(p, place)))
-        return self.terms.in_frame(self.terms.x, ca.horzcat(*multipliers), numbers)
+        return in_frame(self.terms, self.terms.x, ca.horzcat(*multipliers), numbers)
 
     @property
     def _force_rows(self) -> list[list[int]]:

@@ -9,10 +9,9 @@ multipliers. An equilibrium is a stationary point.
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from dlo_casadi.effects import (
     BoundaryEffect,
@@ -31,9 +30,9 @@ from dlo_casadi.model.cable_model import (
     CableModel,
 )
 from dlo_casadi.model.clips import BESIDE, clip_size
-from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
+from dlo_casadi.rod.element import LAYOUT_SIZE, Segment
 from dlo_casadi.rod.ends import ClipConditions, EndConditions
-from dlo_casadi.rod.in_frame import SegmentInFrame
+from dlo_casadi.rod.section import Section
 
 # Number of models whose expressions and functions are cached: a diagnosis compares about thirty.
 MODELS = 64
@@ -46,16 +45,6 @@ class _SegmentTerms:
     lagrangian: ca.SX
     advance: ca.SX
     ratio: ca.SX
-
-
-class SegmentNumbers(NamedTuple):
-    """Arguments of a segment beside its nodes and multipliers."""
-
-    p: ca.SX
-    rest: ca.SX
-    place: ca.SX
-    deviation: ca.SX
-    shares: ca.SX
 
 
 class Lagrangian:
@@ -250,8 +239,9 @@ class Lagrangian:
             found = (getattr(law, factor)(of, self.model.cable, local) for law, local in laws)
             return prod(found, start=ca.SX(1))
 
-        factors = (partial(product, factor) for factor in ("along", "of_bend", "tangent"))
-        return Section(bending, known.get(TORSIONAL_STIFFNESS, ca.SX(0)), *factors)
+        along, of_bend, tangent = (partial(product, k) for k in ("along", "of_bend", "tangent"))
+        torsion = known.get(TORSIONAL_STIFFNESS, ca.SX(0))
+        return Section(bending, torsion, along, of_bend, tangent)
 
     def segment_energy(self, segment: Segment) -> ca.SX:
         """Elastic energy of one segment minus the work of the loads along it [J]."""
@@ -344,58 +334,6 @@ class Lagrangian:
         true = self.segment(stretched, condensed.inner, condensed.square)
         # The end of this curve is in the Lagrangian's derivative by the multipliers.
         return _SegmentTerms(lagrangian, kind.advance(true), stretched)
-
-    def in_frame(self, x: ca.SX, multipliers: ca.SX, numbers: SegmentNumbers) -> SegmentInFrame:
-        """A segment in space, written in the frame in its middle.
-
-        Parameters
-        ----------
-        x : (8,)
-            Frames of both nodes.
-        multipliers : (3, 1 + n_springs + n_clips) [N]
-            Force on the end's holder, then on springs and clips.
-        """
-        spread, dead = len(self.kind.rule[0]), len(self.dead_forces)
-        weights = np.zeros((spread + dead + len(self.pulls), multipliers.shape[1]))
-        weights[:spread, 0] = -1.0
-        weights[spread + dead :, 1:] = -np.eye(len(self.pulls))
-        loads = self.segment_forces(numbers.p, numbers.place, numbers.deviation)
-
-        def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
-            local = ca.vertcat(ca.DM(self.node.identity), phi)
-            return ca.SX(self.segment_in_frame(local, inner, forces, *numbers))
-
-        total = ca.SX(loads) + multipliers @ ca.DM(weights.T)
-        return SegmentInFrame(self.kind, energy, x, total, weights)
-
-    @cached_property
-    def segment_forces(self) -> ca.Function:
-        """(p, place, deviation) -> dead forces (dimension, m) [N] on it, see `segment_in_frame`."""
-        forces = self.forces_on(self.segment(self.stretch, self.inner, ca.SX(0)))
-        forces += [ca.SX.zeros(self.node.dimension)] * len(self.pulls)
-        arguments = [self.p, self.place, self.deviation]
-        return ca.Function("segment_forces", arguments, [ca.horzcat(*forces)])
-
-    @cached_property
-    def segment_in_frame(self) -> ca.Function:
-        """(local, inner, forces, p, rest, place, deviation, shares) -> energy [J] of a segment.
-
-        Its minimum over the internal unknowns is that of `segment_by_share`. Forces are arguments,
-        because the energy does not change if a segment and the forces on it are rotated together.
-        The multipliers of the end's place, springs and clips are such forces, too, see `in_frame`.
-        """
-        kind, h, inner = self.kind, self.length, self.inner
-        ratio, local = ca.SX.sym("ratio"), ca.SX.sym("local", self.local.numel())
-        segment = self.segment(ratio, inner, inner**2, local)
-        count = len(self.forces_on(segment)) + len(self.pulls)
-        forces = ca.SX.sym("force", self.node.dimension, count)
-        energy = self.elastic_energy(segment) - self.work_along(segment, ca.horzsplit(forces))
-        tension = ca.substitute(-ca.gradient(energy, ratio) / h, inner, ca.SX.zeros(inner.shape))
-        lagrangian = kind.expanded(segment, energy, self.elastic_energy)
-        lagrangian -= self.axial_compliance * h * tension**2 / 2
-        own = [self.p, self.rest_strains, self.place, self.deviation, self.share_symbols]
-        found = ca.substitute(lagrangian, ratio, self.stretch)
-        return ca.Function("segment_in_frame", [local, inner, forces, *own], [found])
 
     @cached_property
     def compliance_of(self) -> dict[int, ca.SX]:

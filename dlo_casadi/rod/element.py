@@ -15,77 +15,10 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.rod.node import Node
+from dlo_casadi.rod.section import Cell, Section
 
 # Number of values per segment in `Layout.segments`.
 LAYOUT_SIZE = 6
-
-
-@dataclass(frozen=True)
-class Cell:
-    """Interval of the cable on which one discrete strain acts: `width` [m], beginning at `low` [m].
-
-    `mesh` [m] is the largest width of such a cell; kinks are rounded over a share of this width.
-    """
-
-    low: ca.SX
-    width: ca.SX
-    mesh: ca.SX | float
-
-    @property
-    def middle(self) -> ca.SX:
-        """Arc length of its middle [m]."""
-        return self.low + self.width / 2
-
-    @property
-    def high(self) -> ca.SX:
-        """Arc length of its end [m]."""
-        return self.low + self.width
-
-    @property
-    def halves(self) -> "tuple[Cell, Cell]":
-        """The two halves."""
-        half = self.width / 2
-        return Cell(self.low, half, self.mesh / 2), Cell(self.middle, half, self.mesh / 2)
-
-
-def one(_: object) -> ca.SX:
-    """The factor of a section without laws."""
-    return ca.SX(1)
-
-
-@dataclass(frozen=True)
-class Section:
-    """Energy of a section that is bent and twisted.
-
-        W = a (b(|k|) k^T B k + GJ tau^2) / 2                           [N]
-
-    for the curvature k and the twist tau beyond those at rest [1/m]; a and b are products of the
-    section laws' factors, see `SectionLaw`.
-
-    Parameters
-    ----------
-    bending : (1, 1) or (2, 2) [N m^2]
-        B: EI in a plane; in space about the material axes y and z.
-    torsion : scalar GJ [N m^2]
-    along : callable
-        Cell -> a.
-    of_bend, tangent : callable
-        Square of the bend -> b; and -> the factor on the stiffness against a small change of that
-        bend, which is exact for a single law.
-    """
-
-    bending: ca.SX
-    torsion: ca.SX
-    along: Callable[[Cell], ca.SX] = one
-    of_bend: Callable[[ca.SX], ca.SX] = one
-    tangent: Callable[[ca.SX], ca.SX] = one
-
-    def density(self, strain: ca.SX, cell: Cell) -> ca.SX:
-        """Energy per length [N] of strains beyond those at rest [1/m], see `Node.strains`."""
-        axes = self.bending.size1()
-        twist, bend = strain[:-axes], strain[-axes:]
-        bent = self.of_bend(ca.sumsqr(bend)) * ca.dot(bend, ca.mtimes(self.bending, bend))
-        return self.along(cell) * (bent + self.torsion * ca.sumsqr(twist)) / 2
 
 
 @dataclass(frozen=True)
@@ -268,7 +201,8 @@ class Element(ABC):
         """Elastic energy [J] of the cell: the mean over the points of `bends`."""
         bends = self.bends(segment)
         cells = [segment.cell] if len(bends) == 1 else list(segment.cell.halves)
-        densities = [section.density(k, cell) for k, cell in zip(bends, cells, strict=True)]
+        pairs = enumerate(zip(bends, cells, strict=True))
+        densities = [section.density(bend, cell, point) for point, (bend, cell) in pairs]
         mean = sum(densities[1:], start=densities[0]) / len(densities)
         return segment.has_cell * segment.cell.width * mean * segment.stretch
 

@@ -107,10 +107,18 @@ class SegmentInFrame:
         Forces on the segment, in world axes.
     weights : (m, q)
         Derivatives of the forces by q multipliers (3,).
+    known : symbols, callable
+        Symbols in the energy that stay while it is differentiated, and their values: of phi.
     """
 
     def __init__(
-        self, kind: Element, energy: Energy, x: ca.SX, forces: ca.SX, weights: FloatArray
+        self,
+        kind: Element,
+        energy: Energy,
+        x: ca.SX,
+        forces: ca.SX,
+        weights: FloatArray,
+        known: tuple[ca.SX, Callable[[ca.SX], ca.SX]],
     ) -> None:
         self._forces, self._moved = forces, _Kinematics(kind, x)
         self.node_turns = self._moved.node_turns
@@ -119,16 +127,17 @@ class SegmentInFrame:
         self._to_world = ca.kron(ca.DM.eye(weights.shape[1]), self._moved.turn)
         phi, inner = ca.SX.sym("phi", 3), ca.SX.sym("inner", kind.n_inner)
         c = ca.SX.sym("force", *forces.shape)
-        self._symbols = [phi, inner, c]
+        self._symbols = [phi, inner, c, known[0]]
+        values = known[1](self._moved.phi)
         self._value = energy(phi, inner, c)
         self._by_frame = ca.gradient(self._value, ca.vertcat(phi, ca.vec(c)))
         self._by_inner = ca.gradient(self._value, inner)
         resisting = ca.jacobian(self._by_inner, inner)
-        start = [self._moved.phi, ca.SX.zeros(inner.shape), self._body]
+        start = [self._moved.phi, ca.SX.zeros(inner.shape), self._body, values]
         torque, resisting = ca.substitute([self._by_inner, resisting], self._symbols, start)
         # The energy is quadratic in the internal unknowns: one Newton step gives the minimum.
         self._inverse = inverse_of(resisting) if inner.numel() else ca.SX(0, 0)
-        self._there = [self._moved.phi, -self._inverse @ torque, self._body]
+        self._there = [self._moved.phi, -self._inverse @ torque, self._body, values]
 
     def _at(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Insert the segment's rotation vector and forces, and the optimal internal unknowns."""
@@ -136,7 +145,7 @@ class SegmentInFrame:
 
     def derivatives(self) -> SegmentDerivatives:
         """Value, gradient and Hessian, by rotations about the axes of the middle frame."""
-        phi, inner, c = self._symbols
+        phi, inner, c, _ = self._symbols
         both = ca.vertcat(phi, inner)
         flat = ca.vec(c)
         slope, by_force = self._by_frame[:3], self._by_frame[3:]
@@ -199,7 +208,7 @@ class SegmentInFrame:
 
         Rotations are about the axes of the middle frame.
         """
-        _, inner, c = self._symbols
+        _, inner, c, _ = self._symbols
         flat = ca.vec(c)
         turned = ca.kron(ca.DM.eye(c.shape[1]), self._moved.turn.T)
         moved = turned @ ca.jacobian(ca.vec(self._forces), numbers)
