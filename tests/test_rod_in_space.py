@@ -9,7 +9,8 @@ from scipy.linalg import null_space
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.effects import EFFECTS, CableData
+from dlo_casadi.effects import EFFECTS, CableData, SectionLaw
+from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.minima import descend
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -294,11 +295,28 @@ def test_descents_from_far_away_are_minima():
     assert np.all(matrix.negative()[found.converged] == m.n_multipliers)
 
 
+class _StiffensPerPose(SectionLaw):
+    """A law of the bend that depends on a number of each pose."""
+
+    name = "stiffens_per_pose"
+
+    def parameters(self, cable):
+        return (Parameter("share", "m^2", scale=0.01),)
+
+    def per_pose(self, cable):
+        return ("unknown_force_x",)
+
+    def of_bend(self, square, cable, params):
+        return ca.exp((params["share"] + 0.1 * params["unknown_force_x"]) * square)
+
+
 @pytest.mark.parametrize("end", ["clamped", "free"])
 @pytest.mark.parametrize("element", ["arc", "quadratic"])
-def test_a_segment_is_differentiated_as_by_casadi_in_one_go(element, end):
-    """Loads, a spring to a fixed point, a stretching cable and a softening section at once."""
+@pytest.mark.parametrize("more", [(), (_StiffensPerPose(),)])
+def test_a_segment_is_differentiated_as_by_casadi_in_one_go(element, end, more):
+    """Loads, a spring to a fixed point, a stretching cable and softening sections at once."""
     effects = [EFFECTS[name]() for name in ("tether", "axial_stretch", "bending_softening")]
+    effects += more
     cable = CableData(LENGTH, 0.12, 0.006, EI, torsional_stiffness=GJ)
     m = CableModel(cable, 12, element, "clamped", end, DOWN, (*effects, EFFECTS["point_force"]()))
     node = m.node

@@ -225,7 +225,7 @@ def with_new_noise(
     """
     p_value, fit = max(p_values[item.candidate.name] for item in winner.each), winner.fit
     with suppress(EstimationError):
-        fit = settle(fit) if fit.noise.source != "misfit" else fit
+        fit = settle(fit) if fit.noise.source != "misfit" else descend(fit)
         if from_shapes or not (current.scatters or not fit.errors_known):
             return fit, p_value
         again = p_with_new_noise(current, fit, winner, len(p_values))

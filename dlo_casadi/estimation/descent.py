@@ -56,8 +56,8 @@ def descend(
     Returns
     -------
     Fit
-        The minimum, and whether it converged. A descent that stalls, is hopeless or runs out of
-        iterations has not converged.
+        The minimum, and whether it converged. A descent that stalls, is hopeless, runs out of
+        iterations, or finds no worthwhile step although the gradient promises one, has not.
     """
     problem, point = fit.problem, fit.point
     damping, gains, above = 0.0, [np.inf] * STALLED, 0

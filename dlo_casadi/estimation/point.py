@@ -114,8 +114,8 @@ class Normal:
         return np.maximum(np.diag(self.hessian), 1e-12)
 
     def damped(self, damping: float) -> FloatArray:
-        """Hessian for damped steps; directions without information do not move.
+        """Hessian for damped steps.
 
-        Such a direction is the place of a mass of zero.
+        A direction without information, such as the place of a mass of zero, does not move.
         """
         return self.hessian + np.diag(damping * self.scale + NO_INFORMATION)

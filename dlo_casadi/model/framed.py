@@ -77,8 +77,9 @@ def _energy(terms: Lagrangian) -> ca.Function:
     still, axes = ca.SX.zeros(inner.shape), len(terms.node.curvatures)
     bends = kind.bends(replace(segment, inner=still))
     squares = [ca.sumsqr(bend[-axes:]) for bend in bends]
-    law = Expansion(terms.section.of_bend, squares, terms.p)
-    section = terms.section if law.constant else replace(terms.section, expansion=law)
+    section = terms.section
+    law = Expansion(section.of_bend, squares, ca.vertcat(terms.p, terms.deviation))
+    section = section if law.constant else replace(section, expansion=law)
     elastic = partial(kind.elastic, section=section)
     count = len(terms.forces_on(segment)) + len(terms.pulls)
     forces = ca.SX.sym("force", terms.node.dimension, count)

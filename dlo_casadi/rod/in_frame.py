@@ -107,8 +107,8 @@ class SegmentInFrame:
         Forces on the segment, in world axes.
     weights : (m, q)
         Derivatives of the forces by q multipliers (3,).
-    known : symbols, callable
-        Symbols in the energy that stay while it is differentiated, and their values: of phi.
+    known : (symbols, callable)
+        Symbols in the energy that are held while it is differentiated; phi -> their values.
     """
 
     def __init__(

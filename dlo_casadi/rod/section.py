@@ -6,8 +6,8 @@ from math import factorial
 
 import casadi as ca
 
-# Highest derivative of a law in the derivatives of a segment: two by the internal unknowns, two by
-# nodes or one by nodes and one by numbers.
+# Highest derivative of a law by the square of the bend: two by the internal unknowns, and two by
+# nodes, or one by nodes and one by rest strains. With 3, Hessians were a third off.
 _ORDER = 4
 
 
@@ -90,11 +90,12 @@ class Section:
 class Expansion:
     """Taylor polynomial of a law b(q, p), q the square of the bend, about the bends of a segment.
 
-        b = sum_k (b_k + sum_i b_ki (p_i - p_i0)) (q - q_0)^k / k!
+        b = sum_k (b_k + sum_i b_ki (p_i - p_i0)) (q - q_0)^k / k!,     k = 0 ... 4
 
-    A segment is differentiated up to five times in many directions. With `symbols` for all but q
-    and p, which get their `values` afterwards, the law's own operations are not repeated in every
-    derivative: half as many operations for a softening cable in space.
+    A segment is differentiated in many directions. Meanwhile `symbols` stand for the coefficients
+    b_k, b_ki, q_0 and p_i0; their `values` are inserted at the end. The law's own operations are
+    then not repeated in every derivative: quadratic elements of a softening cable in space need
+    half as many.
 
     Parameters
     ----------
@@ -102,8 +103,8 @@ class Expansion:
         q -> b.
     squares : list of scalars [1/m^2]
         q_0 of each point of the segment; none are needed if the law is constant.
-    p : (n_parameters,)
-        Symbols of the parameters.
+    p : (n_numbers,)
+        Symbols on which the law may depend.
     """
 
     def __init__(self, of_bend: Callable[[ca.SX], ca.SX], squares: list[ca.SX], p: ca.SX) -> None:

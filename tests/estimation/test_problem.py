@@ -27,7 +27,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.point import Point, Values
+from dlo_casadi.estimation.point import Normal, Point, Values
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
@@ -463,3 +463,14 @@ def test_a_step_changes_a_stiffness_by_a_factor_of_twenty_at_most():
     )
     theta[stiffness] = unknowns.bounds[1][stiffness]
     assert unknowns.reach(theta)[1][stiffness] == theta[stiffness]
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3, 1e4])
+def test_the_promised_decrease_is_that_of_the_quadratic_model(damping):
+    root = np.random.default_rng(1).normal(size=(5, 3))
+    hessian, gradient = 1e4 * root.T @ root, np.array([0.3, -2.0, 1.0])
+    own = (np.array([[4.0]]), np.zeros((1, 3)), np.array([2.0]))
+    step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
+    decrease = -(gradient @ step + step @ hessian @ step / 2)
+    found = Normal(hessian, gradient, [own]).promised(damping)
+    assert found == pytest.approx(decrease + 0.5, rel=1e-6)
