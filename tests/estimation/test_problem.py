@@ -468,7 +468,7 @@ def test_a_step_changes_a_stiffness_by_a_factor_of_twenty_at_most():
 @pytest.mark.parametrize("damping", [0.0, 0.3, 1e4])
 def test_the_promised_decrease_is_that_of_the_quadratic_model(damping):
     root = np.random.default_rng(1).normal(size=(5, 3))
-    hessian, gradient = 1e4 * root.T @ root, np.array([0.3, -2.0, 1.0])
+    hessian, gradient = 1e4 * root.T @ root, np.array([30.0, -200.0, 100.0])
     own = (np.array([[4.0]]), np.zeros((1, 3)), np.array([2.0]))
     step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
     decrease = -(gradient @ step + step @ hessian @ step / 2)
