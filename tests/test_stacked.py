@@ -48,12 +48,18 @@ def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
     after = mapped(*given)
     assert mapped._vectorised is not None
     assert [x.shape for x in mapped(*(x[:0] for x in given))] == [(0, *x.shape[1:]) for x in first]
+    monkeypatch.setattr(stacked, "WORTH", np.inf)
+    simpler = mapped(*given)
+    assert mapped._simplified
+    assert mapped._function.n_instructions() <= function.n_instructions()
     monkeypatch.setattr(stacked, "FEWEST", 0)
+    monkeypatch.setattr(stacked, "WORTH", 0)
     few = mapped(*(block[:2] for block in given))
     assert [x.strides for x in few] == [x.strides for x in first]
     alone = [mapped(*(block[k : k + 1] for block in given)) for k in (0, 12)]
     for number, (one, other) in enumerate(zip(first, after, strict=True)):
         assert np.isfinite(one).all()
+        np.testing.assert_array_equal(one, simpler[number])
         np.testing.assert_array_equal(one, other)
         assert one.strides == other.strides
         np.testing.assert_array_equal(one[[0, 12]], [x[number][0] for x in alone])

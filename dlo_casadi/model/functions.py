@@ -59,9 +59,12 @@ class Functions:
         still = ca.SX.zeros(delta.shape)
         # Checking costs a tenth of substituting.
         found = [ca.substitute(x, delta, still) if ca.depends_on(x, delta) else x for x in outputs]
-        # Derivatives taken one after the other repeat operations: a fifth, with section laws
-        # half of them.
-        return ca.Function(name, arguments, ca.cse([ca.densify(one) for one in found]))
+        dense = [ca.densify(one) for one in found]
+        # With a law of the bend, half of the operations are repeated. Without one it is a fifth,
+        # which takes longer to find than it saves.
+        square = ca.SX.sym("square")
+        lawless = self.terms.section.of_bend(square).is_constant()
+        return ca.Function(name, arguments, dense if lawless else ca.cse(dense))
 
     def _of_segment(self, name: str, *outputs: ca.SX) -> ca.Function:
         return self._here(name, self._segment_arguments, list(outputs))

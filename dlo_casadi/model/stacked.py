@@ -106,13 +106,14 @@ class Mapped:
     """A CasADi function of a segment (or node), mapped over the segments of poses.
 
     It reads and writes NumPy's memory, because conversion to CasADi's matrices takes several times
-    as long as the evaluation. Once it has been evaluated often, large calls are `vectorised`: they
-    give the same numbers, bit for bit, up to seven times as fast. Threads take turns, because they
-    share the buffers.
+    as long as the evaluation. Once it has been evaluated often, large calls are `vectorised`, and
+    small ones `simplified`: they give the same numbers, bit for bit, up to eight times as fast.
+    Large calls of simplified functions would be a fifth faster still, but these take long to find.
+    Threads take turns, because they share the buffers.
     """
 
     def __init__(self, function: ca.Function) -> None:
-        self._function, self._evaluated = function, 0
+        self._function, self._evaluated, self._simplified = function, 0, False
         self._lock = Lock()
         self._shapes = [
             (function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
@@ -134,8 +135,11 @@ class Mapped:
         """As `_one_by_one`, in the fastest way for this number of segments."""
         self._evaluated += number
         large = number >= FEWEST and number * self._function.n_instructions() > WORTH
-        often = large and self._evaluated > PAID and self._inlined
-        return self._in_blocks(given) if often else self._one_by_one(given)
+        often = self._evaluated > PAID and self._inlined
+        if often and not large and not self._simplified:
+            self._function, self._buffers = simplified(self._function), {}
+            self._simplified = True
+        return self._in_blocks(given) if often and large else self._one_by_one(given)
 
     @cached_property
     def _inlined(self) -> bool:
@@ -177,6 +181,12 @@ def _run(function: tuple[Any, Any], arguments: Sequence[Any], outputs: Sequence[
     for i, out in enumerate(outputs):
         buffer.set_res(i, memoryview(out))
     run()
+
+
+def simplified(function: ca.Function) -> ca.Function:
+    """The same function, each common subexpression computed once: a fifth fewer instructions."""
+    arguments = [ca.SX.sym("x", *function.size_in(i)) for i in range(function.n_in())]
+    return ca.Function(function.name(), arguments, ca.cse(function.call(arguments)))
 
 
 def vectorised(function: ca.Function, size: int) -> ca.Function:
