@@ -120,7 +120,7 @@ class CrossValidation:
 def cross_validate(fit: Fit) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
-    All folds are solved together, in some 6 ms each, unless a state is carried.
+    All folds are solved together, in some 6 ms each.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
@@ -237,19 +237,23 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[Float
 
 
 def _predicted(fit: Fit, thetas: Mapping[int, FloatArray]) -> dict[int, Observed | None]:
-    """Predicted measurements of fitted poses at their own unknowns, from declared ends."""
+    """Predicted measurements of fitted poses at their own unknowns, from declared ends.
+
+    A state follows from the fitted shapes of the poses before, which were measured, too.
+    """
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
     if not thetas:
         return {}
-    if fit.model.has_state:
-        return {k: _predict_all(fit, theta)[problem.used[k]] for k, theta in thetas.items()}
     p = np.repeat(fit.p[None], equilibria.m, axis=0)
-    rest = np.repeat(fit.rest[None], equilibria.m, axis=0)
+    rest = equilibria.rests(fit.point.shapes, fit.p, fit.rest).copy()
     for k, theta in thetas.items():
-        p[k], rest[k] = unknowns.p(theta), unknowns.rest(theta)
+        j = problem.used[k]
+        p[j] = unknowns.p(theta)
+        rest[j] = equilibria.rests(fit.point.shapes, p[j], unknowns.rest(theta))[j]
     solved, converged = equilibria.solve(_declared(fit), p, rest)
     seen = equilibria.seen(solved, p, rest)
-    return {k: seen[k] if converged[k] else None for k in thetas}
+    at = {k: problem.used[k] for k in thetas}
+    return {k: seen[j] if converged[j] else None for k, j in at.items()}
 
 
 def _predict_all(fit: Fit, theta: FloatArray) -> list[Observed | None]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from dlo_casadi.estimation.unknowns import SearchSettings
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import NEAR_LEADER, REFITTED
+from dlo_casadi.thresholds import NEAR_LEADER
 
 # Softness [rad] at which candidates may be scored; largest sum of squares per residual at which
 # relaxed shapes still count as the measured ones.
@@ -57,6 +57,9 @@ FIRST, SECOND = 3, 3
 # Trial bending stiffnesses for a contact, in weights times length squared: from cables that their
 # weight hardly bends down to chains.
 STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
+# Difference of log stiffnesses below which such trials have reached the same minimum: in sessions
+# in space they then differed by 1e-4 at most, or else by a factor of ten and more.
+SAME_STIFFNESS = 0.1
 
 
 def from_data(base: Fit) -> tuple[Fit, float]:
@@ -124,8 +127,6 @@ class RelaxedStart:
         The relaxed fit without the candidate.
     begun, values : Values
         Values before and after the relaxation.
-    left : float
-        Twice the objective.
     beside : tuple of Screened
         Candidates that `near` already has.
     """
@@ -135,7 +136,6 @@ class RelaxedStart:
     problem: Problem
     begun: Values
     values: Values
-    left: float
     beside: tuple[Screened, ...] = ()
 
     @classmethod
@@ -143,16 +143,17 @@ class RelaxedStart:
         """Best start from the measured shapes; for a contact also from several stiffnesses.
 
         The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
-        stiffness that has grown a hundredfold never returns.
+        stiffness that has grown a hundredfold never returns. Most of them lead to one minimum.
         """
         known: list[dict[str, float]] = [{}]
         if not screened.candidate.effect.gradual:
             known += _stiffnesses(near.model)
-        begun = [cls._followed(near, screened, beside, values) for values in known]
-        return min(begun, key=lambda x: x.left)
+        loose = [cls._loose(near, screened, beside, values) for values in known]
+        apart = [x for k, x in enumerate(loose) if not any(x._like(y) for y in loose[:k])]
+        return min((x._strict() for x in apart), key=lambda x: x.left)._retried()
 
     @classmethod
-    def _followed(
+    def _loose(
         cls,
         near: Fit,
         screened: Screened,
@@ -177,12 +178,30 @@ class RelaxedStart:
         if rolls:
             linear, begun = begin(linear, begun.theta, fixed)
         reached = loosely_relaxed(linear, begun, fixed)
-        reached = relaxed(linear, reached, COMPARED[1:-1])
-        problem, reached = _in_own_parameters(near, candidate, linear, reached)
-        reached = relaxed(problem, reached, COMPARED[-1:])
-        reached = retry_outlying_poses(problem, begun, reached, COMPARED[-1], typical=WRONG)
-        left = Relaxation(problem, COMPARED[-1]).objective(reached)
-        return cls(near, screened, problem, begun, reached, left, beside)
+        return cls(near, screened, linear, begun, reached, beside)
+
+    def _like(self, other: RelaxedStart) -> bool:
+        """Whether both have nearly the same stiffnesses, so that they lead to the same minimum."""
+        stiff = self.problem.unknowns.model.stiffness_indices
+        own, its = (x.problem.unknowns.p(x.values.theta)[stiff] for x in (self, other))
+        return bool(np.abs(np.log(own / its)).max() < SAME_STIFFNESS)
+
+    def _strict(self) -> RelaxedStart:
+        """Follow a loosely relaxed start to a nearly strict balance, in its own parameters."""
+        reached = relaxed(self.problem, self.values, COMPARED[1:-1])
+        candidate = self.screened.candidate
+        problem, reached = _in_own_parameters(self.near, candidate, self.problem, reached)
+        return replace(self, problem=problem, values=relaxed(problem, reached, COMPARED[-1:]))
+
+    def _retried(self) -> RelaxedStart:
+        """The start with other shapes tried for outlying poses."""
+        tried = (self.problem, self.begun, self.values, COMPARED[-1])
+        return replace(self, values=retry_outlying_poses(*tried, typical=WRONG))
+
+    @cached_property
+    def left(self) -> float:
+        """Twice the objective."""
+        return Relaxation(self.problem, COMPARED[-1]).objective(self.values)
 
     @property
     def names(self) -> set[str]:
@@ -216,7 +235,8 @@ class RelaxedStart:
         """
         if END_ROLL not in self.problem.unknowns.names:
             return None
-        return self._followed(self.near, self.screened, self.beside, {}, rolls=True)
+        loose = self._loose(self.near, self.screened, self.beside, {}, rolls=True)
+        return loose._strict()._retried()
 
 
 def likeliest(screened: Sequence[Screened]) -> list[Screened]:
@@ -228,7 +248,8 @@ def likeliest(screened: Sequence[Screened]) -> list[Screened]:
 def nearest(
     near: Fit,
     softness: float,
-    likely: Sequence[Screened],
+    alone: Sequence[RelaxedStart],
+    later: Sequence[Screened],
     executor: Executor,
     center: tuple[float, float] | None = None,
     exclude: Sequence[str] = (),
@@ -238,10 +259,10 @@ def nearest(
 ) -> Iterator[list[RelaxedStart]]:
     """Starts whose objective is close to the least one, best first; then those for a further try.
 
-    The least one is that of the first REFITTED candidates, or `least` of another start. If none of
-    them reaches the noise of the relaxed shapes, pairs are tried, provided `pairs` may be added: of
-    FIRST candidates and likely second ones, then of the next ones, at last of those beyond
-    REFITTED, until one reaches the noise; one that surely does is the last. Pairs are returned if
+    The least one is one of the starts `alone`, each with one candidate, or `least` of another. If
+    none of them reaches the noise of the relaxed shapes, pairs are tried, provided `pairs` may be
+    added: of FIRST candidates and likely second ones, then of the next ones, at last of the `later`
+    ones, until one reaches the noise; one that surely does is the last. Pairs are returned if
     REACHED times their objective is less. If single candidates reach the noise, pairs follow for a
     further try.
     """
@@ -253,7 +274,6 @@ def nearest(
         center=center,
         exclude=exclude,
     )
-    alone, later = map_in_order(executor, start, likely[:REFITTED]), likely[REFITTED:]
     begun = _near_least(alone, noise, least)
     reached = bool(begun) and begun[0].left < noise
     if reached or not pairs:

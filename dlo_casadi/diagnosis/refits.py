@@ -23,6 +23,7 @@ import numpy as np
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
+    NEAR_LEAST,
     RelaxedStart,
     from_data,
     likeliest,
@@ -243,14 +244,19 @@ def near_data(
     screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
     likely = likeliest(screened)
     contacts = [x for x in screened if not x.candidate.effect.gradual]
-    begun = list(map_in_order(executor, partial(RelaxedStart.of, near), contacts))
-    touching = confirm_contacts(base, begun, executor)
+    first = [*contacts, *likely[:REFITTED]]
+    begun = list(map_in_order(executor, partial(RelaxedStart.of, near), first))
+    touches, alone = begun[: len(contacts)], begun[len(contacts) :]
+    most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
+    touches = [start for start in touches if start.left <= most]
+    touching = confirm_contacts(base, touches, executor)
     explained = any(explains(item.fit) for item in touching)
-    least = min(start.left for start in begun) if explained else np.inf
-    among, pairs = (executor, center, exclude), pairs and not explained
+    least = min(start.left for start in touches) if explained else np.inf
+    later, among = likely[REFITTED:], (executor, center, exclude)
+    pairs = pairs and not explained
     kept: list[RelaxedStart] = []
     tried: list[Confirmed] = []
-    for starts in nearest(near, softness, likely, *among, pairs=pairs, least=least):
+    for starts in nearest(near, softness, alone, later, *among, pairs=pairs, least=least):
         kept += starts[:REFITTED]
         tried += _confirmed(base, starts[:REFITTED], executor, rolls=not explained)
         if any(item.fit.noise.source != "misfit" for item in tried):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, candidates_of, setup_of
 from dlo_casadi.diagnosis.from_data import (
     RelaxedStart,
@@ -14,8 +15,8 @@ from dlo_casadi.diagnosis.from_data import (
     nearest,
     screened_from_data,
 )
-from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data
-from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
+from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data, near_data
+from dlo_casadi.effects import EFFECTS, BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import refit
@@ -29,6 +30,7 @@ from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
+from dlo_casadi.thresholds import REFITTED
 
 TRUE = CableData(1.0, 0.08, 0.007, bending_stiffness=0.018, torsional_stiffness=0.007)
 DECLARED = replace(TRUE, bending_stiffness=0.011, torsional_stiffness=0.007)
@@ -110,9 +112,9 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypa
     near, softness = from_data(base)
     asked = []
     monkeypatch.setattr(RelaxedStart, "and_second", lambda start, **_: asked.append(start) or [])
-    wrong = [screened["stiffness_gradient"]]
+    wrong = [RelaxedStart.of(near, screened["stiffness_gradient"])]
     for pairs in (False, True):
-        (found,) = nearest(near, softness, wrong, InProcess(), pairs=pairs)
+        (found,) = nearest(near, softness, wrong, (), InProcess(), pairs=pairs)
         assert [start.names for start in found] == [{"stiffness_gradient"}]
         assert bool(asked) == pairs
 
@@ -129,20 +131,25 @@ def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
         seconds.append(name)
         return [start(left_by_pair[0] if name == "6" else 50.0, name, "other")]
 
+    def found_among(listed):
+        first = [RelaxedStart.of(near, x) for x in listed[:REFITTED]]
+        ((found,),) = nearest(near, 0.01, first, listed[REFITTED:], InProcess())
+        return found
+
     monkeypatch.setattr(RelaxedStart, "of", lambda near, x: start(100.0 + int(x), x))
     monkeypatch.setattr(RelaxedStart, "and_second", and_second)
-    ((found,),) = nearest(near, 0.01, "01234567", InProcess())
+    found = found_among("01234567")
     assert found.names == {"6", "other"}
     assert seconds == list("01234567")
 
     seconds.clear()
     left_by_pair[0] = 1.1
-    ((found,),) = nearest(near, 0.01, "01234567", InProcess())
+    found = found_among("01234567")
     assert found.names == {"6", "other"}
     assert seconds == list("0123456")
 
     seconds.clear()
-    ((found,),) = nearest(near, 0.01, "612345", InProcess())
+    found_among("612345")
     assert seconds == list("123") + list("456")
 
 
@@ -150,14 +157,13 @@ def test_pairs_follow_a_single_candidate_that_reached_the_noise_in_vain(monkeypa
     """A softening and a stiff section did; with each the fit misfits: a taper and a drift."""
     near = SimpleNamespace(point=SimpleNamespace(data=1.0))
     pair = SimpleNamespace(names={"0", "other"}, left=1.0)
-    alone = {x: SimpleNamespace(names={x}, left=1.0 + int(x)) for x in "01"}
-    monkeypatch.setattr(RelaxedStart, "of", lambda near, x: alone[x])
+    alone = [SimpleNamespace(names={x}, left=1.0 + int(x)) for x in "01"]
     monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [pair])
-    lists = nearest(near, 0.01, "01", InProcess())
-    assert next(lists) == [alone["0"]]
+    lists = nearest(near, 0.01, alone, (), InProcess())
+    assert next(lists) == [alone[0]]
     assert next(lists) == [pair]
     assert next(lists, None) is None
-    assert len(list(nearest(near, 0.01, "01", InProcess(), pairs=False))) == 1
+    assert len(list(nearest(near, 0.01, alone, (), InProcess(), pairs=False))) == 1
 
 
 TABLE = -0.25
@@ -193,14 +199,17 @@ def on_a_table():
     return Fit(replace(problem, noise=misfit), problem.evaluate(values))
 
 
-def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
+def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table, monkeypatch):
     near, softness = from_data(on_a_table)
     assert near.p[0] > 100 * 0.02
 
     listed = [x for x in candidates_of(near, None, ()) if x.name in ("contact_plane", "tether")]
     screened = screened_from_data(near, softness, listed)
     contact, tether = sorted(screened, key=lambda x: x.candidate.name)
+    followed, strict = [], RelaxedStart._strict
+    monkeypatch.setattr(RelaxedStart, "_strict", lambda x: followed.append(x) or strict(x))
     start = RelaxedStart.of(near, contact)
+    assert len(followed) == 1  # four stiffnesses lead to one minimum
     (found,) = confirm_contacts(on_a_table, [start], InProcess())
     assert found.name == "contact_plane"
     assert explains(found.fit)
@@ -209,13 +218,28 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
     assert found.fit.value("contact_plane.height") == pytest.approx(TABLE, abs=5e-4)
 
     # The tether leaves far more than the table, which explains the shapes: it is no rival.
-    among = (near, softness, [tether], InProcess())
+    among = (near, softness, [RelaxedStart.of(near, tether)], (), InProcess())
     assert next(nearest(*among, pairs=False))
     assert not next(nearest(*among, pairs=False, least=start.left))
 
     # Contacts change so much from 16 to 32 elements that Newton's method alone loses a pose.
     coarse = refit(found.fit, found.fit.model.with_mesh(16))
     assert 1e-3 < mesh_error(coarse) < 1e-2
+
+
+def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(on_a_table, monkeypatch):
+    others, asked = EFFECTS.keys() - {"contact_plane", "tether"}, []
+
+    def fitted(_, starts, __):
+        asked.append([start.screened.candidate.name for start in starts])
+        return []
+
+    monkeypatch.setattr(refits, "confirm_contacts", fitted)
+    monkeypatch.setattr(refits, "_confirmed", lambda *_, **__: [])
+    near_data(on_a_table, InProcess(), None, tuple(others), pairs=False)
+    monkeypatch.setattr(refits, "NEAR_LEAST", 0.0)
+    near_data(on_a_table, InProcess(), None, tuple(others), pairs=False)
+    assert asked == [["contact_plane"], []]
 
 
 def test_a_pose_at_a_fold_ends_a_fit_with_an_error_that_says_so(base):
