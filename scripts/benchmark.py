@@ -145,6 +145,8 @@ def run_space() -> dict[str, Any]:
         "largest_over_smallest": times.max() / times.min(),
         "farthest_from_the_line": np.abs(times / line - 1).max(),
     }
+    out["softening"] = {n: space_speed.softening(n) for n in (12, 24)}
+    print("softening", out["softening"], flush=True)
     out["clips"] = {}
     for kinds in (
         *(("pinned",), ("eyelet",), ("pinned", "pinned")),

@@ -46,11 +46,11 @@ def in_frame(
     def energy(phi: ca.SX, inner: ca.SX, forces: ca.SX) -> ca.SX:
         return ca.SX(of_segment(ca.vertcat(middle, phi), inner, forces, law, *numbers)[0])
 
-    def known(phi: ca.SX) -> ca.SX:
+    def held(phi: ca.SX) -> ca.SX:
         return ca.SX(of_segment(ca.vertcat(middle, phi), 0, 0, 0, *numbers)[1])
 
     total = ca.SX(loads) + multipliers @ ca.DM(weights.T)
-    return SegmentInFrame(terms.kind, energy, x, total, weights, (law, known))
+    return SegmentInFrame(terms.kind, energy, x, total, weights, (law, held))
 
 
 @lru_cache(maxsize=MODELS)
@@ -78,8 +78,9 @@ def _energy(terms: Lagrangian) -> ca.Function:
     bends = kind.bends(replace(segment, inner=still))
     squares = [ca.sumsqr(bend[-axes:]) for bend in bends]
     section = terms.section
-    law = Expansion(section.of_bend, squares, ca.vertcat(terms.p, terms.deviation))
-    section = section if law.constant else replace(section, expansion=law)
+    points = squares if terms.has_law_of_bend else []
+    law = Expansion(section.of_bend, points, ca.vertcat(terms.p, terms.deviation))
+    section = replace(section, expansion=law) if points else section
     elastic = partial(kind.elastic, section=section)
     count = len(terms.forces_on(segment)) + len(terms.pulls)
     forces = ca.SX.sym("force", terms.node.dimension, count)

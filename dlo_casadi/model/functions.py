@@ -62,9 +62,8 @@ class Functions:
         dense = [ca.densify(one) for one in found]
         # With a law of the bend, half of the operations are repeated. Without one it is a fifth,
         # which takes longer to find than it saves.
-        square = ca.SX.sym("square")
-        lawless = self.terms.section.of_bend(square).is_constant()
-        return ca.Function(name, arguments, dense if lawless else ca.cse(dense))
+        found = ca.cse(dense) if self.terms.has_law_of_bend else dense
+        return ca.Function(name, arguments, found)
 
     def _of_segment(self, name: str, *outputs: ca.SX) -> ca.Function:
         return self._here(name, self._segment_arguments, list(outputs))

@@ -243,6 +243,11 @@ class Lagrangian:
         torsion = known.get(TORSIONAL_STIFFNESS, ca.SX(0))
         return Section(bending, torsion, along, of_bend, tangent)
 
+    @cached_property
+    def has_law_of_bend(self) -> bool:
+        """Whether the bending stiffness changes with the bend."""
+        return not self.section.of_bend(ca.SX.sym("square")).is_constant()
+
     def segment_energy(self, segment: Segment) -> ca.SX:
         """Elastic energy of one segment minus the work of the loads along it [J]."""
         return self.elastic_energy(segment) - self.work_along(segment, self.forces_on(segment))

@@ -107,7 +107,7 @@ class SegmentInFrame:
         Forces on the segment, in world axes.
     weights : (m, q)
         Derivatives of the forces by q multipliers (3,).
-    known : (symbols, callable)
+    held : (symbols, callable)
         Symbols in the energy that are held while it is differentiated; phi -> their values.
     """
 
@@ -118,7 +118,7 @@ class SegmentInFrame:
         x: ca.SX,
         forces: ca.SX,
         weights: FloatArray,
-        known: tuple[ca.SX, Callable[[ca.SX], ca.SX]],
+        held: tuple[ca.SX, Callable[[ca.SX], ca.SX]],
     ) -> None:
         self._forces, self._moved = forces, _Kinematics(kind, x)
         self.node_turns = self._moved.node_turns
@@ -127,8 +127,8 @@ class SegmentInFrame:
         self._to_world = ca.kron(ca.DM.eye(weights.shape[1]), self._moved.turn)
         phi, inner = ca.SX.sym("phi", 3), ca.SX.sym("inner", kind.n_inner)
         c = ca.SX.sym("force", *forces.shape)
-        self._symbols = [phi, inner, c, known[0]]
-        values = known[1](self._moved.phi)
+        self._symbols = [phi, inner, c, held[0]]
+        values = held[1](self._moved.phi)
         self._value = energy(phi, inner, c)
         self._by_frame = ca.gradient(self._value, ca.vertcat(phi, ca.vec(c)))
         self._by_inner = ca.gradient(self._value, inner)

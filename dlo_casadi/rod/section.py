@@ -102,7 +102,7 @@ class Expansion:
     of_bend : callable
         q -> b.
     squares : list of scalars [1/m^2]
-        q_0 of each point of the segment; none are needed if the law is constant.
+        q_0 of each point of the segment.
     p : (n_numbers,)
         Symbols on which the law may depend.
     """
@@ -110,7 +110,6 @@ class Expansion:
     def __init__(self, of_bend: Callable[[ca.SX], ca.SX], squares: list[ca.SX], p: ca.SX) -> None:
         q = ca.SX.sym("q")
         rows = [ca.SX(of_bend(q))]
-        self.constant = rows[0].is_constant()
         for _ in range(_ORDER):
             rows.append(ca.gradient(rows[-1], q))
         column = ca.vertcat(*rows)
@@ -119,8 +118,7 @@ class Expansion:
         # One block of columns per point: b and its derivatives by q, then the derivatives of all
         # these by each parameter; in the last row q_0 and the parameters.
         law = ca.vertcat(ca.horzcat(column, by_p[:, own]), ca.horzcat(q, p[own].T))
-        points = [] if self.constant else squares
-        blocks = [ca.substitute(ca.densify(law), q, square) for square in points]
+        blocks = [ca.substitute(ca.densify(law), q, square) for square in squares]
         self.values = ca.horzcat(ca.SX(law.size1(), 0), *blocks)
         self.symbols = ca.SX.sym("law", *self.values.shape)
         self._own = p[own]

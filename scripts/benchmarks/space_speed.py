@@ -21,7 +21,7 @@ from benchmarks.speed import FLAGS, HERE, summary
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.codegen.shapes import pose_table, records_of
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import BendingSoftening, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, ClipKind, HeldClip
@@ -49,6 +49,7 @@ ENDS = [
     ((0.65141, -0.47903, 0.11108), (0.205104, 0.106403, -0.376811, 0.897009)),
 ]
 GUESSES = 8  # most first guesses of a pose
+SOFTNESS = 0.1  # of a softening cable [m]: half as stiff at a bend of 10/m
 
 
 def problem(n: int, element: str, bent: float = 1.0) -> SpaceProblem:
@@ -96,7 +97,7 @@ class Timed:
 
     def __init__(self, own: SpaceProblem, copies: int = 1) -> None:
         self.own = own
-        source = generate(own.model, own.model.nominal, own.rest)
+        source = generate(own.model, own.p, own.rest)
         texts = dict(source.files)
         parts = [
             texts["dlo_solver.c"],
@@ -211,6 +212,19 @@ def per_element(n: int, element: str) -> float:
     own, repeats = Timed(problem(n, element)), max(3, 100 // n)
     fastest = [own.solve(pose, None, repeats)[0].min() for pose in own.own.poses]
     return float(np.median(fastest)) / n
+
+
+def softening(n: int) -> dict[str, float]:
+    """Median over the poses of the fastest cold solve [s]: the cable, and one that softens."""
+    plain = problem(n, "quadratic")
+    model = plain.model.with_effect(BendingSoftening())
+    p = model.nominal.copy()
+    p[model.names.index("bending_softening.softness")] = SOFTNESS
+    found = {}
+    for name, own in (("plain", plain), ("softening", replace(plain, model=model, p=p))):
+        solver = Timed(own, copies=3)
+        found[name] = float(np.median([solver.solve(x, None, 20)[0].min() for x in own.poses]))
+    return found
 
 
 def near(kinds: Sequence[ClipKind], n: int = 12) -> tuple[HeldPose, ...]:

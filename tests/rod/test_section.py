@@ -4,7 +4,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from dlo_casadi.rod.section import Expansion, one
+from dlo_casadi.effects import BendingSoftening, CableData, StiffnessGradient
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.section import Expansion
 
 
 def test_an_expanded_law_has_the_derivatives_of_the_law():
@@ -28,10 +31,15 @@ def test_an_expanded_law_has_the_derivatives_of_the_law():
             first, second = ca.gradient(first, q), ca.gradient(second, q)
 
 
-def test_a_section_without_a_law_of_the_bend_needs_no_expansion():
-    expansion = Expansion(one, [ca.SX.sym("q")], ca.SX.sym("p", 2))
-    assert expansion.constant
-    assert not expansion.symbols.numel()
+@pytest.mark.parametrize(
+    ("effects", "law"),
+    [((), False), ((StiffnessGradient(),), False), ((BendingSoftening(),), True)],
+)
+def test_only_a_law_of_the_bend_is_expanded(effects, law):
+    cable = CableData(1.0, 0.1, 0.008, 0.01, torsional_stiffness=0.008)
+    held = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
+    terms = lagrangian_of(CableModel(cable, 4, "quadratic", effects=effects, **held))
+    assert terms.has_law_of_bend == law
 
 
 @pytest.mark.parametrize("parameters", [0, 1])
