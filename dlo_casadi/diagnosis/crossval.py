@@ -239,29 +239,21 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[Float
 def _predicted(fit: Fit, thetas: Mapping[int, FloatArray]) -> dict[int, Observed | None]:
     """Predicted measurements of fitted poses at their own unknowns, from declared ends.
 
-    A state follows from the fitted shapes of the poses before, which were measured, too.
+    A state before a pose is that of the fit, moved with the unknowns to first order.
     """
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
     if not thetas:
         return {}
     p = np.repeat(fit.p[None], equilibria.m, axis=0)
-    rest = equilibria.rests(fit.point.shapes, fit.p, fit.rest).copy()
-    for k, theta in thetas.items():
-        j = problem.used[k]
-        p[j] = unknowns.p(theta)
-        rest[j] = equilibria.rests(fit.point.shapes, p[j], unknowns.rest(theta))[j]
+    rest = equilibria.rests(fit.point.shapes, fit.p, fit.rest)
+    at = {k: problem.used[k] for k in thetas}
+    for k, j in at.items():
+        p[j] = unknowns.p(thetas[k])
+        by_theta = fit.linearization.shapes.rest[j][:, : unknowns.size]
+        rest[j] += by_theta @ (thetas[k] - fit.point.theta)
     solved, converged = equilibria.solve(_declared(fit), p, rest)
     seen = equilibria.seen(solved, p, rest)
-    at = {k: problem.used[k] for k in thetas}
     return {k: seen[j] if converged[j] else None for k, j in at.items()}
-
-
-def _predict_all(fit: Fit, theta: FloatArray) -> list[Observed | None]:
-    """Predicted measurements of all poses in order at one theta, with the state carried along."""
-    equilibria, unknowns = fit.problem.equilibria, fit.problem.unknowns
-    p, rest = unknowns.p(theta), unknowns.rest(theta)
-    solved, converged = equilibria.solve(_declared(fit), p, rest)
-    return [*equilibria.seen(solved, p, rest)] if converged.all() else [None] * equilibria.m
 
 
 def _declared(fit: Fit) -> Shapes:
@@ -294,7 +286,7 @@ def _stretches(fit: Fit) -> CrossValidation:
         step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
         lower, upper = problem.unknowns.bounds
         theta = np.clip(fit.point.theta + step[:size], lower, upper)
-        seen = _predict_all(fit, theta)[j]
+        seen = _predicted(fit, {0: theta})[0]
         missed = None if seen is None else item.misses(seen.curve)[left_out]
         errors.append(None if missed is None else (missed, np.zeros(0)))
         off: FloatArray = lin.raw[0] + lin.raw_directions[0] @ step

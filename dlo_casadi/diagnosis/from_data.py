@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
@@ -38,7 +38,10 @@ SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 # Softness [rad] through which candidates are relaxed before they are compared; largest objective of
 # a candidate relative to the least one. In two sessions in space the hidden effect left 3105 and
 # 8250, its only rival 8051, and all others 27800 and more. If the least is noise, differences are
-# twice those of log likelihoods: a tenth of hundreds is beyond doubt.
+# twice those of log likelihoods: a tenth of hundreds is beyond doubt. A soft balance is less
+# informative for a contact, but the tables of eight sessions left least, and 1.1 to 1.9 times the
+# noise of shapes that need not balance; in three without a table, a contact left 5 to 22 times the
+# least.
 COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; for a
 # strict balance, relative to that of shapes that need not balance.
@@ -57,8 +60,8 @@ FIRST, SECOND = 3, 3
 # Trial bending stiffnesses for a contact, in weights times length squared: from cables that their
 # weight hardly bends down to chains.
 STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
-# Difference of log stiffnesses below which such trials have reached the same minimum: in sessions
-# in space they then differed by 1e-4 at most, or else by a factor of ten and more.
+# Difference of log stiffnesses below which such trials have reached the same minimum: in six
+# sessions in space they differed by 2e-4 at most or by 0.7 and more.
 SAME_STIFFNESS = 0.1
 
 
@@ -129,6 +132,8 @@ class RelaxedStart:
         Values before and after the relaxation.
     beside : tuple of Screened
         Candidates that `near` already has.
+    left : float
+        Twice the objective; infinite while the balance is still soft.
     """
 
     near: Fit
@@ -137,6 +142,7 @@ class RelaxedStart:
     begun: Values
     values: Values
     beside: tuple[Screened, ...] = ()
+    left: float = np.inf
 
     @classmethod
     def of(cls, near: Fit, screened: Screened, beside: tuple[Screened, ...] = ()) -> RelaxedStart:
@@ -145,11 +151,12 @@ class RelaxedStart:
         The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
         stiffness that has grown a hundredfold never returns. Most of them lead to one minimum.
         """
-        known: list[dict[str, float]] = [{}]
-        if not screened.candidate.effect.gradual:
-            known += _stiffnesses(near.model)
-        loose = [cls._loose(near, screened, beside, values) for values in known]
-        apart = [x for k, x in enumerate(loose) if not any(x._like(y) for y in loose[:k])]
+        known = [{}] if screened.candidate.effect.gradual else [{}, *_stiffnesses(near)]
+        apart: list[RelaxedStart] = []
+        for values in known:
+            loose = cls._loose(near, screened, beside, values)
+            if not any(loose._like(other) for other in apart):
+                apart.append(loose)
         return min((x._strict() for x in apart), key=lambda x: x.left)._retried()
 
     @classmethod
@@ -165,7 +172,8 @@ class RelaxedStart:
         """Relax from the measured shapes and known values, with the candidate initially absent.
 
         Uses the parameters in which the candidate is linear: a tether without force has no anchor.
-        The relaxed shapes and parameters of `near` are distorted by what that model lacks.
+        The relaxed shapes and parameters of `near` are distorted by what that model lacks. The
+        balance is still soft.
         """
         candidate = screened.candidate
         scan = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
@@ -191,17 +199,17 @@ class RelaxedStart:
         reached = relaxed(self.problem, self.values, COMPARED[1:-1])
         candidate = self.screened.candidate
         problem, reached = _in_own_parameters(self.near, candidate, self.problem, reached)
-        return replace(self, problem=problem, values=relaxed(problem, reached, COMPARED[-1:]))
+        return self._at(problem, relaxed(problem, reached, COMPARED[-1:]))
 
     def _retried(self) -> RelaxedStart:
         """The start with other shapes tried for outlying poses."""
         tried = (self.problem, self.begun, self.values, COMPARED[-1])
-        return replace(self, values=retry_outlying_poses(*tried, typical=WRONG))
+        return self._at(self.problem, retry_outlying_poses(*tried, typical=WRONG))
 
-    @cached_property
-    def left(self) -> float:
-        """Twice the objective."""
-        return Relaxation(self.problem, COMPARED[-1]).objective(self.values)
+    def _at(self, problem: Problem, values: Values) -> RelaxedStart:
+        """The start at other values, in a nearly strict balance."""
+        left = Relaxation(problem, COMPARED[-1]).objective(values)
+        return replace(self, problem=problem, values=values, left=left)
 
     @property
     def names(self) -> set[str]:
@@ -330,8 +338,14 @@ def _as_measured(
     return problem, with_springs_in_place(problem, found)
 
 
-def _stiffnesses(model: CableModel) -> list[dict[str, float]]:
-    """Stiffnesses by name for each of STIFFNESSES_OF_CONTACT, in their declared ratio."""
+def _stiffnesses(near: Fit) -> list[dict[str, float]]:
+    """Stiffnesses by name for each of STIFFNESSES_OF_CONTACT, in their declared ratio.
+
+    None if the stiffnesses are not estimated.
+    """
+    model = near.model
+    if not near.problem.unknowns.free[model.stiffness_indices].any():
+        return []
     typical = model.cable.mass * float(np.linalg.norm(model.gravity)) * model.cable.length**2
     own = model.nominal[model.stiffness_indices]
     names = [model.names[k] for k in model.stiffness_indices]

@@ -236,9 +236,10 @@ def near_data(
 ) -> Tried:
     """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
 
-    In a misfit scores are useless, and a refit follows the declared model's error. If the best
-    candidate does not explain the shapes, its end roll is searched again, then that of the next. If
-    all fits misfit, too, pairs are tried even where a single candidate's start reached the noise.
+    In a misfit scores are useless, and a refit follows the declared model's error. Contacts are
+    fitted first, unless their starts leave far more than the best one. If the best candidate does
+    not explain the shapes, its end roll is searched again, then that of the next. If all fits
+    misfit, too, pairs are tried even where a single candidate's start reached the noise.
     """
     near, softness = from_data(base)
     screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
@@ -267,7 +268,9 @@ def near_data(
     names = {x.candidate.name for item in tried for x in item.each}.union(
         *(start.names for start in kept)
     )
-    far = [x.candidate.name for x in likely[:REFITTED] if x.candidate.name not in names]
+    names |= fitted.keys()
+    far = [x.candidate.name for x in (*contacts, *likely[:REFITTED])]
+    far = [name for name in far if name not in names]
     p_values = p_values_of(screened)
     # Those that fit the shapes best, and loads started from the forces of one; of pairs the second.
     for item in (*(start.screened for start in kept), *(x.screened for x in tried)):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dlo_casadi.diagnosis import from_data as from_data_module
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, candidates_of, setup_of
 from dlo_casadi.diagnosis.from_data import (
@@ -16,7 +17,7 @@ from dlo_casadi.diagnosis.from_data import (
     screened_from_data,
 )
 from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data, near_data
-from dlo_casadi.effects import EFFECTS, BendingAnisotropy, CableData, ContactPlane
+from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import refit
@@ -227,19 +228,72 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table, m
     assert 1e-3 < mesh_error(coarse) < 1e-2
 
 
-def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(on_a_table, monkeypatch):
-    others, asked = EFFECTS.keys() - {"contact_plane", "tether"}, []
+def named(name, *, gradual=True):
+    return SimpleNamespace(
+        candidate=SimpleNamespace(name=name, effect=SimpleNamespace(gradual=gradual)),
+        score=1.0,
+        p_value=1.0,
+    )
 
-    def fitted(_, starts, __):
-        asked.append([start.screened.candidate.name for start in starts])
-        return []
 
-    monkeypatch.setattr(refits, "confirm_contacts", fitted)
-    monkeypatch.setattr(refits, "_confirmed", lambda *_, **__: [])
-    near_data(on_a_table, InProcess(), None, tuple(others), pairs=False)
-    monkeypatch.setattr(refits, "NEAR_LEAST", 0.0)
-    near_data(on_a_table, InProcess(), None, tuple(others), pairs=False)
-    assert asked == [["contact_plane"], []]
+@pytest.mark.parametrize(
+    ("left", "fitted"),
+    [
+        ({"table": 2.9, "tether": 1.0}, True),
+        ({"table": 3.1, "tether": 1.0}, False),
+        ({"table": 9.0}, True),
+    ],
+)
+def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, monkeypatch):
+    def start(_, x):
+        name = x.candidate.name
+        return SimpleNamespace(screened=x, names={name}, left=left[name])
+
+    asked = []
+    monkeypatch.setattr(RelaxedStart, "of", start)
+    monkeypatch.setattr(refits, "from_data", lambda _: (None, 0.01))
+    monkeypatch.setattr(refits, "candidates_of", lambda *_: ())
+    screened = [named(name, gradual=name != "table") for name in left]
+    monkeypatch.setattr(refits, "screened_from_data", lambda *_: screened)
+    monkeypatch.setattr(
+        refits, "confirm_contacts", lambda _, starts, __: asked.extend(starts) or []
+    )
+    monkeypatch.setattr(refits, "nearest", lambda *_, **__: [])
+    monkeypatch.setattr(refits, "loads_from_best", lambda *_: [])
+    tried = near_data(None, InProcess(), None, (), pairs=False)
+    assert [x.names for x in asked] == [{"table"}] * fitted
+    assert set(tried.far) == set(left)
+
+
+def test_of_trial_stiffnesses_with_one_minimum_one_is_followed(monkeypatch):
+    """And other shapes of outlying poses are tried in the best of all minima only."""
+
+    class Start(SimpleNamespace):
+        _like = RelaxedStart._like
+
+        def _strict(self):
+            followed.append(self.stiffness)
+            return self
+
+        def _retried(self):
+            return self
+
+    def loose(near, screened, beside, known):
+        stiffness = known.get("EI", 1.0)
+        model = SimpleNamespace(stiffness_indices=[0])
+        unknowns = SimpleNamespace(model=model, p=lambda theta: theta)
+        values, problem = (
+            SimpleNamespace(theta=np.array([stiffness])),
+            SimpleNamespace(unknowns=unknowns),
+        )
+        return Start(stiffness=stiffness, left=-stiffness, values=values, problem=problem)
+
+    followed = []
+    monkeypatch.setattr(RelaxedStart, "_loose", loose)
+    trials = [{"EI": x} for x in (1.00001, 20.0, 1.08, 1.16)]
+    monkeypatch.setattr(from_data_module, "_stiffnesses", lambda _: trials)
+    assert RelaxedStart.of(None, named("table", gradual=False)).stiffness == 20.0
+    assert followed == [1.0, 20.0, 1.16]
 
 
 def test_a_pose_at_a_fold_ends_a_fit_with_an_error_that_says_so(base):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.effects import BendingSoftening, CableData, StiffnessGradient
+from dlo_casadi.model import framed
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.section import Expansion
@@ -40,6 +41,7 @@ def test_only_a_law_of_the_bend_is_expanded(effects, law):
     held = {"start": "clamped", "end": "clamped", "gravity": (0.0, 0.0, -9.81)}
     terms = lagrangian_of(CableModel(cable, 4, "quadratic", effects=effects, **held))
     assert terms.has_law_of_bend == law
+    assert bool(framed._energy(terms).numel_in(3)) == law
 
 
 @pytest.mark.parametrize("parameters", [0, 1])
