@@ -4,11 +4,11 @@ Leaving pose j out of the normal equations gives the unknowns without it in one 
 
     theta_(-j) = theta - (H - H_j)^-1 (g - g_j)
 
-(exact for a linear model). Pose j is then predicted from its declared end conditions. If this is
-far less likely than the linear model says, as where a tether's stiffness and anchor act as a
-product, the step was too long. The other poses are then fitted again, or the linear model counts if
-the fit does not explain its points. If there is one pose only, stretches of its arc take the place
-of poses.
+(exact for a linear model). Pose j is then predicted from its declared end conditions and, if poses
+leave a state behind, from the state before it. If this is far less likely than the linear model
+says, as where a tether's stiffness and anchor act as a product, the step was too long. The other
+poses are then fitted again, or the linear model counts if the fit does not explain its points. If
+there is one pose only, stretches of its arc take the place of poses.
 
 References
 ----------
@@ -120,7 +120,7 @@ class CrossValidation:
 def cross_validate(fit: Fit) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 
-    All folds are solved together, in some 6 ms each.
+    All folds are solved together.
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
@@ -239,7 +239,7 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[Float
 def _predicted(fit: Fit, thetas: Mapping[int, FloatArray]) -> dict[int, Observed | None]:
     """Predicted measurements of fitted poses at their own unknowns, from declared ends.
 
-    A state before a pose is that of the fit, moved with the unknowns to first order.
+    The state before a pose is that of the fit, to which its first-order change is added.
     """
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
     if not thetas:

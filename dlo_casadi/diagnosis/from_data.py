@@ -39,9 +39,9 @@ SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 # a candidate relative to the least one. In two sessions in space the hidden effect left 3105 and
 # 8250, its only rival 8051, and all others 27800 and more. If the least is noise, differences are
 # twice those of log likelihoods: a tenth of hundreds is beyond doubt. A soft balance is less
-# informative for a contact, but the tables of eight sessions left least, and 1.1 to 1.9 times the
-# noise of shapes that need not balance; in three without a table, a contact left 5 to 22 times the
-# least.
+# informative for a contact, but hidden tables left least in five sessions, and in eight 1.2 to 1.9
+# times what shapes leave that need not balance; in three sessions without a table, a contact left 5
+# to 22 times the least.
 COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; for a
 # strict balance, relative to that of shapes that need not balance.
@@ -60,8 +60,8 @@ FIRST, SECOND = 3, 3
 # Trial bending stiffnesses for a contact, in weights times length squared: from cables that their
 # weight hardly bends down to chains.
 STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
-# Difference of log stiffnesses below which such trials count as at one minimum: in six sessions in
-# space it was 0.08 at most, or 0.5 and more.
+# Two such trials whose log stiffnesses differ by less are at the same minimum: in six sessions in
+# space they differed by 0.08 at most, or by 0.5 and more.
 SAME_STIFFNESS = 0.1
 
 
@@ -149,7 +149,8 @@ class RelaxedStart:
         """Best start from the measured shapes; for a contact also from several stiffnesses.
 
         The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
-        stiffness that has grown a hundredfold never returns. Most of them lead to one minimum.
+        stiffness that has grown a hundredfold never returns. Trials that reach the same minimum are
+        followed once.
         """
         known = [{}] if screened.candidate.effect.gradual else [{}, *_stiffnesses(near)]
         apart: list[RelaxedStart] = []

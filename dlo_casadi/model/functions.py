@@ -58,12 +58,11 @@ class Functions:
         delta = self.terms.delta
         still = ca.SX.zeros(delta.shape)
         # Checking costs a tenth of substituting.
-        found = [ca.substitute(x, delta, still) if ca.depends_on(x, delta) else x for x in outputs]
-        dense = [ca.densify(one) for one in found]
+        here = [ca.substitute(x, delta, still) if ca.depends_on(x, delta) else x for x in outputs]
+        dense = [ca.densify(one) for one in here]
         # With a law of the bend, half of the operations are repeated. Without one it is a fifth,
         # which takes longer to find than it saves.
-        found = ca.cse(dense) if self.terms.has_law_of_bend else dense
-        return ca.Function(name, arguments, found)
+        return ca.Function(name, arguments, ca.cse(dense) if self.terms.has_law_of_bend else dense)
 
     def _of_segment(self, name: str, *outputs: ca.SX) -> ca.Function:
         return self._here(name, self._segment_arguments, list(outputs))

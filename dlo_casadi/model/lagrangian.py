@@ -246,7 +246,8 @@ class Lagrangian:
     @cached_property
     def has_law_of_bend(self) -> bool:
         """Whether the bending stiffness changes with the bend."""
-        return not self.section.of_bend(ca.SX.sym("square")).is_constant()
+        square = ca.SX.sym("square")
+        return bool(ca.depends_on(self.section.of_bend(square), square))
 
     def segment_energy(self, segment: Segment) -> ca.SX:
         """Elastic energy of one segment minus the work of the loads along it [J]."""

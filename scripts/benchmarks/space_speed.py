@@ -49,7 +49,7 @@ ENDS = [
     ((0.65141, -0.47903, 0.11108), (0.205104, 0.106403, -0.376811, 0.897009)),
 ]
 GUESSES = 8  # most first guesses of a pose
-SOFTNESS = 0.1  # of a softening cable [m]: half as stiff at a bend of 10/m
+SOFTNESS = 0.1  # of a softening cable [m]: half the moment at a bend of 10/m
 
 
 def problem(n: int, element: str, bent: float = 1.0) -> SpaceProblem:
