@@ -26,6 +26,7 @@ from dlo_casadi.diagnosis.from_data import (
     NEAR_LEAST,
     RelaxedStart,
     from_data,
+    left_without,
     likeliest,
     nearest,
     screened_from_data,
@@ -49,7 +50,7 @@ from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import EVIDENCE_APART, REFITTED
+from dlo_casadi.thresholds import EVIDENCE_APART, IN_QUESTION, REFITTED
 
 # Shares of the one-step estimate from which a refit is tried, in this order.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -152,13 +153,16 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     """Test a candidate without derivative where it vanishes, by the gain of a refit.
 
     The refit starts from the base. It also starts from the measured shapes, unless the base has a
-    declared noise and reaches it: an estimated noise may hide what the base lacks.
+    declared noise and reaches it (an estimated noise may hide what the base lacks), or the
+    candidate gains nothing in relaxed shapes.
     """
     start = dict(candidate.scans[0])
     fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
     if base.beyond_noise or not base.noise.known:
         near, _ = from_data(base)
-        fit = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start)).fit()
+        begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
+        p_value = survival(left_without(near) - begun.left, len(start), noise_dof)
+        fit = begun.fit() if p_value < IN_QUESTION else None
         if fit is not None:
             fit = fit.reweighed(base.noise, base.problem.priors)
             fits.append(_followed(fit, candidate.add_to(base.model), {}, MOST_STEPS))

@@ -64,6 +64,7 @@ class BatchEquilibrium:
         self.node = self.assembly.node
         self._ends = np.array([pose.vector for pose in self.poses])
         self.used_deviations = [model.deviation_names.index(name) for name in model.deviations]
+        self._last_rests: tuple[tuple[FloatArray, ...], FloatArray] = (), np.zeros(0)
 
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes with these nodes (m, n_nodes, coordinates), without forces and deviations."""
@@ -79,9 +80,19 @@ class BatchEquilibrium:
         """
         if rest.ndim == 2:
             return rest
-        out = np.repeat(rest[None], self.m, axis=0)
         if not self.model.has_state:
-            return out
+            return np.repeat(rest[None], self.m, axis=0)
+        # The same shapes are evaluated, observed and linearised.
+        inputs = shapes.x, shapes.deviation, p, rest
+        known, out = self._last_rests
+        if not (known and all(map(np.array_equal, known, inputs))):
+            out = self._carried(shapes, p, rest)
+            self._last_rests = tuple(part.copy() for part in inputs), out
+        return out.copy()
+
+    def _carried(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """As `rests`, computed from pose to pose."""
+        out = np.repeat(rest[None], self.m, axis=0)
         # Newton's method for all poses at once: if a law is linear in the rest curvature, one step;
         # of any law each step makes at least one more pose exact.
         strains = len(self.node.strains)

@@ -16,7 +16,12 @@ from dlo_casadi.diagnosis.from_data import (
     nearest,
     screened_from_data,
 )
-from dlo_casadi.diagnosis.refits import confirm_contacts, confirm_from_data, near_data
+from dlo_casadi.diagnosis.refits import (
+    confirm_contacts,
+    confirm_from_data,
+    near_data,
+    scored_by_refit,
+)
 from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
@@ -122,7 +127,7 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypa
 
 def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
     """A drift had no score beside a tether, and came seventh alone."""
-    near, seconds, left_by_pair = SimpleNamespace(point=SimpleNamespace(data=1.0)), [], [1.3]
+    near, seconds, left_by_pair = relaxed_stub(data=1.0), [], [1.3]
 
     def start(left, *names):
         return SimpleNamespace(names=set(names), left=left)
@@ -154,14 +159,30 @@ def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
     assert seconds == list("123") + list("456")
 
 
-def test_pairs_follow_a_single_candidate_that_reached_the_noise_in_vain(monkeypatch):
+def relaxed_stub(data, n_residuals=1):
+    """What `nearest` reads of a relaxed fit."""
+    return SimpleNamespace(
+        point=SimpleNamespace(data=data), problem=SimpleNamespace(n_residuals=n_residuals)
+    )
+
+
+@pytest.mark.parametrize("soft_data", [0.1, 1.0])
+def test_shapes_that_fit_the_noise_do_not_lower_what_counts_as_reaching_it(soft_data, monkeypatch):
+    """In a session the hidden pair left 568 of 432 residuals, shapes with a soft balance 282."""
+    monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [])
+    alone = [SimpleNamespace(names={"0"}, left=1.4)]
+    assert len(list(nearest(relaxed_stub(soft_data), 0.1, alone, (), InProcess()))) == 2
+
+
+@pytest.mark.parametrize(("left", "first"), [(1.0, 1), (2.9, 2)])
+def test_pairs_follow_a_single_candidate_that_came_near_the_noise_in_vain(left, first, monkeypatch):
     """A softening and a stiff section did; with each the fit misfits: a taper and a drift."""
-    near = SimpleNamespace(point=SimpleNamespace(data=1.0))
+    near = relaxed_stub(data=1.0)
     pair = SimpleNamespace(names={"0", "other"}, left=1.0)
-    alone = [SimpleNamespace(names={x}, left=1.0 + int(x)) for x in "01"]
+    alone = [SimpleNamespace(names={x}, left=left + int(x) * left) for x in "01"]
     monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [pair])
     lists = nearest(near, 0.01, alone, (), InProcess())
-    assert next(lists) == [alone[0]]
+    assert next(lists) == alone[:first]
     assert next(lists) == [pair]
     assert next(lists, None) is None
     assert len(list(nearest(near, 0.01, alone, (), InProcess(), pairs=False))) == 1
@@ -263,6 +284,25 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
     tried = near_data(None, InProcess(), None, (), pairs=False)
     assert [x.names for x in asked] == [{"table"}] * fitted
     assert set(tried.far) == set(left)
+
+
+@pytest.mark.parametrize(("left", "fitted"), [(80.0, True), (99.0, False), (300.0, False)])
+def test_a_contact_that_gains_nothing_in_relaxed_shapes_is_not_fitted_from_there(
+    left, fitted, monkeypatch
+):
+    asked = []
+    start = SimpleNamespace(left=left, fit=lambda: asked.append(left))
+    effect = SimpleNamespace(scans=({"height": 0.0},), frees=("height",), add_to=lambda _: None)
+    base = SimpleNamespace(
+        model=None, beyond_noise=True, noise=SimpleNamespace(known=False), value=lambda _: 0.0
+    )
+    monkeypatch.setattr(refits, "_followed", lambda *_: None)
+    monkeypatch.setattr(refits, "from_data", lambda _: (None, 0.01))
+    monkeypatch.setattr(refits, "left_without", lambda _: 100.0)
+    monkeypatch.setattr(RelaxedStart, "of", lambda *_: start)
+    found = scored_by_refit(base, effect, 50.0)
+    assert asked == [left] * fitted
+    assert (found.score, found.p_value) == (0.0, 1.0)
 
 
 def test_of_trial_stiffnesses_with_one_minimum_one_is_followed(monkeypatch):
