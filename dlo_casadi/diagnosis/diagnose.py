@@ -275,8 +275,7 @@ class Search:
     def of_simpler_effects(self, found: Found) -> Found | None:
         """Search among effects with fewer parameters, if one of these may be the larger of two.
 
-        An effect of many parameters may stand for two effects of one parameter each: at most one
-        effect more than found is added.
+        An effect of many parameters may stand for two effects of one parameter each.
         """
         if not found.added or self.declared.noise.source == "misfit":
             return None
@@ -288,8 +287,7 @@ class Search:
         # An effect that only a larger model could screen has no score here.
         if best < LARGER_OF_TWO * scores.get(winner.name, np.inf):
             return None
-        most = min(self.max_effects, len(found.added) + 1)
-        return replace(self, exclude=[*self.exclude, *others], wider=self, max_effects=most).run()
+        return replace(self, exclude=[*self.exclude, *others], wider=self).run()
 
     def _or_causes(self, found: Found) -> tuple[Found, UnknownForce | None]:
         """The found effects, or causes of an unknown force if these are better; and the force."""

@@ -46,12 +46,12 @@ COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; where
 # shapes that need not balance leave more than the noise, relative to what they leave.
 REACHED = 1.5
-# Share of that sum up to which single candidates are fitted before pairs are tried. Evidence: in a
-# session in space a softening left 1.35 of it, other candidates 17 times and more; eighteen pairs
-# were tried in vain, and the tilt beside it was then found from its fit.
+# Multiple of that sum below which single candidates are fitted before pairs are tried. Evidence: in
+# a session in space a softening left 1.35 times it, all others 17 times and more. Eighteen pairs
+# were tried in vain; the next step of the search found the tilt beside it.
 CLOSE = 2.0
-# Sum of squares, relative to that of the relaxed shapes, below which no further pair is tried. In
-# four sessions in space the hidden pair left 1.01, 1.10, 1.14 and 1.54, other pairs 1.5 and more.
+# Multiple of the expected sum below which a pair is the last one tried. In four sessions in space
+# the hidden pair left 1.01, 1.10, 1.14 and 1.54 times the relaxed shapes, others 1.5 and more.
 SURELY_REACHED = 1.2
 # Sum of squares per residual that most poses leave, above which no pose is tried again: not a pose,
 # but the candidate is wrong. In a session in space seven of thirteen such starts gained by a second
@@ -279,13 +279,15 @@ def nearest(
     """Starts whose objective is close to the least one, best first; then those for a further try.
 
     The least one is one of the starts `alone`, each with one candidate, or `least` of another. If
-    none of them comes close to the noise, pairs are tried, provided `pairs` may be added: of FIRST
-    candidates and likely second ones, then of the next ones, at last of the `later` ones, until one
-    reaches the noise; one that surely does is the last. Pairs are returned if REACHED times their
-    objective is less. If single candidates come close, pairs follow for a further try.
+    none of them is below CLOSE times REACHED, pairs are tried, provided `pairs` may be added: of
+    FIRST candidates and likely second ones, then of the next ones, at last of the `later` ones
+    unless a single candidate is below REACHED. They end with those that reach REACHED, at once with
+    one that reaches SURELY_REACHED. Pairs are returned if REACHED times their objective is less
+    than that of single candidates not yet returned. After these, pairs follow for a further try.
     """
-    # A balance that is softer than the measured shapes need fits their noise, too.
-    expected = max(near.point.data, near.problem.n_residuals)
+    expected = near.point.data
+    if near.problem.noise.known:  # very soft shapes leave less than the noise
+        expected = max(expected, near.problem.n_residuals)
     noise, start = REACHED * expected, partial(RelaxedStart.of, near)
     second = partial(
         RelaxedStart.and_second,
@@ -295,9 +297,10 @@ def nearest(
         exclude=exclude,
     )
     begun = _near_least(alone, noise, least)
-    reached = bool(begun) and begun[0].left < CLOSE * noise
-    if reached or not pairs:
-        yield begun
+    nearest_left = begun[0].left if begun else np.inf
+    told = begun if nearest_left < CLOSE * noise or not pairs else []
+    if told or not pairs:
+        yield told
     if not pairs:
         return
     own: dict[frozenset[str], RelaxedStart] = {}
@@ -311,13 +314,14 @@ def nearest(
             if kept and kept[0].left < SURELY_REACHED * expected:
                 break
         firsts = firsts[FIRST:]
-        if not firsts and later and not reached:
+        if not firsts and later and nearest_left >= noise:
             firsts, later = sorted(map_in_order(executor, start, later), key=lambda x: x.left), []
             begun = _near_least((*begun, *firsts), noise, least)
             if begun[0].left < noise:
                 yield begun
                 return
-    yield kept if reached or (kept and REACHED * kept[0].left < begun[0].left) else begun
+    new = [x for x in begun if not any(x is known for known in told)]
+    yield kept if not new or (kept and REACHED * kept[0].left < new[0].left) else new
 
 
 def _near_least(

@@ -24,6 +24,7 @@ from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
     NEAR_LEAST,
+    NEAR_NOISE,
     RelaxedStart,
     from_data,
     left_without,
@@ -50,7 +51,7 @@ from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import EVIDENCE_APART, IN_QUESTION, REFITTED
+from dlo_casadi.thresholds import EVIDENCE_APART, REFITTED
 
 # Shares of the one-step estimate from which a refit is tried, in this order.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -153,16 +154,15 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     """Test a candidate without derivative where it vanishes, by the gain of a refit.
 
     The refit starts from the base. It also starts from the measured shapes, unless the base has a
-    declared noise and reaches it (an estimated noise may hide what the base lacks), or the
-    candidate gains nothing in relaxed shapes.
+    declared noise and reaches it: an estimated noise may hide what the base lacks. What gains less
+    than a tenth in relaxed shapes needs no such start: the base is then close to the contact.
     """
     start = dict(candidate.scans[0])
     fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
     if base.beyond_noise or not base.noise.known:
         near, _ = from_data(base)
         begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
-        p_value = survival(left_without(near) - begun.left, len(start), noise_dof)
-        fit = begun.fit() if p_value < IN_QUESTION else None
+        fit = begun.fit() if NEAR_NOISE * begun.left < left_without(near) else None
         if fit is not None:
             fit = fit.reweighed(base.noise, base.problem.priors)
             fits.append(_followed(fit, candidate.add_to(base.model), {}, MOST_STEPS))
@@ -243,7 +243,7 @@ def near_data(
     In a misfit scores are useless, and a refit follows the declared model's error. Contacts are
     fitted first, unless their starts leave far more than the best one. If the best candidate does
     not explain the shapes, its end roll is searched again, then that of the next. If all fits
-    misfit, too, pairs are tried even where a single candidate's start reached the noise.
+    misfit, too, pairs are tried even where a single candidate's start came close to the noise.
     """
     near, softness = from_data(base)
     screened = screened_from_data(near, softness, candidates_of(near, center, exclude))

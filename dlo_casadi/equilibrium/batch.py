@@ -82,7 +82,7 @@ class BatchEquilibrium:
             return rest
         if not self.model.has_state:
             return np.repeat(rest[None], self.m, axis=0)
-        # The same shapes are evaluated, observed and linearised.
+        # The same shapes are evaluated, observed and linearised. No state depends on forces.
         inputs = shapes.x, shapes.deviation, p, rest
         known, out = self._last_rests
         if not (known and all(map(np.array_equal, known, inputs))):

@@ -53,7 +53,7 @@ FIRST_DAMPING, LEAST_DAMPING, OF_UNKNOWNS = 1.0, 0.1, 0.01
 REFUSED = 6
 # Maximum number of iterations at each softness; they end below this relative decrease. Models that
 # lack something creep by 1 or 2 % per step, the right one needs three to five steps: in three dear
-# sessions in space, 5e-3 took a seventh more time for the same effects.
+# sessions in space that needed 90 to 120 s, 5e-3 took a seventh more for the same effects.
 STEPS, CONVERGED = 20, 2e-2
 
 
@@ -369,7 +369,7 @@ class Relaxation:
             if not reached < least:
                 break
             gain, values, least = least - reached, found, reached
-            if damping == first:  # a smaller one was refused just now: keep it for one more step
+            if damping == first:  # after a refusal it stays: a smaller one has just failed
                 damping = max(damping / 10, LEAST_DAMPING)
             if gain < CONVERGED * reached:
                 break

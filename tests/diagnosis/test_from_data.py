@@ -159,19 +159,38 @@ def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
     assert seconds == list("123") + list("456")
 
 
-def relaxed_stub(data, n_residuals=1):
+def relaxed_stub(data, n_residuals=1, *, known=True):
     """What `nearest` reads of a relaxed fit."""
     return SimpleNamespace(
-        point=SimpleNamespace(data=data), problem=SimpleNamespace(n_residuals=n_residuals)
+        point=SimpleNamespace(data=data),
+        problem=SimpleNamespace(n_residuals=n_residuals, noise=SimpleNamespace(known=known)),
     )
 
 
-@pytest.mark.parametrize("soft_data", [0.1, 1.0])
-def test_shapes_that_fit_the_noise_do_not_lower_what_counts_as_reaching_it(soft_data, monkeypatch):
+@pytest.mark.parametrize(("known", "lists"), [(True, 2), (False, 1)])
+def test_shapes_that_fit_a_known_noise_do_not_lower_what_counts_as_reaching_it(
+    known, lists, monkeypatch
+):
     """In a session the hidden pair left 568 of 432 residuals, shapes with a soft balance 282."""
     monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [])
     alone = [SimpleNamespace(names={"0"}, left=1.4)]
-    assert len(list(nearest(relaxed_stub(soft_data), 0.1, alone, (), InProcess()))) == 2
+    near = relaxed_stub(0.1, known=known)
+    assert len(list(nearest(near, 0.1, alone, (), InProcess()))) == lists
+
+
+def test_later_candidates_are_tried_unless_one_reaches_the_noise(monkeypatch):
+    """A single candidate that only comes close is fitted at once, and may be the wrong one."""
+    lefts = {"late": 1.2}
+    monkeypatch.setattr(RelaxedStart, "of", lambda _, x: SimpleNamespace(names={x}, left=lefts[x]))
+    monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [])
+    alone = [SimpleNamespace(names={"0"}, left=2.0)]
+    first, last = nearest(relaxed_stub(1.0), 0.1, alone, ["late"], InProcess())
+    assert [x.names for x in first] == [{"0"}]
+    assert [x.names for x in last] == [{"late"}]
+    lefts["late"] = 7.0
+    assert [
+        x.names for x in [*nearest(relaxed_stub(1.0), 0.1, alone, ["late"], InProcess())][1]
+    ] == []
 
 
 @pytest.mark.parametrize(("left", "first"), [(1.0, 1), (2.9, 2)])
@@ -286,7 +305,7 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
     assert set(tried.far) == set(left)
 
 
-@pytest.mark.parametrize(("left", "fitted"), [(80.0, True), (99.0, False), (300.0, False)])
+@pytest.mark.parametrize(("left", "fitted"), [(80.0, True), (99.0, False), (np.inf, False)])
 def test_a_contact_that_gains_nothing_in_relaxed_shapes_is_not_fitted_from_there(
     left, fitted, monkeypatch
 ):

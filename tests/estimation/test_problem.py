@@ -171,6 +171,25 @@ def test_a_drift_is_carried_in_order():
     np.testing.assert_allclose(moved.x, stacked.x, atol=1e-8)  # IPOPT's tol
 
 
+def test_rests_are_those_of_the_present_shapes_and_parameters():
+    """They are kept from one call to the next, and computed again as soon as anything differs."""
+    model = CableModel(CABLE, 8, effects=(RestCurvatureDrift(),))
+    p, rest, poses = np.array([0.06, 0.3]), np.full(8, 0.8), poses_at(3)
+    equilibria = BatchEquilibrium(model, poses)
+    shapes = equilibria.start_shapes(np.random.default_rng(0).normal(0.0, 1.0, (3, 9, 1)))
+    first = equilibria.rests(shapes, p, rest)
+    equilibria.rests(shapes, p, rest)[:] = 0.0
+    np.testing.assert_array_equal(equilibria.rests(shapes, p, rest), first)
+    for other in ((shapes, 2 * p, rest), (shapes, p, 2 * rest)):
+        anew = BatchEquilibrium(model, poses).rests(*other)
+        np.testing.assert_array_equal(equilibria.rests(*other), anew)
+        assert np.abs(anew - first).max() > 1e-3
+    shapes.x[0] += 0.1 * np.arange(9)[:, None]
+    anew = BatchEquilibrium(model, poses).rests(shapes, p, rest)
+    np.testing.assert_array_equal(equilibria.rests(shapes, p, rest), anew)
+    assert np.abs(anew - first).max() > 1e-3
+
+
 def test_a_set_is_carried_in_order():
     """Its law is not linear; a shape that is not finite spoils later poses only."""
     model = CableModel(CABLE, 8, effects=(PlasticSet(),))

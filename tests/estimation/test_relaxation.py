@@ -1,6 +1,7 @@
 """A relaxed balance along the measured shapes: any stiffness, roll and twist."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -180,3 +181,31 @@ def test_a_spring_hangs_at_the_place_that_its_effect_says():
     place = [model.border_names.index(f"spring_0.place_{axis}") for axis in "xy"]
     for lam, seen in zip(values.shapes.lam, problem.observed(values), strict=True):
         np.testing.assert_allclose(lam[place], seen.curve.at(np.array([0.4]))[0], atol=1e-12)
+
+
+class Creeping(Relaxation):
+    """Steps with a damping below 10 are refused, others take one unknown down by a share."""
+
+    def objective(self, values, seen=None):
+        return float(values.theta[0])
+
+    def _linearized(self, values):
+        return None
+
+    def _scaled(self, linearized, values):
+        return linearized
+
+    def _stepped(self, values, linearized, damping, fixed):
+        self.problem.asked.append(damping)
+        factor = 1 - self.problem.share if damping >= 10 else 2.0
+        return replace(values, theta=values.theta * factor)
+
+
+@pytest.mark.parametrize(
+    ("share", "asked"), [(0.1, [1, 10, 10, 1, 10, 10, 1, 10]), (0.015, [1, 10])]
+)
+def test_a_damping_stays_after_a_refusal_and_a_creeping_fit_ends(share, asked):
+    none = {"observed": lambda _: None, "located": lambda *_: None}
+    problem = SimpleNamespace(asked=[], share=share, **none)
+    Creeping(problem, 0.01).solve(Values(np.ones(1), None, []), steps=5)
+    assert problem.asked == asked
