@@ -172,13 +172,13 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
 def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable(monkeypatch):
     """On a table that is not declared: fitted to 0.3 mm, rest shape and clamps bend to it."""
     held = {"start": "clamped", "end": "clamped"}
-    model = CableModel(CableData(0.8, 0.08, 0.006, bending_stiffness=0.06), 20, n_rest=4, **held)
+    model = CableModel(CableData(0.8, 0.08, 0.006, bending_stiffness=0.06), 12, n_rest=4, **held)
     table = model.with_effect(ContactPlane())
     p = table.nominal.copy()
     p[table.names.index("contact_plane.height")] = -0.2
-    rng, s = np.random.default_rng(2), np.linspace(0.02, 0.98, 12) * model.cable.length
+    rng, s = np.random.default_rng(4), np.linspace(0.02, 0.98, 12) * model.cable.length
     poses = []
-    for _ in range(6):
+    for _ in range(5):
         way, span = rng.uniform(-0.5, 0.5), rng.uniform(0.5, 0.65)
         first, last = rng.uniform(-0.6, 0.6, 2)
         ends = (0.0, 0.0), (span * np.cos(way), span * np.sin(way))
