@@ -279,11 +279,13 @@ def nearest(
     """Starts whose objective is close to the least one, best first; then those for a further try.
 
     The least one is one of the starts `alone`, each with one candidate, or `least` of another. If
-    none of them is below CLOSE times REACHED, pairs are tried, provided `pairs` may be added: of
-    FIRST candidates and likely second ones, then of the next ones, at last of the `later` ones
-    unless a single candidate is below REACHED. They end with those that reach REACHED, at once with
-    one that reaches SURELY_REACHED. Pairs are returned if REACHED times their objective is less
-    than that of single candidates not yet returned. After these, pairs follow for a further try.
+    it comes within CLOSE times REACHED of the noise, single candidates are returned at once.
+
+    Then pairs are tried, provided `pairs` may be added: of FIRST candidates and likely second ones,
+    then of the next ones, at last of the `later` ones unless a single candidate is within REACHED.
+    The first ones within REACHED are the last ones tried, one within SURELY_REACHED is the last.
+    Pairs are returned if no single candidates are left to return, or if REACHED times their
+    objective is less than that of those.
     """
     expected = near.point.data
     if near.problem.noise.known:  # very soft shapes leave less than the noise

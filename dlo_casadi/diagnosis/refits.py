@@ -154,8 +154,8 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     """Test a candidate without derivative where it vanishes, by the gain of a refit.
 
     The refit starts from the base. It also starts from the measured shapes, unless the base has a
-    declared noise and reaches it: an estimated noise may hide what the base lacks. What gains less
-    than a tenth in relaxed shapes needs no such start: the base is then close to the contact.
+    declared noise and reaches it: an estimated noise may hide what the base lacks. A contact
+    that leaves hardly less than the base in relaxed shapes (less than a tenth) needs no such start.
     """
     start = dict(candidate.scans[0])
     fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]

@@ -52,7 +52,7 @@ FIRST_DAMPING, LEAST_DAMPING, OF_UNKNOWNS = 1.0, 0.1, 0.01
 # Maximum number of trials of a step; each has ten times the damping of the one before.
 REFUSED = 6
 # Maximum number of iterations at each softness; they end below this relative decrease. Models that
-# lack something creep by 1 or 2 % per step, the right one needs three to five steps: in three dear
+# lack something creep by 1 or 2 % per step, the right one needs three to five steps: in three
 # sessions in space that needed 90 to 120 s, 5e-3 took a seventh more for the same effects.
 STEPS, CONVERGED = 20, 2e-2
 
