@@ -35,7 +35,7 @@ KEPT_INFORMATION = 1e-6
 # the leading one. In ten sessions with a hidden effect its score is among the first three, and at
 # least 0.99 of the leading one. Of two effects the smaller has 0.02, and is found in the next step.
 REFITTED = 6
-WORTH = 0.1
+WORTH = 0.3
 # The same for a model that lacks something large and is scored at the measured shapes. Relative to
 # the leading score, the true effect had 1 in six cables simulated by this program; in four sessions
 # of another simulator (space_pull, space_taper, space_drift, space_flat) 1, 1, 0.86 and 0.71.

@@ -40,7 +40,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from hidden_sets import LINE, RANDOM_SIZES, Simulated, simulated
+from hidden_sets import LINE, RANDOM_SIZES, Simulated, about_axis, simulated
 from simulated import random_session
 
 import dlo_casadi as dlo
@@ -258,10 +258,12 @@ def run_random(
     row["missed"] += [name for name in row["shown"] if not any(name in names for names in named)]
     row["wrong"] = [sorted(names) for names in named if not names & set(found.hidden)]
     last, errors = result.stages[-1], {}
+    angle = last.parameters.get("bending_anisotropy.angle")
+    true = about_axis(found.values, angle.value) if angle else found.values
     for name in ("bending_stiffness", "torsional_stiffness"):
         own = last.parameters.get(name)
         if own is not None and last.explains:
-            row["inside"][name] = within(own.interval_95, found.values[name])
+            row["inside"][name] = within(own.interval_95, true[name])
     for stage in result.stages:
         errors[stage.name] = stage.rmse_fit_measured_branch
     simpler = [x for name in ("initial", "stiffness_only") if (x := errors.get(name)) is not None]

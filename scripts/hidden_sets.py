@@ -106,10 +106,10 @@ def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Gen
     }[name]()
 
 
-def _nearer_to_y(values: Values) -> Values:
-    """The same stiffnesses about both axes, EI that about the axis nearer to y: a fit's, too."""
+def about_axis(values: Values, near: float = 0.0) -> Values:
+    """The same stiffnesses about both axes, EI that about the axis nearer to an angle [rad]."""
     ratio, angle = (values.get(f"bending_anisotropy.{name}", 0.0) for name in ("ratio", "angle"))
-    if abs(angle) <= np.pi / 4:
+    if abs(np.remainder(angle - near + np.pi / 2, np.pi) - np.pi / 2) <= np.pi / 4:
         return values
     return values | {
         "bending_stiffness": values["bending_stiffness"] * ratio,
@@ -193,7 +193,7 @@ def _tried(
         model = model.with_effect(EFFECTS[name]())
         sizes = _sizes(name, cable, 4.0 / length, generator)
         values |= {f"{name}.{key}": value for key, value in sizes.items()}
-    values = _nearer_to_y(values)
+    values = about_axis(values)
     p = model.nominal.copy()
     for k, name in enumerate(model.names):
         p[k] = values.get(name, p[k])

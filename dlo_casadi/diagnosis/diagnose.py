@@ -13,6 +13,7 @@ import numpy as np
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.near_data import near_data
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
 from dlo_casadi.diagnosis.screening import Screened, p_values_of, sidak, survival
@@ -255,7 +256,7 @@ class Search:
         """Candidates screened and refitted beside those already added."""
         if self._starts_at_shapes(current) and force is None:
             pairs = added + 2 <= self.max_effects
-            return refits.near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
+            return near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:

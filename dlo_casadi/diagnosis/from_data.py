@@ -46,10 +46,12 @@ COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; where
 # shapes that need not balance leave more than the noise, relative to what they leave.
 REACHED = 1.5
-# Multiple of that sum below which single candidates are fitted before pairs are tried. Evidence: in
-# a session in space a softening left 1.35 times it, all others 17 times and more. Eighteen pairs
-# were tried in vain; the next step of the search found the tilt beside it.
-CLOSE = 2.0
+# Multiple of that sum below which single candidates are fitted before pairs are tried, and a pair
+# before others are. Evidence: in a session in space a softening left 1.35 times it, all others 17
+# times and more. Eighteen pairs were tried in vain; the next step of the search found the tilt
+# beside it. In another one the hidden pair left 2.4 times it, single candidates and other pairs 4.5
+# times and more.
+CLOSE = 3.0
 # Multiple of the expected sum below which a pair is the last one tried. In four sessions in space
 # the hidden pair left 1.01, 1.10, 1.14 and 1.54 times the relaxed shapes, others 1.5 and more.
 SURELY_REACHED = 1.2
@@ -110,6 +112,13 @@ def _beside(base: Fit, model: CableModel) -> Problem:
     """The problem of another model, with a base's noise and with priors without any scatter."""
     priors = Priors.of(base.problem.priors.tolerances, model)
     return replace(base.problem_in(model), priors=priors)
+
+
+def expected_left(near: Fit) -> float:
+    """Twice the objective that a relaxed fit's shapes should leave if its model lacks nothing."""
+    left = near.point.data
+    # Very soft shapes leave less than a known noise.
+    return max(left, near.problem.n_residuals) if near.problem.noise.known else left
 
 
 def left_without(near: Fit) -> float:
@@ -223,6 +232,11 @@ class RelaxedStart:
         return replace(self, problem=problem, values=values, left=left)
 
     @property
+    def reached(self) -> bool:
+        """Whether it leaves no more than noise."""
+        return self.left < REACHED * expected_left(self.near)
+
+    @property
     def names(self) -> set[str]:
         """Names of its candidates."""
         return {x.candidate.name for x in (*self.beside, self.screened)}
@@ -278,18 +292,17 @@ def nearest(
 ) -> Iterator[list[RelaxedStart]]:
     """Starts whose objective is close to the least one, best first; then those for a further try.
 
-    The least one is one of the starts `alone`, each with one candidate, or `least` of another. If
-    it comes within CLOSE times REACHED of the noise, single candidates are returned at once.
+    The least one is one of the starts `alone`, each with one candidate, or `least` of another.
+    Those that come within CLOSE times REACHED of the noise are returned at once.
 
     Then pairs are tried, provided `pairs` may be added: of FIRST candidates and likely second ones,
     then of the next ones, at last of the `later` ones unless a single candidate is within REACHED.
-    The first ones within REACHED are the last ones tried, one within SURELY_REACHED is the last.
-    Pairs are returned if no single candidates are left to return, or if REACHED times their
-    objective is less than that of those.
+    A pair that comes as close, and leaves least, is returned at once, too. The first ones within
+    REACHED are the last ones tried, one within SURELY_REACHED is the last. Pairs are returned if no
+    single candidates are left to return, or if REACHED times their objective is less than that of
+    those.
     """
-    expected = near.point.data
-    if near.problem.noise.known:  # very soft shapes leave less than the noise
-        expected = max(expected, near.problem.n_residuals)
+    expected = expected_left(near)
     noise, start = REACHED * expected, partial(RelaxedStart.of, near)
     second = partial(
         RelaxedStart.and_second,
@@ -300,7 +313,7 @@ def nearest(
     )
     begun = _near_least(alone, noise, least)
     nearest_left = begun[0].left if begun else np.inf
-    told = begun if nearest_left < CLOSE * noise or not pairs else []
+    told = [x for x in begun if x.left < CLOSE * noise or not pairs]
     if told or not pairs:
         yield told
     if not pairs:
@@ -315,6 +328,9 @@ def nearest(
             kept = _near_least(own.values(), noise)
             if kept and kept[0].left < SURELY_REACHED * expected:
                 break
+            if kept and kept[0].left < CLOSE * noise and not _in(told, kept[0]):
+                told = [*told, kept[0]]
+                yield told[-1:]
         firsts = firsts[FIRST:]
         if not firsts and later and nearest_left >= noise:
             firsts, later = sorted(map_in_order(executor, start, later), key=lambda x: x.left), []
@@ -322,8 +338,13 @@ def nearest(
             if begun[0].left < noise:
                 yield begun
                 return
-    new = [x for x in begun if not any(x is known for known in told)]
-    yield kept if not new or (kept and REACHED * kept[0].left < new[0].left) else new
+    new = [x for x in begun if not _in(told, x)]
+    pairs_left = [x for x in kept if not _in(told, x)]
+    yield pairs_left if not new or (kept and REACHED * kept[0].left < new[0].left) else new
+
+
+def _in(starts: Iterable[RelaxedStart], start: RelaxedStart) -> bool:
+    return any(start is known for known in starts)
 
 
 def _near_least(

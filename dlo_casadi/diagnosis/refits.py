@@ -6,7 +6,7 @@ are too far from the measured ones to follow any effect, there are two other sta
 One is an unknown force that fits the shapes: a force f_j in every pose at one place r_j of the
 cable. A load is its cause if the load's own law gives these forces. Once the place is known, all
 loads are linear in their parameters (a tether in k and k a: f = k a - k r), and least squares give
-the start. The other start is at the measured shapes, see `diagnosis.from_data`.
+the start. The other start is at the measured shapes, see `diagnosis.near_data`.
 """
 
 from __future__ import annotations
@@ -20,38 +20,32 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
+from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import (
-    NEAR_LEAST,
     NEAR_NOISE,
     RelaxedStart,
     from_data,
     left_without,
-    likeliest,
-    nearest,
-    screened_from_data,
 )
 from dlo_casadi.diagnosis.screening import (
     Screen,
     Screened,
     in_order,
-    p_values_of,
-    sidak,
     survival,
 )
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, places_in, start_from
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.descent import NEARLY, descend, refit
-from dlo_casadi.estimation.fit import explains, misfits
+from dlo_casadi.estimation.descent import NEARLY, refit
+from dlo_casadi.estimation.fit import misfits
 from dlo_casadi.estimation.problem import Priors
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import EVIDENCE_APART, REFITTED
+from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Shares of the one-step estimate from which a refit is tried, in this order.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -158,14 +152,17 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
     that leaves hardly less than the base in relaxed shapes (less than a tenth) needs no such start.
     """
     start = dict(candidate.scans[0])
-    fits = [_followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
+    fits = [followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
     if base.beyond_noise or not base.noise.known:
         near, _ = from_data(base)
-        begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
-        fit = begun.fit() if NEAR_NOISE * begun.left < left_without(near) else None
+        most = left_without(near) / NEAR_NOISE
+        fit = None
+        if near.point.data < most:  # no start leaves less than shapes that need not balance
+            begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
+            fit = begun.fit() if begun.left < most else None
         if fit is not None:
             fit = fit.reweighed(base.noise, base.problem.priors)
-            fits.append(_followed(fit, candidate.add_to(base.model), {}, MOST_STEPS))
+            fits.append(followed(fit, candidate.add_to(base.model), {}, MOST_STEPS))
     best = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     if best is None:
         return Screened(candidate, 0.0, 1.0, start)
@@ -186,7 +183,7 @@ def confirm(
     if beside is not None:
         same = beside.weighed_as(base)
         model = screened.candidate.add_to(base.model)
-        fits = (found, _followed(same, model, screened.start, MOST_STEPS, ceiling))
+        fits = (found, followed(same, model, screened.start, MOST_STEPS, ceiling))
         found = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     return Confirmed.of(screened, base, found)
 
@@ -198,9 +195,9 @@ def confirm_cause(base: Fit, force: UnknownForce, screened: Screened) -> Confirm
     """
     forces = force.force_per_pose
     values = start_from(force.fit, force.position, forces, screened.candidate)
-    fit = _followed(force.fit, screened.candidate.add_to(base.model), values, STEPS_FROM_FORCES)
+    fit = followed(force.fit, screened.candidate.add_to(base.model), values, STEPS_FROM_FORCES)
     if fit is not None and base.noise.before is not None and not misfits(fit):
-        fit = _at_noise(fit, base.noise.before)
+        fit = at_noise(fit, base.noise.before)
     return Confirmed.of(screened, base, fit)
 
 
@@ -209,128 +206,13 @@ def ceiling_beside(fit: Fit) -> float:
     return fit.point.objective + max(GIVEN_UP, fit.point.objective)
 
 
-def _at_noise(fit: Fit, noise: NoiseModel) -> Fit:
+def at_noise(fit: Fit, noise: NoiseModel) -> Fit:
     """A fit that meets its points, weighed by their noise instead of that of a misfit."""
     priors = Priors.of(fit.problem.priors.tolerances, fit.model)
     return refine(fit.reweighed(noise, priors), first=True)
 
 
-def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
-    """Fit with a candidate added, from the relaxed base; None if it reaches no equilibrium.
-
-    It keeps the base's weights if the candidate does not bring it to the noise of the points.
-    """
-    with suppress(EstimationError):
-        fit = start.fit()
-        if fit is not None and misfits(fit):
-            fit = descend(fit.reweighed(base.noise, base.problem.priors), tolerance=NEARLY)
-        if fit is not None and not misfits(fit):
-            fit = _at_noise(fit, start.problem.noise)
-        return Confirmed.of(start.screened, base, fit, start.beside)
-    return None
-
-
-def near_data(
-    base: Fit,
-    executor: Executor,
-    center: tuple[float, float] | None,
-    exclude: Sequence[str],
-    *,
-    pairs: bool,
-) -> Tried:
-    """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
-
-    In a misfit scores are useless, and a refit follows the declared model's error. Contacts are
-    fitted first, unless their starts leave far more than the best one. If the best candidate does
-    not explain the shapes, its end roll is searched again, then that of the next. If all fits
-    misfit, too, pairs are tried even where a single candidate's start came close to the noise.
-    """
-    near, softness = from_data(base)
-    screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
-    likely = likeliest(screened)
-    contacts = [x for x in screened if not x.candidate.effect.gradual]
-    first = [*contacts, *likely[:REFITTED]]
-    begun = list(map_in_order(executor, partial(RelaxedStart.of, near), first))
-    touches, alone = begun[: len(contacts)], begun[len(contacts) :]
-    most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
-    touches = [start for start in touches if start.left <= most]
-    touching = confirm_contacts(base, touches, executor)
-    explained = any(explains(item.fit) for item in touching)
-    least = min(start.left for start in touches) if explained else np.inf
-    later, among = likely[REFITTED:], (executor, center, exclude)
-    pairs = pairs and not explained
-    kept: list[RelaxedStart] = []
-    tried: list[Confirmed] = []
-    for starts in nearest(near, softness, alone, later, *among, pairs=pairs, least=least):
-        kept += starts[:REFITTED]
-        tried += _confirmed(base, starts[:REFITTED], executor, rolls=not explained)
-        if any(item.fit.noise.source != "misfit" for item in tried):
-            break
-    tried = loads_from_best(base, screened, tried, executor)
-    fitted = {item.name: item.screened for item in touching}
-    screened = in_order([fitted.get(x.candidate.name, x) for x in screened])
-    names = {x.candidate.name for item in tried for x in item.each}.union(
-        *(start.names for start in kept)
-    )
-    names |= fitted.keys()
-    far = [x.candidate.name for x in (*contacts, *likely[:REFITTED])]
-    far = [name for name in far if name not in names]
-    p_values = p_values_of(screened)
-    # Those that fit the shapes best, and loads started from the forces of one; of pairs the second.
-    for item in (*(start.screened for start in kept), *(x.screened for x in tried)):
-        single, name = sidak(item.p_value, len(screened)), item.candidate.name
-        p_values[name] = min(single, p_values.get(name, 1.0))
-    return Tried(screened, p_values, [*touching, *tried], far)
-
-
-def _confirmed(
-    base: Fit, starts: Sequence[RelaxedStart], executor: Executor, *, rolls: bool
-) -> list[Confirmed]:
-    """Fits from starts; until one explains the shapes, with `rolls` other end rolls are tried."""
-    tried = list(map_in_order(executor, partial(confirm_from_data, base), starts))
-    for k, start in enumerate(starts) if rolls else ():
-        item = tried[k]
-        # The error of a wrong end roll may look like a scatter from pose to pose.
-        if item is None or not explains(item.fit) or item.fit.scatters:
-            item = tried[k] = confirm_rolled(base, start, item)
-        if item is not None and explains(item.fit):
-            break
-    return [item for item in tried if item is not None]
-
-
-def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
-    """The likelier of `found` and a fit from the start with the end roll searched again."""
-    rolled = start.rolled()
-    other = confirm_from_data(base, rolled) if rolled else None
-    both = [item for item in (found, other) if item is not None]
-    return max(both, key=lambda item: (explains(item.fit), item.fit.log_evidence), default=None)
-
-
-def confirm_contacts(
-    base: Fit, begun: Sequence[RelaxedStart], executor: Executor
-) -> list[Confirmed]:
-    """`confirm_from_data` of effects without derivative where they vanish, scored by gain.
-
-    For a contact, a soft balance is less informative than a fit. Gains are computed with the
-    noise of the base, which may hide what the base lacks: they are at least this large.
-    """
-    found = map_in_order(executor, partial(_confirm_contact, base), begun)
-    return [item for item in found if item is not None]
-
-
-def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
-    item, screened = confirm_from_data(base, start), start.screened
-    if item is None:
-        return None
-    same = item.fit.reweighed(base.noise, base.problem.priors)
-    fit = _followed(same, same.model, {}, MOST_STEPS) or same
-    gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
-    values = {name: item.fit.value(name) for name in screened.candidate.frees}
-    p_value = survival(gain, len(values), np.inf)
-    return replace(item, screened=Screened(screened.candidate, gain, p_value, values))
-
-
-def _followed(
+def followed(
     start: Fit,
     model: CableModel,
     values: Mapping[str, float],
@@ -353,14 +235,15 @@ def refit_with(base: Fit, screened: Screened, ceiling: float = np.inf) -> Fit | 
             name: begin[name] + (share if name in screened.candidate.screened else 1.0) * way
             for name, way in ((q, value - begin[q]) for q, value in screened.start.items())
         }
-        fit = _followed(base, model, values, MOST_STEPS, ceiling)
+        fit = followed(base, model, values, MOST_STEPS, ceiling)
         if fit is None:
             continue
         same = best is not None and abs(fit.point.objective - best.point.objective) < ONE_PLACE
         if best is None or fit.point.objective < best.point.objective:
             best = fit
         gain = 2 * (base.point.objective - best.point.objective)
-        if same or (gain > 0 and (best.converged or gain > PROMISED * screened.score)):
+        hopeless = share < SHARES[0] and best.point.objective > ceiling
+        if same or hopeless or (gain > 0 and (best.converged or gain > PROMISED * screened.score)):
             break
     return best
 
@@ -370,14 +253,16 @@ def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
 
     Without its set, the poses of a cable that has taken one are far from equilibrium, and the fit
     may end in other equilibria. The declared model has fewer effects: a fit that ends above it is
-    not the minimum, and starts again from the declared model's fit.
+    not the minimum, and starts again from the declared model's fit. A fit that is far worse than
+    with the candidate ends before its minimum, see `ceiling_beside`.
     """
-    model = candidate.remove_from(fit.model, declared.model)
-    found = _followed(fit, model, {})
+    model, ceiling = candidate.remove_from(fit.model, declared.model), ceiling_beside(fit)
+    found = followed(fit, model, {}, ceiling=ceiling)
     nested = declared.reweighed(fit.noise, fit.problem.priors)
     if found is None or found.point.objective > nested.point.objective:
         values = {name: fit.value(name) for name in fit.model.names}
-        both = [x for x in (found, _followed(nested, model, values)) if x is not None]
+        other = followed(nested, model, values, ceiling=ceiling)
+        both = [x for x in (found, other) if x is not None]
         found = min(both, key=lambda x: x.point.objective, default=None)
     return found
 
@@ -430,7 +315,7 @@ def _confirm_load(base: Fit, best: Confirmed, screened: Screened) -> Confirmed |
     values = start_from(best.fit, position, forces, screened.candidate)
     without = best.candidate.remove_from(model, base.model)
     larger, ceiling = screened.candidate.add_to(without), ceiling_beside(best.fit)
-    fit = _followed(best.fit, larger, values, MOST_STEPS, ceiling)
+    fit = followed(best.fit, larger, values, MOST_STEPS, ceiling)
     with suppress(EstimationError):
         found = Confirmed.of(screened, base, fit, best.beside)
         if found and found.fit.log_evidence > best.fit.log_evidence - EVIDENCE_APART:

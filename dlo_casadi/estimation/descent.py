@@ -31,7 +31,8 @@ CONVERGED, NEARLY = 1e-4, 1e-2
 FIRST_DAMPING = 1e-3
 # A descent has stalled if this many steps together gain less than one converged step may.
 STALLED = 4
-# A descent is hopeless if its minimum is predicted above a ceiling in this many steps in a row.
+# A descent is hopeless if its minimum is predicted above a ceiling in this many steps in a row, or
+# if the remaining steps cannot reach the ceiling with the largest recent gain.
 HOPELESS = 3
 # Uphill steps allowed before backtracking; largest rise of the objective allowed.
 WATCHED, WORSE = 2, 3.0
@@ -64,7 +65,7 @@ def descend(
     lin = fit.linearization
     normal = problem.step_equations(point, lin)
     curvature = Curvature.none(len(point.theta))
-    for _ in range(steps):
+    for done in range(1, steps + 1):
         limit = point.objective + 1e-9 * abs(point.objective)
         model, before = curvature.added(normal), damping
         trial = _ahead(problem, point, lin, model, damping, limit, WATCHED)
@@ -89,7 +90,8 @@ def descend(
         curvature = curvature.after(step, normal, ahead, gains[-1])
         point, normal = trial, ahead
         if ceiling < np.inf:
-            above = above + 1 if point.objective - normal.promised() > ceiling else 0
+            within = min(normal.promised(), max(gains) * (steps - done))
+            above = above + 1 if point.objective - within > ceiling else 0
         if above == HOPELESS:
             return Fit(problem, point)
     return Fit(problem, point)

@@ -210,23 +210,33 @@ def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
 
     `modes`: number of slow displacements kept out of the noise estimate, if noise is estimated.
     """
-    model, moved = fit.model.with_mesh(n), None
+    moved = _moved(fit, n)
+    return _anew(fit, n) if moved is None else refine(moved, rounds=2, modes=modes)
+
+
+def _moved(fit: Fit, n: int) -> Fit | None:
+    """The fit on another mesh, with its weights; None if its minimum is not reached there.
+
+    The coarse mesh may be too far off, or a pose loses its stability on the way to this mesh.
+    """
     with suppress(EstimationError):
-        moved = refit(fit, model)
-    if moved is None or moved.point.objective > STUCK * fit.point.objective:
-        # The coarse mesh was too far off, or a pose loses its stability on the way to this mesh and
-        # no step succeeds: start again from the measured shapes.
-        problem, known = fit.problem, fit.noise.before or fit.noise
-        return fit_model(
-            model,
-            problem.history,
-            problem.priors.tolerances,
-            known.std if known.source == "declared" else None,
-            free=problem.unknowns.names,
-            values=fit.p,
-            readings=known.readings,
-        )
-    return refine(moved, rounds=2, modes=modes)
+        moved = refit(fit, fit.model.with_mesh(n))
+        return moved if moved.point.objective <= STUCK * fit.point.objective else None
+    return None
+
+
+def _anew(fit: Fit, n: int) -> Fit:
+    """The same model fitted on another mesh, from the measured shapes."""
+    problem, known = fit.problem, fit.noise.before or fit.noise
+    return fit_model(
+        fit.model.with_mesh(n),
+        problem.history,
+        problem.priors.tolerances,
+        known.std if known.source == "declared" else None,
+        free=problem.unknowns.names,
+        values=fit.p,
+        readings=known.readings,
+    )
 
 
 def mesh_error(fit: Fit) -> float:
@@ -259,19 +269,23 @@ def fine_enough(
 ) -> tuple[Fit, float]:
     """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
 
-    If an effect is missing, the mesh error need only be small against the misfit.
+    The noise is estimated on the last mesh only. If an effect is missing, the mesh error need only
+    be small against the misfit.
     """
-    while True:
-        if fit.noise.source == "misfit":
-            return fit, mesh_error(fit)
+    moved = False
+    while fit.noise.source != "misfit":
         if n != fit.model.n:
             try:
-                fit = refine_mesh(fit, n, modes)
+                fit, moved = _moved(fit, n) or _anew(fit, n), True
             except EstimationError:
                 # The parameters have no equilibria near the measured shapes on a finer mesh.
-                return fit, mesh_error(fit)
+                break
+            continue
         error = mesh_error(fit)
         largest = finest if np.isfinite(error) else SEARCH_MESH
+        if moved and (error <= allowed_mesh_error(fit) or n >= largest):
+            with suppress(EstimationError):
+                fit, moved = refine(fit, rounds=2, modes=modes), False
         allowed = allowed_mesh_error(fit)
         if error <= allowed or n >= largest:
             return fit, error
@@ -279,6 +293,7 @@ def fine_enough(
         order = 1 + ELEMENTS[fit.model.element].order / 2
         finer = n * np.clip((error / allowed) ** (1 / order), 1.2, 2.0)
         n = min(2 * int(np.ceil(finer / 2)), largest)
+    return fit, mesh_error(fit)
 
 
 def allowed_mesh_error(fit: Fit) -> float:

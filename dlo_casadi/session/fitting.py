@@ -353,8 +353,9 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
     for stage in others:
         if stage.name in SIMPLER:
             better = not fit.converged or _off(stage) < _off(own)
-            for found in _from_simpler(fit, stage, better)[1:]:
-                if found.point.objective <= fit.point.objective - CONVERGED:
+            least = fit.point.objective - CONVERGED
+            for found in _from_simpler(fit, stage, better, least)[1:]:
+                if found.point.objective <= least:
                     found = found if fit.noise.source == "misfit" else refine(found)
                     best = max(best, found, key=lambda item: item.log_evidence)
     return best
@@ -395,11 +396,11 @@ def _off(stage: Stage) -> float:
     return np.inf if error is None else error
 
 
-def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> list[Fit]:
+def _from_simpler(fit: Fit, simpler: Stage, better: bool, ceiling: float = np.inf) -> list[Fit]:
     """A straight cable with a stage's stiffness, and the fit that starts there.
 
     Empty if some pose has no equilibrium with it. Unless that cable is `better`, its objective must
-    be below the fit's.
+    be below the fit's. `ceiling`: see `descend`.
     """
     problem, model = fit.problem, fit.model
     values = model.nominal.copy()
@@ -413,5 +414,5 @@ def _from_simpler(fit: Fit, simpler: Stage, better: bool) -> list[Fit]:
         return []
     found = [Fit(problem, point)]
     with suppress(EstimationError):  # at a fold of its equilibria
-        found.append(descend(found[0]))
+        found.append(descend(found[0], ceiling=ceiling))
     return found

@@ -105,16 +105,16 @@ def test_an_unknown_force_has_its_prior_beside_clips(base):
 def test_a_fit_that_loses_its_poses_starts_again_from_the_declared_model(base, monkeypatch):
     """If it ends above that model, which is nested in it."""
     (screened,) = Screen(base, [taper_of(base.model)]).run(np.inf)
-    larger, followed, lost = refit_with(base, screened), refits._followed, []
+    larger, followed, lost = refit_with(base, screened), refits.followed, []
 
-    def first_lost(start, *others):
-        found = followed(start, *others)
+    def first_lost(start, *others, **options):
+        found = followed(start, *others, **options)
         if not lost:
             lost.append(found)
             found = replace(found, point=replace(found.point, objective=1e9))
         return found
 
-    monkeypatch.setattr(refits, "_followed", first_lost)
+    monkeypatch.setattr(refits, "followed", first_lost)
     smaller = refit_without(larger, taper_of(base.model), base)
     assert smaller.point.objective == pytest.approx(lost[0].point.objective, rel=1e-6)
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.diagnosis import from_data as from_data_module
+from dlo_casadi.diagnosis import near_data as fits_near_data
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, candidates_of, setup_of
 from dlo_casadi.diagnosis.from_data import (
@@ -16,12 +17,13 @@ from dlo_casadi.diagnosis.from_data import (
     nearest,
     screened_from_data,
 )
-from dlo_casadi.diagnosis.refits import (
+from dlo_casadi.diagnosis.near_data import (
     confirm_contacts,
     confirm_from_data,
+    confirm_rolled,
     near_data,
-    scored_by_refit,
 )
+from dlo_casadi.diagnosis.refits import scored_by_refit
 from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
@@ -139,24 +141,71 @@ def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
 
     def found_among(listed):
         first = [RelaxedStart.of(near, x) for x in listed[:REFITTED]]
-        ((found,),) = nearest(near, 0.01, first, listed[REFITTED:], InProcess())
-        return found
+        return nearest(near, 0.01, first, listed[REFITTED:], InProcess())
 
     monkeypatch.setattr(RelaxedStart, "of", lambda near, x: start(100.0 + int(x), x))
     monkeypatch.setattr(RelaxedStart, "and_second", and_second)
-    found = found_among("01234567")
+    lists = found_among("01234567")
+    (found,) = next(lists)
     assert found.names == {"6", "other"}
+    assert seconds == list("0123456")
+    assert [*lists] == [[]]
     assert seconds == list("01234567")
 
     seconds.clear()
     left_by_pair[0] = 1.1
-    found = found_among("01234567")
+    ((found,),) = found_among("01234567")
     assert found.names == {"6", "other"}
     assert seconds == list("0123456")
 
     seconds.clear()
-    found_among("612345")
+    list(found_among("612345"))
     assert seconds == list("123") + list("456")
+
+
+@pytest.mark.parametrize(("misfit", "fitted"), [(False, "01"), (True, "012")])
+def test_if_the_first_candidate_explains_the_shapes_only_close_ones_are_fitted(
+    misfit, fitted, monkeypatch
+):
+    lefts = {"0": 10.0, "1": 14.0, "2": 16.0}
+    starts = [SimpleNamespace(names={x}, left=left) for x, left in lefts.items()]
+    asked = []
+
+    def confirm(_, start):
+        asked.extend(start.names)
+        source = "misfit" if misfit else "estimated"
+        fit = SimpleNamespace(noise=SimpleNamespace(source=source), chi2_per_dof=1.0)
+        return SimpleNamespace(fit=fit)
+
+    monkeypatch.setattr(fits_near_data, "confirm_from_data", confirm)
+    found = fits_near_data.confirmed(None, starts, InProcess(), rolls=False)
+    assert asked == list(fitted)
+    assert len(found) == len(fitted)
+
+
+@pytest.mark.parametrize(
+    ("scatters", "reached", "rolled", "tried"),
+    [
+        (False, False, 1.0, False),
+        (True, True, 1.0, False),
+        (True, False, 9.5, False),
+        (True, False, 1.0, True),
+    ],
+)
+def test_another_end_roll_is_tried_if_the_first_may_look_like_a_scatter(
+    scatters, reached, rolled, tried, monkeypatch
+):
+    def item(evidence, *, scatters):
+        noise = SimpleNamespace(source="estimated")
+        fit = SimpleNamespace(noise=noise, chi2_per_dof=1.0, log_evidence=evidence)
+        fit.scatters = scatters
+        return SimpleNamespace(fit=fit)
+
+    known, better = item(1.0, scatters=scatters), item(2.0, scatters=False)
+    other = SimpleNamespace(left=rolled)
+    start = SimpleNamespace(left=10.0, reached=reached, rolled=lambda: other)
+    monkeypatch.setattr(fits_near_data, "confirm_from_data", lambda *_: better)
+    assert confirm_rolled(None, start, known) is (better if tried else known)
 
 
 def relaxed_stub(data, n_residuals=1, *, known=True):
@@ -193,7 +242,7 @@ def test_later_candidates_are_tried_unless_one_reaches_the_noise(monkeypatch):
     ] == []
 
 
-@pytest.mark.parametrize(("left", "first"), [(1.0, 1), (2.9, 2)])
+@pytest.mark.parametrize(("left", "first"), [(1.0, 1), (2.0, 2), (2.9, 1)])
 def test_pairs_follow_a_single_candidate_that_came_near_the_noise_in_vain(left, first, monkeypatch):
     """A softening and a stiff section did; with each the fit misfits: a taper and a drift."""
     near = relaxed_stub(data=1.0)
@@ -291,32 +340,36 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
 
     asked = []
     monkeypatch.setattr(RelaxedStart, "of", start)
-    monkeypatch.setattr(refits, "from_data", lambda _: (None, 0.01))
-    monkeypatch.setattr(refits, "candidates_of", lambda *_: ())
+    monkeypatch.setattr(fits_near_data, "from_data", lambda _: (None, 0.01))
+    monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
     screened = [named(name, gradual=name != "table") for name in left]
-    monkeypatch.setattr(refits, "screened_from_data", lambda *_: screened)
+    monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: screened)
     monkeypatch.setattr(
-        refits, "confirm_contacts", lambda _, starts, __: asked.extend(starts) or []
+        fits_near_data, "confirm_contacts", lambda _, starts, __: asked.extend(starts) or []
     )
-    monkeypatch.setattr(refits, "nearest", lambda *_, **__: [])
-    monkeypatch.setattr(refits, "loads_from_best", lambda *_: [])
+    monkeypatch.setattr(fits_near_data, "nearest", lambda *_, **__: [])
+    monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *_: [])
     tried = near_data(None, InProcess(), None, (), pairs=False)
     assert [x.names for x in asked] == [{"table"}] * fitted
     assert set(tried.far) == set(left)
 
 
-@pytest.mark.parametrize(("left", "fitted"), [(80.0, True), (99.0, False), (np.inf, False)])
+@pytest.mark.parametrize(
+    ("shapes", "left", "fitted"),
+    [(50.0, 80.0, True), (50.0, 99.0, False), (50.0, np.inf, False), (95.0, 80.0, False)],
+)
 def test_a_contact_that_gains_nothing_in_relaxed_shapes_is_not_fitted_from_there(
-    left, fitted, monkeypatch
+    shapes, left, fitted, monkeypatch
 ):
+    """Nor started, where shapes that need not balance leave as much as the model without it."""
     asked = []
     start = SimpleNamespace(left=left, fit=lambda: asked.append(left))
     effect = SimpleNamespace(scans=({"height": 0.0},), frees=("height",), add_to=lambda _: None)
     base = SimpleNamespace(
         model=None, beyond_noise=True, noise=SimpleNamespace(known=False), value=lambda _: 0.0
     )
-    monkeypatch.setattr(refits, "_followed", lambda *_: None)
-    monkeypatch.setattr(refits, "from_data", lambda _: (None, 0.01))
+    monkeypatch.setattr(refits, "followed", lambda *_: None)
+    monkeypatch.setattr(refits, "from_data", lambda _: (relaxed_stub(shapes), 0.01))
     monkeypatch.setattr(refits, "left_without", lambda _: 100.0)
     monkeypatch.setattr(RelaxedStart, "of", lambda *_: start)
     found = scored_by_refit(base, effect, 50.0)

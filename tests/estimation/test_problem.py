@@ -24,6 +24,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation import descent
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model
@@ -404,7 +405,8 @@ def test_noise_free_round_trip_is_exact():
     np.testing.assert_allclose(found.point.theta, exact, atol=1e-4)
 
 
-def test_a_descent_is_given_up_if_its_minimum_is_above_a_ceiling():
+def start_without_a_mass():
+    """A model that lacks a lumped mass, at the true values of what it has."""
     truth = CableModel(CABLE, 10, effects=(LumpedMass(),), n_rest=5)
     p, coefficients = np.array([0.06, 0.04, 0.3]), np.array([0.5, 1.0, 1.5, 0.8, 0.4])
     measured = measured_from(truth, p, coefficients, 5, 0.0)
@@ -413,7 +415,11 @@ def test_a_descent_is_given_up_if_its_minimum_is_above_a_ceiling():
     theta = problem.unknowns.pack(p[:1], coefficients)
     values = projected(problem, theta, solved(problem, theta))
     problem = problem.weighed(values)
-    start = Fit(problem, problem.evaluate(values))
+    return Fit(problem, problem.evaluate(values))
+
+
+def test_a_descent_is_given_up_if_its_minimum_is_above_a_ceiling():
+    start = start_without_a_mass()
     found = descend(start)
     least = found.point.objective
     assert found.converged
@@ -421,6 +427,21 @@ def test_a_descent_is_given_up_if_its_minimum_is_above_a_ceiling():
     given_up = descend(start, ceiling=0.9 * least)
     assert not given_up.converged
     assert least < given_up.point.objective < start.point.objective
+
+
+@pytest.mark.parametrize(("depth", "steps"), [(30.0, 40), (100.0, 6)])
+def test_a_descent_is_given_up_if_its_steps_are_too_short(depth, steps, monkeypatch):
+    """Each gains 1: forty of them reach a ceiling 30 below, but not one 100 below."""
+    start, taken = start_without_a_mass(), []
+
+    def ahead(problem, point, *_):
+        taken.append(point)
+        return replace(point, objective=point.objective - 1.0)
+
+    monkeypatch.setattr(descent, "_ahead", ahead)
+    monkeypatch.setattr(Normal, "promised", lambda *_: np.inf)
+    assert not descend(start, ceiling=start.point.objective - depth).converged
+    assert len(taken) == steps
 
 
 @pytest.mark.long

@@ -200,7 +200,7 @@ def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable(monk
     assert nearest_to_poses(nearest, again, staged, diagnosed=True) == (nearest, stage)
 
     # If all fits are worse, at an edge of stability, the declared model at the simpler fit is not.
-    monkeypatch.setattr(fitting, "descend", lambda _: fit)
+    monkeypatch.setattr(fitting, "descend", lambda _, **__: fit)
     monkeypatch.setattr(fitting, "fit_to_misfit", lambda _: fit)
     _, stage = nearest_to_poses(fit, stages, staged, diagnosed=True)
     assert stage.rmse_fit_measured_branch == pytest.approx(stages[0].rmse_fit_measured_branch)

@@ -1,0 +1,171 @@
+"""Fits of candidates that start at the measured shapes, for a base that misfits them.
+
+The starts are those of `diagnosis.from_data`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from dlo_casadi.diagnosis.candidates import candidates_of
+from dlo_casadi.diagnosis.from_data import (
+    NEAR_LEAST,
+    NEAR_NOISE,
+    REACHED,
+    RelaxedStart,
+    from_data,
+    likeliest,
+    nearest,
+    screened_from_data,
+)
+from dlo_casadi.diagnosis.refits import (
+    MOST_STEPS,
+    Confirmed,
+    Tried,
+    at_noise,
+    followed,
+    loads_from_best,
+)
+from dlo_casadi.diagnosis.screening import Screened, in_order, p_values_of, sidak, survival
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.descent import NEARLY, descend
+from dlo_casadi.estimation.fit import explains, misfits
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.thresholds import REFITTED
+
+
+def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
+    """Fit with a candidate added, from the relaxed base; None if it reaches no equilibrium.
+
+    It keeps the base's weights if the candidate does not bring it to the noise of the points.
+    """
+    with suppress(EstimationError):
+        fit = start.fit()
+        if fit is not None and misfits(fit):
+            fit = descend(fit.reweighed(base.noise, base.problem.priors), tolerance=NEARLY)
+        if fit is not None and not misfits(fit):
+            fit = at_noise(fit, start.problem.noise)
+        return Confirmed.of(start.screened, base, fit, start.beside)
+    return None
+
+
+def near_data(
+    base: Fit,
+    executor: Executor,
+    center: tuple[float, float] | None,
+    exclude: Sequence[str],
+    *,
+    pairs: bool,
+) -> Tried:
+    """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
+
+    In a misfit scores are useless, and a refit follows the declared model's error. Contacts are
+    fitted first, unless their starts leave far more than the best one. If the best candidate does
+    not explain the shapes, its end roll is searched again, then that of the next. If all fits
+    misfit, too, pairs are tried even where a single candidate's start came close to the noise.
+    """
+    near, softness = from_data(base)
+    screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
+    likely = likeliest(screened)
+    contacts = [x for x in screened if not x.candidate.effect.gradual]
+    first = [*contacts, *likely[:REFITTED]]
+    begun = list(map_in_order(executor, partial(RelaxedStart.of, near), first))
+    touches, alone = begun[: len(contacts)], begun[len(contacts) :]
+    most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
+    touches = [start for start in touches if start.left <= most]
+    touching = confirm_contacts(base, touches, executor)
+    explained = any(explains(item.fit) for item in touching)
+    least = min(start.left for start in touches) if explained else np.inf
+    later, among = likely[REFITTED:], (executor, center, exclude)
+    pairs = pairs and not explained
+    kept: list[RelaxedStart] = []
+    tried: list[Confirmed] = []
+    for starts in nearest(near, softness, alone, later, *among, pairs=pairs, least=least):
+        kept += starts[:REFITTED]
+        tried += confirmed(base, starts[:REFITTED], executor, rolls=not explained)
+        if any(item.fit.noise.source != "misfit" for item in tried):
+            break
+    tried = loads_from_best(base, screened, tried, executor)
+    fitted = {item.name: item.screened for item in touching}
+    screened = in_order([fitted.get(x.candidate.name, x) for x in screened])
+    names = {x.candidate.name for item in tried for x in item.each}.union(
+        *(start.names for start in kept)
+    )
+    names |= fitted.keys()
+    far = [x.candidate.name for x in (*contacts, *likely[:REFITTED])]
+    far = [name for name in far if name not in names]
+    p_values = p_values_of(screened)
+    # Those that fit the shapes best, and loads started from the forces of one; of pairs the second.
+    for item in (*(start.screened for start in kept), *(x.screened for x in tried)):
+        single, name = sidak(item.p_value, len(screened)), item.candidate.name
+        p_values[name] = min(single, p_values.get(name, 1.0))
+    return Tried(screened, p_values, [*touching, *tried], far)
+
+
+def confirmed(
+    base: Fit, starts: Sequence[RelaxedStart], executor: Executor, *, rolls: bool
+) -> list[Confirmed]:
+    """Fits from starts, best first; until one explains the shapes, with `rolls` other end rolls.
+
+    If the first one explains them, the others are fitted only if their starts leave less than
+    REACHED times as much.
+    """
+    tried: list[Confirmed] = []
+    for group in (starts[:1], starts[1:]):
+        explained = any(explains(item.fit) for item in tried)
+        close = [x for x in group if not explained or x.left < REACHED * starts[0].left]
+        found = list(map_in_order(executor, partial(confirm_from_data, base), close))
+        for k, start in enumerate(close) if rolls and not explained else ():
+            item = found[k] = confirm_rolled(base, start, found[k])
+            if item is not None and explains(item.fit):
+                break
+        tried += filter(None, found)
+    return tried
+
+
+def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
+    """The likelier of `found` and a fit from the start with the end roll searched again.
+
+    The error of a wrong end roll may look like a scatter from pose to pose: if `found` explains the
+    shapes by a scatter, but its start did not reach the noise, a roll that leaves less is tried.
+    """
+    explained = found is not None and explains(found.fit)
+    if found is not None and explained and (start.reached or not found.fit.scatters):
+        return found
+    rolled = start.rolled()
+    if rolled is None or (explained and NEAR_NOISE * rolled.left > start.left):
+        return found
+    other = confirm_from_data(base, rolled)
+    both = [item for item in (found, other) if item is not None]
+    return max(both, key=lambda item: (explains(item.fit), item.fit.log_evidence), default=None)
+
+
+def confirm_contacts(
+    base: Fit, begun: Sequence[RelaxedStart], executor: Executor
+) -> list[Confirmed]:
+    """`confirm_from_data` of effects without derivative where they vanish, scored by gain.
+
+    For a contact, a soft balance is less informative than a fit. Gains are computed with the
+    noise of the base, which may hide what the base lacks: they are at least this large.
+    """
+    found = map_in_order(executor, partial(_confirm_contact, base), begun)
+    return [item for item in found if item is not None]
+
+
+def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
+    item, screened = confirm_from_data(base, start), start.screened
+    if item is None:
+        return None
+    same = item.fit.reweighed(base.noise, base.problem.priors)
+    fit = followed(same, same.model, {}, MOST_STEPS) or same
+    gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
+    values = {name: item.fit.value(name) for name in screened.candidate.frees}
+    p_value = survival(gain, len(values), np.inf)
+    return replace(item, screened=Screened(screened.candidate, gain, p_value, values))
