@@ -34,6 +34,7 @@ KEPT_INFORMATION = 1e-6
 # Maximum number of candidates refitted in one step, and the smallest score for a refit relative to
 # the leading one. In ten sessions with a hidden effect its score is among the first three, and at
 # least 0.99 of the leading one. Of two effects the smaller has 0.02, and is found in the next step.
+# In 35 steps of nineteen sessions in space, with a limit of 0.1, the chosen one had 0.43 or more.
 REFITTED = 6
 WORTH = 0.3
 # The same for a model that lacks something large and is scored at the measured shapes. Relative to

@@ -109,7 +109,7 @@ def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Gen
 def about_axis(values: Values, near: float = 0.0) -> Values:
     """The same stiffnesses about both axes, EI that about the axis nearer to an angle [rad]."""
     ratio, angle = (values.get(f"bending_anisotropy.{name}", 0.0) for name in ("ratio", "angle"))
-    if abs(np.remainder(angle - near + np.pi / 2, np.pi) - np.pi / 2) <= np.pi / 4:
+    if not ratio or abs(np.remainder(angle - near + np.pi / 2, np.pi) - np.pi / 2) <= np.pi / 4:
         return values
     return values | {
         "bending_stiffness": values["bending_stiffness"] * ratio,

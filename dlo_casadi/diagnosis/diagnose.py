@@ -55,7 +55,6 @@ from dlo_casadi.thresholds import (
     WORTH,
 )
 
-NOT_NEAR = "does not come near the measured shapes"
 RAN_AWAY = "its fit ran away: no noise can be estimated from it"
 
 
@@ -226,7 +225,7 @@ class Search:
             first = force if not added else None
             tried = self._tried(current, first, len(added))
             chosen, lost = choose(tried.refits, current, validation, self.doubt)
-            lost |= dict.fromkeys(tried.far, NOT_NEAR)
+            lost |= tried.far
             better, p_value = current, 1.0
             if chosen:
                 winner, *rivals = chosen

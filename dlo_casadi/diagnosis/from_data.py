@@ -46,11 +46,11 @@ COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; where
 # shapes that need not balance leave more than the noise, relative to what they leave.
 REACHED = 1.5
-# Multiple of that sum below which single candidates are fitted before pairs are tried, and a pair
-# before others are. Evidence: in a session in space a softening left 1.35 times it, all others 17
-# times and more. Eighteen pairs were tried in vain; the next step of the search found the tilt
-# beside it. In another one the hidden pair left 2.4 times it, single candidates and other pairs 4.5
-# times and more.
+# Multiple of that sum, including REACHED, below which single candidates are fitted before pairs are
+# tried, and a pair before others are. Evidence: in a session in space a softening left 1.35 times
+# it, all others 17 times and more. Eighteen pairs were tried in vain; the next step of the search
+# found the tilt beside it. In another one the hidden pair left 2.4 times it, single candidates and
+# other pairs 4.5 times and more.
 CLOSE = 3.0
 # Multiple of the expected sum below which a pair is the last one tried. In four sessions in space
 # the hidden pair left 1.01, 1.10, 1.14 and 1.54 times the relaxed shapes, others 1.5 and more.
@@ -233,7 +233,7 @@ class RelaxedStart:
 
     @property
     def reached(self) -> bool:
-        """Whether it leaves no more than noise."""
+        """Whether it leaves no more than noise, as the shapes it was begun beside show it."""
         return self.left < REACHED * expected_left(self.near)
 
     @property
@@ -292,12 +292,12 @@ def nearest(
 ) -> Iterator[list[RelaxedStart]]:
     """Starts whose objective is close to the least one, best first; then those for a further try.
 
-    The least one is one of the starts `alone`, each with one candidate, or `least` of another.
-    Those that come within CLOSE times REACHED of the noise are returned at once.
+    The least one is one of the starts `alone`, each with one candidate, or `least` of another. If
+    it comes within CLOSE times REACHED of the noise, single candidates are returned at once.
 
     Then pairs are tried, provided `pairs` may be added: of FIRST candidates and likely second ones,
     then of the next ones, at last of the `later` ones unless a single candidate is within REACHED.
-    A pair that comes as close, and leaves least, is returned at once, too. The first ones within
+    A pair that comes as close, and leaves least so far, is returned at once. The first ones within
     REACHED are the last ones tried, one within SURELY_REACHED is the last. Pairs are returned if no
     single candidates are left to return, or if REACHED times their objective is less than that of
     those.
@@ -313,7 +313,7 @@ def nearest(
     )
     begun = _near_least(alone, noise, least)
     nearest_left = begun[0].left if begun else np.inf
-    told = [x for x in begun if x.left < CLOSE * noise or not pairs]
+    told = begun if nearest_left < CLOSE * noise or not pairs else []
     if told or not pairs:
         yield told
     if not pairs:
@@ -330,21 +330,21 @@ def nearest(
                 break
             if kept and kept[0].left < CLOSE * noise and not _in(told, kept[0]):
                 told = [*told, kept[0]]
-                yield told[-1:]
+                yield [kept[0]]
         firsts = firsts[FIRST:]
         if not firsts and later and nearest_left >= noise:
             firsts, later = sorted(map_in_order(executor, start, later), key=lambda x: x.left), []
             begun = _near_least((*begun, *firsts), noise, least)
             if begun[0].left < noise:
-                yield begun
+                yield [x for x in begun if not _in(told, x)]
                 return
-    new = [x for x in begun if not _in(told, x)]
-    pairs_left = [x for x in kept if not _in(told, x)]
-    yield pairs_left if not new or (kept and REACHED * kept[0].left < new[0].left) else new
+    new, more = ([x for x in some if not _in(told, x)] for some in (begun, kept))
+    yield more if not new or (kept and REACHED * kept[0].left < new[0].left) else new
 
 
 def _in(starts: Iterable[RelaxedStart], start: RelaxedStart) -> bool:
-    return any(start is known for known in starts)
+    """Whether starts have the same candidates as this one, and leave hardly more."""
+    return any(x.names == start.names and x.left < NEAR_NOISE * start.left for x in starts)
 
 
 def _near_least(

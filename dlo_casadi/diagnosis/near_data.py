@@ -40,6 +40,9 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import REFITTED
 
+NOT_NEAR = "does not come near the measured shapes"
+LESS_NEAR = "comes less near the measured shapes than one that explains them"
+
 
 def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
     """Fit with a candidate added, from the relaxed base; None if it reaches no equilibrium.
@@ -68,8 +71,9 @@ def near_data(
 
     In a misfit scores are useless, and a refit follows the declared model's error. Contacts are
     fitted first, unless their starts leave far more than the best one. If the best candidate does
-    not explain the shapes, its end roll is searched again, then that of the next. If all fits
-    misfit, too, pairs are tried even where a single candidate's start came close to the noise.
+    not explain the shapes, or only by a scatter, its end roll is searched again, then that of the
+    next. If all fits misfit, too, pairs are tried even where a single candidate's start came close
+    to the noise.
     """
     near, softness = from_data(base)
     screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
@@ -87,9 +91,12 @@ def near_data(
     pairs = pairs and not explained
     kept: list[RelaxedStart] = []
     tried: list[Confirmed] = []
+    far = dict.fromkeys((x.candidate.name for x in (*contacts, *likely[:REFITTED])), NOT_NEAR)
     for starts in nearest(near, softness, alone, later, *among, pairs=pairs, least=least):
-        kept += starts[:REFITTED]
-        tried += confirmed(base, starts[:REFITTED], executor, rolls=not explained)
+        close, found = confirmed(base, starts[:REFITTED], executor, rolls=not explained)
+        kept += close
+        tried += found
+        far |= {x.screened.candidate.name: LESS_NEAR for x in starts[len(close) : REFITTED]}
         if any(item.fit.noise.source != "misfit" for item in tried):
             break
     tried = loads_from_best(base, screened, tried, executor)
@@ -99,8 +106,7 @@ def near_data(
         *(start.names for start in kept)
     )
     names |= fitted.keys()
-    far = [x.candidate.name for x in (*contacts, *likely[:REFITTED])]
-    far = [name for name in far if name not in names]
+    far = {name: why for name, why in far.items() if name not in names}
     p_values = p_values_of(screened)
     # Those that fit the shapes best, and loads started from the forces of one; of pairs the second.
     for item in (*(start.screened for start in kept), *(x.screened for x in tried)):
@@ -111,23 +117,25 @@ def near_data(
 
 def confirmed(
     base: Fit, starts: Sequence[RelaxedStart], executor: Executor, *, rolls: bool
-) -> list[Confirmed]:
-    """Fits from starts, best first; until one explains the shapes, with `rolls` other end rolls.
+) -> tuple[list[RelaxedStart], list[Confirmed]]:
+    """The starts that are fitted, best first, and their fits.
 
-    If the first one explains them, the others are fitted only if their starts leave less than
-    REACHED times as much.
+    If the first fit explains the shapes, others are fitted only if their starts leave less than
+    REACHED times as much. Until one explains them, with `rolls` other end rolls are tried.
     """
+    fitted: list[RelaxedStart] = []
     tried: list[Confirmed] = []
     for group in (starts[:1], starts[1:]):
         explained = any(explains(item.fit) for item in tried)
         close = [x for x in group if not explained or x.left < REACHED * starts[0].left]
+        fitted += close
         found = list(map_in_order(executor, partial(confirm_from_data, base), close))
         for k, start in enumerate(close) if rolls and not explained else ():
             item = found[k] = confirm_rolled(base, start, found[k])
             if item is not None and explains(item.fit):
                 break
         tried += filter(None, found)
-    return tried
+    return fitted, tried
 
 
 def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:

@@ -124,14 +124,14 @@ class Tried:
         Of their scores as the best of all, by name.
     refits : list of Confirmed
         Of the likely ones.
-    far : list of str
-        Names of likely candidates that stayed far from the measured shapes.
+    far : dict of str
+        Why likely candidates were not fitted from the measured shapes, by name.
     """
 
     screened: list[Screened]
     p_values: dict[str, float]
     refits: list[Confirmed]
-    far: list[str] = field(default_factory=list)
+    far: dict[str, str] = field(default_factory=dict)
 
 
 def scored(
@@ -157,7 +157,7 @@ def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screen
         near, _ = from_data(base)
         most = left_without(near) / NEAR_NOISE
         fit = None
-        if near.point.data < most:  # no start leaves less than shapes that need not balance
+        if near.point.data < most:  # a start hardly leaves less than shapes that need not balance
             begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
             fit = begun.fit() if begun.left < most else None
         if fit is not None:
@@ -230,6 +230,7 @@ def refit_with(base: Fit, screened: Screened, ceiling: float = np.inf) -> Fit | 
     model = screened.candidate.add_to(base.model)
     begin = dict(zip(model.names, base.values_in(model), strict=True))
     best: Fit | None = None
+    hopeless = 0
     for share in SHARES:
         values = {
             name: begin[name] + (share if name in screened.candidate.screened else 1.0) * way
@@ -242,8 +243,12 @@ def refit_with(base: Fit, screened: Screened, ceiling: float = np.inf) -> Fit | 
         if best is None or fit.point.objective < best.point.objective:
             best = fit
         gain = 2 * (base.point.objective - best.point.objective)
-        hopeless = share < SHARES[0] and best.point.objective > ceiling
-        if same or hopeless or (gain > 0 and (best.converged or gain > PROMISED * screened.score)):
+        hopeless += fit.point.objective > ceiling
+        if (
+            same
+            or hopeless == 2
+            or (gain > 0 and (best.converged or gain > PROMISED * screened.score))
+        ):
             break
     return best
 
@@ -253,8 +258,9 @@ def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
 
     Without its set, the poses of a cable that has taken one are far from equilibrium, and the fit
     may end in other equilibria. The declared model has fewer effects: a fit that ends above it is
-    not the minimum, and starts again from the declared model's fit. A fit that is far worse than
-    with the candidate ends before its minimum, see `ceiling_beside`.
+    not the minimum, and starts again from the declared model's fit. A descent to a minimum that
+    leaves twice as much as with the candidate ends early (`ceiling_beside`): that the candidate is
+    needed is then beyond doubt, and others that replace it have to do better than it does.
     """
     model, ceiling = candidate.remove_from(fit.model, declared.model), ceiling_beside(fit)
     found = followed(fit, model, {}, ceiling=ceiling)

@@ -32,7 +32,7 @@ FIRST_DAMPING = 1e-3
 # A descent has stalled if this many steps together gain less than one converged step may.
 STALLED = 4
 # A descent is hopeless if its minimum is predicted above a ceiling in this many steps in a row, or
-# if the remaining steps cannot reach the ceiling with the largest recent gain.
+# if the remaining steps cannot reach the ceiling with the largest of the last STALLED gains.
 HOPELESS = 3
 # Uphill steps allowed before backtracking; largest rise of the objective allowed.
 WATCHED, WORSE = 2, 3.0
@@ -89,7 +89,7 @@ def descend(
         ahead = problem.step_equations(trial, lin)
         curvature = curvature.after(step, normal, ahead, gains[-1])
         point, normal = trial, ahead
-        if ceiling < np.inf:
+        if ceiling < np.inf and done < steps:
             within = min(normal.promised(), max(gains) * (steps - done))
             above = above + 1 if point.objective - within > ceiling else 0
         if above == HOPELESS:

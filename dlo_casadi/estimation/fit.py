@@ -269,31 +269,39 @@ def fine_enough(
 ) -> tuple[Fit, float]:
     """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
 
-    The noise is estimated on the last mesh only. If an effect is missing, the mesh error need only
-    be small against the misfit.
+    The noise is estimated again once a mesh is fine enough. If an effect is missing, the mesh error
+    need only be small against the misfit.
     """
-    moved = False
+    known = fit  # the last fit whose noise was estimated on its mesh
     while fit.noise.source != "misfit":
         if n != fit.model.n:
             try:
-                fit, moved = _moved(fit, n) or _anew(fit, n), True
+                moved = _moved(fit, n)
+                fit = moved or _anew(fit, n)
             except EstimationError:
                 # The parameters have no equilibria near the measured shapes on a finer mesh.
                 break
+            known = known if moved else fit
             continue
         error = mesh_error(fit)
         largest = finest if np.isfinite(error) else SEARCH_MESH
-        if moved and (error <= allowed_mesh_error(fit) or n >= largest):
-            with suppress(EstimationError):
-                fit, moved = refine(fit, rounds=2, modes=modes), False
         allowed = allowed_mesh_error(fit)
-        if error <= allowed or n >= largest:
+        if error > allowed and n < largest:
+            # Even; cautious: as if a coarse mesh lost half of the order above the second.
+            order = 1 + ELEMENTS[fit.model.element].order / 2
+            finer = n * np.clip((error / allowed) ** (1 / order), 1.2, 2.0)
+            n = min(2 * int(np.ceil(finer / 2)), largest)
+        elif fit is known:
             return fit, error
-        # Even; cautious: as if a coarse mesh lost half of the order above the second.
-        order = 1 + ELEMENTS[fit.model.element].order / 2
-        finer = n * np.clip((error / allowed) ** (1 / order), 1.2, 2.0)
-        n = min(2 * int(np.ceil(finer / 2)), largest)
-    return fit, mesh_error(fit)
+        else:
+            try:
+                fit = known = refine(fit, rounds=2, modes=modes)
+            except EstimationError:
+                break
+    if fit is not known:
+        with suppress(EstimationError):
+            known = refine(fit, rounds=2, modes=modes)
+    return known, mesh_error(known)
 
 
 def allowed_mesh_error(fit: Fit) -> float:

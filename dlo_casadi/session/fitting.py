@@ -353,9 +353,9 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
     for stage in others:
         if stage.name in SIMPLER:
             better = not fit.converged or _off(stage) < _off(own)
-            least = fit.point.objective - CONVERGED
-            for found in _from_simpler(fit, stage, better, least)[1:]:
-                if found.point.objective <= least:
+            # Minima are predicted well enough to tell twice the objective from less than it.
+            for found in _from_simpler(fit, stage, better, 2 * fit.point.objective)[1:]:
+                if found.point.objective <= fit.point.objective - CONVERGED:
                     found = found if fit.noise.source == "misfit" else refine(found)
                     best = max(best, found, key=lambda item: item.log_evidence)
     return best
