@@ -46,12 +46,12 @@ COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; where
 # shapes that need not balance leave more than the noise, relative to what they leave.
 REACHED = 1.5
-# Multiple of that sum, including REACHED, below which single candidates are fitted before pairs are
-# tried, and a pair before others are. Evidence: in a session in space a softening left 1.35 times
-# it, all others 17 times and more. Eighteen pairs were tried in vain; the next step of the search
-# found the tilt beside it. In another one the hidden pair left 2.4 times it, single candidates and
-# other pairs 4.5 times and more.
-CLOSE = 3.0
+# Multiples of that sum, including REACHED, below which single candidates are fitted before pairs
+# are tried, and a pair before others are. Evidence: in a session in space a softening left 1.35
+# times it, all others 17 times and more. Eighteen pairs were tried in vain; the next step of the
+# search found the tilt beside it. In another one the first of a hidden pair left 2.6 times it and
+# led astray. In a third one the hidden pair left 2.4 times it, all others 4.5 times and more.
+CLOSE, CLOSE_PAIR = 2.0, 3.0
 # Multiple of the expected sum below which a pair is the last one tried. In four sessions in space
 # the hidden pair left 1.01, 1.10, 1.14 and 1.54 times the relaxed shapes, others 1.5 and more.
 SURELY_REACHED = 1.2
@@ -297,10 +297,10 @@ def nearest(
 
     Then pairs are tried, provided `pairs` may be added: of FIRST candidates and likely second ones,
     then of the next ones, at last of the `later` ones unless a single candidate is within REACHED.
-    A pair that comes as close, and leaves least so far, is returned at once. The first ones within
-    REACHED are the last ones tried, one within SURELY_REACHED is the last. Pairs are returned if no
-    single candidates are left to return, or if REACHED times their objective is less than that of
-    those.
+    A pair that comes within CLOSE_PAIR times REACHED, and leaves least so far, is returned at once.
+    The first ones within REACHED are the last ones tried, one within SURELY_REACHED is the last.
+    Pairs are returned if no single candidates are left to return, or if REACHED times their
+    objective is less than that of those.
     """
     expected = expected_left(near)
     noise, start = REACHED * expected, partial(RelaxedStart.of, near)
@@ -328,7 +328,7 @@ def nearest(
             kept = _near_least(own.values(), noise)
             if kept and kept[0].left < SURELY_REACHED * expected:
                 break
-            if kept and kept[0].left < CLOSE * noise and not _in(told, kept[0]):
+            if kept and kept[0].left < CLOSE_PAIR * noise and not _in(told, kept[0]):
                 told = [*told, kept[0]]
                 yield [kept[0]]
         firsts = firsts[FIRST:]

@@ -81,7 +81,7 @@ def near_data(
     contacts = [x for x in screened if not x.candidate.effect.gradual]
     first = [*contacts, *likely[:REFITTED]]
     begun = list(map_in_order(executor, partial(RelaxedStart.of, near), first))
-    touches, alone = begun[: len(contacts)], begun[len(contacts) :]
+    touches, singles = begun[: len(contacts)], begun[len(contacts) :]
     most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
     touches = [start for start in touches if start.left <= most]
     touching = confirm_contacts(base, touches, executor)
@@ -92,12 +92,13 @@ def near_data(
     kept: list[RelaxedStart] = []
     tried: list[Confirmed] = []
     far = dict.fromkeys((x.candidate.name for x in (*contacts, *likely[:REFITTED])), NOT_NEAR)
-    for starts in nearest(near, softness, alone, later, *among, pairs=pairs, least=least):
+    for starts in nearest(near, softness, singles, later, *among, pairs=pairs, least=least):
         close, found = confirmed(base, starts[:REFITTED], executor, rolls=not explained)
         kept += close
         tried += found
         far |= {x.screened.candidate.name: LESS_NEAR for x in starts[len(close) : REFITTED]}
-        if any(item.fit.noise.source != "misfit" for item in tried):
+        # Beside a single candidate a second one may be found in the next step.
+        if any(explains(x.fit) or not (x.beside or x.fit.noise.source == "misfit") for x in tried):
             break
     tried = loads_from_best(base, screened, tried, executor)
     fitted = {item.name: item.screened for item in touching}
