@@ -366,6 +366,28 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
 
 
 @pytest.mark.parametrize(
+    ("beside", "chi2", "lists"), [((), 3.0, 1), (("other",), 3.0, 2), (("other",), 1.0, 1)]
+)
+def test_a_pair_ends_the_search_only_if_it_explains_the_shapes(beside, chi2, lists, monkeypatch):
+    """The first pair that came close to the noise may be the wrong one."""
+    tether, asked = named("tether"), []
+    fit = SimpleNamespace(noise=SimpleNamespace(source="declared"), chi2_per_dof=chi2)
+    item = SimpleNamespace(fit=fit, beside=beside, each=(tether,), screened=tether)
+    begun = SimpleNamespace(screened=tether, names={"tether"}, left=1.0)
+    monkeypatch.setattr(RelaxedStart, "of", lambda *_: begun)
+    monkeypatch.setattr(fits_near_data, "from_data", lambda _: (None, 0.01))
+    monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
+    monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: [tether])
+    monkeypatch.setattr(fits_near_data, "nearest", lambda *_, **__: iter([[begun], [begun]]))
+    monkeypatch.setattr(
+        fits_near_data, "confirmed", lambda _, starts, *__, **___: (asked.append(1) or [], [item])
+    )
+    monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *args: args[2])
+    near_data(None, InProcess(), None, (), pairs=True)
+    assert len(asked) == lists
+
+
+@pytest.mark.parametrize(
     ("shapes", "left", "fitted"),
     [(50.0, 80.0, True), (50.0, 99.0, False), (50.0, np.inf, False), (95.0, 80.0, False)],
 )
