@@ -39,6 +39,7 @@ from dlo_casadi.estimation.fit import (
     at_random,
     explains,
     fine_enough,
+    misfits,
 )
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
@@ -336,7 +337,7 @@ class Search:
             if needless:
                 fit = settle(smaller)
                 added = [item for item in added if item is not effect]
-            elif effect.after is not added[-1].after:
+            elif effect.after is not added[-1].after and (effect.rivals or not misfits(smaller)):
                 fit, chosen = self._judged_again(fit, smaller, effect)
                 added = [chosen if item is effect else item for item in added]
         return fit, added
@@ -346,9 +347,13 @@ class Search:
 
         Sequential replacement (Miller 1990): an effect may be the best one alone, and another one
         beside what was still missing then. Alone, a force explained a tilt and a drift better than
-        either. `smaller` lacks the effect.
+        either. `smaller` lacks the effect; if it misfits, scores are useless and only known rivals
+        are judged.
         """
         screened, before, name = self._screened(smaller), cross_validate(smaller), effect.name
+        if misfits(smaller):
+            among = {name, *(rival.name for rival in effect.rival_candidates)}
+            screened = [item for item in screened if item.candidate.name in among]
         p_values = p_values_of(screened)
         own = [item for item in screened if item.candidate.name == name]
         known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}

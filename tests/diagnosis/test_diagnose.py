@@ -262,3 +262,29 @@ def test_only_rivals_of_the_same_search_tell_which_refit_is_given_up(monkeypatch
     Search._leading(search, fit, screened, p_values, {"known": confirmed})
     Search._leading(search, fit, screened[1:], p_values, {"excluded": confirmed})
     assert ceilings == [600.0, np.inf]
+
+
+@pytest.mark.parametrize(
+    ("misfit", "rivals", "again"), [(False, (), True), (True, (), False), (True, ("set",), True)]
+)
+def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(misfit, rivals, again, monkeypatch):
+    """Scores are useless there, and candidates were compared from the measured shapes."""
+    asked = []
+
+    def judged_again(fit, smaller, effect):
+        asked.append(effect)
+        return fit, effect
+
+    fit, smaller = (SimpleNamespace(log_evidence=value) for value in (0.0, -1e5))
+    first, last = (SimpleNamespace(candidate=None, rivals=rivals, after=k) for k in range(2))
+    monkeypatch.setattr(module.refits, "refit_without", lambda *_: smaller)
+    monkeypatch.setattr(module, "misfits", lambda _: misfit)
+    monkeypatch.setattr(module, "candidates_of", lambda *_: ())
+    monkeypatch.setattr(module, "p_of_removal", lambda *_: 0.0)
+    search = SimpleNamespace(
+        _fine=lambda found, _: found, from_shapes=True, declared=None, center=None, exclude=(),
+        significance=0.01, _judged_again=judged_again,
+    )  # fmt: skip
+    _, left = Search._pruned(search, fit, [first, last])
+    assert asked == [first] * again
+    assert left == [first, last]
