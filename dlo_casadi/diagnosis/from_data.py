@@ -49,8 +49,9 @@ REACHED = 1.5
 # Multiples of that sum, including REACHED, below which single candidates are fitted before pairs
 # are tried, and a pair before others are. Evidence: in a session in space a softening left 1.35
 # times it, all others 17 times and more. Eighteen pairs were tried in vain; the next step of the
-# search found the tilt beside it. In another one the first of a hidden pair left 2.6 times it and
-# led astray. In a third one the hidden pair left 2.4 times it, all others 4.5 times and more.
+# search found the tilt beside it. In another one the first of a hidden pair left 2.6 times it; once
+# it was fitted alone, the second was not found. In a third one the hidden pair left 2.4 times it,
+# all others 4.5 times and more.
 CLOSE, CLOSE_PAIR = 2.0, 3.0
 # Multiple of the expected sum below which a pair is the last one tried. In four sessions in space
 # the hidden pair left 1.01, 1.10, 1.14 and 1.54 times the relaxed shapes, others 1.5 and more.
@@ -233,7 +234,7 @@ class RelaxedStart:
 
     @property
     def reached(self) -> bool:
-        """Whether it leaves no more than noise, as the shapes it was begun beside show it."""
+        """Whether it leaves no more than the noise that the relaxed shapes of `near` show."""
         return self.left < REACHED * expected_left(self.near)
 
     @property
@@ -328,7 +329,7 @@ def nearest(
             kept = _near_least(own.values(), noise)
             if kept and kept[0].left < SURELY_REACHED * expected:
                 break
-            if kept and kept[0].left < CLOSE_PAIR * noise and not _in(told, kept[0]):
+            if kept and kept[0].left < CLOSE_PAIR * noise and not _known(told, kept[0]):
                 told = [*told, kept[0]]
                 yield [kept[0]]
         firsts = firsts[FIRST:]
@@ -336,13 +337,13 @@ def nearest(
             firsts, later = sorted(map_in_order(executor, start, later), key=lambda x: x.left), []
             begun = _near_least((*begun, *firsts), noise, least)
             if begun[0].left < noise:
-                yield [x for x in begun if not _in(told, x)]
+                yield [x for x in begun if not _known(told, x)]
                 return
-    new, more = ([x for x in some if not _in(told, x)] for some in (begun, kept))
+    new, more = ([x for x in some if not _known(told, x)] for some in (begun, kept))
     yield more if not new or (kept and REACHED * kept[0].left < new[0].left) else new
 
 
-def _in(starts: Iterable[RelaxedStart], start: RelaxedStart) -> bool:
+def _known(starts: Iterable[RelaxedStart], start: RelaxedStart) -> bool:
     """Whether starts have the same candidates as this one, and leave hardly more."""
     return any(x.names == start.names and x.left < NEAR_NOISE * start.left for x in starts)
 

@@ -353,7 +353,7 @@ def not_worse(fit: Fit, stages: Sequence[Stage]) -> Fit:
     for stage in others:
         if stage.name in SIMPLER:
             better = not fit.converged or _off(stage) < _off(own)
-            # If a minimum is predicted above twice the objective, it is not below it.
+            # A descent that seems to end above twice the objective will not end below it.
             for found in _from_simpler(fit, stage, better, 2 * fit.point.objective)[1:]:
                 if found.point.objective <= fit.point.objective - CONVERGED:
                     found = found if fit.noise.source == "misfit" else refine(found)
