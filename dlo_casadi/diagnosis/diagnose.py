@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -143,9 +143,10 @@ class Search:
         """Refits of the declared model with a candidate, by name, made only as needed."""
         return self.wider.refitted if self.wider is not None else {}
 
-    def _screened(self, current: Fit) -> list[Screened]:
-        """Score tests of all `candidates_of` a fit, best first."""
+    def _screened(self, current: Fit, among: Collection[str] = ()) -> list[Screened]:
+        """Score tests of all `candidates_of` a fit, or of those named, best first."""
         listed = candidates_of(current, self.center, self.exclude)
+        listed = [x for x in listed if not among or x.name in among]
         degrees = screening_degrees(current)
         with suppress(EstimationError):
             return refits.scored(current, listed, degrees, self.executor)
@@ -350,10 +351,9 @@ class Search:
         either. `smaller` lacks the effect; if it misfits, scores are useless and only known rivals
         are judged.
         """
-        screened, before, name = self._screened(smaller), cross_validate(smaller), effect.name
-        if misfits(smaller):
-            among = {name, *(rival.name for rival in effect.rival_candidates)}
-            screened = [item for item in screened if item.candidate.name in among]
+        before, name = cross_validate(smaller), effect.name
+        rivals_only = {name, *(rival.name for rival in effect.rival_candidates)}
+        screened = self._screened(smaller, rivals_only if misfits(smaller) else ())
         p_values = p_values_of(screened)
         own = [item for item in screened if item.candidate.name == name]
         known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}

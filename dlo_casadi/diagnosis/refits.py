@@ -45,7 +45,7 @@ from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import EVIDENCE_APART
+from dlo_casadi.thresholds import EVIDENCE_APART, IN_QUESTION
 
 # Shares of the one-step estimate from which a refit is tried, in this order.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -137,23 +137,32 @@ class Tried:
 def scored(
     base: Fit, listed: Sequence[Candidate], noise_dof: float, executor: Executor
 ) -> list[Screened]:
-    """Score tests of candidates, best first; see `Screen.run`."""
+    """Score tests of candidates, best first; see `Screen.run`.
+
+    An estimated noise may hide what the base lacks, but then some effect's score shows it: in nine
+    sessions with a hidden table at least 50, with p-values of 3e-9 and less; with the table found,
+    the least p-value was 0.12.
+    """
     gradual = [x for x in listed if x.effect.gradual]
     found = Screen(base, gradual).run(noise_dof, executor) if gradual else []
+    shows = not found or found[0].p_value < IN_QUESTION
+    lacks = base.beyond_noise or (shows and not base.noise.known)
     others = (x for x in listed if not x.effect.gradual)
-    return in_order([*found, *(scored_by_refit(base, x, noise_dof) for x in others)])
+    tested = (scored_by_refit(base, x, noise_dof, from_shapes=lacks) for x in others)
+    return in_order([*found, *tested])
 
 
-def scored_by_refit(base: Fit, candidate: Candidate, noise_dof: float) -> Screened:
+def scored_by_refit(
+    base: Fit, candidate: Candidate, noise_dof: float, *, from_shapes: bool
+) -> Screened:
     """Test a candidate without derivative where it vanishes, by the gain of a refit.
 
-    The refit starts from the base. It also starts from the measured shapes, unless the base has a
-    declared noise and reaches it: an estimated noise may hide what the base lacks. A contact
+    The refit starts from the base. It also starts from the measured shapes, if asked for. A contact
     that leaves hardly less than the base in relaxed shapes (less than a tenth) needs no such start.
     """
     start = dict(candidate.scans[0])
     fits = [followed(base, candidate.add_to(base.model), start, MOST_STEPS)]
-    if base.beyond_noise or not base.noise.known:
+    if from_shapes:
         near, _ = from_data(base)
         most = left_without(near) / NEAR_NOISE
         fit = None

@@ -50,7 +50,7 @@ class Functions:
     def mapped(self, name: str) -> Mapped:
         """The function of that name over many segments (or nodes) of many poses."""
         if name not in self._mapped:
-            self._mapped[name] = Mapped(getattr(self, name))
+            self._mapped[name] = Mapped(getattr(self, name), self.terms.has_law_of_bend)
         return self._mapped[name]
 
     def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
@@ -60,9 +60,7 @@ class Functions:
         # Checking costs a tenth of substituting.
         here = [ca.substitute(x, delta, still) if ca.depends_on(x, delta) else x for x in outputs]
         dense = [ca.densify(one) for one in here]
-        # With a law of the bend, half of the operations are repeated. Without one it is a fifth,
-        # which takes longer to find than it saves.
-        return ca.Function(name, arguments, ca.cse(dense) if self.terms.has_law_of_bend else dense)
+        return ca.Function(name, arguments, dense)
 
     def _of_segment(self, name: str, *outputs: ca.SX) -> ca.Function:
         return self._here(name, self._segment_arguments, list(outputs))

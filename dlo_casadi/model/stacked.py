@@ -110,10 +110,19 @@ class Mapped:
     small ones `simplified`: they give the same numbers, bit for bit, up to eight times as fast.
     Large calls of simplified functions would be a fifth faster still, but these take long to find.
     Threads take turns, because they share the buffers.
+
+    Parameters
+    ----------
+    function : ca.Function
+        Of scalars (SX).
+    repeats : bool
+        Whether half of its operations are repeated, as with a law of the bend: then large calls are
+        also simplified.
     """
 
-    def __init__(self, function: ca.Function) -> None:
+    def __init__(self, function: ca.Function, repeats: bool = False) -> None:
         self._function, self._evaluated, self._simplified = function, 0, False
+        self._repeats = repeats
         self._lock = Lock()
         self._shapes = [
             (function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
@@ -136,7 +145,7 @@ class Mapped:
         self._evaluated += number
         large = number >= FEWEST and number * self._function.n_instructions() > WORTH
         often = self._evaluated > PAID and self._inlined
-        if often and not large and not self._simplified:
+        if often and not self._simplified and (self._repeats or not large):
             self._function, self._buffers = simplified(self._function), {}
             self._simplified = True
         return self._in_blocks(given) if often and large else self._one_by_one(given)

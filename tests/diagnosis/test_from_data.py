@@ -405,7 +405,7 @@ def test_a_contact_that_gains_nothing_in_relaxed_shapes_is_not_fitted_from_there
     monkeypatch.setattr(refits, "from_data", lambda _: (relaxed_stub(shapes), 0.01))
     monkeypatch.setattr(refits, "left_without", lambda _: 100.0)
     monkeypatch.setattr(RelaxedStart, "of", lambda *_: start)
-    found = scored_by_refit(base, effect, 50.0)
+    found = scored_by_refit(base, effect, 50.0, from_shapes=True)
     assert asked == [left] * fitted
     assert (found.score, found.p_value) == (0.0, 1.0)
 
