@@ -61,7 +61,7 @@ def descend(
     ceiling : float
         Objective above which the minimum is of no interest, see HOPELESS.
     share : float
-        Share of the objective that counts as converged, see MISFIT_GAIN.
+        Share of the objective; a descent whose last STALLED steps gain less has converged.
 
     Returns
     -------
@@ -93,7 +93,7 @@ def descend(
         if gains[-1] < least and damping < 1e-2:
             return Fit(problem, trial, converged=True)
         if sum(gains) < max(least, share * trial.objective):
-            return Fit(problem, trial, converged=sum(gains) >= least)
+            return Fit(problem, trial, converged=sum(gains) < share * trial.objective)
         step, lin = trial.theta - point.theta, problem.linearize(trial)
         ahead = problem.step_equations(trial, lin)
         curvature = curvature.after(step, normal, ahead, gains[-1])

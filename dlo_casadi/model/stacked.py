@@ -144,7 +144,7 @@ class Mapped:
         """As `_one_by_one`, in the fastest way for this number of segments."""
         self._evaluated += number
         large = number >= FEWEST and number * self._function.n_instructions() > WORTH
-        often = self._evaluated > PAID and self._inlined
+        often, large = self._evaluated > PAID, large and self._inlined
         if often and not self._simplified and (self._repeats or not large):
             self._function, self._buffers = simplified(self._function), {}
             self._simplified = True

@@ -23,7 +23,8 @@ from dlo_casadi.diagnosis.near_data import (
     confirm_rolled,
     near_data,
 )
-from dlo_casadi.diagnosis.refits import scored_by_refit
+from dlo_casadi.diagnosis.refits import scored, scored_by_refit
+from dlo_casadi.diagnosis.screening import Screened
 from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
@@ -385,6 +386,36 @@ def test_a_pair_ends_the_search_only_if_it_explains_the_shapes(beside, chi2, lis
     monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *args: args[2])
     near_data(None, InProcess(), None, (), pairs=True)
     assert len(asked) == lists
+
+
+@pytest.mark.parametrize(
+    ("beyond", "known", "p_value", "asked"),
+    [
+        (True, True, 1.0, True),
+        (False, True, 1e-9, False),
+        (False, False, 1e-9, True),
+        (False, False, 0.01, False),
+        (False, False, None, True),
+    ],
+)
+def test_a_contact_starts_at_the_shapes_only_if_the_base_lacks_something(
+    beyond, known, p_value, asked, monkeypatch
+):
+    """That it misfits, or, beside an estimated noise, that another effect is significant."""
+    told = []
+    base = SimpleNamespace(beyond_noise=beyond, noise=SimpleNamespace(known=known))
+    listed = [SimpleNamespace(effect=SimpleNamespace(gradual=False))]
+    if p_value is not None:
+        listed.append(SimpleNamespace(effect=SimpleNamespace(gradual=True)))
+    leading = Screened(None, 1.0, p_value, {})
+    monkeypatch.setattr(refits, "Screen", lambda *_: SimpleNamespace(run=lambda *_: [leading]))
+    monkeypatch.setattr(
+        refits,
+        "scored_by_refit",
+        lambda *_, from_shapes: told.append(from_shapes) or Screened(None, 0.0, 1.0, {}),
+    )
+    scored(base, listed, np.inf, InProcess())
+    assert told == [asked]
 
 
 @pytest.mark.parametrize(

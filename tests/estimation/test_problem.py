@@ -444,6 +444,22 @@ def test_a_descent_is_given_up_if_its_steps_are_too_short(depth, steps, monkeypa
     assert len(taken) == steps
 
 
+@pytest.mark.parametrize(("share", "steps"), [(0.0, 10), (0.1, 4)])
+def test_a_misfit_need_not_be_known_exactly(share, steps, monkeypatch):
+    """Each step gains one percent: four of them less than a tenth, and no step is the last one."""
+    start, taken = start_without_a_mass(), []
+
+    def ahead(problem, point, *_):
+        taken.append(point)
+        return replace(point, objective=0.99 * point.objective)
+
+    monkeypatch.setattr(descent, "_ahead", ahead)
+    monkeypatch.setattr(descent, "least_decrease", lambda *_: 0.0)
+    monkeypatch.setattr(Normal, "promised", lambda *_: np.inf)
+    assert descend(start, steps=10, share=share).converged is bool(share)
+    assert len(taken) == steps
+
+
 @pytest.mark.long
 def test_a_drift_comes_back():
     """Rate and stiffness from poses in order; in another one the cable seems not to repeat."""
