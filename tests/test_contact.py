@@ -228,7 +228,7 @@ def test_a_plane_that_is_not_declared():
     assert "contact_plane" not in [item.name for item in clean]
     (candidate,) = (item for item in touched if item.name == "contact_plane")
     assert candidate.effect == plane
-    scored = scored_by_refit(fits[0], candidate, np.inf, from_shapes=False)
+    scored = scored_by_refit(fits[0], candidate, np.inf, from_shapes=True)
     assert scored.p_value < 1e-9
     fit = scored.fit
     for name, true in (("contact_plane.height", -0.17), ("bending_stiffness", 2e-3)):
