@@ -32,21 +32,23 @@ def arguments(function: ca.Function, m: int, count: int) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     "name", [*NAMES, *(pytest.param(name, marks=pytest.mark.long) for name in OTHERS)]
 )
-@pytest.mark.parametrize("torsion", [None, 0.015])
+@pytest.mark.parametrize(("torsion", "repetitive"), [(None, True), (0.015, False)])
 @pytest.mark.parametrize("element", ELEMENTS_IN_SPACE)
 def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
-    element, torsion, name, monkeypatch
+    element, torsion, repetitive, name, monkeypatch
 ):
     cable = replace(CABLE, torsional_stiffness=torsion)
     gravity = (0.0, -9.81) if torsion is None else (0.0, 0.0, -9.81)
     model = CableModel(cable, 6, element, effects=EFFECTS, gravity=gravity)
     function = getattr(functions_of(model), name)
     monkeypatch.setattr(stacked, "WORTH", 0)
-    mapped, given = Mapped(function), arguments(function, 13, 6)  # 78 segments: two blocks
+    mapped = Mapped(function, repetitive=repetitive)
+    given = arguments(function, 13, 6)  # 78 segments: two blocks
     first = mapped(*given)
     monkeypatch.setattr(stacked, "PAID", 0)
     after = mapped(*given)
     assert mapped._vectorised is not None
+    assert mapped._simplified is repetitive
     assert [x.shape for x in mapped(*(x[:0] for x in given))] == [(0, *x.shape[1:]) for x in first]
     monkeypatch.setattr(stacked, "WORTH", np.inf)
     simpler = mapped(*given)
@@ -83,6 +85,7 @@ def test_a_function_that_calls_another_stays_scalar(monkeypatch):
     mapped = Mapped(ca.Function("f", [x], [ca.densify(2 * called(x))]))
     (given,) = arguments(mapped._function, 3, 10)
     (found,) = mapped(given)
+    assert mapped._vectorised is None
     np.testing.assert_allclose(found[..., 0, 0], 2 * (given**2).sum(axis=2))
 
 

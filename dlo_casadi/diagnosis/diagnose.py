@@ -143,16 +143,16 @@ class Search:
         """Refits of the declared model with a candidate, by name, made only as needed."""
         return self.wider.refitted if self.wider is not None else {}
 
-    def _screened(self, current: Fit, among: Collection[str] = ()) -> list[Screened]:
+    def _screened(self, current: Fit, among: Collection[str] | None = None) -> list[Screened]:
         """Score tests of all `candidates_of` a fit, or of those named, best first."""
         listed = candidates_of(current, self.center, self.exclude)
-        listed = [x for x in listed if not among or x.name in among]
-        degrees = screening_degrees(current)
+        listed = [x for x in listed if among is None or x.name in among]
+        given = screening_degrees(current), self.significance, self.executor
         with suppress(EstimationError):
-            return refits.scored(current, listed, degrees, self.executor)
+            return refits.scored(current, listed, *given)
         # A held-out pose has no equilibrium, so what poses leave behind cannot be determined.
         listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
-        return refits.scored(current, listed, degrees, self.executor)
+        return refits.scored(current, listed, *given)
 
     def diagnosis(self) -> Diagnosis:
         """Result of the search, without effects that explain too little."""
@@ -353,7 +353,7 @@ class Search:
         """
         before, name = cross_validate(smaller), effect.name
         rivals_only = {name, *(rival.name for rival in effect.rival_candidates)}
-        screened = self._screened(smaller, rivals_only if misfits(smaller) else ())
+        screened = self._screened(smaller, rivals_only if misfits(smaller) else None)
         p_values = p_values_of(screened)
         own = [item for item in screened if item.candidate.name == name]
         known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}

@@ -45,7 +45,7 @@ from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import EVIDENCE_APART, SIGNIFICANCE
+from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Shares of the one-step estimate from which a refit is tried, in this order.
 SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -135,16 +135,22 @@ class Tried:
 
 
 def scored(
-    base: Fit, listed: Sequence[Candidate], noise_dof: float, executor: Executor
+    base: Fit,
+    listed: Sequence[Candidate],
+    noise_dof: float,
+    significance: float,
+    executor: Executor,
 ) -> list[Screened]:
     """Score tests of candidates, best first; see `Screen.run`.
 
-    An estimated noise may hide a contact, but not from all other scores: in five sessions with a
-    hidden table the least p-value was below 1e-15, and with the table found 0.12 or more.
+    Contacts also start at the measured shapes if the base leaves more than noise, or if its noise
+    is estimated and some score is significant. An estimated noise may hide a contact, but not from
+    all other scores: in five sessions with a hidden table the least p-value was below 1e-15, and
+    with the table found 0.12 or more.
     """
     gradual = [x for x in listed if x.effect.gradual]
     found = Screen(base, gradual).run(noise_dof, executor) if gradual else []
-    significant = not found or found[0].p_value < SIGNIFICANCE
+    significant = not found or found[0].p_value < significance
     lacks = base.beyond_noise or (significant and not base.noise.known)
     others = (x for x in listed if not x.effect.gradual)
     tested = (scored_by_refit(base, x, noise_dof, from_shapes=lacks) for x in others)
@@ -156,8 +162,8 @@ def scored_by_refit(
 ) -> Screened:
     """Test a candidate without derivative where it vanishes, by the gain of a refit.
 
-    The refit starts from the base. It also starts from the measured shapes, if asked for. A contact
-    that leaves hardly less than the base in relaxed shapes (less than a tenth) needs no such start.
+    The refit starts from the base; with `from_shapes` also from the measured shapes, unless the
+    contact leaves hardly less than the base in relaxed shapes (less than a tenth).
     """
     start = dict(candidate.scans[0])
     fits = [followed(base, candidate.add_to(base.model), start, MOST_STEPS)]

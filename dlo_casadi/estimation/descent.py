@@ -31,8 +31,8 @@ CONVERGED, NEARLY = 1e-4, 1e-2
 FIRST_DAMPING = 1e-3
 # A descent has stalled if this many steps together gain less than one converged step may.
 STALLED = 4
-# Share of the objective below which the gain of STALLED steps ends a descent of a model that lacks
-# something: half a percent of the distances. Four sessions in space went on for 13 to 40 steps.
+# Share of the objective that STALLED steps have to gain together in a model that lacks something;
+# it is half a percent of the distances. Four such descents in space took 13 to 40 steps without it.
 MISFIT_GAIN = 1e-2
 # A descent is hopeless if its minimum is predicted above a ceiling in this many steps in a row, or
 # if the remaining steps cannot reach the ceiling with the largest of the last STALLED gains.
@@ -61,7 +61,8 @@ def descend(
     ceiling : float
         Objective above which the minimum is of no interest, see HOPELESS.
     share : float
-        Share of the objective; a descent whose last STALLED steps gain less has converged.
+        Share of the objective: a descent ends once its last STALLED steps together gain less, and
+        has converged unless it is damped. With zero it does not.
 
     Returns
     -------
@@ -92,8 +93,9 @@ def descend(
         least = least_decrease(problem, trial, tolerance)
         if gains[-1] < least and damping < 1e-2:
             return Fit(problem, trial, converged=True)
-        if sum(gains) < max(least, share * trial.objective):
-            return Fit(problem, trial, converged=sum(gains) < share * trial.objective)
+        small = share > 0 and sum(gains) < share * trial.objective
+        if small or sum(gains) < least:
+            return Fit(problem, trial, converged=small and damping < 1e-2)
         step, lin = trial.theta - point.theta, problem.linearize(trial)
         ahead = problem.step_equations(trial, lin)
         curvature = curvature.after(step, normal, ahead, gains[-1])

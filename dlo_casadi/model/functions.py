@@ -14,7 +14,7 @@ from dlo_casadi.effects import MeasurementEffect, StateEffect
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.framed import SegmentNumbers, in_frame
 from dlo_casadi.model.lagrangian import MODELS, lagrangian_of
-from dlo_casadi.model.stacked import Mapped
+from dlo_casadi.model.stacked import Mapped, simplified
 from dlo_casadi.rod.element import LAYOUT_SIZE, Segment
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
@@ -46,12 +46,25 @@ class Functions:
         self._by = ca.vertcat(self.terms.delta, *border)
         self._numbers = ca.vertcat(p, rest, deviation)
         self._mapped: dict[str, Mapped] = {}
+        self._compact: dict[str, ca.Function] = {}
 
     def mapped(self, name: str) -> Mapped:
         """The function of that name over many segments (or nodes) of many poses."""
         if name not in self._mapped:
-            self._mapped[name] = Mapped(getattr(self, name), self.terms.has_law_of_bend)
+            self._mapped[name] = Mapped(getattr(self, name), repetitive=self._is_repetitive(name))
         return self._mapped[name]
+
+    def compact(self, name: str) -> ca.Function:
+        """The function of that name for larger expressions, with few repeated operations."""
+        if not self._is_repetitive(name):
+            return getattr(self, name)
+        if name not in self._compact:
+            self._compact[name] = simplified(getattr(self, name))
+        return self._compact[name]
+
+    def _is_repetitive(self, name: str) -> bool:
+        """With a law of the bend half of a segment's operations are repeated, else a fifth."""
+        return self.terms.has_law_of_bend and name.startswith("segment")
 
     def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
         """A function at zero increments, with dense outputs."""

@@ -108,21 +108,21 @@ class Mapped:
     It reads and writes NumPy's memory, because conversion to CasADi's matrices takes several times
     as long as the evaluation. Once it has been evaluated often, large calls are `vectorised`, and
     small ones `simplified`: they give the same numbers, bit for bit, up to eight times as fast.
-    Large calls of simplified functions would be a fifth faster still, but these take long to find.
-    Threads take turns, because they share the buffers.
+    Large calls of simplified functions would be a fifth faster still, but to simplify takes longer
+    than that saves, unless the function is `repetitive`. Threads take turns, because they share the
+    buffers.
 
     Parameters
     ----------
     function : ca.Function
         Of scalars (SX).
-    repeats : bool
-        Whether half of its operations are repeated, as with a law of the bend: then large calls are
-        also simplified.
+    repetitive : bool
+        Whether about half of its operations are repeated ones.
     """
 
-    def __init__(self, function: ca.Function, repeats: bool = False) -> None:
+    def __init__(self, function: ca.Function, *, repetitive: bool = False) -> None:
         self._function, self._evaluated, self._simplified = function, 0, False
-        self._repeats = repeats
+        self._repetitive = repetitive
         self._lock = Lock()
         self._shapes = [
             (function.size2_out(i), function.size1_out(i)) for i in range(function.n_out())
@@ -143,12 +143,17 @@ class Mapped:
     def _evaluate(self, number: int, given: Sequence[FloatArray]) -> list[FloatArray]:
         """As `_one_by_one`, in the fastest way for this number of segments."""
         self._evaluated += number
-        large = number >= FEWEST and number * self._function.n_instructions() > WORTH
-        often, large = self._evaluated > PAID, large and self._inlined
-        if often and not self._simplified and (self._repeats or not large):
+        often = self._evaluated > PAID
+        if often and not self._simplified and (self._repetitive or not self._is_large(number)):
             self._function, self._buffers = simplified(self._function), {}
             self._simplified = True
-        return self._in_blocks(given) if often and large else self._one_by_one(given)
+        in_blocks = often and self._is_large(number)
+        return self._in_blocks(given) if in_blocks else self._one_by_one(given)
+
+    def _is_large(self, number: int) -> bool:
+        """Whether calls for this number of segments are worth being `vectorised`."""
+        operations = number * self._function.n_instructions()
+        return number >= FEWEST and operations > WORTH and self._inlined
 
     @cached_property
     def _inlined(self) -> bool:

@@ -71,7 +71,9 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
     energy, gradient, _ = functions.at_ends(*_end_arguments(model, s))
-    own, reached = functions.segment_potential(*_segment_arguments(model, s, clamped), inner)
+    own, reached = functions.compact("segment_potential")(
+        *_segment_arguments(model, s, clamped), inner
+    )
     energy = sum(ca.horzsplit(own), start=energy)
     conditions = sum(ca.horzsplit(reached), start=gradient[2 * model.node.increment :])
     multipliers = np.flatnonzero(model.are_multipliers[: model.n_lam]).tolist()
@@ -95,7 +97,7 @@ def balance(model: CableModel, s: PoseSymbols) -> Any:
     """Gradient of the Lagrangian by increments and multipliers: force balance, then conditions."""
     b, functions = model.node.increment, functions_of(model)
     ends = functions.end_slope(*_end_arguments(model, s))
-    gradient = functions.segment_slope(*_segment_arguments(model, s))
+    gradient = functions.compact("segment_slope")(*_segment_arguments(model, s))
     none = ca.DM.zeros(b)
     rows = ca.horzcat(none, gradient[b : 2 * b, :]) + ca.horzcat(gradient[:b, :], none)
     rows = rows[:, : model.chain.n_nodes]
@@ -107,7 +109,7 @@ def balance(model: CableModel, s: PoseSymbols) -> Any:
 def tangent(model: CableModel, s: PoseSymbols) -> Any:
     """Hessian of the Lagrangian by increments and multipliers: the derivative of `balance`."""
     b, count, functions = model.node.increment, model.chain.n_nodes, functions_of(model)
-    *_, segments = functions.segment(*_segment_arguments(model, s))
+    *_, segments = functions.compact("segment")(*_segment_arguments(model, s))
     *_, ends = functions.at_ends(*_end_arguments(model, s))
     # Unknowns of each block: those of two nodes, and the border. A segment after the last node is
     # possible; its entries for a next node are left out.
@@ -144,7 +146,7 @@ class ShapeExpressions:
 def shape(model: CableModel, s: PoseSymbols) -> ShapeExpressions:
     """True shape and reactions. The energy is the Lagrangian, equal if the conditions hold."""
     layout, count, functions = model.chain.layout, model.n + 1, functions_of(model)
-    energy, advance, strains = functions.segment_shape(*_segment_arguments(model, s))
+    energy, advance, strains = functions.compact("segment_shape")(*_segment_arguments(model, s))
     ends, forces, moments = functions.end_shape(*_end_arguments(model, s))
     steps = ca.horzcat(s.pose[: model.node.dimension], advance[:, layout.advancing.tolist()])
     return ShapeExpressions(
@@ -159,7 +161,9 @@ def shape(model: CableModel, s: PoseSymbols) -> ShapeExpressions:
 def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Measured curve ((n + 1) d or 2 d,), by node: place, and dr/ds of smooth elements."""
     layout, d, functions = model.chain.layout, model.node.dimension, functions_of(model)
-    steps = functions.segment_curve(*_segment_arguments(model, s))[:, layout.advancing.tolist()]
+    steps = functions.compact("segment_curve")(*_segment_arguments(model, s))[
+        :, layout.advancing.tolist()
+    ]
     points = ca.cumsum(ca.horzcat(s.pose[:d], steps[:d, :]), 1)
     rates = steps[d:, :]
     rates = ca.horzcat(rates[:, 0], (rates[:, :-1] + rates[:, 1:]) / 2, rates[:, -1])

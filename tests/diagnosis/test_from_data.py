@@ -401,7 +401,7 @@ def test_a_pair_ends_the_search_only_if_it_explains_the_shapes(beside, chi2, lis
 def test_a_contact_starts_at_the_shapes_only_if_the_base_lacks_something(
     beyond, known, p_value, asked, monkeypatch
 ):
-    """That it misfits, or, beside an estimated noise, that another effect is significant."""
+    """It leaves more than noise, or its noise is estimated and another effect is significant."""
     told = []
     base = SimpleNamespace(beyond_noise=beyond, noise=SimpleNamespace(known=known))
     listed = [SimpleNamespace(effect=SimpleNamespace(gradual=False))]
@@ -414,7 +414,7 @@ def test_a_contact_starts_at_the_shapes_only_if_the_base_lacks_something(
         "scored_by_refit",
         lambda *_, from_shapes: told.append(from_shapes) or Screened(None, 0.0, 1.0, {}),
     )
-    scored(base, listed, np.inf, InProcess())
+    scored(base, listed, np.inf, 0.005, InProcess())
     assert told == [asked]
 
 
