@@ -192,7 +192,8 @@ def fit_to_misfit(near: Fit) -> Fit:
     """Fit a model that lacks something, its points weighed by how well it can meet them.
 
     If an effect is missing, a fit to a fraction of a millimetre distorts every free unknown and
-    ends where single poses lose their equilibrium (folds).
+    ends where single poses lose their equilibrium (folds). The minimum is approximate, see
+    MISFIT_GAIN.
     """
     doubted = near.noise.doubted(MISFIT_STD * near.model.cable.length)
     noise = replace(doubted, source="misfit", before=near.noise)

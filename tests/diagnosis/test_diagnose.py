@@ -288,3 +288,15 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(misfit, rivals, 
     _, left = Search._pruned(search, fit, [first, last])
     assert asked == [first] * again
     assert left == [first, last]
+
+
+def test_only_effects_that_are_asked_for_are_screened(monkeypatch):
+    """Where only rivals are judged again, no others are scored."""
+    listed = [SimpleNamespace(name=name) for name in ("set", "drift", "table")]
+    monkeypatch.setattr(module, "candidates_of", lambda *_: listed)
+    monkeypatch.setattr(module, "screening_degrees", lambda _: np.inf)
+    monkeypatch.setattr(module.refits, "scored", lambda _, among, *__: [x.name for x in among])
+    search = SimpleNamespace(center=None, exclude=(), significance=0.01, executor=InProcess())
+    assert Search._screened(search, None) == ["set", "drift", "table"]
+    assert Search._screened(search, None, {"drift", "set"}) == ["set", "drift"]
+    assert Search._screened(search, None, set()) == []
