@@ -61,14 +61,15 @@ def descend(
     ceiling : float
         Objective above which the minimum is of no interest, see HOPELESS.
     share : float
-        Share of the objective: a descent ends once its last STALLED steps together gain less, and
-        has converged unless it is damped. With zero it does not.
+        Share of the objective: a descent also ends once its last STALLED steps together gain less.
+        By default it does not.
 
     Returns
     -------
     Fit
         The minimum, and whether it converged. A descent that stalls, is hopeless, runs out of
-        iterations, or finds no worthwhile step although the gradient promises one, has not.
+        iterations, or finds no worthwhile step although the gradient promises one, has not. One
+        that ends by its `share` has, unless it is damped.
     """
     problem, point = fit.problem, fit.point
     damping, gains, above = 0.0, [np.inf] * STALLED, 0
