@@ -117,10 +117,10 @@ def near_data(
 
 
 def _is_last(item: Confirmed) -> bool:
-    """Whether nothing else needs to be tried beside it.
+    """Whether the search ends with this fit of a single candidate or a pair.
 
-    Beside a single candidate a second one may be found in the next step. A pair that explains the
-    shapes only just may be wrong: one left 1.46 times the noise, the hidden pair 1.18 times.
+    A second effect may be found beside a single one in the next step. A pair that barely explains
+    the shapes may be wrong: one left 1.46 times the noise, the hidden pair 1.18 times.
     """
     fit = item.fit
     reached = fit.chi2_per_dof < SURELY_REACHED

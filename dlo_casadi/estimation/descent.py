@@ -31,8 +31,9 @@ CONVERGED, NEARLY = 1e-4, 1e-2
 FIRST_DAMPING = 1e-3
 # A descent has stalled if this many steps together gain less than one converged step may.
 STALLED = 4
-# Share of the objective that STALLED steps have to gain together in a model that lacks something;
-# it is half a percent of the distances. Four such descents in space took 13 to 40 steps without it.
+# Share of the objective that STALLED steps have to gain together if the model lacks something. One
+# percent of it is half a percent of the distances. Without this limit, such descents took 13 to 40
+# steps in four sessions in space.
 MISFIT_GAIN = 1e-2
 # A descent is hopeless if its minimum is predicted above a ceiling in this many steps in a row, or
 # if the remaining steps cannot reach the ceiling with the largest of the last STALLED gains.

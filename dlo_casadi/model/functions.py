@@ -55,7 +55,10 @@ class Functions:
         return self._mapped[name]
 
     def compact(self, name: str) -> ca.Function:
-        """The function of that name for larger expressions, with few repeated operations."""
+        """The function of that name as a part of larger expressions.
+
+        Repeated operations are removed if there are many.
+        """
         if not self._is_repetitive(name):
             return getattr(self, name)
         if name not in self._compact:
@@ -63,7 +66,7 @@ class Functions:
         return self._compact[name]
 
     def _is_repetitive(self, name: str) -> bool:
-        """With a law of the bend half of a segment's operations are repeated, else a fifth."""
+        """Whether half of its operations are repeated: with a law of the bend; else a fifth is."""
         return self.terms.has_law_of_bend and name.startswith("segment")
 
     def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
