@@ -115,9 +115,19 @@ class _Moving:
         return [white @ change for white, (_, change) in zip(problem.whitening, moved, strict=True)]
 
 
-def _scan(active: Sequence[Candidate], k: int) -> dict[str, float]:
-    """Values of the k-th scan of some candidates."""
-    return {name: value for c in active for name, value in c.scans[k].items()}
+def _scan(candidates: Sequence[Candidate], k: int) -> dict[str, float]:
+    """Values of the k-th scan of candidates, or of the last one of those that have fewer."""
+    return {q: x for c in candidates for q, x in c.scans[min(k, len(c.scans) - 1)].items()}
+
+
+def _moved_together(listed: Sequence[Candidate], k: int) -> list[list[Candidate]]:
+    """Groups of candidates that share a model, of which some have a k-th scan.
+
+    Effects on the state act through all later poses, which costs more: they have their own model.
+    """
+    several = [c for c in listed if len(c.scans) > 1]
+    apart = ([c for c in several if isinstance(c.effect, StateEffect) == s] for s in (False, True))
+    return [group for group in apart if any(k < len(c.scans) for c in group)]
 
 
 def _derivatives(
@@ -128,16 +138,11 @@ def _derivatives(
     out = []
     for k in scans:
         found = {}
-        # Effects on the state act through all later poses, which costs more: separate them.
-        for state in (False, True):
-            moved = [c for c in listed if 0 < k < len(c.scans)]
-            active = [c for c in moved if isinstance(c.effect, StateEffect) == state]
-            key = tuple(candidate.name for candidate in active)
-            if not key:
-                continue
+        for group in _moved_together(listed, k) if k > 0 else ():
+            key = tuple(candidate.name for candidate in group)
             if key not in moving:
-                moving[key] = _Moving.of(fit, active)
-            found[moving[key].names] = moving[key].by_names(_scan(active, k))
+                moving[key] = _Moving.of(fit, group)
+            found[moving[key].names] = moving[key].by_names(_scan(group, k))
         out.append(found)
     return out
 
@@ -297,13 +302,14 @@ class RelaxedScreen(Screen):
         """Normal equations at scans, with each pose's own unknowns eliminated."""
         begun: dict[tuple[str, ...], _Moving] = {}
         for k in scans:
-            active = [c for c in self.listed if k < len(c.scans)]
-            names = tuple(candidate.name for candidate in active)
-            if names not in begun:
-                begun[names] = _Moving.of(self.fit, active, relaxed=True)
-            problem, values = begun[names].problem, begun[names].at(_scan(active, k))
-            normal = Relaxation(problem, self.softness).normal(values)
-            yield AtScan(active, k, normal.hessian, normal.gradient, problem.unknowns.names)
+            for group in _moved_together(self.listed, k) if k > 0 else [self.listed]:
+                names = tuple(candidate.name for candidate in group)
+                if names not in begun:
+                    begun[names] = _Moving.of(self.fit, group, relaxed=True)
+                problem, values = begun[names].problem, begun[names].at(_scan(group, k))
+                normal = Relaxation(problem, self.softness).normal(values)
+                active = [c for c in group if k < len(c.scans)]
+                yield AtScan(active, k, normal.hessian, normal.gradient, problem.unknowns.names)
 
 
 def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, FloatArray, int]:

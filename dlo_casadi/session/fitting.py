@@ -308,8 +308,8 @@ class SimplerFits:
 
 def simpler_fits(
     options: EstimationOptions, declared: CableModel, measured: Sequence[MeasuredPose], n: int
-) -> tuple[SimplerFits, list[Stage]]:
-    """The simpler fits, and their stages on a mesh of n elements."""
+) -> SimplerFits:
+    """The simpler fits, on a mesh of at most n elements."""
     # One number of a simplified model: a coarse mesh suffices.
     model = straight(declared).with_mesh(min(n, first_mesh(declared)))
     alone = fit_stiffness(model, measured)
@@ -324,8 +324,7 @@ def simpler_fits(
             inner=options.algorithm1_inner,
         )
         seconds = time.perf_counter() - began
-    found = SimplerFits(model, alone, loop, missing, seconds)
-    return found, found.stages(measured, n)
+    return SimplerFits(model, alone, loop, missing, seconds)
 
 
 def _not_applicable(

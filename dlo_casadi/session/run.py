@@ -145,11 +145,11 @@ def fit_session(
         intervals = dict.fromkeys(profiled(fit)) if diagnosed else profile_intervals(fit)
         return fit_stage("batch", fit, measured, intervals, reported)
 
-    own = staged(fit)
-    simpler, stages = compared()
-    if fit.model.n != n:
-        stages = simpler.stages(measured, fit.model.n)
+    simpler = compared()
     clock.add("algorithm1", simpler.seconds)
+    predicted = begin(executor, simpler.stages, measured, fit.model.n)
+    own = staged(fit)
+    stages = predicted()
     best = _confirmed(fit, confirming, clock)
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])
