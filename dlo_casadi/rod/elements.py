@@ -30,6 +30,7 @@ from dlo_casadi.rod.node import (
     series,
 )
 from dlo_casadi.rod.section import Section
+from dlo_casadi.rod.traced import traced
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
 _GAUSS = 0.5 / np.sqrt(3)
@@ -193,17 +194,7 @@ class Helix(Element):
 
     def local(self, first: ca.SX, last: ca.SX) -> ca.SX:
         """Frame in the middle (4,), and the rotation vector phi (3,) [rad] from node to node."""
-        x, y, z, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
-        # Halve the angle once more: the series of the arc sine then needs few terms.
-        vector, halves = ca.vertcat(x, y, z), []
-        for _ in range(2):
-            cosine = ca.sqrt((1 + w) / 2)
-            vector, w = vector / (2 * cosine), cosine
-            halves.append((vector, w))
-        phi = 8 * series(_ARCSINE, ca.sumsqr(vector)) * vector
-        half, w = halves[0]
-        middle = quaternion_product(ca.vertsplit(first), (*ca.vertsplit(half), w))
-        return ca.vertcat(*middle, phi)
+        return _between(first, last)
 
     def strain(self, segment: Segment) -> ca.SX:
         """Mean twist, and mean curvatures about the axes y and z."""
@@ -214,6 +205,23 @@ class Helix(Element):
         return segment.ratio * rotated(segment.local[:4], _turned(segment.local[4:], u - 0.5))
 
 
+@traced
+def _between(first: ca.SX, last: ca.SX) -> ca.SX:
+    """Frame in the middle of two frames, and the rotation vector from one to the other."""
+    x, y, z, w = quaternion_product(conjugate(ca.vertsplit(first)), ca.vertsplit(last))
+    # Halve the angle once more: the series of the arc sine then needs few terms.
+    vector, halves = ca.vertcat(x, y, z), []
+    for _ in range(2):
+        cosine = ca.sqrt((1 + w) / 2)
+        vector, w = vector / (2 * cosine), cosine
+        halves.append((vector, w))
+    phi = 8 * series(_ARCSINE, ca.sumsqr(vector)) * vector
+    half, w = halves[0]
+    middle = quaternion_product(ca.vertsplit(first), (*ca.vertsplit(half), w))
+    return ca.vertcat(*middle, phi)
+
+
+@traced
 def _turned(phi: ca.SX, x: ca.SX | float) -> ca.SX:
     """exp(x phi) e_x."""
     a = x * phi
@@ -251,12 +259,7 @@ class QuadraticHelix(Helix):
 
     def tangent(self, segment: Segment, u: ca.SX | float) -> ca.SX:
         """The helix's, turned by the bubble to first order."""
-        middle, phi = segment.local[:4], segment.local[4:]
-        x = u - 0.5
-        turn = (1 - 4 * x * x) * (segment.inner - x / 3 * ca.cross(phi, segment.inner))
-        across = ca.vertcat(0, turn[2], -turn[1])
-        bowed = across + x * ca.cross(phi, across)
-        return rotated(middle, segment.ratio * _turned(phi, x) + segment.stretch * bowed)
+        return _bowed(segment.local, segment.inner, segment.ratio, segment.stretch, u - 0.5)
 
     def condensed(
         self, segment: Segment, lagrangian: ca.SX, elastic: Callable[[Segment], ca.SX]
@@ -284,6 +287,17 @@ class QuadraticHelix(Helix):
         return list(ca.substitute(whole, [segment.inner], [ca.SX.zeros(3)]))
 
 
+@traced
+def _bowed(local: ca.SX, inner: ca.SX, ratio: ca.SX, stretch: ca.SX, x: ca.SX | float) -> ca.SX:
+    """`QuadraticHelix.tangent` at x from the middle of the element."""
+    middle, phi = local[:4], local[4:]
+    turn = (1 - 4 * x * x) * (inner - x / 3 * ca.cross(phi, inner))
+    across = ca.vertcat(0, turn[2], -turn[1])
+    bowed = across + x * ca.cross(phi, across)
+    return rotated(middle, ratio * _turned(phi, x) + stretch * bowed)
+
+
+@traced
 def inverse_of(a: ca.SX) -> ca.SX:
     """Inverse of a symmetric matrix (3, 3), by cofactors."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] ** 2

@@ -28,6 +28,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.rod.element import Element
 from dlo_casadi.rod.elements import inverse_of
 from dlo_casadi.rod.node import conjugate, quaternion_product
+from dlo_casadi.rod.traced import traced
 
 # (rotation vector phi (3,), internal unknowns, forces (3, m) [N]) -> energy of a segment [J].
 Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]
@@ -262,6 +263,7 @@ class _Kinematics:
         self.lever = -ca.skew(self.z) / 2
 
 
+@traced
 def _rotation(q: ca.SX) -> ca.SX:
     """Matrix (3, 3) of a unit quaternion."""
     x, y, z, w = ca.vertsplit(q)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray, unit
+from dlo_casadi.rod.traced import traced
 
 _CASADI = (ca.SX, ca.MX, ca.DM)
 
@@ -251,11 +252,9 @@ class Frame(Node):
     @staticmethod
     def moved(x: Any, delta: Any) -> Any:
         """Turn about the frames' own axes."""
-        half = [part / 2 for part in components(delta)]
-        turned = quaternion_product(components(x), (*half, 1.0))
         if isinstance(x, _CASADI):
-            scale = 1 / ca.sqrt(1 + sum((h * h for h in half), start=ca.SX(0)))
-            return ca.vertcat(*turned) * scale
+            return _frame_moved(x, delta)
+        turned = quaternion_product(components(x), (*components(delta / 2), 1.0))
         return unit(np.stack(np.broadcast_arrays(*turned), axis=-1))
 
     @staticmethod
@@ -291,9 +290,9 @@ class Frame(Node):
     @staticmethod
     def difference(x: Any, y: Any) -> Any:
         """2 tan(angle / 2) about the axis of the rotation from x to y, in the frame x."""
-        *vector, w = quaternion_product(conjugate(components(x)), components(y))
         if isinstance(x, _CASADI):
-            return ca.vertcat(*(2 * v / w for v in vector))
+            return _frame_difference(x, y)
+        *vector, w = quaternion_product(conjugate(components(x)), components(y))
         # Half a turn has an infinite increment; it is limited to a very long one.
         w = np.where(np.abs(w) < 1e-12, np.where(w < 0, -1e-12, 1e-12), w)
         return np.stack([2 * v / w for v in vector], axis=-1)
@@ -339,12 +338,27 @@ class Frame(Node):
         return bool(np.abs(gap).max() < tolerance)
 
 
+@traced
+def _frame_moved(x: ca.SX, delta: ca.SX) -> ca.SX:
+    """`Frame.moved` of expressions."""
+    half = [part / 2 for part in ca.vertsplit(delta)]
+    turned = quaternion_product(ca.vertsplit(x), (*half, 1.0))
+    return ca.vertcat(*turned) * (1 / ca.sqrt(1 + sum((h * h for h in half), start=ca.SX(0))))
+
+
+@traced
+def _frame_difference(x: ca.SX, y: ca.SX) -> ca.SX:
+    """`Frame.difference` of expressions."""
+    *vector, w = quaternion_product(conjugate(ca.vertsplit(x)), ca.vertsplit(y))
+    return ca.vertcat(*(2 * v / w for v in vector))
+
+
 NODES: dict[int, type[Node]] = {node.dimension: node for node in (Heading, Frame)}
 
 
-def components(x: Any) -> Any:
-    """Components of a vector: the rows of an expression, or the last axis of an array."""
-    return ca.vertsplit(x) if isinstance(x, _CASADI) else np.moveaxis(x, -1, 0)
+def components(x: FloatArray) -> FloatArray:
+    """Components of vectors, which are the last axis of an array."""
+    return np.moveaxis(x, -1, 0)
 
 
 def quaternion_product(p: Any, q: Any) -> tuple[Any, Any, Any, Any]:
@@ -372,6 +386,7 @@ def conjugate(q: Any) -> tuple[Any, Any, Any, Any]:
     return (-x, -y, -z, w)
 
 
+@traced
 def rotated(q: Any, vector: Any) -> ca.SX:
     """Vector (3,) turned by the unit quaternion q: v + 2 w (u x v) + 2 u x (u x v)."""
     u, w = q[:3], q[3]
@@ -379,6 +394,7 @@ def rotated(q: Any, vector: Any) -> ca.SX:
     return vector + w * once + ca.cross(u, once)
 
 
+@traced
 def rotation(vector: ca.SX) -> ca.SX:
     """Unit quaternion (x, y, z, w) of a rotation vector (3,) [rad] of less than 1.7 rad."""
     half = vector / 2
