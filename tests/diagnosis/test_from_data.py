@@ -24,7 +24,7 @@ from dlo_casadi.diagnosis.near_data import (
     near_data,
 )
 from dlo_casadi.diagnosis.refits import scored, scored_by_refit
-from dlo_casadi.diagnosis.screening import Screened
+from dlo_casadi.diagnosis.screening import RelaxedScreen, Screen, Screened
 from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
@@ -94,6 +94,25 @@ def screened(base):
 def test_a_relaxed_model_has_the_measured_shapes(base, near):
     assert near.noise.std == NOISE
     assert near.residual_rms < 2 * NOISE < base.residual_rms
+
+
+@pytest.mark.parametrize("relaxed", [False, True])
+def test_a_score_does_not_depend_on_what_is_scanned_beside_it(base, relaxed):
+    """Candidates with 1, 5, 23 and 35 trial values share models, but not their scores."""
+    fit, softness = from_data(base) if relaxed else (base, 0.0)
+    names = ("plastic_set", "tether", "stiff_section", "side_load")
+    listed = [x for x in candidates(fit.model, setup_of(fit.model, n_poses=6)) if x.name in names]
+    assert sorted(len(x.scans) for x in listed) == [1, 5, 23, 35]
+
+    def scores(*some):
+        screen = RelaxedScreen(fit, some, softness) if relaxed else Screen(fit, some)
+        return {item.candidate.name: item.score for item in screen.run(np.inf)}
+
+    together = scores(*listed)
+    # The place of an absent tether is one more soft condition: half a percent of a score.
+    near = 1e-2 if relaxed else 1e-6
+    for one in listed:
+        assert together[one.name] == pytest.approx(scores(one)[one.name], rel=near), one.name
 
 
 def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near, screened):
