@@ -78,7 +78,7 @@ def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
 
 @dataclass(frozen=True)
 class _Moving:
-    """Candidates scanned along the cable together, in a model without the other candidates.
+    """Candidates scanned together, in a model without the others.
 
     Moving a local effect that is still absent changes no shape, so only the derivatives by its own
     parameters have to be recomputed.
@@ -149,7 +149,7 @@ def _derivatives(
 
 @dataclass(frozen=True)
 class AtScan:
-    """Normal equations of the model with all candidates, those `active` at their scan `k`."""
+    """Normal equations of a model with candidates, those `active` at their scan `k`."""
 
     active: list[Candidate]
     k: int

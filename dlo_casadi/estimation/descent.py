@@ -47,6 +47,7 @@ def descend(
     steps: int = 40,
     tolerance: float = CONVERGED,
     ceiling: float = np.inf,
+    share: float = 0.0,
 ) -> Fit:
     """Levenberg-Marquardt from a problem's point, which has to be an equilibrium.
 
@@ -60,16 +61,18 @@ def descend(
         Decrease of the objective at which the fit has converged, see CONVERGED.
     ceiling : float
         Objective above which the minimum is of no interest, see HOPELESS.
+    share : float
+        Share of the objective: a descent also ends once its last STALLED steps together gain less.
+        By default it does not.
 
     Returns
     -------
     Fit
         The minimum, and whether it converged. A descent that stalls, is hopeless, runs out of
         iterations, or finds no worthwhile step although the gradient promises one, has not. One
-        that ends by MISFIT_GAIN has, unless it is damped.
+        that ends by its `share` has, unless it is damped.
     """
     problem, point = fit.problem, fit.point
-    share = MISFIT_GAIN if problem.noise.source == "misfit" else 0.0
     damping, gains, above = 0.0, [np.inf] * STALLED, 0
     lin = fit.linearization
     normal = problem.step_equations(point, lin)

@@ -11,7 +11,7 @@ from dlo_casadi.effects import Setup
 from dlo_casadi.effects.cable import height_of
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.descent import descend, on_other_mesh, refit
+from dlo_casadi.estimation.descent import MISFIT_GAIN, descend, on_other_mesh, refit
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
@@ -193,14 +193,14 @@ def fit_to_misfit(near: Fit) -> Fit:
 
     If an effect is missing, a fit to a fraction of a millimetre distorts every free unknown and
     ends where single poses lose their equilibrium (folds). The minimum is approximate, see
-    MISFIT_GAIN in descent.py.
+    MISFIT_GAIN.
     """
     doubted = near.noise.doubted(MISFIT_STD * near.model.cable.length)
     noise = replace(doubted, source="misfit", before=near.noise)
     priors = Priors.of(near.problem.priors.tolerances, near.model)
     # Ends that may deviate in each pose would absorb what is missing, and predict worse.
     priors = replace(priors, scatter=SCATTER_FLOOR * priors.scatter)
-    return descend(near.reweighed(noise, priors))
+    return descend(near.reweighed(noise, priors), share=MISFIT_GAIN)
 
 
 # ---- meshes ------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.errors import ConfigError, EstimationError
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.descent import CONVERGED, descend, least_decrease
+from dlo_casadi.estimation.descent import CONVERGED, MISFIT_GAIN, descend, least_decrease
 from dlo_casadi.estimation.fit import (
     explains,
     fine_enough,
@@ -412,6 +412,7 @@ def _from_simpler(fit: Fit, simpler: Stage, better: bool, ceiling: float = np.in
     if point is None or (not better and point.objective >= fit.point.objective):
         return []
     found = [Fit(problem, point)]
+    share = MISFIT_GAIN if fit.noise.source == "misfit" else 0.0
     with suppress(EstimationError):  # at a fold of its equilibria
-        found.append(descend(found[0], ceiling=ceiling))
+        found.append(descend(found[0], ceiling=ceiling, share=share))
     return found

@@ -147,9 +147,8 @@ def fit_session(
 
     simpler = compared()
     clock.add("algorithm1", simpler.seconds)
-    predicted = begin(executor, simpler.stages, measured, fit.model.n)
     own = staged(fit)
-    stages = predicted()
+    stages = simpler.stages(measured, fit.model.n)
     best = _confirmed(fit, confirming, clock)
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])

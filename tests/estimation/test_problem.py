@@ -25,9 +25,10 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation import descent
+from dlo_casadi.estimation import fit as fit_module
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.fit import fit_model, fit_to_misfit
 from dlo_casadi.estimation.point import Normal, Point, Values
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
@@ -445,26 +446,31 @@ def test_a_descent_is_given_up_if_its_steps_are_too_short(depth, steps, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("source", "needed", "steps", "converged"),
-    [("declared", 0.0, 10, False), ("misfit", 0.0, 4, True), ("misfit", 0.1, 4, False)],
+    ("share", "needed", "steps", "converged"),
+    [(0.0, 0.0, 10, False), (0.1, 0.0, 4, True), (0.1, 0.1, 4, False)],
 )
-def test_a_misfit_need_not_be_known_exactly(source, needed, steps, converged, monkeypatch):
-    """Each step gains a tenth of a percent, four less than one; if damped, they may creep."""
+def test_a_misfit_need_not_be_known_exactly(share, needed, steps, converged, monkeypatch):
+    """Each step gains one percent, and four less than a tenth; if damped, they may creep."""
     start, taken = start_without_a_mass(), []
-    noise = replace(start.noise, source=source)
-    start = replace(start, problem=replace(start.problem, noise=noise))
 
     def ahead(problem, point, lin, model, damping, *_):
         if damping < needed:
             return None
         taken.append(point)
-        return replace(point, objective=0.999 * point.objective)
+        return replace(point, objective=0.99 * point.objective)
 
     monkeypatch.setattr(descent, "_ahead", ahead)
     monkeypatch.setattr(descent, "least_decrease", lambda *_: 0.0)
     monkeypatch.setattr(Normal, "promised", lambda *_: np.inf)
-    assert descend(start, steps=10).converged is converged
+    assert descend(start, steps=10, share=share).converged is converged
     assert len(taken) == steps
+
+
+def test_a_fit_to_its_misfit_is_such_a_descent(monkeypatch):
+    asked = []
+    monkeypatch.setattr(fit_module, "descend", lambda near, **given: asked.append(given) or near)
+    assert fit_to_misfit(start_without_a_mass()).noise.source == "misfit"
+    assert asked == [{"share": descent.MISFIT_GAIN}]
     assert 0 < descent.MISFIT_GAIN < 0.02  # one percent of the distances
 
 

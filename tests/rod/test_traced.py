@@ -4,8 +4,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from dlo_casadi.rod.elements import Helix, inverse_of
-from dlo_casadi.rod.node import Frame, rotated, rotation
+from dlo_casadi.rod import elements, in_frame, node
+from dlo_casadi.rod.elements import Helix
+from dlo_casadi.rod.node import Frame, rotation
 from dlo_casadi.rod.traced import traced
 
 
@@ -16,7 +17,17 @@ def random(*sizes):
 
 @pytest.mark.parametrize(
     ("function", "sizes"),
-    [(rotated, (4, 3)), (rotation, (3,)), (inverse_of, ((3, 3),))],
+    [
+        (node.rotated, (4, 3)),
+        (node.rotation, (3,)),
+        (node._frame_moved, (4, 3)),
+        (node._frame_difference, (4, 4)),
+        (elements._between, (4, 4)),
+        (elements._turned, (3, 1)),
+        (elements._bowed, (7, 3, 1, 1, 1)),
+        (elements.inverse_of, ((3, 3),)),
+        (in_frame._rotation, (4,)),
+    ],
     ids=lambda x: getattr(x, "__name__", None),
 )
 def test_values_and_number_of_operations_are_the_same(function, sizes):
@@ -29,7 +40,7 @@ def test_values_and_number_of_operations_are_the_same(function, sizes):
     np.testing.assert_array_equal(*values)
 
 
-def test_a_function_is_traced_once_for_all_sizes_of_its_arguments():
+def test_a_function_is_traced_once_for_each_size_of_its_arguments():
     calls = []
 
     @traced
@@ -41,6 +52,7 @@ def test_a_function_is_traced_once_for_all_sizes_of_its_arguments():
     assert ca.is_equal(scaled(x, 2.0), 2.0 * x, 3)
     assert ca.is_equal(scaled(y, 0.0), ca.SX.zeros(2), 3)
     assert ca.is_equal(scaled(ca.vertcat(x, y), 2), 2 * ca.vertcat(x, y), 3)
+    assert ca.is_equal(scaled(x, ca.DM(2)), 2.0 * x, 3)
     assert calls == [(2, 1), (4, 1)]
 
 
