@@ -188,6 +188,7 @@ class Search:
     def _searched(self) -> Found:
         """Search from the measured shapes: first if the fit leaves far more than noise, else last.
 
+        If the first one finds nothing, that does not count: only the nearest candidates were tried.
         A scatter from pose to pose explains anything: if the declared model and the result have
         one, the search is repeated as if there were none, then also from the measured shapes.
         """
@@ -195,7 +196,7 @@ class Search:
         may_be_far = self.several and self.declared.noise.source != "misfit"
         # In such a fit the first effect may stand for two; the next ones then only fit its error.
         first = of_shapes.run() if may_be_far and not explains(self.declared) else None
-        if first is not None and not first.unexplained:
+        if first is not None and first.added and not first.unexplained:
             return first
         found = self._forwards()
         if self.several and found.fit.scatters and self.declared.scatters:

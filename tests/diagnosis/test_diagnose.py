@@ -242,6 +242,22 @@ def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, mon
     assert searched == ([False, True] if scatter else [False])
 
 
+def test_shapes_near_which_nothing_is_found_do_not_end_the_search(found, fit, monkeypatch):
+    """A drift and a stretch left 1.64 times the noise; from the shapes none was significant."""
+    ended = Found.of(found.after, found.added, found.ranked, 12, 0.005)
+    searched = []
+
+    def run(search):
+        searched.append(search.from_shapes)
+        return replace(ended, added=()) if search.from_shapes else ended
+
+    monkeypatch.setattr(module, "explains", lambda _: False)
+    monkeypatch.setattr(Search, "run", run)
+    monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
+    assert diagnose(fit).verdict == "effect_found"
+    assert searched == [True, False]
+
+
 def test_only_rivals_of_the_same_search_tell_which_refit_is_given_up(monkeypatch):
     """An effect that a search among simpler ones excludes may stand for two of them."""
     ceilings = []
