@@ -13,7 +13,7 @@ SIGNIFICANCE = 0.005
 # below the share that effects keep: more than 1e-6 on twelve sessions of centre-lines.
 COLLINEAR = 1e-7
 # Number of scanned places that count as one independent test: neighbouring places, a few
-# hundredths of the length apart, are correlated; long sections overlap with more than half.
+# hundredths of the length apart, are correlated.
 SCANS_PER_TEST = 3
 # Step of the coarse scan, in places. Places between are scanned around a candidate's best place if
 # its p-value there is below IN_QUESTION. Ten times the significance: a score higher by a fifth than

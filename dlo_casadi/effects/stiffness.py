@@ -71,7 +71,7 @@ class StiffSection(SectionLaw):
         )
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
-        """Try short and long sections all along the cable, long ones at every second place."""
+        """Try short and long sections all along the cable."""
         length = setup.cable.length
         return tuple(
             {
@@ -79,7 +79,7 @@ class StiffSection(SectionLaw):
                 "end": float(min(share + width / 2, 1.0) * length),
             }
             for width in SECTIONS
-            for share in PLACES[:: int(width / SECTIONS[0])]
+            for share in PLACES
         )
 
     def place(self, values: Mapping[str, float]) -> float:
