@@ -188,7 +188,7 @@ class Search:
     def _searched(self) -> Found:
         """Search from the measured shapes: first if the fit leaves far more than noise, else last.
 
-        If the first one finds nothing, that does not count: only the nearest candidates were tried.
+        A first search that finds nothing does not count: it has tried the nearest candidates only.
         A scatter from pose to pose explains anything: if the declared model and the result have
         one, the search is repeated as if there were none, then also from the measured shapes.
         """

@@ -78,7 +78,7 @@ def extended(fit: Fit, listed: Sequence[Candidate]) -> CableModel:
 
 @dataclass(frozen=True)
 class _Moving:
-    """Candidates scanned together, in a model without the others.
+    """Candidates moved from scan to scan together, in a model without the others.
 
     Moving a local effect that is still absent changes no shape, so only the derivatives by its own
     parameters have to be recomputed.
@@ -121,7 +121,7 @@ def _scan(candidates: Sequence[Candidate], k: int) -> dict[str, float]:
 
 
 def _moved_together(listed: Sequence[Candidate], k: int) -> list[list[Candidate]]:
-    """Groups of candidates that share a model, of which some have a k-th scan.
+    """Groups of candidates that share a model; in each some have a k-th scan.
 
     Effects on the state act through all later poses, which costs more: they have their own model.
     """
