@@ -13,6 +13,13 @@ import numpy as np
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates_of, equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.from_data import from_data
+from dlo_casadi.diagnosis.from_pose_to_pose import (
+    as_repeating,
+    at_random_instead,
+    may_gain,
+    with_moved_ends,
+)
 from dlo_casadi.diagnosis.near_data import near_data
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
@@ -24,7 +31,6 @@ from dlo_casadi.diagnosis.selection import (
     Ranked,
     added_by,
     choose,
-    likelier_by,
     p_of_removal,
     ranking,
     with_new_noise,
@@ -35,8 +41,6 @@ from dlo_casadi.effects import PointLoad, StateEffect
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import (
     FINEST_MESH,
-    as_repeating,
-    at_random,
     explains,
     fine_enough,
     misfits,
@@ -139,6 +143,11 @@ class Search:
         return self._screened(self.declared)
 
     @cached_property
+    def relaxed(self) -> tuple[Fit, float]:
+        """The declared model relaxed at the measured shapes, see `from_data`."""
+        return from_data(self.declared)
+
+    @cached_property
     def refitted(self) -> dict[str, Confirmed | None]:
         """Refits of the declared model with a candidate, by name, made only as needed."""
         return self.wider.refitted if self.wider is not None else {}
@@ -156,8 +165,13 @@ class Search:
 
     def diagnosis(self) -> Diagnosis:
         """Result of the search, without effects that explain too little."""
-        fit, found, force = self.declared, self._searched(), None
-        near = self.at_random(found)
+        fit, force = self.declared, None
+        misfit = fit.noise.source == "misfit"
+        near = with_moved_ends(self.relaxed[0], self.finest) if misfit else None
+        if near is not None:
+            return replace(self, declared=near).diagnosis()
+        found = self._searched()
+        near = at_random_instead(fit, found, self.finest) if misfit else None
         if near is not None:
             return replace(self, declared=near).diagnosis()
         if found.unexplained:
@@ -202,8 +216,11 @@ class Search:
         if self.several and found.fit.scatters and self.declared.scatters:
             with suppress(EstimationError):
                 repeating = replace(self, declared=as_repeating(self.declared))
-                found = found.or_better(repeating._forwards(), EVIDENCE_APART)
-        if may_be_far and (found.unexplained or found.fit.scatters):
+                if may_gain(repeating.declared, repeating.first, self.declared):
+                    found = found.or_better(repeating._forwards(), EVIDENCE_APART)
+        # Ends of each pose's own hardly imitate an effect, see `with_moved_ends`.
+        imitated = found.fit.scatters and not found.fit.problem.random_std.any()
+        if may_be_far and (found.unexplained or imitated):
             found = found.or_better(first or of_shapes.run())
         # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.validation.complete
@@ -258,7 +275,9 @@ class Search:
         """Candidates screened and refitted beside those already added."""
         if self._starts_at_shapes(current) and force is None:
             pairs = added + 2 <= self.max_effects
-            return near_data(current, self.executor, self.center, self.exclude, pairs=pairs)
+            near = self.relaxed if current is self.declared else from_data(current)
+            among = self.executor, self.center, self.exclude
+            return near_data(current, near, *among, pairs=pairs)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:
@@ -298,23 +317,6 @@ class Search:
         force = estimate_unknown_force(start, self.executor)
         causes = self.run(force) if force is not None and self.several else None
         return found.or_better(causes), force
-
-    def at_random(self, found: Found) -> Fit | None:
-        """The declared model with random effects, if it misfits and they explain it equally well.
-
-        Effects found in a misfit were never tested against the scatter that they leave: the mean
-        over 12 poses of a scatter of 8 mm was taken for an offset. From this fit on they are.
-        """
-        if self.declared.noise.source != "misfit" or not (found.unexplained or found.fit.scatters):
-            return None
-        near = at_random(self.declared)
-        if near is None:
-            return None
-        if self.finest:
-            n = max(near.model.n, min(found.fit.model.n, self.finest))
-            near = fine_enough(near, n, finest=self.finest)[0]
-        likelier = found.unexplained or likelier_by(found.fit, near) > -EVIDENCE_APART
-        return near if likelier and explains(near) else None
 
     def _pruned(self, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
         """Backward step: remove effects that later ones have made superfluous.

@@ -20,7 +20,6 @@ from dlo_casadi.diagnosis.from_data import (
     REACHED,
     SURELY_REACHED,
     RelaxedStart,
-    from_data,
     likeliest,
     nearest,
     screened_from_data,
@@ -62,6 +61,7 @@ def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
 
 def near_data(
     base: Fit,
+    relaxed: tuple[Fit, float],
     executor: Executor,
     center: tuple[float, float] | None,
     exclude: Sequence[str],
@@ -74,9 +74,9 @@ def near_data(
     fitted first, unless their starts leave far more than the best one. If the best candidate does
     not explain the shapes, or only by a scatter, its end roll is searched again, then that of the
     next. If all fits misfit, too, pairs are tried even where a single candidate's start came close
-    to the noise.
+    to the noise. `relaxed`: the relaxed base and its softness, see `from_data`.
     """
-    near, softness = from_data(base)
+    near, softness = relaxed
     screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
     likely = likeliest(screened)
     contacts = [x for x in screened if not x.candidate.effect.gradual]

@@ -77,6 +77,10 @@ class ClampAngle(ClampTurn):
     dimensions = (2,)
     errors = ("heading_error",)
     tolerances: ClassVar = {"start_heading_error": "heading", "end_heading_error": "heading"}
+    as_deviation: ClassVar = {
+        "start_heading_error": "start_heading",
+        "end_heading_error": "end_heading",
+    }
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Turn the clamps."""
@@ -101,6 +105,12 @@ class ClampRotation(ClampTurn):
     dimensions = (3,)
     errors = ("y", "z")
     tolerances: ClassVar = dict.fromkeys(("start_y", "start_z", "end_y", "end_z"), "rotation")
+    as_deviation: ClassVar = {
+        "start_y": "start_rotation_y",
+        "start_z": "start_rotation_z",
+        "end_y": "end_rotation_y",
+        "end_z": "end_rotation_z",
+    }
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:
         """Turn the clamps."""

@@ -104,6 +104,8 @@ class Effect:
     # Words for what differs between poses if the parameters are random from pose to pose; empty if
     # this is never tried.
     at_random: ClassVar[str] = ""
+    # Parameter -> the deviation of a pose, see `deviation_names`, that has the same effect.
+    as_deviation: ClassVar[Mapping[str, str]] = {}
     # Whether tables of parameters list it while it is a nuisance.
     shown: ClassVar[bool] = True
     # Whether the effect applies in the plane (2), in space (3).

@@ -21,6 +21,7 @@ class EndOffset(BoundaryEffect):
     name = "end_offset"
     at_random = "an end displaced by a vector of its own"
     tolerances: ClassVar = {"dx": "end", "dy": "end", "dz": "end"}
+    as_deviation: ClassVar = {"dx": "end_x", "dy": "end_y", "dz": "end_z"}
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the offset."""

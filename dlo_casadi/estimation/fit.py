@@ -23,7 +23,6 @@ from dlo_casadi.estimation.variances import (
     SMOOTH_MODES,
     errors_of,
     first_reading_noise,
-    pose_scatter_of,
     refine,
 )
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -123,27 +122,6 @@ def fit_model(
             if near and errors_of(near, estimated=not near.noise.known, repeats=False)[1].std > 0:
                 return max(fit, refine(near, first=True), key=lambda found: found.log_evidence)
     return fit
-
-
-def as_repeating(fit: Fit) -> Fit:
-    """Refit as if nothing differed at random from pose to pose, with the noise as it is."""
-    return descend(fit.reweighed(priors=replace(fit.problem.priors, pose_scatter=PoseScatter())))
-
-
-def at_random(fit: Fit) -> Fit | None:
-    """Refit of a misfit with a random effect from pose to pose, if that explains it; else None."""
-    different = different_poses(fit.problem.history, fit.model)
-    if fit.noise.source != "misfit" or different < DIFFERENT:
-        return None
-    known = fit.noise.before or fit.noise
-    found = pose_scatter_of(fit.reweighed(known), known).scatter
-    if not found.std:
-        return None
-    with suppress(EstimationError):
-        priors = replace(fit.problem.priors, pose_scatter=found)
-        near = refine(fit.reweighed(known, priors), first=True)
-        return near if explains(near) else None
-    return None
 
 
 def _minimum(problem: Problem, theta: FloatArray) -> Fit:

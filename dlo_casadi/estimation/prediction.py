@@ -368,7 +368,7 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     """
     names, covariance = fit.named_covariance
     used = [fit.model.deviation_names[k] for k in fit.problem.equilibria.used_deviations]
-    scatter = dict(zip(used, map(float, fit.problem.deviation_std), strict=True))
+    scatter = dict(zip(used, map(float, fit.problem.fixture_std), strict=True))
     history, apart = fit.problem.history, 0.0
     if different_poses(history, fit.model) < DIFFERENT:
         apart = repeat_std(history, fit.model, fit.noise.of_points.beside_repeats)

@@ -147,9 +147,20 @@ class Problem:
         return self._prior[1]
 
     @property
+    def fixture_std(self) -> FloatArray:
+        """Scatter of the fixtures within their tolerances: of the deviations that the model has."""
+        return self.priors.scatter[self.equilibria.used_deviations]
+
+    @cached_property
+    def random_std(self) -> FloatArray:
+        """Scatter of the same deviations from pose to pose beyond that, see `pose_scatter`."""
+        of_deviations = self.priors.pose_scatter.of_deviations(self.unknowns.model)
+        return of_deviations[self.equilibria.used_deviations]
+
+    @cached_property
     def deviation_std(self) -> FloatArray:
         """Standard deviations of the deviations that the model has."""
-        return self.priors.scatter[self.equilibria.used_deviations]
+        return np.hypot(self.fixture_std, self.random_std)
 
     @property
     def n_residuals(self) -> int:
@@ -172,12 +183,13 @@ class Problem:
 
         The covariance of pose j is that of its noise plus E_j E_j^T. Column k of E_j is the change
         of the residuals by one standard deviation of mode k of the pose's own rest curvature.
+        Random deviations of the ends are unknowns instead, and may be large.
         """
         weights = [
             self.measured[j].whitening(self.noise, s)
             for j, s in zip(self.used, values.projections, strict=True)
         ]
-        for k, way in enumerate(self.own_errors(values)):
+        for k, way in enumerate([] if self.random_std.any() else self.own_errors(values)):
             if not way.size:
                 continue
             seen = weights[k] @ way

@@ -235,7 +235,9 @@ class Fit:
             by_errors = taken @ column
             errors += float(by_errors @ by_errors)
             own += float(((by_errors @ white @ way) ** 2).sum())
-        parts = (errors - own) ** 2 / self.noise.slow_dof + own**2 / rest.dof
+        # The weights contain what is random, unless the deviations of the ends do.
+        noise = errors if problem.random_std.any() else errors - own
+        parts = noise**2 / self.noise.slow_dof + own**2 / rest.dof
         parts /= column[index] ** 2
         return max(LEAST_NOISE_DEGREES, 1 / parts) if parts > 0 else np.inf
 
@@ -291,7 +293,7 @@ class Fit:
     @property
     def _by_fixtures(self) -> list[FloatArray]:
         """Variance (R_j,) of each residual caused by the deviations of a pose's ends."""
-        size, std = self.problem.unknowns.size, self.problem.deviation_std
+        size, std = self.problem.unknowns.size, self.problem.fixture_std
         return [
             ((directions[:, size:] * std) ** 2).sum(axis=1)
             for directions in self.linearization.raw_directions

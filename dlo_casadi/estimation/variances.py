@@ -202,7 +202,7 @@ def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
 
 def _beyond_tolerances(fit: Fit) -> bool:
     """Whether the poses' ends deviate from declared values significantly beyond their scatter."""
-    own = fit.own_deviations / fit.problem.deviation_std
+    own = fit.own_deviations / fit.problem.fixture_std
     return bool((own**2).sum() > own.size + 2 * np.sqrt(2 * own.size))
 
 
@@ -211,7 +211,7 @@ def _scatters_of(
 ) -> list[ScatterEstimate]:
     """Size of each random quantity of a repeat, estimated as the only one."""
     problem, point, lin = fit.problem, fit.point, fit.linearization
-    size, std = problem.unknowns.size, problem.deviation_std
+    size, std = problem.unknowns.size, problem.fixture_std
     kept = range(0, len(problem.used), -(-len(problem.used) // MOST_POSES))
     poses = []
     for k in kept:
@@ -336,7 +336,9 @@ def scatter_of(fit: Fit) -> FloatArray:
     # a third.
     d, b = node.dimension, node.increment
     for group in (range(d), range(d, d + 2 * b), range(2 * (d + b), len(scatter))):
-        members = [k for k, column in enumerate(columns) if column in group]
+        # Where they differ at random beyond the tolerance, nothing tells the tolerance's part.
+        random = problem.random_std > 0
+        members = [k for k, column in enumerate(columns) if column in group and not random[k]]
         if members:
             known = max(determined[members].sum(), 0.0)
             unknown = max(1 - known / (len(members) * len(problem.used)), 1e-6)

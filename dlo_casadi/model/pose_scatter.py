@@ -74,6 +74,19 @@ class PoseScatter:
         """Parameters of `within(model)`, given those of the model."""
         return np.concatenate([p, np.zeros(len(self.within(model).names) - len(p))])
 
+    def of_deviations(self, model: CableModel) -> FloatArray:
+        """Standard deviations (n_deviations,) of a pose's deviations that have the same effect.
+
+        Zeros if it is no deviation of the ends.
+        """
+        names, std = model.deviation_names, np.zeros(len(model.deviation_names))
+        effect = effect_of(self.source, model)
+        if effect is not None:
+            for q in effect.parameters(model.cable):
+                if q.name in effect.as_deviation:
+                    std[names.index(effect.as_deviation[q.name])] = self.std
+        return std
+
     def ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
         """Directions (n_parameters, q), (n_rests, q) of parameters and rests of `within(model)`.
 

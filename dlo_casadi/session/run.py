@@ -10,12 +10,13 @@ import numpy as np
 
 from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.diagnosis.from_data import from_data
+from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_moved_ends
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
 from dlo_casadi.estimation.fit import (
     SEARCH_MESH,
-    at_random,
     fine_enough,
     mesh_error,
     refine_mesh,
@@ -153,7 +154,8 @@ def fit_session(
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])
     if not diagnosed:
-        near = at_random(fit)
+        misfit = fit.noise.source == "misfit"
+        near = (with_moved_ends(from_data(fit)[0]) or at_random(fit)) if misfit else None
         if near is not None:
             fit, error = near, mesh_error(near)
             if not config.model.n:

@@ -11,9 +11,11 @@ import pytest
 
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis import diagnose as module
+from dlo_casadi.diagnosis import from_pose_to_pose
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search, diagnose
+from dlo_casadi.diagnosis.from_pose_to_pose import at_random_instead
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.selection import Found
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
@@ -138,10 +140,10 @@ def test_an_effect_found_in_a_misfit_has_to_hold_beside_the_scatter_from_pose_to
         return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, **known)
 
     near = scattering(3040.0 - behind)
-    monkeypatch.setattr(module, "at_random", lambda _: near)
-    search = Search(scattering(0.0, "misfit"), None, (), 0.005, 4, lambda *_: None, None)
+    monkeypatch.setattr(from_pose_to_pose, "at_random", lambda _: near)
     found = SimpleNamespace(fit=scattering(3040.0), unexplained=False)
-    assert search.at_random(found) is (near if again else None)
+    other = at_random_instead(scattering(0.0, "misfit"), found)
+    assert other is (near if again else None)
 
 
 def test_evidence_of_scatter_and_of_effects_is_compared_on_one_mesh(monkeypatch):
@@ -154,14 +156,14 @@ def test_evidence_of_scatter_and_of_effects_is_compared_on_one_mesh(monkeypatch)
         return SimpleNamespace(log_evidence=evidence, noise=noise, problem=problem, **known)
 
     coarse, fine = scattering(3065.6, 10), scattering(3072.0, 15)
-    monkeypatch.setattr(module, "at_random", lambda _: coarse)
+    monkeypatch.setattr(from_pose_to_pose, "at_random", lambda _: coarse)
     refined = {10: coarse, 15: fine}
-    monkeypatch.setattr(module, "fine_enough", lambda _, n, finest: (refined[n], 0.0))
-    search = Search(scattering(0.0, 10, "misfit"), None, (), 0.005, 4, lambda *_: None, None, 80)
+    monkeypatch.setattr(from_pose_to_pose, "fine_enough", lambda _, n, finest: (refined[n], 0.0))
+    misfit = scattering(0.0, 10, "misfit")
     found = SimpleNamespace(fit=scattering(3072.3, 15), unexplained=False)
-    assert search.at_random(found) is fine
+    assert at_random_instead(misfit, found, 80) is fine
     refined[15] = scattering(3072.0, 15, chi2=676.0)  # the fit was lost on the finer mesh
-    assert search.at_random(found) is None
+    assert at_random_instead(misfit, found, 80) is None
 
 
 def test_the_score_predicts_the_gain_of_a_refit(session):

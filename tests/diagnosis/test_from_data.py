@@ -371,7 +371,6 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
 
     asked = []
     monkeypatch.setattr(RelaxedStart, "of", start)
-    monkeypatch.setattr(fits_near_data, "from_data", lambda _: (None, 0.01))
     monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
     screened = [named(name, gradual=name != "table") for name in left]
     monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: screened)
@@ -380,7 +379,7 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
     )
     monkeypatch.setattr(fits_near_data, "nearest", lambda *_, **__: [])
     monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *_: [])
-    tried = near_data(None, InProcess(), None, (), pairs=False)
+    tried = near_data(None, (None, 0.01), InProcess(), None, (), pairs=False)
     assert [x.names for x in asked] == [{"table"}] * fitted
     assert set(tried.far) == set(left)
 
@@ -398,7 +397,6 @@ def test_a_pair_ends_the_search_only_if_it_surely_explains_the_shapes(
     item = SimpleNamespace(fit=fit, beside=beside, each=(tether,), screened=tether)
     begun = SimpleNamespace(screened=tether, names={"tether"}, left=1.0)
     monkeypatch.setattr(RelaxedStart, "of", lambda *_: begun)
-    monkeypatch.setattr(fits_near_data, "from_data", lambda _: (None, 0.01))
     monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
     monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: [tether])
     monkeypatch.setattr(fits_near_data, "nearest", lambda *_, **__: iter([[begun], [begun]]))
@@ -406,7 +404,7 @@ def test_a_pair_ends_the_search_only_if_it_surely_explains_the_shapes(
         fits_near_data, "confirmed", lambda _, starts, *__, **___: (asked.append(1) or [], [item])
     )
     monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *args: args[2])
-    near_data(None, InProcess(), None, (), pairs=True)
+    near_data(None, (None, 0.01), InProcess(), None, (), pairs=True)
     assert len(asked) == lists
 
 

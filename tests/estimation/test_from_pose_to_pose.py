@@ -1,6 +1,7 @@
 """What differs at random from pose to pose is named, sized, and does not pull the stiffness."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import hidden_sets
 import numpy as np
@@ -9,6 +10,8 @@ from hidden_sets import simulated
 
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
+from dlo_casadi.diagnosis.from_data import from_data
+from dlo_casadi.diagnosis.from_pose_to_pose import as_repeating, may_gain, with_moved_ends
 from dlo_casadi.diagnosis.refits import confirm
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import EFFECTS, CableData
@@ -16,7 +19,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, gap_std_of_repeats
 from dlo_casadi.estimation.constrained import profile_interval
-from dlo_casadi.estimation.fit import as_repeating
+from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, sources_in
@@ -25,7 +28,7 @@ from dlo_casadi.runtime.parallel import generator_of
 from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.session.measure import measured_poses, read_inputs
 from dlo_casadi.session.stages import fit_stage
-from dlo_casadi.thresholds import EVIDENCE_APART, SIGNIFICANCE
+from dlo_casadi.thresholds import DIFFERENT, EVIDENCE_APART, SIGNIFICANCE
 
 PLANE = CableData(0.6, 0.04, 0.005, 0.01)
 SPACE = CableData(0.6, 0.04, 0.005, 0.01, torsional_stiffness=0.008)
@@ -73,16 +76,93 @@ def test_displacements_are_those_of_shapes_solved_anew(case):
             assert found[:, :, k] == pytest.approx(there, rel=1e-4, abs=1e-7 * sizes[k])
 
 
-def test_turned_clamps_are_named_and_leave_the_stiffness_alone():
+def test_random_ends_are_deviations_of_the_ends():
+    pins, clamps, space = (model for model, _ in MODELS.values())
+    ends = {"end_x": 2.0, "end_y": 2.0}
+    turns = dict.fromkeys([f"{side}_rotation_{axis}" for side in ("start", "end") for axis in "yz"])
+    for model, source, deviations in (
+        (pins, "end_offset", ends),
+        (pins, "pin_moment", {}),
+        (clamps, "clamp_angle", {"start_heading": 2.0, "end_heading": 2.0}),
+        (clamps, "length_error", {}),
+        (clamps, REST_CURVATURE, {}),
+        (space, "end_offset", {**ends, "end_z": 2.0}),
+        (space, "clamp_rotation", dict.fromkeys(turns, 2.0)),
+    ):
+        std = PoseScatter(2.0, source=source).of_deviations(model)
+        found = {name: x for name, x in zip(model.deviation_names, std, strict=True) if x}
+        assert found == deviations
+
+
+@pytest.fixture(scope="module")
+def turned():
+    """A session in the plane whose clamps turn from pose to pose, and its declared fit."""
     found = simulated(generator_of(7, 1), 2, 0, "clamp_angle")
-    session = found.session
-    measured = measured_poses(session, read_inputs(session))
-    fit, _ = fit_declared(session, declared_model(session), measured)
+    measured = measured_poses(found.session, read_inputs(found.session))
+    return found, fit_declared(found.session, declared_model(found.session), measured)[0]
+
+
+def test_evidence_of_random_ends_is_that_of_their_covariance(turned):
+    """Ends as unknowns of each pose, as if their covariance were added to that of the noise."""
+    fit = turned[1]
+    problem, lin = fit.problem, fit.linearization
+    away, precision = fit.point.theta - problem.mean, problem.precision
+
+    def expected(std):
+        """Log likelihood with ends and theta integrated out, to first order about `fit`."""
+        variances = problem.fixture_std**2 + (std * (problem.random_std > 0)) ** 2
+        gradient, hessian, rest = precision @ away, precision.copy(), away @ precision @ away
+        rows = zip(lin.residuals, lin.by_theta, lin.by_deviation, fit.own_deviations, strict=True)
+        for e, a, b, own in rows:
+            covariance, e = np.eye(len(e)) + (b * variances) @ b.T, e - b @ own
+            solved = np.linalg.solve(covariance, np.column_stack([a, e]))
+            hessian += a.T @ solved[:, :-1]
+            gradient = gradient + a.T @ solved[:, -1]
+            rest += e @ solved[:, -1] + np.linalg.slogdet(covariance)[1]
+        rest += np.linalg.slogdet(hessian)[1] - gradient @ np.linalg.solve(hessian, gradient)
+        return -rest / 2
+
+    def found(std):
+        scatter = replace(problem.priors.pose_scatter, std=std)
+        return descend(fit.reweighed(priors=replace(problem.priors, pose_scatter=scatter)))
+
+    std = problem.priors.pose_scatter.std
+    for other in (0.8 * std, 1.25 * std):
+        gain = found(other).log_evidence - found(std).log_evidence
+        assert gain == pytest.approx(expected(other) - expected(std), abs=0.05)
+
+
+def test_turned_clamps_are_named_and_leave_the_stiffness_alone(turned):
+    found, fit = turned
     own = fit.problem.priors.pose_scatter
     assert own.source == "clamp_angle"
     assert own.std == pytest.approx(found.values["random.clamp_angle"], rel=0.5)
     interval = profile_interval(fit)
     assert interval.low < found.values["bending_stiffness"] < interval.high
+
+
+def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes():
+    """To first order about the misfit no random effect explained this session."""
+    found = simulated(generator_of(3306, 6), 3, 0, "clamp_rotation")
+    measured = measured_poses(found.session, read_inputs(found.session))
+    fit, _ = fit_declared(found.session, declared_model(found.session), measured)
+    assert fit.noise.source == "misfit"
+    near = with_moved_ends(from_data(fit)[0])
+    own = near.problem.priors.pose_scatter
+    assert own.source == "clamp_rotation"
+    assert own.std == pytest.approx(found.values["random.clamp_rotation"], rel=0.2)
+    assert near.chi2_per_dof == pytest.approx(1.0, abs=0.15)
+    interval = profile_interval(near)
+    assert interval.low < found.values["bending_stiffness"] < interval.high
+    # A single pose less than the fewest that show what differs from pose to pose.
+    few = replace(near.problem, history=near.problem.history[: DIFFERENT - 1])
+    assert with_moved_ends(SimpleNamespace(problem=few, model=near.model)) is None
+
+
+@pytest.mark.parametrize(("score", "worth"), [(40.0, False), (60.0, True)])
+def test_effects_without_a_scatter_are_sought_where_a_score_promises_as_much(score, worth):
+    repeating, scattering = (SimpleNamespace(log_evidence=x) for x in (0.0, 100.0))
+    assert may_gain(repeating, [SimpleNamespace(score=score)], scattering) is worth
 
 
 def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_with(monkeypatch):
