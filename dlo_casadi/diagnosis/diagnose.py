@@ -17,7 +17,6 @@ from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     at_random_instead,
-    may_gain,
     with_moved_ends,
 )
 from dlo_casadi.diagnosis.near_data import near_data
@@ -55,6 +54,7 @@ from dlo_casadi.thresholds import (
     EVIDENCE_APART,
     LARGER_OF_TWO,
     LEFT,
+    PROMISED,
     REFITTED,
     SIGNIFICANCE,
     WORTH,
@@ -204,7 +204,8 @@ class Search:
 
         A first search that finds nothing does not count: it has tried the nearest candidates only.
         A scatter from pose to pose explains anything: if the declared model and the result have
-        one, the search is repeated as if there were none, then also from the measured shapes.
+        one, the search is repeated as if there were none, unless that promises nothing better, and
+        from the measured shapes, unless only ends scatter, which hardly imitate an effect.
         """
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
@@ -216,15 +217,19 @@ class Search:
         if self.several and found.fit.scatters and self.declared.scatters:
             with suppress(EstimationError):
                 repeating = replace(self, declared=as_repeating(self.declared))
-                if may_gain(repeating.declared, repeating.first, self.declared):
+                if found.unexplained or repeating._may_gain(self.declared):
                     found = found.or_better(repeating._forwards(), EVIDENCE_APART)
-        # Ends of each pose's own hardly imitate an effect, see `with_moved_ends`.
         imitated = found.fit.scatters and not found.fit.problem.random_std.any()
         if may_be_far and (found.unexplained or imitated):
             found = found.or_better(first or of_shapes.run())
         # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.validation.complete
         return self._or_causes(found)[0] if lost else found
+
+    def _may_gain(self, scattering: Fit) -> bool:
+        """Whether effects may explain as much as the scatter of a fit that explains the data."""
+        promised = max((item.score / 2 for item in self.first), default=0.0)
+        return promised > PROMISED * (scattering.log_evidence - self.declared.log_evidence)
 
     def _forwards(self) -> Found:
         """Result of `run`, or of the same among simpler effects if that is better."""

@@ -1,6 +1,5 @@
 """Fits in which something differs at random from pose to pose, or nothing does."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -8,7 +7,6 @@ import numpy as np
 
 from dlo_casadi.diagnosis.from_data import COMPARED, REACHED, expected_left
 from dlo_casadi.diagnosis.refits import at_noise
-from dlo_casadi.diagnosis.screening import Screened
 from dlo_casadi.diagnosis.selection import Found, likelier_by
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.continuation import relaxed
@@ -26,22 +24,11 @@ from dlo_casadi.thresholds import DIFFERENT, EVIDENCE_APART
 # Standard deviations of loose ends: of the place, as a share of the length, and of a clamp's
 # direction [rad]. A judgement: a setup in which they differ more is a broken one.
 LOOSE_PLACE, LOOSE_TURN = 0.02, 0.1
-# Share of the log likelihood that a scatter gains which the best score without it must promise; a
-# score is twice the gain of one step. Evidence: where effects were hidden, 0.45 to 2.9 in the three
-# sessions whose fit without scatter was near; where something differed at random, 0.05 to 0.45 in
-# twenty.
-PROMISED = 0.25
 
 
 def as_repeating(fit: Fit) -> Fit:
     """Refit as if nothing differed at random from pose to pose, with the noise as it is."""
     return descend(fit.reweighed(priors=replace(fit.problem.priors, pose_scatter=PoseScatter())))
-
-
-def may_gain(repeating: Fit, screened: Sequence[Screened], scattering: Fit) -> bool:
-    """Whether effects beside a fit `as_repeating` may explain as much as the scatter does."""
-    promised = max((item.score / 2 for item in screened), default=0.0)
-    return promised > PROMISED * (scattering.log_evidence - repeating.log_evidence)
 
 
 def with_moved_ends(near: Fit, finest: int | None = None) -> Fit | None:

@@ -11,7 +11,7 @@ from hidden_sets import simulated
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.from_data import from_data
-from dlo_casadi.diagnosis.from_pose_to_pose import as_repeating, may_gain, with_moved_ends
+from dlo_casadi.diagnosis.from_pose_to_pose import as_repeating, with_moved_ends
 from dlo_casadi.diagnosis.refits import confirm
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import EFFECTS, CableData
@@ -159,10 +159,12 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes():
     assert with_moved_ends(SimpleNamespace(problem=few, model=near.model)) is None
 
 
-@pytest.mark.parametrize(("score", "worth"), [(40.0, False), (60.0, True)])
+@pytest.mark.parametrize(("score", "worth"), [(70.0, False), (90.0, True)])
 def test_effects_without_a_scatter_are_sought_where_a_score_promises_as_much(score, worth):
-    repeating, scattering = (SimpleNamespace(log_evidence=x) for x in (0.0, 100.0))
-    assert may_gain(repeating, [SimpleNamespace(score=score)], scattering) is worth
+    repeating = SimpleNamespace(log_evidence=0.0)
+    search = Search(repeating, None, (), SIGNIFICANCE, 4, lambda *_: None, InProcess())
+    vars(search)["first"] = [SimpleNamespace(score=score)]
+    assert search._may_gain(SimpleNamespace(log_evidence=100.0)) is worth
 
 
 def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_with(monkeypatch):
