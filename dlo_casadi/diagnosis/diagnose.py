@@ -17,6 +17,8 @@ from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     at_random_instead,
+    enough_poses,
+    of_ends,
     with_moved_ends,
 )
 from dlo_casadi.diagnosis.near_data import near_data
@@ -166,8 +168,8 @@ class Search:
     def diagnosis(self) -> Diagnosis:
         """Result of the search, without effects that explain too little."""
         fit, force = self.declared, None
-        misfit = fit.noise.source == "misfit"
-        near = with_moved_ends(self.relaxed[0], self.finest) if misfit else None
+        misfit = fit.noise.source == "misfit" and enough_poses(fit)
+        near = with_moved_ends(fit, self.relaxed[0], self.finest) if misfit else None
         if near is not None:
             return replace(self, declared=near).diagnosis()
         found = self._searched()
@@ -219,17 +221,16 @@ class Search:
                 repeating = replace(self, declared=as_repeating(self.declared))
                 if found.unexplained or repeating._may_gain(self.declared):
                     found = found.or_better(repeating._forwards(), EVIDENCE_APART)
-        imitated = found.fit.scatters and not found.fit.problem.random_std.any()
-        if may_be_far and (found.unexplained or imitated):
+        if may_be_far and (found.unexplained or (found.fit.scatters and not of_ends(found.fit))):
             found = found.or_better(first or of_shapes.run())
         # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.validation.complete
         return self._or_causes(found)[0] if lost else found
 
     def _may_gain(self, scattering: Fit) -> bool:
-        """Whether effects may explain as much as the scatter of a fit that explains the data."""
-        promised = max((item.score / 2 for item in self.first), default=0.0)
-        return promised > PROMISED * (scattering.log_evidence - self.declared.log_evidence)
+        """Whether a score promises a fair share of what the scatter gains over this fit."""
+        least = PROMISED * (scattering.log_evidence - self.declared.log_evidence)
+        return not self.declared.converged or any(item.score / 2 > least for item in self.first)
 
     def _forwards(self) -> Found:
         """Result of `run`, or of the same among simpler effects if that is better."""
@@ -281,8 +282,7 @@ class Search:
         if self._starts_at_shapes(current) and force is None:
             pairs = added + 2 <= self.max_effects
             near = self.relaxed if current is self.declared else from_data(current)
-            among = self.executor, self.center, self.exclude
-            return near_data(current, near, *among, pairs=pairs)
+            return near_data(current, near, self.executor, self.center, self.exclude, pairs=pairs)
         screened = self.first if current is self.declared else self._screened(current)
         p_values = p_values_of(screened)
         if force is None:

@@ -42,8 +42,8 @@ STUCK = 2.0
 # First std of each repeat's own rest curvature, in turns per length: several times that measured on
 # heavy cables, 0.1 to 0.3 1/m.
 FIRST_REST_TURNS = 0.05
-# Largest chi-square per degree of freedom at which a fit explains its points: a scatter of turns of
-# 0.06 rad, treated to first order, left 1.25.
+# Largest chi-square per degree of freedom at which a fit explains its points: random turns of
+# 0.06 rad left 1.25 when treated to first order, as random lengths and moments still are.
 EXPLAINED = 1.5
 FINEST_MESH = 160
 # Maximum number of elements in the search for missing effects, which takes a hundred refits.

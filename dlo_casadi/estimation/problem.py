@@ -47,12 +47,12 @@ class Priors:
     Parameters
     ----------
     scatter : (n_deviations,)
-        Standard deviations of a pose's own deviations.
+        Standard deviations of a pose's own deviations within the tolerances.
     roughness_std : float
         Prior of the rest curvature, see `Unknowns.prior`.
     pose_scatter : PoseScatter
-        Rest curvature of each repeat's own. By default none: the cable returns to the same shape
-        unless the data show otherwise.
+        What else differs at random between repeats. By default nothing: the cable returns to the
+        same shape unless the data show otherwise.
     told : tuple of (row (size,), value)
         Other knowledge of theta: row @ theta is `value`, with a standard deviation of one.
     """
@@ -81,7 +81,7 @@ class Problem:
         `history[k] for k in fitted`, the same as `measured[j] for j in used`.
     weights : tuple of (R_j, R_j), optional
         Whitening matrices W_j of the fitted poses, see `weighed`. Objectives of two problems can
-        be compared only if both have the same weights.
+        be compared only if both have the same weights and priors of the deviations.
     """
 
     unknowns: Unknowns
@@ -182,8 +182,8 @@ class Problem:
         """Return the problem with the weights of the residuals computed at these values.
 
         The covariance of pose j is that of its noise plus E_j E_j^T. Column k of E_j is the change
-        of the residuals by one standard deviation of mode k of the pose's own rest curvature.
-        Random deviations of the ends are unknowns instead, and may be large.
+        of the residuals by one standard deviation of component k of what differs at random.
+        Random ends are unknowns instead, as their effect may be far from linear.
         """
         weights = [
             self.measured[j].whitening(self.noise, s)

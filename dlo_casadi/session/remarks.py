@@ -304,7 +304,8 @@ def fit_warnings(
         lines += [
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
         ]
-    if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor:
+    random = fit.problem.random_std.any()
+    if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor and not random:
         apart = float(np.hypot(fit.fixture_error, floor))
         lines.append(
             f"fixtures may vary from pose to pose by about {_scatter(fit)}, as far as tolerances "

@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.from_data import from_data
-from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_moved_ends
+from dlo_casadi.diagnosis.from_pose_to_pose import at_random, enough_poses, with_moved_ends
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
@@ -154,13 +154,13 @@ def fit_session(
     own = own if best.point is fit.point else staged(best)
     fit = fitting.not_worse(best, [*stages, own])
     if not diagnosed:
-        misfit = fit.noise.source == "misfit"
-        near = (with_moved_ends(from_data(fit)[0]) or at_random(fit)) if misfit else None
+        near = None
+        if fit.noise.source == "misfit" and enough_poses(fit):
+            near = with_moved_ends(fit, from_data(fit)[0]) or at_random(fit)
         if near is not None:
-            fit, error = near, mesh_error(near)
-            if not config.model.n:
-                fit, error = fine_enough(near, near.model.n)
-            meshed = fit
+            kept = (near, mesh_error(near)) if config.model.n else None
+            meshed, error = kept or fine_enough(near, near.model.n)
+            fit = meshed
         fit = as_measured(fit)
     own = own if fit is best else staged(fit)
     nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged, diagnosed=diagnosed)

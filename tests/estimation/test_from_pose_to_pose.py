@@ -11,7 +11,12 @@ from hidden_sets import simulated
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.from_data import from_data
-from dlo_casadi.diagnosis.from_pose_to_pose import as_repeating, with_moved_ends
+from dlo_casadi.diagnosis.from_pose_to_pose import (
+    as_repeating,
+    enough_poses,
+    of_ends,
+    with_moved_ends,
+)
 from dlo_casadi.diagnosis.refits import confirm
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import EFFECTS, CableData
@@ -141,27 +146,54 @@ def test_turned_clamps_are_named_and_leave_the_stiffness_alone(turned):
     assert interval.low < found.values["bending_stiffness"] < interval.high
 
 
-def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes():
-    """To first order about the misfit no random effect explained this session."""
+@pytest.fixture(scope="module")
+def misfit():
+    """A session in space whose clamps turn from pose to pose, and its declared fit: a misfit."""
     found = simulated(generator_of(3306, 6), 3, 0, "clamp_rotation")
     measured = measured_poses(found.session, read_inputs(found.session))
-    fit, _ = fit_declared(found.session, declared_model(found.session), measured)
+    return found, fit_declared(found.session, declared_model(found.session), measured)[0]
+
+
+@pytest.fixture(scope="module")
+def near(misfit):
+    """The same with clamps that turn at random, found from the measured shapes."""
+    return with_moved_ends(misfit[1], from_data(misfit[1])[0])
+
+
+def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
+    """To first order about the misfit no random effect explained this session."""
+    found, fit = misfit
     assert fit.noise.source == "misfit"
-    near = with_moved_ends(from_data(fit)[0])
     own = near.problem.priors.pose_scatter
     assert own.source == "clamp_rotation"
+    assert of_ends(near)
     assert own.std == pytest.approx(found.values["random.clamp_rotation"], rel=0.2)
     assert near.chi2_per_dof == pytest.approx(1.0, abs=0.15)
     interval = profile_interval(near)
     assert interval.low < found.values["bending_stiffness"] < interval.high
-    # A single pose less than the fewest that show what differs from pose to pose.
     few = replace(near.problem, history=near.problem.history[: DIFFERENT - 1])
-    assert with_moved_ends(SimpleNamespace(problem=few, model=near.model)) is None
+    assert enough_poses(fit)
+    assert not enough_poses(SimpleNamespace(problem=few, model=near.model))
+
+
+def test_a_kept_mesh_is_that_of_the_misfit(misfit, near):
+    fit = misfit[1]
+    finer = SimpleNamespace(model=fit.model.with_mesh(near.model.n + 2))
+    assert with_moved_ends(finer, from_data(fit)[0]).model.n == near.model.n + 2
+
+
+def test_a_scatter_is_of_the_ends_only_if_all_its_rivals_are(near):
+    own = near.problem.priors.pose_scatter
+    for rival, alone in (("end_offset", True), (REST_CURVATURE, False)):
+        scatter = replace(own, rivals=(PoseScatter(0.01, source=rival),))
+        priors = SimpleNamespace(pose_scatter=scatter)
+        both = SimpleNamespace(problem=SimpleNamespace(priors=priors), model=near.model)
+        assert of_ends(both) is alone
 
 
 @pytest.mark.parametrize(("score", "worth"), [(70.0, False), (90.0, True)])
 def test_effects_without_a_scatter_are_sought_where_a_score_promises_as_much(score, worth):
-    repeating = SimpleNamespace(log_evidence=0.0)
+    repeating = SimpleNamespace(log_evidence=0.0, converged=True)
     search = Search(repeating, None, (), SIGNIFICANCE, 4, lambda *_: None, InProcess())
     vars(search)["first"] = [SimpleNamespace(score=score)]
     assert search._may_gain(SimpleNamespace(log_evidence=100.0)) is worth
@@ -271,3 +303,16 @@ def test_gap_of_two_equilibria_moves_with_each_repeat_as_energies_solved_anew():
         uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
         found = gap_std_of_repeats(model, model.nominal, rest, pose, pair, uncertainty)
         assert found == pytest.approx(np.linalg.norm(moved), rel=1e-4)
+
+
+def test_density_of_a_pose_with_turned_clamps_is_that_of_its_own_turns(near):
+    """The fit is right, so that densities as predicted are those to first order."""
+    validation = cross_validate(near)
+    for k, density in enumerate(validation.densities):
+        ends, fixed = near.linearization.by_deviation[k], near.problem.deviation_std
+        white = near.linearization.residuals[k] - ends @ near.own_deviations[k]
+        covariance = np.eye(len(white)) + (ends * fixed**2) @ ends.T
+        alone = -white @ np.linalg.solve(covariance, white) / 2
+        alone -= np.linalg.slogdet(covariance)[1] / 2
+        alone += np.linalg.slogdet(near.problem.whitening[k])[1]
+        assert density == pytest.approx(alone, abs=5.0)
