@@ -15,6 +15,7 @@ import numpy as np
 
 from dlo_casadi.diagnosis.candidates import candidates_of
 from dlo_casadi.diagnosis.from_data import (
+    CLOSE,
     NEAR_LEAST,
     NEAR_NOISE,
     REACHED,
@@ -119,12 +120,13 @@ def near_data(
 def _is_last(item: Confirmed) -> bool:
     """Whether the search ends with this fit of a single candidate or a pair.
 
-    A second effect may be found beside a single one in the next step. A pair that barely explains
-    the shapes may be wrong: one left 1.46 times the noise, the hidden pair 1.18 times.
+    A second effect may be found beside a single one in the next step, unless its fit was lost on
+    the way: one left 20 times the noise, its start twice; the hidden pair was found from the start.
+    A pair that barely explains the shapes may be wrong: one left 1.46 times the noise, the hidden
+    pair 1.18 times.
     """
-    fit = item.fit
-    reached = fit.chi2_per_dof < SURELY_REACHED
-    return fit.noise.source != "misfit" and (reached or not item.beside)
+    most = SURELY_REACHED if item.beside else CLOSE * REACHED
+    return item.fit.noise.source != "misfit" and item.fit.chi2_per_dof < most
 
 
 def confirmed(
