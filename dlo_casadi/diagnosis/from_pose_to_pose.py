@@ -41,9 +41,9 @@ def of_ends(fit: Fit) -> bool:
 def with_moved_ends(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | None:
     """Fit, started at relaxed shapes, in which clamps turn or ends move from pose to pose.
 
-    None if no such fit meets the points. Missing effects hardly look like that: where one of them
-    was random, loose ends left at most 1.02 times the noise in eight of nine sessions in space;
-    twelve sessions with hidden effects 1.2 to 140 times.
+    None if no such fit meets the points. Missing effects hardly look like that: with turns and
+    displacements loose at once, eight of nine sessions in space in which one of them is random left
+    at most 1.02 times the noise, twelve with hidden effects 1.2 to 140 times.
 
     Parameters
     ----------

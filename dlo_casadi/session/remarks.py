@@ -304,6 +304,7 @@ def fit_warnings(
         lines += [
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
         ]
+    # Where ends differ at random beyond the tolerances, the line above has told by how much.
     random = fit.problem.random_std.any()
     if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor and not random:
         apart = float(np.hypot(fit.fixture_error, floor))
