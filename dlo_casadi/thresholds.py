@@ -50,7 +50,7 @@ EVIDENCE_APART = 5.0
 # Share of what a scatter from pose to pose gains in log likelihood that the best score without it
 # must promise; one step gains half a score. It promised 0.45 to 2.9 in four sessions with hidden
 # effects, 0.02 to 0.34 in nineteen in which something differed at random, 0.45 in another one.
-PROMISED = 0.4
+LEAST_PROMISED = 0.4
 
 # Difference of -2 log likelihood below which two random effects cannot be told apart: a likelihood
 # ratio of 20. Moments of both pins and smooth rest curvatures differed by 2 to 9 in three sessions.

@@ -55,8 +55,8 @@ from dlo_casadi.thresholds import (
     DIFFERENT,
     EVIDENCE_APART,
     LARGER_OF_TWO,
+    LEAST_PROMISED,
     LEFT,
-    PROMISED,
     REFITTED,
     SIGNIFICANCE,
     WORTH,
@@ -229,7 +229,7 @@ class Search:
 
     def _may_gain(self, scattering: Fit) -> bool:
         """Whether a score promises a fair share of what the scatter gains over this fit."""
-        least = PROMISED * (scattering.log_evidence - self.declared.log_evidence)
+        least = LEAST_PROMISED * (scattering.log_evidence - self.declared.log_evidence)
         return not self.declared.converged or any(item.score / 2 > least for item in self.first)
 
     def _forwards(self) -> Found:
