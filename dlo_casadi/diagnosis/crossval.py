@@ -203,7 +203,7 @@ def _density(fit: Fit, k: int, off: FloatArray, covariance: FloatArray) -> float
 
 
 def _density_of(fit: Fit, k: int, seen: Observed | None, covariance: FloatArray) -> float:
-    """`_density` of the k-th fitted pose as `_near_fitted_ends`; -inf if it has no equilibrium."""
+    """`_density` of the k-th pose, seen as in `_near_fitted_ends`; -inf without an equilibrium."""
     if seen is None:
         return -np.inf
     item = fit.problem.measured[fit.problem.used[k]]

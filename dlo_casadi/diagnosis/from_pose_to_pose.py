@@ -33,7 +33,7 @@ def as_repeating(fit: Fit) -> Fit:
 
 
 def of_ends(fit: Fit) -> bool:
-    """Whether its scatter, and all that cannot be distinguished from it, are those of the ends."""
+    """Whether only turns or displacements of the ends may differ at random, rivals included."""
     scatter = fit.problem.priors.pose_scatter
     return all(one.of_deviations(fit.model).any() for one in (scatter, *scatter.rivals))
 
@@ -47,8 +47,10 @@ def with_moved_ends(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | 
 
     Parameters
     ----------
+    misfit : Fit
+        Of the declared model.
     near : Fit
-        Relaxed shapes of the misfit, see `from_data`.
+        The same model relaxed at the measured shapes, see `from_data`.
     finest : int, optional
         Maximum number of elements to which the mesh may be refined; by default the misfit's mesh.
     """
