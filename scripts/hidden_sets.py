@@ -18,7 +18,7 @@ from dlo_casadi.effects import EFFECTS, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import Prediction, predict_poses
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.model.pose_scatter import PoseScatter, effect_of
 from dlo_casadi.sensing.noise import NoiseModel
 
 Draw = Callable[..., float]
@@ -41,15 +41,15 @@ FINE, HALVED = 0.1 * MARKERS[1], 2
 # one point its middle moves as far as that node is from the lowest place. Six poses of a set were
 # up to 3.1 mm from their shapes on 320 elements with 40, and up to 0.4 mm with 160.
 FINER_ON_TABLES = 4
-# Sizes of what differs from pose to pose, by EI [N m^2] and length [m]: each moves the cable by
-# several times the noise.
+# Sizes of what differs from pose to pose, by length [m]: each moves the cable by several times the
+# noise.
 RANDOM_SIZES = {
-    "rest_curvature": lambda stiffness, length: 0.15 / length,
-    "pin_moment": lambda stiffness, length: 0.3 * stiffness / length,
-    "clamp_angle": lambda stiffness, length: 0.05,
-    "clamp_rotation": lambda stiffness, length: 0.05,
-    "end_offset": lambda stiffness, length: 0.008 * length,
-    "length_error": lambda stiffness, length: 0.008 * length,
+    "rest_curvature": lambda length: 0.15 / length,
+    "pin_moment": lambda length: 0.3 / length,
+    "clamp_angle": lambda length: 0.05,
+    "clamp_rotation": lambda length: 0.05,
+    "end_offset": lambda length: 0.008 * length,
+    "length_error": lambda length: 0.008 * length,
 }
 
 # Ends that show what differs from pose to pose in the plane. Between two clamps a smooth rest
@@ -202,9 +202,9 @@ def _tried(
     waves = generator.normal(0.0, 0.1, (len(model.node.curvatures), 3))
     scatter, draws = PoseScatter(), np.zeros((0, POSES))
     if random:
-        size = RANDOM_SIZES[random](bending, length) * generator.uniform(0.5, 1.5)
+        size = RANDOM_SIZES[random](length) * generator.uniform(0.5, 1.5)
         scatter = PoseScatter(size, source=random)
-        count = scatter.ways(model)[0].shape[1]
+        count = scatter.ways(model)[1].shape[1]
         draws = scatter.sizes(count)[:, None] * generator.standard_normal((count, POSES))
         values[f"random.{random}"] = size
     model, shapes = _finely(model, p, waves, true, scatter, draws)
@@ -287,10 +287,16 @@ def _shapes(
     rest = _rest(waves, model)
     if not scatter.std:
         return predict_poses(model, p, rest, poses)
-    own, (by_p, by_rest) = scatter.within(model), scatter.ways(model)
-    p = scatter.values(p, model)
+    effect = effect_of(scatter.source, model)
+    if effect is not None:  # an effect of one pose is one of all poses of that session
+        own, draws = model.with_effect(effect), draws.T
+        return [
+            predict_poses(own, np.append(p, draw), rest, [pose])[0]
+            for draw, pose in zip(draws, poses, strict=True)
+        ]
+    _, modes = scatter.ways(model)
     return [
-        predict_poses(own, p + by_p @ draw, rest + by_rest @ draw, [pose])[0]
+        predict_poses(model, p, rest + modes @ draw, [pose])[0]
         for draw, pose in zip(draws.T, poses, strict=True)
     ]
 

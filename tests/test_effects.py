@@ -127,7 +127,7 @@ def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[S
     shapes = any_shapes(a, scale=1.5 * scale)
     given = Inputs.of(p, scale * any_rest(a)[0], pose[None])
     # Springs rest at the origin: their unknowns are those of no other model.
-    lam = scale * shapes.lam * (np.arange(a.k) < model.n_conditions)
+    lam = scale * shapes.lam * (np.arange(a.k) < len(model.condition_names))
     shapes = Shapes.declared(shapes.x, lam, len(model.clips))
     # The node at a saddle is in its frame, as in all shapes.
     return replace(shapes, x=a.clipped(shapes, given).in_frames(shapes.x)), given
@@ -148,7 +148,7 @@ def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[
         "curve": curve.z,
         "curve by all": curve.along(along)[..., kept],
         "rest after": after[0],
-        "rest after by all": a.state_along(after, along.x, along.rest, along.p)[..., kept],
+        "rest after by all": a.state_along(after, along)[..., kept],
     }
 
 
@@ -229,7 +229,7 @@ def test_derivatives_by_parameters_against_finite_differences(case):
         ("curve", a.curve_slopes(shapes, given).along(along), a.curve),
         (
             "state",
-            a.state_along(after, along.x, along.rest, along.p),
+            a.state_along(after, along),
             lambda s, g: a.state_after(s, g)[0],
         ),
     ):

@@ -44,7 +44,7 @@ from dlo_casadi.effects import EFFECTS, NUISANCES, RANDOM, CableData, Effect, kn
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import ConfigError, DloError, counted
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter
 from dlo_casadi.rod.node import Frame
 
@@ -357,7 +357,8 @@ def metadata_of(
     scatter = file.scatter or _Scatter()
     fixtures = {name: std or 0.0 for name, std in (scatter.fixtures or {}).items()}
     own, smoothness = scatter.from_pose_to_pose, scatter.rest_curvature_smoothness
-    size = own.std or scatter.rest_curvature_std
+    size, stiffness = own.std or scatter.rest_curvature_std, file.parameters[BENDING_STIFFNESS]
+    size /= PoseScatter(source=own.source).factor(stiffness.value)
     pose_scatter = PoseScatter(size, smoothness, source=own.source)
     return Metadata(
         path=source,

@@ -332,9 +332,7 @@ def limit_checks(
         if x != "clearance"  # a clearance hardly depends on the mesh
         for size in [shape.sizes(*shape.on(x), x).max()]
     } | {"clearance": 1.0}
-    own = uncertainty.pose_scatter
-    with_own = own.within(drawn), own.values(cable.p, drawn)
-    varied = Varied(*with_own, shape.rest_on(drawn), pose, near, uncertainty)
+    varied = Varied(drawn, cable.p, shape.rest_on(drawn), pose, near, uncertainty)
     likely = varied.exceedances({name: ratio[name] * bound for name, bound in bounds.items()})
     out = []
     for use in shape.uses(limits):

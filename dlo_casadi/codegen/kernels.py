@@ -387,7 +387,7 @@ def _triangle(a: ca.SX) -> ca.SX:
 def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
     """Energy of the holders, without end conditions."""
     node = model.node
-    x, lam = ca.SX.sym("x", 2 * node.coordinates), ca.SX.zeros(model.n_conditions)
+    x, lam = ca.SX.sym("x", 2 * node.coordinates), ca.SX.zeros(len(model.condition_names))
     pose = np.zeros(model.n_pose)
     pose[2 * node.dimension : EndConditions.size(node)] = 2 * node.identity
     value, _, _ = functions_of(model).at_ends(

@@ -18,8 +18,8 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     at_random_instead,
     enough_poses,
-    of_ends,
-    with_moved_ends,
+    of_rest,
+    with_loose_poses,
 )
 from dlo_casadi.diagnosis.near_data import near_data
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
@@ -169,7 +169,7 @@ class Search:
         """Result of the search, without effects that explain too little."""
         fit, force = self.declared, None
         misfit = fit.noise.source == "misfit" and enough_poses(fit)
-        near = with_moved_ends(fit, self.relaxed[0], self.finest) if misfit else None
+        near = with_loose_poses(fit, self.relaxed[0], self.finest) if misfit else None
         if near is not None:
             return replace(self, declared=near).diagnosis()
         found = self._searched()
@@ -207,7 +207,7 @@ class Search:
         A first search that finds nothing does not count: it has tried the nearest candidates only.
         A scatter from pose to pose explains anything: if the declared model and the result have
         one, the search is repeated as if there were none, unless that promises nothing better, and
-        from the measured shapes, unless only ends scatter, which hardly imitate an effect.
+        from the measured shapes, unless only fixtures scatter, which hardly imitate an effect.
         """
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
@@ -221,7 +221,7 @@ class Search:
                 repeating = replace(self, declared=as_repeating(self.declared))
                 if found.unexplained or repeating._may_gain(self.declared):
                     found = found.or_better(repeating._forwards(), EVIDENCE_APART)
-        if may_be_far and (found.unexplained or (found.fit.scatters and not of_ends(found.fit))):
+        if may_be_far and (found.unexplained or (found.fit.scatters and of_rest(found.fit))):
             found = found.or_better(first or of_shapes.run())
         # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.validation.complete

@@ -17,9 +17,10 @@ from dlo_casadi.estimation.variances import pose_scatter_of, refine
 from dlo_casadi.model.pose_scatter import PoseScatter, sources_in
 from dlo_casadi.thresholds import DIFFERENT, EVIDENCE_APART
 
-# Standard deviations of loose ends: of a place, as a share of the length, and of a clamp's turns
-# [rad]. A judgement: a setup in which they differ more is a broken one.
-LOOSE_PLACE, LOOSE_TURN = 0.02, 0.1
+# Standard deviations of what is loose in each pose: of a place or a length, as a share of the
+# length; of a clamp's turns [rad]; of the curvature by a pin's moment, in 1 / length. A judgement:
+# a setup in which they differ more is a broken one.
+LOOSE_PLACE, LOOSE_TURN, LOOSE_BEND = 0.02, 0.1, 1.0
 
 
 def enough_poses(fit: Fit) -> bool:
@@ -32,18 +33,19 @@ def as_repeating(fit: Fit) -> Fit:
     return descend(fit.reweighed(priors=replace(fit.problem.priors, pose_scatter=PoseScatter())))
 
 
-def of_ends(fit: Fit) -> bool:
-    """Whether only turns or displacements of the ends may differ at random, rivals included."""
+def of_rest(fit: Fit) -> bool:
+    """Whether it may be the shape at rest that differs at random: the likeliest source or a rival."""
     scatter = fit.problem.priors.pose_scatter
-    return all(one.of_deviations(fit.model).any() for one in (scatter, *scatter.rivals))
+    return not all(one.deviations(fit.model) for one in (scatter, *scatter.rivals))
 
 
-def with_moved_ends(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | None:
-    """Fit, started at relaxed shapes, in which clamps turn or ends move from pose to pose.
+def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | None:
+    """Fit, started at relaxed shapes, in which something other than the shape at rest is random.
 
-    None if no such fit meets the points. Missing effects hardly look like that: with turns and
-    displacements loose at once, eight of nine sessions in space in which one of them is random left
-    at most 1.02 times the noise, twelve with hidden effects 1.2 to 140 times.
+    Ends that turn or move, moments of pins, lengths: one of them is an unknown of each pose, with a
+    wide prior. None if no such fit meets the points. Missing effects hardly look like that: with
+    turns and displacements loose at once, eight of nine sessions in space in which one of them is
+    random left at most 1.02 times the noise, twelve with hidden effects 1.2 to 140 times.
 
     Parameters
     ----------
@@ -55,22 +57,26 @@ def with_moved_ends(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | 
         Maximum number of elements to which the mesh may be refined; by default the misfit's mesh.
     """
     problem, model = near.problem, near.model
-    sizes = {"m": LOOSE_PLACE * model.cable.length, "rad": LOOSE_TURN}
-    each = [PoseScatter(1.0, source=source) for source in sources_in(model)]
+    sizes = {
+        "m": LOOSE_PLACE * model.cable.length,
+        "rad": LOOSE_TURN,
+        "N m": LOOSE_BEND / model.cable.length,
+    }
     least, begun = NEAR_NOISE * expected_left(near), None
-    for scatter in (one for one in each if one.of_deviations(model).any()):
+    for scatter in (PoseScatter(1.0, source=source) for source in sources_in(model)):
         loose = replace(scatter, std=sizes[scatter.unit(model)])
         own = replace(problem, priors=replace(problem.priors, pose_scatter=loose))
-        values = relaxed(own, near.point, COMPARED)
+        own, point = own.taken_over(near.point, problem)
+        values = relaxed(own, point, COMPARED)
         left = Relaxation(own, COMPARED[-1]).objective(values)
         if left < least:
-            least, begun = left, (own, values)
+            least, begun = left, (own, point, values)
     if begun is None:
         return None
     with suppress(EstimationError):
-        own, values = begun
-        fit = fit_from(own, near.point, SOFTNESS[len(COMPARED) :], followed=values)
-        found = None if fit is None else at_random(fit.reweighed(priors=problem.priors))
+        own, point, values = begun
+        fit = fit_from(own, point, SOFTNESS[len(COMPARED) :], followed=values)
+        found = None if fit is None else at_random(fit)
         if found is not None:
             n = misfit.model.n
             found = fine_enough(found, found.model.n, finest=finest)[0] if finest else found
@@ -101,7 +107,7 @@ def at_random_instead(misfit: Fit, found: Found, finest: int | None = None) -> F
 
     Effects found in a misfit were never tested against the scatter that they leave: the mean over
     12 poses of a scatter of 8 mm was taken for an offset. From this fit on they are. `finest`: as
-    in `with_moved_ends`.
+    in `with_loose_poses`.
     """
     near = at_random(misfit) if found.unexplained or found.fit.scatters else None
     if near is None:

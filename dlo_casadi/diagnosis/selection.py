@@ -252,8 +252,7 @@ def p_with_new_noise(before: Fit, after: Fit, winner: Confirmed, tried: int) -> 
         return 1.0
     priors = replace(before.problem.priors, pose_scatter=pose_scatter)
     larger = after.reweighed(noise, priors)
-    smaller = replace(larger.problem, unknowns=before.problem.unknowns)
-    without = descend(Fit(smaller, smaller.evaluate(before.point)))
+    without = descend(before.weighed_as(larger))
     gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
     dof = len(winner.candidate.frees)
     return sidak(survival(gain, dof, noise_degrees(larger)), tried)

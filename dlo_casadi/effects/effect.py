@@ -106,6 +106,8 @@ class Effect:
     at_random: ClassVar[str] = ""
     # Parameter -> the deviation of a pose, see `deviation_names`, that has the same effect.
     as_deviation: ClassVar[Mapping[str, str]] = {}
+    # Whether its parameters are moments per bending stiffness [1/m]; `energy` gets moments [N m].
+    per_stiffness: ClassVar[bool] = False
     # Whether tables of parameters list it while it is a nuisance.
     shown: ClassVar[bool] = True
     # Whether the effect applies in the plane (2), in space (3).

@@ -82,19 +82,22 @@ class EndSpring(PinSpring):
 class PinMoment(BoundaryEffect):
     """Moments of the pins on the cable, as friction leaves them.
 
-        V = -start phi(0) - end phi(L)                                [J]
+        V = -EI (start phi(0) + end phi(L))                           [J]
 
-    They differ from pose to pose, so they cannot be declared.
+    They differ from pose to pose, so they cannot be declared. Shapes tell the ratio of a moment to
+    EI: with a prior on moments as unknowns of each pose, a smaller EI would need smaller moments.
 
     Parameters
     ----------
-    start, end : scalar [N m]
-        Counter-clockwise; vanish at 0. Only those of pinned ends.
+    start, end : scalar [1/m]
+        Curvature to which the pin bends the cable there: its moment over EI, counter-clockwise;
+        vanish at 0. Only those of pinned ends.
     """
 
     sides: tuple[str, ...] = ("start", "end")
     name = "pin_moment"
     at_random = "moments of its own at the pins, as friction leaves them,"
+    per_stiffness = True
     dimensions = (2,)
 
     @classmethod
@@ -109,8 +112,8 @@ class PinMoment(BoundaryEffect):
         return cls(sides=tuple(side for side, held in ends.items() if held == "pinned"))
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
-        """Declare the moments."""
-        return Parameter.symmetric(self.sides, "N m", 0.1 * cable.bending_stiffness / cable.length)
+        """Declare the curvatures."""
+        return Parameter.symmetric(self.sides, "1/m", 0.1 / cable.length)
 
     def energy(self, first: ca.SX, last: ca.SX, params: Params) -> ca.SX:
         """Energy of the moments [J]."""

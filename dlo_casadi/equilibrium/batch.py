@@ -69,7 +69,8 @@ class BatchEquilibrium:
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes with these nodes (m, n_nodes, coordinates), without forces and deviations."""
         border = [border_of(self.model, *each) for each in zip(self.poses, x, strict=True)]
-        return Shapes.declared(x, np.array(border).reshape((self.m, -1)), len(self.model.clips))
+        still = np.zeros((self.m, len(self.model.deviation_names)))
+        return Shapes(x, np.array(border).reshape((self.m, -1)), still)
 
     # ---- state -----------------------------------------------------------------------------------
 
@@ -97,8 +98,11 @@ class BatchEquilibrium:
         # of any law each step makes at least one more pose exact.
         strains = len(self.node.strains)
         for _ in range(self.m):
-            after, _, by_rest, _ = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))
-            change, slopes = after[:-1] - out[1:], by_rest.reshape((self.m, strains, -1, strains))
+            after = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))
+            change, slopes = (
+                after[0][:-1] - out[1:],
+                after[2].reshape((self.m, strains, -1, strains)),
+            )
             for j in range(1, self.m - 1):
                 before = change[j - 1].reshape((strains, -1))
                 change[j] += np.einsum("ick,kc->ic", slopes[j], before).ravel()
@@ -375,8 +379,7 @@ class BatchEquilibrium:
             x[j][..., moving], lam[j][..., moving] = now.x[0], now.lam[0]
             if j + 1 < self.m:
                 slopes = tuple(part[one] for part in after)
-                changed = self.assembly.state_along(slopes, now.x, now.rest, now.p)[0]
-                rest[j + 1][..., moving] = changed
+                rest[j + 1][..., moving] = self.assembly.state_along(slopes, now)[0]
         return replace(along, x=x, lam=lam, rest=rest)
 
     def observe(

@@ -5,7 +5,7 @@ computed to first order if newly solved shapes agree with it; otherwise it is co
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -243,6 +243,11 @@ class Varied:
             )
         return out
 
+    @property
+    def _larger(self) -> CableModel:
+        """The model with the deviations that each repeat has of its own."""
+        return self.uncertainty.pose_scatter.within(self.model)
+
     @cached_property
     def _ways(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self.uncertainty.ways_in(self.model)
@@ -251,8 +256,9 @@ class Varied:
     def _along(self) -> Tangents:
         """Derivatives of the shape by the ways in which a repeat may differ."""
         by_p, by_rest, by_deviation = self._ways
-        return BatchEquilibrium(self.model, [self.pose]).by_rest(
-            self.found.shapes, self.p, self.rest, by_rest, by_p, by_deviation
+        shapes = replace(self.found.shapes, deviation=np.zeros((1, len(by_deviation))))
+        return BatchEquilibrium(self._larger, [self.pose]).by_rest(
+            shapes, self.p, self.rest, by_rest, by_p, by_deviation
         )
 
     def linear(self, names: tuple[str, ...]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
@@ -260,7 +266,7 @@ class Varied:
         count = len(self.uncertainty.causes_in(self.model))
         z = _STEP * np.vstack([np.eye(count), -np.eye(count), np.zeros((1, count))])
         near, given = self._near(z), self._given(z)
-        found = {name: sizes_of(self.model, near, given, name) for name in names}
+        found = {name: sizes_of(self._larger, near, given, name) for name in names}
         slopes = {name: x[:count] - x[count : 2 * count] for name, x in found.items()}
         sizes = {name: x[-1] for name, x in found.items()}
         return sizes, {name: np.asarray(x.T / (2 * _STEP)) for name, x in slopes.items()}
@@ -295,11 +301,11 @@ class Varied:
         for begin in range(0, len(z), CHUNK):
             some = slice(begin, begin + CHUNK)
             own, start = given.subset(some), near.subset(some)
-            batch = BatchEquilibrium(self.model, [self.pose] * len(start.x))
+            batch = BatchEquilibrium(self._larger, [self.pose] * len(start.x))
             shapes, converged = batch.solve_or_descend(start, own.p, own.rest, tolerance=_TOLERANCE)
             lost.append(~(converged & batch.stable(shapes, own.p, own.rest)))
             for name in names:
-                parts[name].append(sizes_of(self.model, shapes, own, name))
+                parts[name].append(sizes_of(self._larger, shapes, own, name))
         return {name: np.concatenate(x) for name, x in parts.items()}, np.concatenate(lost)
 
 

@@ -76,28 +76,26 @@ class Uncertainty:
     def ways_in(self, model: CableModel) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Independent directions in which a new repeat of a pose may differ, one std each.
 
-        Changes of the parameters (n_parameters, q) of `pose_scatter.within(model)`, the rest
-        strains (n_rests, q) and the deviations (n_deviations, q), without unknown forces. Causes:
-        the fitted unknowns, the fixtures, each repeat's own random quantity, and what is `added`.
+        Changes of the parameters (n_parameters, q), the rest strains (n_rests, q) and the
+        deviations (n_deviations, q) of `pose_scatter.within(model)`, without unknown forces.
+        Causes: the fitted unknowns, the fixtures, each repeat's own random quantity, and what is
+        `added`.
         """
         by_p, by_rest = (by @ self.root for by in self.unknowns_in(model))
-        scattered, modes = self.pose_scatter.ways(model)
+        own, modes = self.pose_scatter.ways(model)
         sizes = self.pose_scatter.sizes(modes.shape[1])
-        n, m = by_p.shape[1], len(model.deviations)
-        count = n + m + len(sizes)
+        n, m, k = by_p.shape[1], len(model.deviations), len(self.added)
         scatter = np.array([self.scatter.get(name, 0.0) for name in model.deviations])
         used = [model.deviation_names.index(name) for name in model.deviations]
-        by_deviation = np.zeros((len(model.deviation_names), count))
-        by_deviation[used, n + np.arange(m)] = np.where(np.isfinite(scatter), scatter, 0.0)
+        fixtures = np.zeros((len(own), m))
+        fixtures[used, np.arange(m)] = np.where(np.isfinite(scatter), scatter, 0.0)
+        new = np.zeros((len(by_p), k))
+        at = [model.names.index(name) for name in self.added]
+        new[at, np.arange(k)] = [*self.added.values()]
+        by_p = np.hstack([np.pad(by_p, [(0, 0), (0, m + len(sizes))]), new])
         by_rest = np.hstack([np.pad(by_rest, [(0, 0), (0, m)]), modes * sizes])
-        more = len(scattered) - len(by_p)
-        by_p = np.hstack([np.pad(by_p, [(0, more), (0, m)]), scattered * sizes])
-        new = np.zeros((len(by_p), len(self.added)))
-        new[[model.names.index(name) for name in self.added], range(len(self.added))] = [
-            *self.added.values()
-        ]
-        none = [(0, 0), (0, len(self.added))]
-        return np.hstack([by_p, new]), np.pad(by_rest, none), np.pad(by_deviation, none)
+        by_deviation = np.pad(np.hstack([fixtures, own * sizes]), [(0, 0), (n, k)])
+        return by_p, np.pad(by_rest, [(0, 0), (0, k)]), by_deviation
 
     def causes_in(self, model: CableModel) -> tuple[str, ...]:
         """Cause of each direction of `ways_in`.
@@ -201,10 +199,10 @@ def displacements(
     through the equilibrium. The measured difference of repeats is added, equal at all places.
     """
     by_p, by_rest, by_deviation = uncertainty.ways_in(model)
-    scatter = uncertainty.pose_scatter
-    p, equilibria = scatter.values(p, model), BatchEquilibrium(scatter.within(model), [pose])
-    along = equilibria.by_rest(found.shapes, p, rest, by_rest, by_p, by_deviation)
-    ((seen, change),) = equilibria.observe(found.shapes, p, rest, along)
+    equilibria = BatchEquilibrium(uncertainty.pose_scatter.within(model), [pose])
+    shapes = replace(found.shapes, deviation=np.zeros((1, len(by_deviation))))
+    along = equilibria.by_rest(shapes, p, rest, by_rest, by_p, by_deviation)
+    ((seen, change),) = equilibria.observe(shapes, p, rest, along)
     curve, d = seen.curve, seen.curve.d
     alike = np.broadcast_to(uncertainty.repeat_std * np.eye(d), (len(s), d, d))
     return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
@@ -298,9 +296,8 @@ def _gap_slopes(
     uncertainty: Uncertainty,
 ) -> FloatArray:
     """Changes (q,) [J] of the difference in energy along `Uncertainty.ways_in`."""
-    along, scatter = uncertainty.ways_in(model), uncertainty.pose_scatter
-    given, larger = (scatter.values(p, model), rest), scatter.within(model)
-    own, other = (energy_slope(larger, pose, eq, given, along, _SHARE) for eq in pair)
+    along, larger = uncertainty.ways_in(model), uncertainty.pose_scatter.within(model)
+    own, other = (energy_slope(larger, pose, eq, (p, rest), along, _SHARE) for eq in pair)
     return np.asarray(other - own)
 
 

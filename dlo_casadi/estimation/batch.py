@@ -104,7 +104,7 @@ def _compressed(problem: Problem, point: Point) -> list[tuple[FloatArray, FloatA
 
 def _observed_size(problem: Problem) -> int:
     """Number of quantities the residuals depend on: the measured curve's and the wrenches'."""
-    model = problem.unknowns.model
+    model = problem.equilibria.model
     curve = (model.chain.n + 1) * int(functions_of(model).station.size1_out(0))
     return curve + problem.equilibria.wrenches * int(functions_of(model).readings.size1_out(0))
 
@@ -125,7 +125,7 @@ class _BatchNlp:
 
     def __init__(self, problem: Problem, p: FloatArray) -> None:
         self.problem = problem
-        unknowns, model = problem.unknowns, problem.unknowns.model
+        unknowns, model = problem.unknowns, problem.equilibria.model
         self.poses = list(range(problem.equilibria.m)) if model.has_state else list(problem.used)
         self.n_x, self.n_lam = problem.equilibria.assembly.n, model.n_border
         self.columns = problem.equilibria.used_deviations
@@ -143,7 +143,7 @@ class _BatchNlp:
     def _differentiate(self) -> None:
         """Values, Jacobians and Hessian of one pose by its own unknowns and theta."""
         problem = self.problem
-        unknowns, model = problem.unknowns, problem.unknowns.model
+        unknowns, model = problem.unknowns, problem.equilibria.model
         theta = ca.SX.sym("theta", unknowns.size)
         own = ca.SX.sym("own", self.stride)
         pose = ca.SX.sym("pose", model.n_pose)
@@ -176,7 +176,7 @@ class _BatchNlp:
     def _assemble(self) -> None:
         """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
         problem, m = self.problem, len(self.poses)
-        unknowns, model = problem.unknowns, problem.unknowns.model
+        unknowns, model = problem.unknowns, problem.equilibria.model
         size, n_z, n_rows = unknowns.size, _observed_size(problem), _n_rows(problem)
         x = ca.MX.sym("x", size + self.stride * m)
         factor = ca.MX.sym("factor", n_rows, n_z * len(problem.used))
@@ -302,7 +302,7 @@ class _BatchNlp:
         for j in self.poses:
             scaled = point.shapes.deviation[j, self.columns] / problem.deviation_std
             parts = [point.shapes.x[j, :, 0], point.shapes.lam[j] / self.force, scaled]
-            if problem.unknowns.model.has_state:
+            if problem.equilibria.model.has_state:
                 parts.append(rests[j])
             own.append(np.concatenate(parts))
         out, stats = run_ipopt(

@@ -285,7 +285,7 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
             rows.append((own.x[k], own.lam[k], own.deviation[k]))
             continue
         pose = problem.history[index].pose
-        deviation = np.zeros(len(fit.model.deviation_names))
+        deviation = np.zeros_like(own.deviation[0])
         try:
             before = (problem.history[index - 1].pose, rows[-1][0]) if rows else None
             found = solve_after(fit.model, fit.p, fit.rest, pose, before)
@@ -295,12 +295,13 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
                 raise EstimationError(error.message) from error
             rows.append((*next(first_guesses(fit.model, fit.p, fit.rest, pose)), deviation))
     x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
-    return on_other_mesh(Shapes(x, lam, deviation), fit.model, problem.unknowns.model)
+    models = fit.problem.equilibria.model, problem.equilibria.model
+    return on_other_mesh(Shapes(x, lam, deviation), *models)
 
 
 def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
     """Nodes and forces on obstacles interpolated from one model's mesh to another's."""
-    moved = with_border_of(shapes, model, other)
+    moved = shapes.in_order_of(model, other)
     if model.chain == other.chain:
         return moved
     coarse, fine = model.chain.places, other.chain.places
@@ -308,14 +309,3 @@ def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shape
     if model.surfaces and model.surfaces == other.surfaces:
         moved.lam[:, other.n_lam :] = forces_on_other_mesh(shapes.lam, model, other)
     return replace(moved, x=x)
-
-
-def with_border_of(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:
-    """Multipliers in another model's order; those that only that model has start at zero."""
-    if model.border_names == other.border_names:
-        return shapes
-    lam = np.zeros((len(shapes.lam), other.n_border))
-    for i, name in enumerate(other.border_names):
-        if name in model.border_names:
-            lam[:, i] = shapes.lam[:, model.border_names.index(name)]
-    return replace(shapes, lam=lam)

@@ -225,12 +225,13 @@ def mesh_error(fit: Fit) -> float:
     the square of the element size (Richardson). Infinite if the fitted parameters have no
     equilibria nearby on the finer mesh.
     """
-    model = fit.model.with_mesh(2 * fit.model.n)
+    own = fit.problem.equilibria.model
+    model = own.with_mesh(2 * own.n)
     equilibria = BatchEquilibrium(
         model, [item.pose for item in fit.problem.measured], wrenches=False
     )
     state = fit.p, model.rest_basis @ fit.coefficients
-    start = on_other_mesh(fit.point.shapes, fit.model, model)
+    start = on_other_mesh(fit.point.shapes, own, model)
     shapes, converged = equilibria.solve_or_descend(start, *state)
     if not converged.all():
         return float("inf")

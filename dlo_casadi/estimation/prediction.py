@@ -193,7 +193,7 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     for j, (one, way) in enumerate(zip(known, told, strict=True)):
         if one is not None and way is None:
             x[j], lam[j] = one.equilibrium.x, one.equilibrium.multipliers
-    return Shapes.declared(x, lam, len(model.clips))
+    return Shapes(x, lam, np.zeros_like(shapes.deviation))
 
 
 def _tells_no_side(model: CableModel, pose: HeldPose) -> bool:
@@ -367,8 +367,8 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     If there are many different poses, each repeat's own rest curvature accounts for it instead.
     """
     names, covariance = fit.named_covariance
-    used = [fit.model.deviation_names[k] for k in fit.problem.equilibria.used_deviations]
-    scatter = dict(zip(used, map(float, fit.problem.fixture_std), strict=True))
+    # Those of fixtures are the first.
+    scatter = dict(zip(fit.model.deviations, map(float, fit.problem.fixture_std), strict=False))
     history, apart = fit.problem.history, 0.0
     if different_poses(history, fit.model) < DIFFERENT:
         apart = repeat_std(history, fit.model, fit.noise.of_points.beside_repeats)

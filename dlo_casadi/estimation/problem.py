@@ -117,8 +117,8 @@ class Problem:
 
     @cached_property
     def equilibria(self) -> BatchEquilibrium:
-        """The model over the problem's own poses."""
-        return self._equilibria_of(self.unknowns.model)
+        """The model over the problem's own poses, with what is random as deviations of each."""
+        return self._equilibria_of(self.priors.pose_scatter.within(self.unknowns.model))
 
     def _equilibria_of(self, model: CableModel) -> BatchEquilibrium:
         wrenches = any(item.reactions for item in self.measured)
@@ -146,20 +146,22 @@ class Problem:
         """Precision matrix (size, size) of the prior of theta."""
         return self._prior[1]
 
-    @property
+    @cached_property
     def fixture_std(self) -> FloatArray:
-        """Scatter of the fixtures within their tolerances: of the deviations that the model has."""
-        return self.priors.scatter[self.equilibria.used_deviations]
+        """Scatter of the fixtures within their tolerances, by `used_deviations`; of others zero."""
+        others = len(self.equilibria.model.deviation_names) - len(self.priors.scatter)
+        return np.pad(self.priors.scatter, (0, others))[self.equilibria.used_deviations]
 
     @cached_property
     def random_std(self) -> FloatArray:
         """Scatter of the same deviations from pose to pose beyond that, see `pose_scatter`."""
-        of_deviations = self.priors.pose_scatter.of_deviations(self.unknowns.model)
-        return of_deviations[self.equilibria.used_deviations]
+        scatter = self.priors.pose_scatter
+        random = np.isin(self.equilibria.model.deviations, scatter.deviations(self.unknowns.model))
+        return np.where(random, scatter.std, 0.0)
 
     @cached_property
     def deviation_std(self) -> FloatArray:
-        """Standard deviations of the deviations that the model has."""
+        """Standard deviations of the deviations that the poses have."""
         return np.hypot(self.fixture_std, self.random_std)
 
     @property
@@ -183,7 +185,8 @@ class Problem:
 
         The covariance of pose j is that of its noise plus E_j E_j^T. Column k of E_j is the change
         of the residuals by one standard deviation of component k of what differs at random.
-        Random ends are unknowns instead, as their effect may be far from linear.
+        All but a rest curvature is instead an unknown of the pose: its effect may be far from
+        linear.
         """
         weights = [
             self.measured[j].whitening(self.noise, s)
@@ -204,13 +207,15 @@ class Problem:
         """
         if not scatters:
             return []
-        (shapes, p, rest), model = self.state(values), self.unknowns.model
+        model = own = self.equilibria.model
         for scatter in scatters:
-            p, model = scatter.values(p, model), scatter.within(model)
+            model = scatter.within(model)
         larger = self._equilibria_of(model)
         ways = [scatter.ways(model) for scatter in scatters]
-        by_p, by_rest = (np.concatenate(parts, axis=1) for parts in zip(*ways, strict=True))
-        along = larger.by_rest(shapes, p, rest, by_rest, by_p)
+        by_own, by_rest = (np.concatenate(parts, axis=1) for parts in zip(*ways, strict=True))
+        shapes, p, rest = self.state(values)
+        shapes = shapes.in_order_of(own, model)
+        along = larger.by_rest(shapes, p, rest, by_rest, by_deviation=by_own)
         seen = larger.observe(shapes, p, rest, along)
         edges = np.cumsum([columns.shape[1] for columns, _ in ways])[:-1]
         moved = [
@@ -282,6 +287,25 @@ class Problem:
         point = self.evaluate(Values(values.theta, shapes, values.projections))
         return point if np.isfinite(point.objective) else None
 
+    def taken_over(self, values: Values, other: Problem) -> tuple[Problem, Point]:
+        """Objective at values of a problem with other priors; weights are computed there if needed.
+
+        Deviations that only this problem's poses have are zero. Where values have others,
+        equilibria are solved without them: EstimationError if a pose has none nearby.
+        """
+        models, shapes = (other.equilibria.model, self.equilibria.model), values.shapes
+        lost = ~np.isin(models[0].deviation_names, models[1].deviation_names)
+        values = Values(values.theta, shapes.in_order_of(*models), values.projections)
+        problem = self if self.weights else self.weighed(values)
+        if not shapes.deviation[:, lost].any():
+            return problem, problem.evaluate(values)
+        point = problem.balanced(values)
+        if point is None:
+            raise EstimationError(
+                "without what differs at random, a pose has no equilibrium near its shape"
+            )
+        return problem, point
+
     # ---- derivatives -------------------------------------------------------------------------
 
     def linearize(self, point: Values) -> Linearization:
@@ -352,7 +376,7 @@ class Problem:
         each = np.broadcast_to(own.ravel(), (len(own), own.size)) if coupled else own
         both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), each], axis=1)
         shapes = Vector(along.x @ both[:, None, :, None], along.lam @ both[:, :, None])
-        deviation = np.zeros((len(own), len(self.unknowns.model.deviation_names)))
+        deviation = np.zeros((len(own), len(self.equilibria.model.deviation_names)))
         deviation[:, self.equilibria.used_deviations] = own
         return shapes, deviation
 

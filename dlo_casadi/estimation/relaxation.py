@@ -210,7 +210,7 @@ class Relaxation:
         a, m = equilibria.assembly, equilibria.m
         nodes, border, own, known, q = self._counts
         unit = np.broadcast_to(np.eye(own, q), (m, own, q))
-        deviation = np.zeros((m, len(model.deviation_names), q))
+        deviation = np.zeros((m, values.shapes.deviation.shape[1], q))
         used = equilibria.used_deviations
         grown = values.shapes.deviation[:, used] * self._are_forces
         deviation[:, used] = unit[:, border:] + grown[:, :, None] * self._growth(values)
@@ -232,9 +232,9 @@ class Relaxation:
     @cached_property
     def _are_forces(self) -> BoolArray:
         """Whether each deviation (used,) is a force on the cable, which scales with stiffness."""
-        model, used = self.problem.unknowns.model, self.problem.equilibria.used_deviations
+        model = self.problem.equilibria.model
         names = {name for effect in model.effects for name in effect.per_pose(model.cable)}
-        return np.array([model.deviation_names[k] in names for k in used], dtype=bool)
+        return np.array([name in names for name in model.deviations], dtype=bool)
 
     def _growth(self, values: Values) -> FloatArray:
         """Change (q,) of log bending stiffness along a pose's unknowns and theta.
@@ -261,7 +261,7 @@ class Relaxation:
             assembly = problem.equilibria.assembly
             after = assembly.state_after(values.shapes, given)
             states[0, :, known:-1] = problem.unknowns.rest_slopes
-            states[1:, :, :-1] = assembly.state_along(after, along.x, along.rest, along.p)[:-1]
+            states[1:, :, :-1] = assembly.state_along(after, along)[:-1]
         return list(states)
 
     def _linearized(self, values: Values) -> _Linearized:

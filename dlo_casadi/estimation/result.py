@@ -45,16 +45,16 @@ class Fit:
         return {"problem": self.problem, "point": self.point, "converged": self.converged}
 
     def reweighed(self, noise: NoiseModel | None = None, priors: Priors | None = None) -> Fit:
-        """The same point with another noise or other priors, and with weights computed there."""
+        """The same point with another noise or other priors; raises as `Problem.taken_over`."""
         noise, priors = noise or self.noise, priors or self.problem.priors
-        problem = replace(self.problem, noise=noise, priors=priors).weighed(self.point)
-        return Fit(problem, problem.evaluate(self.point))
+        problem = replace(self.problem, noise=noise, priors=priors, weights=None)
+        return Fit(*problem.taken_over(self.point, self.problem))
 
     def weighed_as(self, other: Fit) -> Fit:
         """The same point with noise, priors and weights of another fit of the same points."""
         own = other.problem
         problem = replace(self.problem, noise=own.noise, priors=own.priors, weights=own.weights)
-        return Fit(problem, problem.evaluate(self.point))
+        return Fit(*problem.taken_over(self.point, self.problem))
 
     @property
     def model(self) -> CableModel:

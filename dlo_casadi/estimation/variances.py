@@ -202,7 +202,8 @@ def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
 
 def _beyond_tolerances(fit: Fit) -> bool:
     """Whether the poses' ends deviate from declared values significantly beyond their scatter."""
-    own = fit.own_deviations / fit.problem.fixture_std
+    std = fit.problem.fixture_std
+    own = fit.own_deviations[:, std > 0] / std[std > 0]
     return bool((own**2).sum() > own.size + 2 * np.sqrt(2 * own.size))
 
 
@@ -216,12 +217,10 @@ def _scatters_of(
     poses = []
     for k in kept:
         white = problem.measured[problem.used[k]].whitening(noise, point.projections[k])
-        by = white @ lin.raw_directions[k]
-        own = by[:, size:] * std
+        shared, own = np.split(white @ lin.raw_directions[k], [size], axis=1)
         # The poses' deviations are random, too: take the residual without them.
-        deviation = point.shapes.deviation[problem.used[k], problem.equilibria.used_deviations]
-        e = white @ lin.raw[k] - own @ (deviation / std)
-        poses.append((white, e, own, by[:, :size]))
+        e = white @ lin.raw[k] - own @ fit.own_deviations[k]
+        poses.append((white, e, own * std, shared))
     seen = problem.observed(point)
     shapes = np.array([seen[problem.used[k]].curve.nodes for k in kept])
     shapes = shapes - shapes[:, :1]

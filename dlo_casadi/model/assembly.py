@@ -355,8 +355,8 @@ class Assembly:
     def state_after(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, ...]:
         """Rest strains (m, n_rests) after the poses, and their derivatives.
 
-        The derivatives are by both nodes (m, n_rests, 2b), by the cell's own rest strains (m,
-        n_rests, strains), and by p (m, n_rests, n_parameters).
+        The derivatives (m, n_rests, ...) are by both nodes (2b), by the cell's own rest strains
+        (strains), by p (n_parameters), and by the pose's deviation (n_deviations).
         """
         found = self._call_segments("segment_state", shapes, given)
         after, *by = (self._stacked(part[:, self.chain.layout.bends]) for part in found)
@@ -367,16 +367,14 @@ class Assembly:
         same = np.repeat(np.eye(len(self.node.strains)), self.chain.n_cells, axis=0)
         return bool(np.all(slopes[2] == same))
 
-    def state_along(
-        self, slopes: tuple[FloatArray, ...], x: FloatArray, rest: FloatArray, p: FloatArray
-    ) -> FloatArray:
-        """Change (m, n_rests, q) of the rest strains after poses, along nodes, rest and p."""
-        _, by_x, by_rest, by_p = slopes
+    def state_along(self, slopes: tuple[FloatArray, ...], along: Tangents) -> FloatArray:
+        """Change (m, n_rests, q) of the rest strains after poses along directions."""
+        _, by_x, by_rest, by_p, by_deviation = slopes
         strains = (1, len(self.node.strains), 1)
-        both = np.tile(self._both(x)[:, self.chain.layout.bends], (*strains, 1))
-        own = np.tile(np.stack(self.chain.by_strain(rest), axis=2), (*strains, 1))
+        both = np.tile(self._both(along.x)[:, self.chain.layout.bends], (*strains, 1))
+        own = np.tile(np.stack(self.chain.by_strain(along.rest), axis=2), (*strains, 1))
         moved = (by_x[:, :, None] @ both + by_rest[:, :, None] @ own)[:, :, 0]
-        return np.asarray(moved + by_p @ p)
+        return np.asarray(moved + by_p @ along.p + by_deviation @ along.deviation)
 
 
 @lru_cache(maxsize=MODELS)

@@ -79,6 +79,8 @@ class CableModel:
         Kinds of the clips between the ends, in the order along the cable.
     obstacles : tuple of Obstacle
         What the cable may touch in any pose, without friction.
+    random : tuple of Effect
+        Effects whose parameters each pose has of its own: they are among `deviation_names`.
 
     Notes
     -----
@@ -96,6 +98,7 @@ class CableModel:
     priors: Mapping[str, float] = field(default_factory=dict, hash=False)
     clips: tuple[ClipKind, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
+    random: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.gravity) != len(self.cable.axes):
@@ -154,7 +157,8 @@ class CableModel:
     @property
     def deviation_names(self) -> tuple[str, ...]:
         """Names of the unknowns that each pose has of its own."""
-        return deviation_names(self.node, len(self.clips))
+        random = (f"{x.label}.{q.name}" for x in self.random for q in x.parameters(self.cable))
+        return (*deviation_names(self.node, len(self.clips)), *random)
 
     @cached_property
     def rest(self) -> RestCurvature:
@@ -277,11 +281,6 @@ class CableModel:
             thin = min((x.radius for x in self.surfaces if isinstance(x, Capsule)), default=np.inf)
             count = max(2 * count, int(self.cable.length / (2 * thin + self.cable.diameter)))
         return self.with_mesh(count)
-
-    @cached_property
-    def n_conditions(self) -> int:
-        """Number of end conditions."""
-        return len(self.condition_names)
 
     @property
     def n_springs(self) -> int:
@@ -418,8 +417,8 @@ class CableModel:
     def deviations(self) -> tuple[str, ...]:
         """Deviations of a pose that matter for these boundaries."""
         own = [name for effect in self.effects for name in effect.per_pose(self.cable)]
-        clips = self.deviation_names[len(deviation_names(self.node)) :]
-        return (*self._held("end"), *own, *clips)
+        others = self.deviation_names[len(deviation_names(self.node)) :]
+        return (*self._held("end"), *own, *others)
 
 
 @dataclass(frozen=True)

@@ -306,14 +306,15 @@ class Functions:
 
     @cached_property
     def segment_state(self) -> ca.Function:
-        """As `segment` -> rest strains of the cell after the pose; by increments, rest and p."""
+        """As `segment` -> rest strains of the cell after the pose; by increments, rest, p, own."""
         own = self.terms.rest_strains[::3]
         strain, mean = self.kind.strain(self._plain), own
         for effect, local in self.terms.effects_of(StateEffect):
             mean = effect.next_rest(mean, strain, self.model.cable, local)
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
-        slopes = [ca.jacobian(mean, symbols) for symbols in (self.terms.delta, rest, self.terms.p)]
+        by = (self.terms.delta, rest, self.terms.p, self.terms.deviation)
+        slopes = [ca.jacobian(mean, symbols) for symbols in by]
         mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
         return self._of_segment("segment_state", mean, *slopes)
 

@@ -91,16 +91,15 @@ class Lagrangian:
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
         """Effects of one kind in the model, with their own parameters."""
-        names, cable = self.model.names, self.model.cable
-        picked = []
-        for effect in self.model.effects:
+        cable, picked = self.model.cable, []
+        known = dict(zip(self.model.deviation_names, ca.vertsplit(self.deviation), strict=True))
+        known |= zip(self.model.names, ca.vertsplit(self.p), strict=True)
+        for effect in (*self.model.effects, *self.model.random):
             if isinstance(effect, base):
-                own = {
-                    q.name: self.p[names.index(f"{effect.label}.{q.name}")]
-                    for q in effect.parameters(cable)
-                }
-                for name in effect.per_pose(cable):
-                    own[name] = self.deviation[self.model.deviation_names.index(name)]
+                unit = known[BENDING_STIFFNESS] if effect.per_stiffness else 1
+                names = [q.name for q in effect.parameters(cable)]
+                own = {name: unit * known[f"{effect.label}.{name}"] for name in names}
+                own |= {name: known[name] for name in effect.per_pose(cable)}
                 picked.append((effect, own))
         return picked
 
@@ -140,13 +139,14 @@ class Lagrangian:
     def true_ends(self) -> EndConditions:
         """True ends: as declared, plus the pose's deviation and the boundary effects."""
         d, b = self.node.dimension, self.node.increment
-        edges = [0, d, d + b, d + 2 * b, 2 * (d + b), self.deviation.numel()]
-        place, first, last, _, moved = ca.vertsplit(self.deviation, edges)
+        fixed, clips = 2 * (d + b), 2 * (d + b) + d * len(self.model.clips)
+        edges = [0, d, d + b, d + 2 * b, fixed, clips, self.deviation.numel()]
+        place, first, last, _, moved, _ = ca.vertsplit(self.deviation, edges)
         declared = EndConditions.of(self.declared_ends, self.node)
         steps = ca.vertsplit(moved, d) if self.model.clips else []
         pairs = zip(self.declared_clips, steps, strict=True)
-        clips = [clip._replace(place=clip.place + step) for clip, step in pairs]
-        ends = replace(declared, end=declared.end + place, clips=tuple(clips)).turned(first, last)
+        held = [clip._replace(place=clip.place + step) for clip, step in pairs]
+        ends = replace(declared, end=declared.end + place, clips=tuple(held)).turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
         if END_ROLL in self.model.names:
@@ -371,7 +371,11 @@ class Lagrangian:
         gaps = [] if self.model.end == "free" else [true.start - true.end]
         gaps += [gap(true.start_frame, first)] if self.model.start == "clamped" else []
         gaps += [gap(true.end_frame, last)] if self.model.end == "clamped" else []
-        total = ca.dot(self.lam[: self.model.n_conditions], ca.vertcat(*gaps)) if gaps else ca.SX(0)
+        total = (
+            ca.dot(self.lam[: len(self.model.condition_names)], ca.vertcat(*gaps))
+            if gaps
+            else ca.SX(0)
+        )
         for effect, local in self.effects_of(BoundaryEffect):
             total += effect.energy(first, last, local)
         for k, compliance in self.compliance_of.items():

@@ -21,8 +21,8 @@ class PoseScatter:
     Parameters
     ----------
     std : float
-        Standard deviation of each component, see `unit`; 0 if the cable repeats. For a rest
-        curvature [1/m] the root mean square along the cable.
+        Standard deviation of each component; 0 if the cable repeats. For a rest curvature [1/m]
+        the root mean square along the cable; for a pin the moment over EI [1/m].
     smoothness : float
         Correlation length of a rest curvature, as a share of the cable's.
     dof : float
@@ -61,43 +61,43 @@ class PoseScatter:
         return known.at_random if known else "a rest curvature of its own"
 
     def unit(self, model: CableModel) -> str:
-        """Unit of `std`."""
+        """Unit of `std`, times `factor`."""
         effect = effect_of(self.source, model)
+        if effect is not None and effect.per_stiffness:
+            return "N m"
         return "1/m" if effect is None else effect.parameters(model.cable)[0].unit
 
+    def factor(self, stiffness: float) -> float:
+        """What `std` is multiplied by where it is shown: EI [N m^2] for moments, else 1."""
+        known = RANDOM.get(self.source)
+        return stiffness if known is not None and known.per_stiffness else 1.0
+
+    def deviations(self, model: CableModel) -> tuple[str, ...]:
+        """Names of what it varies among the deviations of `within(model)`; none of a curvature."""
+        effect = effect_of(self.source, model)
+        if effect is None:
+            return ()
+        names = (q.name for q in effect.parameters(model.cable))
+        return tuple(effect.as_deviation.get(x, f"{effect.label}.{x}") for x in names)
+
     def within(self, model: CableModel) -> CableModel:
-        """Return the model with the random effect added; the effect is zero on average."""
+        """Return the model in which each pose has the deviations that it varies."""
         effect = effect_of(self.source, model)
-        return model if effect is None or effect in model.effects else model.with_effect(effect)
-
-    def values(self, p: FloatArray, model: CableModel) -> FloatArray:
-        """Parameters of `within(model)`, given those of the model."""
-        return np.concatenate([p, np.zeros(len(self.within(model).names) - len(p))])
-
-    def of_deviations(self, model: CableModel) -> FloatArray:
-        """Standard deviations (n_deviations,) of a pose's deviations that have the same effect.
-
-        Zeros if it is no deviation of the ends.
-        """
-        names, std = model.deviation_names, np.zeros(len(model.deviation_names))
-        effect = effect_of(self.source, model)
-        if effect is not None:
-            for q in effect.parameters(model.cable):
-                if q.name in effect.as_deviation:
-                    std[names.index(effect.as_deviation[q.name])] = self.std
-        return std
+        if effect is None or {*self.deviations(model)} <= {*model.deviation_names}:
+            return model
+        return replace(model, random=(*model.random, effect))
 
     def ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
-        """Directions (n_parameters, q), (n_rests, q) of parameters and rests of `within(model)`.
+        """Directions (n_deviations, q), (n_rests, q) of deviations and rests of `within(model)`.
 
         Each changes one component by a unit.
         """
-        if self.source == REST_CURVATURE:
-            modes = modes_in(model)
-            return np.zeros((len(model.names), modes.shape[1])), modes
-        names = self.within(model).names
-        own = [k for k, name in enumerate(names) if name.startswith(f"{_label(self.source)}.")]
-        return np.eye(len(names))[:, own], np.zeros((model.chain.n_rests, len(own)))
+        names, own = self.within(model).deviation_names, self.deviations(model)
+        none = np.zeros((model.chain.n_rests, len(own)))
+        modes = modes_in(model) if self.source == REST_CURVATURE else none
+        by_deviation = np.zeros((len(names), modes.shape[1]))
+        by_deviation[[names.index(name) for name in own], range(len(own))] = 1.0
+        return by_deviation, modes
 
 
 def sources_in(model: CableModel) -> list[str]:

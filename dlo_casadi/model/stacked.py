@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame, Heading
@@ -42,9 +43,28 @@ class Shapes:
         """Shapes with ends and that number of clips as declared, without deviations."""
         return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]], clips)))))
 
+    def in_order_of(self, model: CableModel, other: CableModel) -> Shapes:
+        """Multipliers and deviations of a model's poses in another model's order.
+
+        Those that only the other model has are zero.
+        """
+        lam = _by_name(self.lam, model.border_names, other.border_names)
+        own = _by_name(self.deviation, model.deviation_names, other.deviation_names)
+        return Shapes(self.x, lam, own)
+
     def subset(self, index: Any) -> Shapes:
         """Shapes of some of the poses."""
         return Shapes(self.x[index], self.lam[index], self.deviation[index])
+
+
+def _by_name(rows: FloatArray, names: Sequence[str], others: Sequence[str]) -> FloatArray:
+    """Columns (m, k) of some names, in the order of others; zeros for new ones."""
+    if names == others:
+        return rows
+    at = dict(zip(names, rows.T, strict=True))
+    return (
+        np.array([at.get(name, np.zeros(len(rows))) for name in others]).reshape((-1, len(rows))).T
+    )
 
 
 @dataclass(frozen=True)

@@ -259,7 +259,12 @@ def _scatter(fit: Fit) -> dict[str, Any] | None:
     if not found.std or not found.shown:
         return None
     others = [other.source for other in found.rivals]
-    return {**fields_of(found, "source", "std"), "unit": found.unit(fit.model), "or": others}
+    return {**_shown(found, fit.p), "unit": found.unit(fit.model), "or": others}
+
+
+def _shown(scatter: PoseScatter, p: FloatArray) -> dict[str, Any]:
+    """Source and standard deviation, of moments in N m."""
+    return {"source": scatter.source, "std": scatter.std * scatter.factor(float(p[0]))}
 
 
 def fit_dict(fit: Fit) -> dict[str, Any]:
@@ -317,7 +322,7 @@ def _cable_dict(
             "fixtures": dict(uncertainty.scatter),
             "rest_curvature_std": uncertainty.pose_scatter.rest_std,
             "rest_curvature_smoothness": uncertainty.pose_scatter.smoothness,
-            "from_pose_to_pose": fields_of(uncertainty.pose_scatter, "source", "std"),
+            "from_pose_to_pose": _shown(uncertainty.pose_scatter, p),
             "hanging": uncertainty.repeat_std,
         },
     }

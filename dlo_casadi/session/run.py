@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.from_data import from_data
-from dlo_casadi.diagnosis.from_pose_to_pose import at_random, enough_poses, with_moved_ends
+from dlo_casadi.diagnosis.from_pose_to_pose import at_random, enough_poses, with_loose_poses
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
@@ -156,7 +156,7 @@ def fit_session(
     if not diagnosed:
         near = None
         if fit.noise.source == "misfit" and enough_poses(fit):
-            near = with_moved_ends(fit, from_data(fit)[0]) or at_random(fit)
+            near = with_loose_poses(fit, from_data(fit)[0]) or at_random(fit)
         if near is not None:
             kept = (near, mesh_error(near)) if config.model.n else None
             meshed, error = kept or fine_enough(near, near.model.n)

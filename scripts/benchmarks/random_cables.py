@@ -321,7 +321,7 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
     inwards = np.all(moments * np.sign(np.diff(phi)[active]) > -1e-7 * scale)
     # Independent of the solver's own elimination: all eigenvalues of the whole matrix.
     stacked = matrix.with_border(arms[None, :, None]).dense()[0]
-    conditions = model.n_conditions + len(active)
+    conditions = len(model.condition_names) + len(active)
     stable = (np.linalg.eigvalsh(stacked / scale) < 0).sum() == conditions
     inside = np.abs(np.diff(phi)).max() < JOINT_BOUND + 1e-7
     return bool(balanced and inwards and stable and inside), error

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from hidden_sets import simulated
 
+from dlo_casadi.cable.file import metadata_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     enough_poses,
-    of_ends,
-    with_moved_ends,
+    of_rest,
+    with_loose_poses,
 )
 from dlo_casadi.diagnosis.refits import confirm
 from dlo_casadi.diagnosis.selection import AddedEffect
@@ -27,7 +28,8 @@ from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, sources_in
+from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, effect_of, sources_in
+from dlo_casadi.report.documents import fit_dict
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import generator_of
 from dlo_casadi.session.fitting import declared_model, fit_declared
@@ -57,6 +59,17 @@ def test_what_may_differ():
     assert sources_in(MODELS["space"][0]) == ["length_error", "clamp_rotation", "end_offset"]
 
 
+def changed(model, scatter, k, x):
+    """Model, parameters and rest curvature with the k-th random component at x, in all poses."""
+    effect, rest = effect_of(scatter.source, model), np.zeros(model.chain.n_rests)
+    if effect is None:
+        return model, model.nominal, rest + x * scatter.ways(model)[1][:, k]
+    larger = model.with_effect(effect)
+    p = larger.nominal.copy()
+    p[len(model.names) + k] = x
+    return larger, p, rest
+
+
 @pytest.mark.parametrize("case", MODELS)
 def test_displacements_are_those_of_shapes_solved_anew(case):
     model, pose = MODELS[case]
@@ -64,52 +77,53 @@ def test_displacements_are_those_of_shapes_solved_anew(case):
     eq = solve_equilibrium(model, model.nominal, rest, pose)
     for source in (REST_CURVATURE, *sources_in(model)):
         scatter = PoseScatter(1e-5, source=source)
-        larger, p = scatter.within(model), scatter.values(model.nominal, model)
-        ways = zip(*(by.T for by in scatter.ways(model)), strict=True)
         uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
         found = displacements(model, model.nominal, rest, pose, eq, uncertainty, s)[1]
         found = found[:, :, len(model.deviations) :]
         sizes = scatter.sizes(found.shape[2] - len(pose.start))
-        for k, (by_p, by_rest) in enumerate(ways):
+        for k, size in enumerate(sizes):
             ahead, behind = (
-                solve_equilibrium(
-                    larger, p + x * by_p, rest + x * by_rest, pose, x_init=eq.x
-                ).points
+                solve_equilibrium(*changed(model, scatter, k, x), pose, x_init=eq.x).points
                 for x in (1e-5, -1e-5)
             )
-            there = (ahead - behind) / 2e-5 * sizes[k]
-            assert found[:, :, k] == pytest.approx(there, rel=1e-4, abs=1e-7 * sizes[k])
+            there = (ahead - behind) / 2e-5 * size
+            assert found[:, :, k] == pytest.approx(there, rel=1e-4, abs=1e-7 * size)
 
 
-def test_random_ends_are_deviations_of_the_ends():
+def test_what_is_random_is_a_deviation_of_each_pose():
     pins, clamps, space = (model for model, _ in MODELS.values())
-    ends = {"end_x": 2.0, "end_y": 2.0}
-    turns = dict.fromkeys([f"{side}_rotation_{axis}" for side in ("start", "end") for axis in "yz"])
-    for model, source, deviations in (
-        (pins, "end_offset", ends),
-        (pins, "pin_moment", {}),
-        (clamps, "clamp_angle", {"start_heading": 2.0, "end_heading": 2.0}),
-        (clamps, "length_error", {}),
-        (clamps, REST_CURVATURE, {}),
-        (space, "end_offset", {**ends, "end_z": 2.0}),
-        (space, "clamp_rotation", dict.fromkeys(turns, 2.0)),
+    turns = [f"{side}_rotation_{axis}" for side in ("start", "end") for axis in "yz"]
+    moments = [f"pin_moment_from_pose_to_pose.{side}" for side in ("start", "end")]
+    length = ["length_error_from_pose_to_pose.length_difference"]
+    for model, source, names, new in (
+        (pins, "end_offset", ["end_x", "end_y"], []),
+        (pins, "pin_moment", moments, moments),
+        (clamps, "clamp_angle", ["start_heading", "end_heading"], []),
+        (clamps, "length_error", length, length),
+        (clamps, REST_CURVATURE, [], []),
+        (space, "end_offset", ["end_x", "end_y", "end_z"], []),
+        (space, "clamp_rotation", turns, []),
     ):
-        std = PoseScatter(2.0, source=source).of_deviations(model)
-        found = {name: x for name, x in zip(model.deviation_names, std, strict=True) if x}
-        assert found == deviations
+        scatter = PoseScatter(2.0, source=source)
+        larger = scatter.within(model)
+        assert [*scatter.deviations(model)] == names
+        assert [*larger.deviation_names] == [*model.deviation_names, *new]
+        assert [*larger.deviations] == [*model.deviations, *new]
+        assert larger.names == model.names
+        assert scatter.within(larger) == larger
 
 
-@pytest.fixture(scope="module")
-def turned():
-    """A session in the plane whose clamps turn from pose to pose, and its declared fit."""
-    found = simulated(generator_of(7, 1), 2, 0, "clamp_angle")
+@pytest.fixture(scope="module", params=["clamp_angle", "length_error"])
+def varied(request):
+    """A session in the plane whose clamps turn, or lengths differ, with its declared fit."""
+    found = simulated(generator_of(7, 1), 2, 0, request.param)
     measured = measured_poses(found.session, read_inputs(found.session))
     return found, fit_declared(found.session, declared_model(found.session), measured)[0]
 
 
-def test_evidence_of_random_ends_is_that_of_their_covariance(turned):
-    """Ends as unknowns of each pose, as if their covariance were added to that of the noise."""
-    fit = turned[1]
+def test_evidence_of_random_unknowns_is_that_of_their_covariance(varied):
+    """Unknowns of each pose, as if their covariance were added to that of the noise."""
+    fit = varied[1]
     problem, lin = fit.problem, fit.linearization
     away, precision = fit.point.theta - problem.mean, problem.precision
 
@@ -137,11 +151,10 @@ def test_evidence_of_random_ends_is_that_of_their_covariance(turned):
         assert gain == pytest.approx(expected(other) - expected(std), abs=0.05)
 
 
-def test_turned_clamps_are_named_and_leave_the_stiffness_alone(turned):
-    found, fit = turned
+def test_what_is_random_is_named_and_leaves_the_stiffness_alone(varied):
+    found, fit = varied
     own = fit.problem.priors.pose_scatter
-    assert own.source == "clamp_angle"
-    assert own.std == pytest.approx(found.values["random.clamp_angle"], rel=0.5)
+    assert own.std == pytest.approx(found.values[f"random.{own.source}"], rel=0.5)
     interval = profile_interval(fit)
     assert interval.low < found.values["bending_stiffness"] < interval.high
 
@@ -157,7 +170,7 @@ def misfit():
 @pytest.fixture(scope="module")
 def near(misfit):
     """The same with clamps that turn at random, found from the measured shapes."""
-    return with_moved_ends(misfit[1], from_data(misfit[1])[0])
+    return with_loose_poses(misfit[1], from_data(misfit[1])[0])
 
 
 def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
@@ -166,7 +179,7 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
     assert fit.noise.source == "misfit"
     own = near.problem.priors.pose_scatter
     assert own.source == "clamp_rotation"
-    assert of_ends(near)
+    assert not of_rest(near)
     assert own.std == pytest.approx(found.values["random.clamp_rotation"], rel=0.2)
     assert near.chi2_per_dof == pytest.approx(1.0, abs=0.15)
     interval = profile_interval(near)
@@ -176,19 +189,62 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
     assert not enough_poses(SimpleNamespace(problem=few, model=near.model))
 
 
+@pytest.fixture(scope="module")
+def rubbed():
+    """A session in the plane with friction at its pins, a misfit, fitted from the shapes."""
+    found = simulated(generator_of(3306, 20), 2, 0, "pin_moment")
+    measured = measured_poses(found.session, read_inputs(found.session))
+    fit, _ = fit_declared(found.session, declared_model(found.session), measured)
+    assert fit.noise.source == "misfit"
+    return found, with_loose_poses(fit, from_data(fit)[0])
+
+
+def test_moments_of_pins_in_a_misfit_are_found_from_the_shapes(rubbed):
+    found, fit = rubbed
+    own = fit.problem.priors.pose_scatter
+    assert own.source == "pin_moment"
+    assert own.std == pytest.approx(found.values["random.pin_moment"], rel=0.3)
+    interval = profile_interval(fit)
+    assert interval.low < found.values["bending_stiffness"] < interval.high
+
+
+def test_without_moments_of_its_own_each_pose_is_in_another_equilibrium(rubbed):
+    fit = rubbed[1]
+    priors = replace(fit.problem.priors, pose_scatter=PoseScatter())
+    problem, point = replace(fit.problem, priors=priors).taken_over(fit.point, fit.problem)
+    assert problem.equilibria.model == fit.model
+    assert point.shapes.deviation.shape[1] == fit.point.shapes.deviation.shape[1] - 2
+    assert np.abs(point.shapes.x - fit.point.shapes.x).max() > 0.01
+    force = problem.equilibria.imbalance(*problem.state(point)).rows
+    assert np.abs(force).max() < 1e-6 * fit.model.force_scale
+    back, again = fit.problem.taken_over(point, problem)
+    assert not again.shapes.deviation[:, -2:].any()
+    assert back.equilibria.model == fit.problem.equilibria.model
+
+
+def test_moments_of_pins_are_written_in_newton_metres_and_read_back(rubbed):
+    fit = rubbed[1]
+    own, document = fit.problem.priors.pose_scatter, fit_dict(fit)
+    written = document["scatter"]["from_pose_to_pose"]
+    assert written == {"source": "pin_moment", "std": pytest.approx(own.std * fit.p[0])}
+    assert own.unit(fit.model) == "N m"
+    read = metadata_of(document | {"model_hash": ""}, None).uncertainty.pose_scatter
+    assert (read.source, read.std) == (own.source, pytest.approx(own.std))
+
+
 def test_a_kept_mesh_is_that_of_the_misfit(misfit, near):
     fit = misfit[1]
     finer = SimpleNamespace(model=fit.model.with_mesh(near.model.n + 2))
-    assert with_moved_ends(finer, from_data(fit)[0]).model.n == near.model.n + 2
+    assert with_loose_poses(finer, from_data(fit)[0]).model.n == near.model.n + 2
 
 
-def test_a_scatter_is_of_the_ends_only_if_all_its_rivals_are(near):
+def test_a_scatter_may_be_of_the_rest_shape_if_a_rival_is(near):
     own = near.problem.priors.pose_scatter
-    for rival, alone in (("end_offset", True), (REST_CURVATURE, False)):
+    for rival, expected in (("end_offset", False), (REST_CURVATURE, True)):
         scatter = replace(own, rivals=(PoseScatter(0.01, source=rival),))
         priors = SimpleNamespace(pose_scatter=scatter)
         both = SimpleNamespace(problem=SimpleNamespace(priors=priors), model=near.model)
-        assert of_ends(both) is alone
+        assert of_rest(both) is expected
 
 
 @pytest.mark.parametrize(("score", "worth"), [(70.0, False), (90.0, True)])
@@ -285,15 +341,11 @@ def test_gap_of_two_equilibria_moves_with_each_repeat_as_energies_solved_anew():
     ]
     for source in (REST_CURVATURE, "pin_moment"):
         scatter = PoseScatter(1e-3, source=source)
-        larger, p = scatter.within(model), scatter.values(model.nominal, model)
-        by_p, by_rest = scatter.ways(model)
         moved = []
-        for k, size in enumerate(scatter.sizes(by_p.shape[1])):
+        for k, size in enumerate(scatter.sizes(scatter.ways(model)[1].shape[1])):
             energies = [
                 [
-                    solve_equilibrium(
-                        larger, p + x * by_p[:, k], rest + x * by_rest[:, k], pose, x_init=eq.x
-                    ).energy
+                    solve_equilibrium(*changed(model, scatter, k, x), pose, x_init=eq.x).energy
                     for x in (1e-3, -1e-3)
                 ]
                 for eq in pair
