@@ -34,7 +34,7 @@ def as_repeating(fit: Fit) -> Fit:
 
 
 def of_rest(fit: Fit) -> bool:
-    """Whether it may be the shape at rest that differs at random: the likeliest source or a rival."""
+    """Whether the shape at rest may differ at random, as the likeliest source or as a rival."""
     scatter = fit.problem.priors.pose_scatter
     return not all(one.deviations(fit.model) for one in (scatter, *scatter.rivals))
 
