@@ -18,7 +18,7 @@ from dlo_casadi.effects import EFFECTS, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import Prediction, predict_poses
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.pose_scatter import PoseScatter, effect_of
+from dlo_casadi.model.pose_scatter import PoseScatter, effect_of, modes_in
 from dlo_casadi.sensing.noise import NoiseModel
 
 Draw = Callable[..., float]
@@ -294,7 +294,7 @@ def _shapes(
             predict_poses(own, np.append(p, draw), rest, [pose])[0]
             for draw, pose in zip(draws, poses, strict=True)
         ]
-    _, modes = scatter.ways(model)
+    modes = modes_in(model)
     return [
         predict_poses(model, p, rest + modes @ draw, [pose])[0]
         for draw, pose in zip(draws.T, poses, strict=True)

@@ -10,7 +10,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -357,9 +357,10 @@ def metadata_of(
     scatter = file.scatter or _Scatter()
     fixtures = {name: std or 0.0 for name, std in (scatter.fixtures or {}).items()}
     own, smoothness = scatter.from_pose_to_pose, scatter.rest_curvature_smoothness
-    size, stiffness = own.std or scatter.rest_curvature_std, file.parameters[BENDING_STIFFNESS]
-    size /= PoseScatter(source=own.source).factor(stiffness.value)
-    pose_scatter = PoseScatter(size, smoothness, source=own.source)
+    pose_scatter = PoseScatter(own.std or scatter.rest_curvature_std, smoothness, source=own.source)
+    if pose_scatter.of_moments:  # written in N m
+        stiffness = file.parameters[BENDING_STIFFNESS].value
+        pose_scatter = replace(pose_scatter, std=own.std / stiffness)
     return Metadata(
         path=source,
         params={name: row.estimate for name, row in file.parameters.items()},

@@ -136,7 +136,7 @@ def cross_validate(fit: Fit) -> CrossValidation:
         thetas.append(theta)
         covariances.append(covariance)
     predicted = _predicted(fit, dict(enumerate(thetas)))
-    near = _near_fitted_ends(fit, dict(enumerate(thetas)), predicted)
+    near = _at_own_deviations(fit, dict(enumerate(thetas)), predicted)
     linear = [
         _density(fit, k, _first_order(fit, k, theta), covariances[k])
         for k, theta in enumerate(thetas)
@@ -151,7 +151,7 @@ def cross_validate(fit: Fit) -> CrossValidation:
     refitted = {k: theta for k, theta in anew.items() if theta is not None}
     again = _predicted(fit, refitted)
     predicted |= again
-    for k, seen in _near_fitted_ends(fit, refitted, again).items():
+    for k, seen in _at_own_deviations(fit, refitted, again).items():
         densities[k] = _density_of(fit, k, seen, covariances[k])
     densities = [x if np.isfinite(x) else known for x, known in zip(densities, linear, strict=True)]
     items = [problem.measured[j] for j in problem.used]
@@ -185,7 +185,7 @@ def _fitted_without(fit: Fit, k: int) -> FloatArray | None:
 
 
 def _first_order(fit: Fit, k: int, theta: FloatArray) -> FloatArray:
-    """Whitened residuals (R_k,) of the k-th fitted pose at other unknowns and its declared ends."""
+    """Whitened residuals (R_k,) of the k-th fitted pose at other unknowns, without deviations."""
     lin, a = fit.linearization, fit.linearization.by_theta[k]
     own = lin.by_deviation[k] @ fit.own_deviations[k]
     return np.asarray(lin.residuals[k] + a @ (theta - fit.point.theta) - own)
@@ -203,7 +203,7 @@ def _density(fit: Fit, k: int, off: FloatArray, covariance: FloatArray) -> float
 
 
 def _density_of(fit: Fit, k: int, seen: Observed | None, covariance: FloatArray) -> float:
-    """`_density` of the k-th pose, seen as in `_near_fitted_ends`; -inf without an equilibrium."""
+    """`_density` of the k-th pose, seen as in `_at_own_deviations`; -inf without an equilibrium."""
     if seen is None:
         return -np.inf
     item = fit.problem.measured[fit.problem.used[k]]
@@ -243,10 +243,10 @@ def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[Float
     return np.clip(fit.point.theta - covariance @ gradient, lower, upper), covariance
 
 
-def _near_fitted_ends(
+def _at_own_deviations(
     fit: Fit, thetas: Mapping[int, FloatArray], predicted: dict[int, Observed | None]
 ) -> dict[int, Observed | None]:
-    """As `predicted`, but where ends differ at random with the ends as fitted.
+    """As `predicted`, but with each pose's random deviations as fitted.
 
     Turns of 0.05 rad have effects of second order far above the noise: predicted from declared
     ends, the density of a pose was e^105 too low.
@@ -261,7 +261,7 @@ def _predicted(
 ) -> dict[int, Observed | None]:
     """Predicted measurements of fitted poses at their own unknowns.
 
-    `start`: shapes with the ends to predict from; by default declared ones.
+    `start`: shapes with the deviations to predict with; by default none.
     The state before a pose is that of the fit, to which its first-order change is added.
     """
     problem, equilibria, unknowns = fit.problem, fit.problem.equilibria, fit.problem.unknowns
@@ -274,7 +274,8 @@ def _predicted(
         p[j] = unknowns.p(thetas[k])
         by_theta = fit.linearization.shapes.rest[j][:, : unknowns.size]
         rest[j] += by_theta @ (thetas[k] - fit.point.theta)
-    solved, converged = equilibria.solve(_declared(fit) if start is None else start, p, rest)
+    start = _declared(fit) if start is None else start
+    solved, converged = equilibria.solve_or_descend(start, p, rest)
     seen = equilibria.seen(solved, p, rest)
     return {k: seen[j] if converged[j] else None for k, j in at.items()}
 

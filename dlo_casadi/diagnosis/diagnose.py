@@ -17,8 +17,8 @@ from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     at_random_instead,
+    bends_at_random,
     enough_poses,
-    of_rest,
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.near_data import near_data
@@ -207,7 +207,7 @@ class Search:
         A first search that finds nothing does not count: it has tried the nearest candidates only.
         A scatter from pose to pose explains anything: if the declared model and the result have
         one, the search is repeated as if there were none, unless that promises nothing better, and
-        from the measured shapes, unless only fixtures scatter, which hardly imitate an effect.
+        from the measured shapes, unless only ends or lengths scatter: effects differ from these.
         """
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"
@@ -221,7 +221,7 @@ class Search:
                 repeating = replace(self, declared=as_repeating(self.declared))
                 if found.unexplained or repeating._may_gain(self.declared):
                     found = found.or_better(repeating._forwards(), EVIDENCE_APART)
-        if may_be_far and (found.unexplained or (found.fit.scatters and of_rest(found.fit))):
+        if may_be_far and (found.unexplained or bends_at_random(found.fit)):
             found = found.or_better(first or of_shapes.run())
         # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.validation.complete

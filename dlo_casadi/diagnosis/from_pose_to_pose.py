@@ -33,18 +33,18 @@ def as_repeating(fit: Fit) -> Fit:
     return descend(fit.reweighed(priors=replace(fit.problem.priors, pose_scatter=PoseScatter())))
 
 
-def of_rest(fit: Fit) -> bool:
-    """Whether the shape at rest may differ at random, as the likeliest source or as a rival."""
+def bends_at_random(fit: Fit) -> bool:
+    """Whether something differs at random that bends the cable, or a rival: `PoseScatter.bends`."""
     scatter = fit.problem.priors.pose_scatter
-    return not all(one.deviations(fit.model) for one in (scatter, *scatter.rivals))
+    return scatter.std > 0 and any(one.bends for one in (scatter, *scatter.rivals))
 
 
 def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | None:
     """Fit, started at relaxed shapes, in which something other than the shape at rest is random.
 
     Ends that turn or move, moments of pins, lengths: one of them is an unknown of each pose, with a
-    wide prior. None if no such fit meets the points. Missing effects hardly look like that: with
-    turns and displacements loose at once, eight of nine sessions in space in which one of them is
+    wide prior. None if no such fit meets the points. Missing effects hardly look like turns or
+    displacements: with both loose at once, eight of nine sessions in space in which one of them is
     random left at most 1.02 times the noise, twelve with hidden effects 1.2 to 140 times.
 
     Parameters
@@ -60,7 +60,7 @@ def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit |
     sizes = {
         "m": LOOSE_PLACE * model.cable.length,
         "rad": LOOSE_TURN,
-        "N m": LOOSE_BEND / model.cable.length,
+        "1/m": LOOSE_BEND / model.cable.length,
     }
     least, begun = NEAR_NOISE * expected_left(near), None
     for scatter in (PoseScatter(1.0, source=source) for source in sources_in(model)):

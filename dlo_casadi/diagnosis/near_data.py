@@ -185,8 +185,10 @@ def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
     item, screened = confirm_from_data(base, start), start.screened
     if item is None:
         return None
-    same = item.fit.reweighed(base.noise, base.problem.priors)
-    fit = followed(same, same.model, {}, MOST_STEPS) or same
+    fit = item.fit
+    with suppress(EstimationError):
+        same = fit.reweighed(base.noise, base.problem.priors)
+        fit = followed(same, same.model, {}, MOST_STEPS) or same
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
     values = {name: item.fit.value(name) for name in screened.candidate.frees}
     p_value = survival(gain, len(values), np.inf)

@@ -278,8 +278,10 @@ def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:
     """
     model, ceiling = candidate.remove_from(fit.model, declared.model), ceiling_beside(fit)
     found = followed(fit, model, {}, ceiling=ceiling)
-    nested = declared.reweighed(fit.noise, fit.problem.priors)
-    if found is None or found.point.objective > nested.point.objective:
+    nested = None
+    with suppress(EstimationError):
+        nested = declared.reweighed(fit.noise, fit.problem.priors)
+    if nested and (found is None or found.point.objective > nested.point.objective):
         values = {name: fit.value(name) for name in fit.model.names}
         other = followed(nested, model, values, ceiling=ceiling)
         both = [x for x in (found, other) if x is not None]

@@ -252,7 +252,10 @@ def p_with_new_noise(before: Fit, after: Fit, winner: Confirmed, tried: int) -> 
         return 1.0
     priors = replace(before.problem.priors, pose_scatter=pose_scatter)
     larger = after.reweighed(noise, priors)
-    without = descend(before.weighed_as(larger))
+    try:
+        without = descend(before.weighed_as(larger))
+    except EstimationError:  # with this scatter alone a pose has no equilibrium near its shape
+        return 0.0
     gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
     dof = len(winner.candidate.frees)
     return sidak(survival(gain, dof, noise_degrees(larger)), tried)

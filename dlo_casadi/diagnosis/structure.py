@@ -54,7 +54,7 @@ class Structure:
         Slow energy per degree of freedom by pose name.
     p_systematic : float or None
         For a cable that does not repeat: probability that alike poses share that much if each
-        repeat has a rest curvature of its own and nothing else is missing.
+        repeat has something random of its own and nothing else is missing.
     """
 
     statistic: float
@@ -70,7 +70,7 @@ class Structure:
 
     @property
     def p_noise(self) -> float:
-        """Probability of the residual if it is noise and each repeat's own rest curvature.
+        """Probability of the residual if it is noise and what differs at random from pose to pose.
 
         That of the less likely of the tests made, corrected for their number (Sidak).
         """

@@ -90,8 +90,8 @@ class PinMoment(BoundaryEffect):
     Parameters
     ----------
     start, end : scalar [1/m]
-        Curvature to which the pin bends the cable there: its moment over EI, counter-clockwise;
-        vanish at 0. Only those of pinned ends.
+        Moment of the pin over EI, counter-clockwise, which is the size of the cable's curvature
+        there; vanish at 0. Only those of pinned ends.
     """
 
     sides: tuple[str, ...] = ("start", "end")

@@ -98,11 +98,9 @@ class BatchEquilibrium:
         # of any law each step makes at least one more pose exact.
         strains = len(self.node.strains)
         for _ in range(self.m):
-            after = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))
-            change, slopes = (
-                after[0][:-1] - out[1:],
-                after[2].reshape((self.m, strains, -1, strains)),
-            )
+            found = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))
+            after, _, by_rest, *_ = found
+            change, slopes = after[:-1] - out[1:], by_rest.reshape((self.m, strains, -1, strains))
             for j in range(1, self.m - 1):
                 before = change[j - 1].reshape((strains, -1))
                 change[j] += np.einsum("ick,kc->ic", slopes[j], before).ravel()

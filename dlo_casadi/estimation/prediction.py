@@ -364,11 +364,11 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     """Causes of uncertainty in predictions from a fit.
 
     The difference between repeats beyond the noise of their points includes that of the fixtures.
-    If there are many different poses, each repeat's own rest curvature accounts for it instead.
+    If there are many different poses, what differs at random accounts for it instead.
     """
     names, covariance = fit.named_covariance
-    # Those of fixtures are the first.
-    scatter = dict(zip(fit.model.deviations, map(float, fit.problem.fixture_std), strict=False))
+    own = fit.model.deviations  # random ones of the problem's poses follow these
+    scatter = dict(zip(own, map(float, fit.problem.fixture_std[: len(own)]), strict=True))
     history, apart = fit.problem.history, 0.0
     if different_poses(history, fit.model) < DIFFERENT:
         apart = repeat_std(history, fit.model, fit.noise.of_points.beside_repeats)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.errors import EstimationError
@@ -38,6 +38,9 @@ from dlo_casadi.sensing.noise import NoiseModel
 # Roughness of the rest curvature until it has been estimated.
 FIRST_ROUGHNESS = 0.3
 NO_SCATTER = PoseScatter()
+# Shares of random deviations on the way to equilibria without them: moments of pins move a cable by
+# centimetres.
+VANISHING = (0.5, 0.2, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +50,8 @@ class Priors:
     Parameters
     ----------
     scatter : (n_deviations,)
-        Standard deviations of a pose's own deviations within the tolerances.
+        Standard deviations of a pose's own deviations within the tolerances, of the model without
+        what is random besides.
     roughness_std : float
         Prior of the rest curvature, see `Unknowns.prior`.
     pose_scatter : PoseScatter
@@ -118,7 +122,8 @@ class Problem:
     @cached_property
     def equilibria(self) -> BatchEquilibrium:
         """The model over the problem's own poses, with what is random as deviations of each."""
-        return self._equilibria_of(self.priors.pose_scatter.within(self.unknowns.model))
+        scatter, model = self.priors.pose_scatter, self.unknowns.model
+        return self._equilibria_of(scatter.within(model) if scatter.std else model)
 
     def _equilibria_of(self, model: CableModel) -> BatchEquilibrium:
         wrenches = any(item.reactions for item in self.measured)
@@ -148,13 +153,16 @@ class Problem:
 
     @cached_property
     def fixture_std(self) -> FloatArray:
-        """Scatter of the fixtures within their tolerances, by `used_deviations`; of others zero."""
+        """Scatter of the fixtures within their tolerances, zero for what is random besides them.
+
+        In the order of `BatchEquilibrium.used_deviations`, as the two below.
+        """
         others = len(self.equilibria.model.deviation_names) - len(self.priors.scatter)
         return np.pad(self.priors.scatter, (0, others))[self.equilibria.used_deviations]
 
     @cached_property
     def random_std(self) -> FloatArray:
-        """Scatter of the same deviations from pose to pose beyond that, see `pose_scatter`."""
+        """Scatter from pose to pose beyond the tolerances, see `pose_scatter`."""
         scatter = self.priors.pose_scatter
         random = np.isin(self.equilibria.model.deviations, scatter.deviations(self.unknowns.model))
         return np.where(random, scatter.std, 0.0)
@@ -192,7 +200,8 @@ class Problem:
             self.measured[j].whitening(self.noise, s)
             for j, s in zip(self.used, values.projections, strict=True)
         ]
-        for k, way in enumerate([] if self.random_std.any() else self.own_errors(values)):
+        random = self.own_errors(values) if self.priors.pose_scatter.rest_std else []
+        for k, way in enumerate(random):
             if not way.size:
                 continue
             seen = weights[k] @ way
@@ -288,23 +297,38 @@ class Problem:
         return point if np.isfinite(point.objective) else None
 
     def taken_over(self, values: Values, other: Problem) -> tuple[Problem, Point]:
-        """Objective at values of a problem with other priors; weights are computed there if needed.
+        """Return the problem with weights, and its objective at values of another problem.
 
-        Deviations that only this problem's poses have are zero. Where values have others,
-        equilibria are solved without them: EstimationError if a pose has none nearby.
+        Both have the same model; their poses may have different random deviations. New ones are
+        zero; those that this problem lacks vanish in steps, from equilibrium to equilibrium. If
+        the problem has no weights, they are computed at the values.
+
+        Raises
+        ------
+        EstimationError
+            If a pose has no equilibrium without them.
         """
-        models, shapes = (other.equilibria.model, self.equilibria.model), values.shapes
-        lost = ~np.isin(models[0].deviation_names, models[1].deviation_names)
-        values = Values(values.theta, shapes.in_order_of(*models), values.projections)
+        own, model = other.equilibria.model, self.equilibria.model
+        lost, shapes = ~np.isin(own.deviation_names, model.deviation_names), values.shapes
+        if shapes.deviation[:, lost].any():
+            shapes = other._without(values, lost)
+        values = Values(values.theta, shapes.in_order_of(own, model), values.projections)
         problem = self if self.weights else self.weighed(values)
-        if not shapes.deviation[:, lost].any():
-            return problem, problem.evaluate(values)
-        point = problem.balanced(values)
-        if point is None:
+        return problem, problem.evaluate(values)
+
+    def _without(self, values: Values, lost: BoolArray) -> Shapes:
+        """Equilibria without some deviations (n_deviations,), see `taken_over`."""
+        shapes, p, rest = self.state(values)
+        first, converged = shapes.deviation, np.ones(self.equilibria.m, dtype=bool)
+        for share in VANISHING:
+            shapes = replace(shapes, deviation=np.where(lost, share * first, first))
+            shapes, converged = self.equilibria.solve_or_descend(shapes, p, rest)
+        if not converged.all():
+            name = self.measured[int(converged.argmin())].pose.name
             raise EstimationError(
-                "without what differs at random, a pose has no equilibrium near its shape"
+                f"{name} has no equilibrium near its shape without what is random in each pose"
             )
-        return problem, point
+        return shapes
 
     # ---- derivatives -------------------------------------------------------------------------
 

@@ -235,8 +235,8 @@ class Fit:
             by_errors = taken @ column
             errors += float(by_errors @ by_errors)
             own += float(((by_errors @ white @ way) ** 2).sum())
-        # The weights contain what is random, unless the deviations of the ends do.
-        noise = errors if problem.random_std.any() else errors - own
+        # The weights contain a random rest curvature; all else is an unknown of each pose.
+        noise = errors - own if rest.rest_std else errors
         parts = noise**2 / self.noise.slow_dof + own**2 / rest.dof
         parts /= column[index] ** 2
         return max(LEAST_NOISE_DEGREES, 1 / parts) if parts > 0 else np.inf
@@ -301,12 +301,12 @@ class Fit:
 
     @cached_property
     def repeat_error(self) -> float:
-        """RMS displacement of points [m] caused by each repeat's own rest curvature."""
+        """RMS displacement of points [m] caused by what differs at random from pose to pose."""
         return self._rms_of_points(self._by_rest)
 
     @property
     def _by_rest(self) -> list[FloatArray]:
-        """Variance (R_j,) of each residual caused by each repeat's own rest curvature."""
+        """Variance (R_j,) of each residual caused by what differs at random from pose to pose."""
         return [(way**2).sum(axis=1) for way in self._own_errors]
 
     @cached_property

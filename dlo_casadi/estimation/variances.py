@@ -78,10 +78,15 @@ def refine(fit: Fit, rounds: int = 3, modes: int = SMOOTH_MODES, *, first: bool 
             float(np.abs(np.log(scatter[ends] / priors.scatter[ends])).max()),
         )
         changed = abs(np.log(noise.std / fit.noise.std))
-        largest = max(rest.std, priors.pose_scatter.std)
-        same = abs(rest.std - priors.pose_scatter.std) <= 0.05 * largest
+        known = priors.pose_scatter
+        same = abs(rest.std - known.std) <= 0.05 * max(rest.std, known.std)
+        same &= rest.source == known.source or not rest.std
         found = replace(priors, roughness_std=roughness, scatter=scatter, pose_scatter=rest)
-        fit = descend(fit.reweighed(noise, found))
+        try:
+            near = fit.reweighed(noise, found)
+        except EstimationError:  # a pose has no equilibrium without what was random
+            near = fit.reweighed(noise, replace(found, pose_scatter=known))
+        fit = descend(near)
         if moved < 0.1 and changed < 0.02 and same:
             break
         if rough and not fit.converged:
@@ -106,7 +111,7 @@ def contradicted(fit: Fit) -> bool:
 def errors_of(
     fit: Fit, modes: int = SMOOTH_MODES, *, estimated: bool, repeats: bool
 ) -> tuple[NoiseModel, PoseScatter]:
-    """Noise of the points and each repeat's own rest curvature, from the residuals.
+    """Noise of the points and what differs at random from pose to pose, from the residuals.
 
     The noise is estimated with all changes of shape projected out. If lines have too few points
     for that, fewer slow displacements are projected out; in the last resort the noise is white,
@@ -267,7 +272,7 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     size = problem.unknowns.size
     bases, left_over = [], []
     scatter = problem.priors.pose_scatter
-    rest = problem.moved_by(point, scatter)[0] if scatter.std > 0 else None
+    rest = problem.moved_by(point, scatter)[0] if scatter.rest_std > 0 else None
     kept = [problem.measured[j].on_points for j in problem.used]
     raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
     ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]

@@ -110,8 +110,9 @@ class CableModel:
         if (self.clips or self.surfaces) and not self.chain.kind.smooth:
             what = "clips" if self.clips else "obstacles"
             raise DloError(f"{what} need a smooth element, found {self.element!r}; try 'quadratic'")
-        labels = [effect.label for effect in self.effects]
-        for effect in self.effects:
+        every = (*self.effects, *self.random)
+        labels = [effect.label for effect in every]
+        for effect in every:
             if labels.count(effect.label) > 1:
                 raise DloError(
                     f"two effects are both labelled {effect.label!r}; give one another label, "

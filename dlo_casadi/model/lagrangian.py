@@ -90,7 +90,7 @@ class Lagrangian:
         self.inner = ca.SX.sym("inner", self.kind.n_inner)
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
-        """Effects of one kind in the model, with their own parameters."""
+        """Effects of one kind in the model, random ones included, with their own parameters."""
         cable, picked = self.model.cable, []
         known = dict(zip(self.model.deviation_names, ca.vertsplit(self.deviation), strict=True))
         known |= zip(self.model.names, ca.vertsplit(self.p), strict=True)
@@ -371,11 +371,8 @@ class Lagrangian:
         gaps = [] if self.model.end == "free" else [true.start - true.end]
         gaps += [gap(true.start_frame, first)] if self.model.start == "clamped" else []
         gaps += [gap(true.end_frame, last)] if self.model.end == "clamped" else []
-        total = (
-            ca.dot(self.lam[: len(self.model.condition_names)], ca.vertcat(*gaps))
-            if gaps
-            else ca.SX(0)
-        )
+        held = self.lam[: len(self.model.condition_names)]
+        total = ca.dot(held, ca.vertcat(*gaps)) if gaps else ca.SX(0)
         for effect, local in self.effects_of(BoundaryEffect):
             total += effect.energy(first, last, local)
         for k, compliance in self.compliance_of.items():

@@ -60,20 +60,29 @@ class PoseScatter:
         known = RANDOM.get(self.source)
         return known.at_random if known else "a rest curvature of its own"
 
+    @property
+    def of_moments(self) -> bool:
+        """Whether it is of moments, which `std` gives per bending stiffness [1/m]."""
+        return self.source in RANDOM and RANDOM[self.source].per_stiffness
+
+    @property
+    def bends(self) -> bool:
+        """Whether it bends the cable, so that a missing effect may look like it."""
+        return self.source == REST_CURVATURE or self.of_moments
+
     def unit(self, model: CableModel) -> str:
-        """Unit of `std`, times `factor`."""
+        """Unit of `std`."""
         effect = effect_of(self.source, model)
-        if effect is not None and effect.per_stiffness:
-            return "N m"
         return "1/m" if effect is None else effect.parameters(model.cable)[0].unit
 
-    def factor(self, stiffness: float) -> float:
-        """What `std` is multiplied by where it is shown: EI [N m^2] for moments, else 1."""
-        known = RANDOM.get(self.source)
-        return stiffness if known is not None and known.per_stiffness else 1.0
+    def size(self, model: CableModel, stiffness: float) -> tuple[float, str]:
+        """Standard deviation and unit as shown to users: of moments in N m, EI times `std`."""
+        if self.of_moments:
+            return self.std * stiffness, "N m"
+        return self.std, self.unit(model)
 
     def deviations(self, model: CableModel) -> tuple[str, ...]:
-        """Names of what it varies among the deviations of `within(model)`; none of a curvature."""
+        """Names of the deviations that it varies in `within(model)`; none for a rest curvature."""
         effect = effect_of(self.source, model)
         if effect is None:
             return ()
@@ -81,11 +90,12 @@ class PoseScatter:
         return tuple(effect.as_deviation.get(x, f"{effect.label}.{x}") for x in names)
 
     def within(self, model: CableModel) -> CableModel:
-        """Return the model in which each pose has the deviations that it varies."""
+        """Return the model whose poses have the deviations that it varies: a larger one, or it."""
         effect = effect_of(self.source, model)
         if effect is None or {*self.deviations(model)} <= {*model.deviation_names}:
             return model
-        return replace(model, random=(*model.random, effect))
+        both = sorted((*model.random, effect), key=lambda one: one.label)
+        return replace(model, random=tuple(both))
 
     def ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
         """Directions (n_deviations, q), (n_rests, q) of deviations and rests of `within(model)`.

@@ -40,7 +40,7 @@ class Shapes:
 
     @classmethod
     def declared(cls, x: FloatArray, lam: FloatArray, clips: int = 0) -> Shapes:
-        """Shapes with ends and that number of clips as declared, without deviations."""
+        """Shapes with ends and that number of clips as declared; nothing else is random."""
         return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]], clips)))))
 
     def in_order_of(self, model: CableModel, other: CableModel) -> Shapes:
@@ -62,9 +62,8 @@ def _by_name(rows: FloatArray, names: Sequence[str], others: Sequence[str]) -> F
     if names == others:
         return rows
     at = dict(zip(names, rows.T, strict=True))
-    return (
-        np.array([at.get(name, np.zeros(len(rows))) for name in others]).reshape((-1, len(rows))).T
-    )
+    columns = [at.get(name, np.zeros(len(rows))) for name in others]
+    return np.array(columns).reshape((-1, len(rows))).T
 
 
 @dataclass(frozen=True)

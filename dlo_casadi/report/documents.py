@@ -259,12 +259,8 @@ def _scatter(fit: Fit) -> dict[str, Any] | None:
     if not found.std or not found.shown:
         return None
     others = [other.source for other in found.rivals]
-    return {**_shown(found, fit.p), "unit": found.unit(fit.model), "or": others}
-
-
-def _shown(scatter: PoseScatter, p: FloatArray) -> dict[str, Any]:
-    """Source and standard deviation, of moments in N m."""
-    return {"source": scatter.source, "std": scatter.std * scatter.factor(float(p[0]))}
+    std, unit = found.size(fit.model, float(fit.p[0]))
+    return {"source": found.source, "std": std, "unit": unit, "or": others}
 
 
 def fit_dict(fit: Fit) -> dict[str, Any]:
@@ -322,7 +318,10 @@ def _cable_dict(
             "fixtures": dict(uncertainty.scatter),
             "rest_curvature_std": uncertainty.pose_scatter.rest_std,
             "rest_curvature_smoothness": uncertainty.pose_scatter.smoothness,
-            "from_pose_to_pose": _shown(uncertainty.pose_scatter, p),
+            "from_pose_to_pose": {
+                "source": uncertainty.pose_scatter.source,
+                "std": uncertainty.pose_scatter.size(model, float(p[0]))[0],
+            },
             "hanging": uncertainty.repeat_std,
         },
     }

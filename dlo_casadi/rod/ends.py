@@ -29,7 +29,7 @@ def reaction_rows(node: type[Node], clips: int = 0) -> dict[str, slice]:
 
 
 def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
-    """Names of the unknowns that each pose has of its own, in the order of `deviation`.
+    """Names of the unknowns that each pose of any model has of its own, in this order.
 
     These are deviations of the ends from declared values [m, rad], a force of unknown cause [N],
     and deviations of the clips [m].

@@ -382,9 +382,13 @@ def nearest_to_poses(
         least *= 1.0 if diagnosed else 1 + 1 / np.sqrt(2 * len(fit.problem.used))
     if _off(own) <= least:
         return fit, own
-    misfit = fit.noise.source == "misfit"
-    first = fit if misfit else fit_to_misfit(fit)
-    found = [] if misfit else [first]
+    found, first = [], fit
+    if fit.noise.source != "misfit":
+        try:
+            first = fit_to_misfit(fit)
+        except EstimationError:  # a pose has no equilibrium without what is random in each
+            return fit, own
+        found = [first]
     found += [other for stage in simpler for other in _from_simpler(first, stage, True)]
     return min([(fit, own), *((x, staged(x)) for x in found)], key=lambda pair: _off(pair[1]))
 

@@ -305,7 +305,7 @@ def fit_warnings(
             f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
         ]
     # Where ends differ at random beyond the tolerances, the line above has told by how much.
-    random = (fit.problem.random_std * fit.problem.fixture_std).any()
+    random = fit.problem.random_std[fit.problem.fixture_std > 0].any()
     if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor and not random:
         apart = float(np.hypot(fit.fixture_error, floor))
         lines.append(
@@ -357,10 +357,10 @@ def _beyond_tolerances(fit: Fit) -> Iterator[str]:
 
 def _own(scatter: PoseScatter, fit: Fit) -> str:
     """What differs from pose to pose, with its size, and what cannot be distinguished from it."""
-    each = [
-        f"{one.words} of {one.std * one.factor(fit.p[0]):.2g} {one.unit(fit.model)}"
-        for one in (scatter, *scatter.rivals)
-    ]
+    each = []
+    for one in (scatter, *scatter.rivals):
+        std, unit = one.size(fit.model, float(fit.p[0]))
+        each.append(f"{one.words} of {std:.2g} {unit}")
     return " or ".join(each)
 
 

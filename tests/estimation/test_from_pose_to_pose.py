@@ -14,8 +14,8 @@ from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
+    bends_at_random,
     enough_poses,
-    of_rest,
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.refits import confirm
@@ -179,7 +179,7 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
     assert fit.noise.source == "misfit"
     own = near.problem.priors.pose_scatter
     assert own.source == "clamp_rotation"
-    assert not of_rest(near)
+    assert not bends_at_random(near)
     assert own.std == pytest.approx(found.values["random.clamp_rotation"], rel=0.2)
     assert near.chi2_per_dof == pytest.approx(1.0, abs=0.15)
     interval = profile_interval(near)
@@ -227,7 +227,7 @@ def test_moments_of_pins_are_written_in_newton_metres_and_read_back(rubbed):
     own, document = fit.problem.priors.pose_scatter, fit_dict(fit)
     written = document["scatter"]["from_pose_to_pose"]
     assert written == {"source": "pin_moment", "std": pytest.approx(own.std * fit.p[0])}
-    assert own.unit(fit.model) == "N m"
+    assert own.size(fit.model, fit.p[0]) == (written["std"], "N m")
     read = metadata_of(document | {"model_hash": ""}, None).uncertainty.pose_scatter
     assert (read.source, read.std) == (own.source, pytest.approx(own.std))
 
@@ -244,7 +244,7 @@ def test_a_scatter_may_be_of_the_rest_shape_if_a_rival_is(near):
         scatter = replace(own, rivals=(PoseScatter(0.01, source=rival),))
         priors = SimpleNamespace(pose_scatter=scatter)
         both = SimpleNamespace(problem=SimpleNamespace(priors=priors), model=near.model)
-        assert of_rest(both) is expected
+        assert bends_at_random(both) is expected
 
 
 @pytest.mark.parametrize(("score", "worth"), [(70.0, False), (90.0, True)])
