@@ -24,6 +24,7 @@ from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, gap_std_of_repeats
+from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.variances import settle
@@ -206,6 +207,15 @@ def test_moments_of_pins_in_a_misfit_are_found_from_the_shapes(rubbed):
     assert own.std == pytest.approx(found.values["random.pin_moment"], rel=0.3)
     interval = profile_interval(fit)
     assert interval.low < found.values["bending_stiffness"] < interval.high
+
+
+def test_ipopt_finds_the_same_minimum_with_moments_as_unknowns(rubbed):
+    fit = descend(rubbed[1])
+    point, residual = solve_batch(fit.problem, fit.point)
+    assert residual < 1e-7
+    assert point.objective == pytest.approx(fit.point.objective, rel=1e-5)
+    gap = point.shapes.deviation[:, -2:] - fit.point.shapes.deviation[:, -2:]
+    assert np.abs(gap).max() < 1e-3 * fit.problem.priors.pose_scatter.std
 
 
 def test_without_moments_of_its_own_each_pose_is_in_another_equilibrium(rubbed):
