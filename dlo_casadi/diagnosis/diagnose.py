@@ -207,7 +207,7 @@ class Search:
         A first search that finds nothing does not count: it has tried the nearest candidates only.
         A scatter from pose to pose explains anything: if the declared model and the result have
         one, the search is repeated as if there were none, unless that promises nothing better, and
-        from the measured shapes, unless only ends or lengths scatter: effects differ from these.
+        from the measured shapes, if what scatters bends the cable, as missing effects do.
         """
         of_shapes = replace(self, from_shapes=True)
         may_be_far = self.several and self.declared.noise.source != "misfit"

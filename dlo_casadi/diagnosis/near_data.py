@@ -185,10 +185,11 @@ def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
     item, screened = confirm_from_data(base, start), start.screened
     if item is None:
         return None
-    fit = item.fit
-    with suppress(EstimationError):
-        same = fit.reweighed(base.noise, base.problem.priors)
-        fit = followed(same, same.model, {}, MOST_STEPS) or same
+    try:
+        same = item.fit.reweighed(base.noise, base.problem.priors)
+    except EstimationError:  # a pose needs what is random in it: no gain can be computed
+        return item
+    fit = followed(same, same.model, {}, MOST_STEPS) or same
     gain = max(2 * (base.point.objective - fit.point.objective), 0.0)
     values = {name: item.fit.value(name) for name in screened.candidate.frees}
     p_value = survival(gain, len(values), np.inf)
