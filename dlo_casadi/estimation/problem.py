@@ -121,7 +121,7 @@ class Problem:
 
     @cached_property
     def equilibria(self) -> BatchEquilibrium:
-        """The model over the problem's own poses, with what is random as deviations of each."""
+        """The model over the problem's own poses; random effects are deviations of each pose."""
         scatter, model = self.priors.pose_scatter, self.unknowns.model
         return self._equilibria_of(scatter.within(model) if scatter.std else model)
 
@@ -153,7 +153,7 @@ class Problem:
 
     @cached_property
     def fixture_std(self) -> FloatArray:
-        """Scatter of the fixtures within their tolerances, zero for what is random besides them.
+        """Scatter of the fixtures within their tolerances; zero for deviations by random effects.
 
         In the order of `BatchEquilibrium.used_deviations`, as the two below.
         """
@@ -326,7 +326,7 @@ class Problem:
         if not converged.all():
             name = self.measured[int(converged.argmin())].pose.name
             raise EstimationError(
-                f"{name} has no equilibrium near its shape without what is random in each pose"
+                f"{name} has no equilibrium near its shape without its own random deviations"
             )
         return shapes
 

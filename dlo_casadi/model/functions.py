@@ -306,7 +306,10 @@ class Functions:
 
     @cached_property
     def segment_state(self) -> ca.Function:
-        """As `segment` -> rest strains of the cell after the pose; by increments, rest, p, own."""
+        """As `segment` -> rest strains of the cell after the pose, and their derivatives.
+
+        The derivatives are by increments, rest, p and deviation.
+        """
         own = self.terms.rest_strains[::3]
         strain, mean = self.kind.strain(self._plain), own
         for effect, local in self.terms.effects_of(StateEffect):

@@ -40,7 +40,7 @@ class Shapes:
 
     @classmethod
     def declared(cls, x: FloatArray, lam: FloatArray, clips: int = 0) -> Shapes:
-        """Shapes with ends and that number of clips as declared; nothing else is random."""
+        """Shapes without deviations, of a model with that number of clips and no random effect."""
         return cls(x, lam, np.zeros((len(x), len(deviation_names(_NODES[x.shape[-1]], clips)))))
 
     def in_order_of(self, model: CableModel, other: CableModel) -> Shapes:
