@@ -95,9 +95,11 @@ def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
     model = base.model.with_mesh(mesh)
     known: NoiseModel = base.noise.before or (base.noise if base.noise.known else alone)
     problem = replace(_beside(base, model), noise=known, weights=None)
-    p = np.where(problem.unknowns.free, model.nominal, problem.unknowns.fixed)
-    start = problem.unknowns.pack(p, np.zeros(model.n_coefficients))
-    problem, values = begin(problem, start)
+    unknowns = problem.unknowns
+    # Shapes then start as those of the first fit do, and are found again.
+    unknowns = replace(unknowns, fixed=np.where(unknowns.free, model.nominal, unknowns.fixed))
+    start = unknowns.pack(unknowns.fixed, np.zeros(model.n_coefficients))
+    problem, values = begin(replace(problem, unknowns=unknowns), start)
     best = None
     for softness in SCORED:
         values = Relaxation(problem, softness).solve(values)

@@ -9,6 +9,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.continuation import relaxed
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import explains, fine_enough, refine_mesh
+from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
@@ -67,9 +68,14 @@ def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit |
         loose = replace(scatter, std=sizes[scatter.unit(model)])
         own = replace(problem, priors=replace(problem.priors, pose_scatter=loose))
         own, point = own.taken_over(near.point, problem)
-        values = relaxed(own, point, COMPARED)
-        left = Relaxation(own, COMPARED[-1]).objective(values)
-        if left < least:
+        values: Values = point
+        # The objective grows as the balance hardens: what exceeds the least one will not return.
+        for soft in COMPARED:
+            values = relaxed(own, values, (soft,))
+            left = Relaxation(own, soft).objective(values)
+            if left >= least:
+                break
+        else:
             least, begun = left, (own, point, values)
     if begun is None:
         return None

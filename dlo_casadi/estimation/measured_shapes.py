@@ -52,6 +52,9 @@ def measured_shapes(
     moving = Kinematics | MeasurementEffect | BoundaryEffect
     kept = tuple(effect for effect in model.effects if isinstance(effect, moving))
     bare = replace(model, effects=kept, priors={}).with_mesh(chain.n, chain.kind.plain)
+    if all(j in problem.used and item.has_line for j, item in enumerate(problem.measured)):
+        # Only first guesses depend on gravity: sessions under several gravities share the result.
+        bare = replace(bare, gravity=tuple(0.0 for _ in model.gravity))
     p = dict(zip(model.names, problem.unknowns.fixed.tolist(), strict=True))
     # These change nothing here: with the same values for all fits, results are found again.
     p |= dict.fromkeys(p.keys() & {*STIFFNESSES, END_ROLL}, 1.0)
