@@ -45,7 +45,7 @@ def test_numbers_of_a_segment_do_not_depend_on_how_they_are_computed(
     mapped = Mapped(function, repetitive=repetitive)
     given = arguments(function, 13, 6)  # 78 segments: two blocks
     first = mapped(*given)
-    monkeypatch.setattr(stacked, "PAID", 0)
+    monkeypatch.setattr(stacked, "OFTEN", 0)
     after = mapped(*given)
     assert mapped._vectorised is not None
     assert mapped._simplified is repetitive
@@ -79,7 +79,7 @@ def test_a_vectorised_function_of_constants_and_selections():
 
 def test_a_function_that_calls_another_stays_scalar(monkeypatch):
     monkeypatch.setattr(stacked, "WORTH", 0)
-    monkeypatch.setattr(stacked, "PAID", 0)
+    monkeypatch.setattr(stacked, "OFTEN", 0)
     x = ca.SX.sym("x", 2)
     called = ca.Function("called", [x], [ca.sumsqr(x)], {"never_inline": True})
     mapped = Mapped(ca.Function("f", [x], [ca.densify(2 * called(x))]))

@@ -116,9 +116,10 @@ def repeated(rows: FloatArray, count: int) -> FloatArray:
 # those that fill up a block included; one of CasADi's scalar interpreter 2 to 4 ns per segment.
 BLOCK = 64
 # Smallest calls that are vectorised: number of segments, and of instructions over all segments,
-# which take the interpreter 0.1 ms. The conversion takes 4 us per instruction, which has paid
-# after that number of segments.
-FEWEST, WORTH, PAID = 8, 3e4, 1400
+# which take the interpreter 0.1 ms. The conversion takes 5 us per instruction, which has paid after
+# 1300 segments; a function that has been evaluated for 400 will usually be for many more: in seven
+# simulated sessions all evaluations together took least with 400 to 700.
+FEWEST, WORTH, OFTEN = 8, 3e4, 400
 
 
 class Mapped:
@@ -162,7 +163,7 @@ class Mapped:
     def _evaluate(self, number: int, given: Sequence[FloatArray]) -> list[FloatArray]:
         """As `_one_by_one`, in the fastest way for this number of segments."""
         self._evaluated += number
-        often = self._evaluated > PAID
+        often = self._evaluated > OFTEN
         if often and not self._simplified and (self._repetitive or not self._is_large(number)):
             self._function, self._buffers = simplified(self._function), {}
             self._simplified = True
@@ -257,5 +258,7 @@ def vectorised(function: ca.Function, size: int) -> ca.Function:
             work[o[0]] = ca.MX.unary(op, work[i[0]])
         else:
             work[o[0]] = ca.MX.binary(op, work[i[0]], work[i[1]])
-    full = [ca.horzcat(ca.MX(size, 0), *(x + ca.MX.zeros(size) for x in row)) for row in outputs]
-    return ca.Function(function.name(), arguments, full)
+    zero = ca.MX.zeros(size)  # constants are scalar
+    full = [[x + zero if x.is_scalar() else x for x in row] for row in outputs]
+    joined = [ca.horzcat(ca.MX(size, 0), *row) for row in full]
+    return ca.Function(function.name(), arguments, joined)
