@@ -168,12 +168,18 @@ def check_dict(
     known = {item.name for item in inputs}
     left_out = [f"{item.name}: {item.reason}" for item in config.skipped if item.name not in known]
     mistakes = [*(item.message for item in found), *left_out, *unread]
+    warnings = list(config.warnings)
+    if any(item.readable for item in inputs) and not any(len(item.points) for item in inputs):
+        warnings.append(
+            "no pose has a line in space, so lengths and fixtures are compared with nothing. Try: "
+            "two or more photographs of each pose; camera.matrix, which `dlo calibrate` finds."
+        )
     return finite(
         {
             "config": config.name,
             "ok": not mistakes,
             "mistakes": mistakes,
-            "warnings": list(config.warnings),
+            "warnings": warnings,
             "poses": [_checked(config, item) for item in inputs],
         }
     )

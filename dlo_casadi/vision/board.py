@@ -244,8 +244,11 @@ def _fit_plane(
 def _other_picture(fit: _Fit, board: Board, camera: Camera, shape: tuple[int, int]) -> str:
     """Sentence on a camera matrix of another picture size or a rotated picture; empty if it fits.
 
-    A principal point is near the middle of the picture from which it was estimated.
+    A principal point is near the middle of the picture from which it was estimated. Markers that
+    are within the shift of their edges may be nearer by chance with another matrix.
     """
+    if fit.rms < _EDGE_SHIFT_PX:
+        return ""
     width, height = shape
     (fx, _, cx), (_, fy, cy), _ = camera.matrix
     turn = "turn it back, as the pictures that it was calibrated with; was its EXIF tag lost?"

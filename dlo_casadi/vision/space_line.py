@@ -319,6 +319,7 @@ def _unsure(
         )
     return (
         f"the markers in {worst} tell where its camera stands to {1e3 * places[worst]:.1f} mm, "
-        f"their corners are {curves[worst].viewpoint.reprojection_error:.2f} px RMS off. Try: that "
-        f"photograph once more, sharp and not too bright.{spoilt(photographs[worst])}"
+        f"their corners are {curves[worst].viewpoint.reprojection_error:.2f} px RMS off. Try: "
+        "camera.matrix, which `dlo calibrate` finds; that photograph once more, sharp and not too "
+        f"bright.{spoilt(photographs[worst])}"
     )

@@ -10,6 +10,7 @@ import pytest
 from dlo_casadi.cli import main
 from dlo_casadi.config import DeclaredCamera, dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import DloError
+from dlo_casadi.report.documents import check_dict
 from dlo_casadi.report.page import failure_page
 from dlo_casadi.report.page_pictures import view_pictures
 from dlo_casadi.session.measure import draw_steps, measured_poses, read_inputs
@@ -58,6 +59,9 @@ def test_a_session_of_views_one_view_and_markers(config, inputs):
     poses = measured_poses(config, inputs)
     assert [len(item.sensors) for item in poses] == [2, 1, 1]
     assert [item.has_line for item in poses] == [True, False, True]
+    assert not check_dict(config, inputs, ())["warnings"]
+    (warning,) = check_dict(config, inputs[1:2], ())["warnings"]
+    assert warning.startswith("no pose has a line in space")
     noise = np.concatenate([sensor.weight for item in poses[:2] for sensor in item.sensors])
     assert np.median(noise) == pytest.approx(1.0, rel=0.1)
 
