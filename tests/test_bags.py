@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from recorded.takes import marker_message
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.recordings import Wishes, make_session, read_recording
+from dlo_casadi.recordings import CloudView, Wishes, make_session, read_recording
 from dlo_casadi.recordings.stills import align_clocks, find_stills
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
@@ -44,14 +45,15 @@ def wrench(t, frame):
 
 
 def written(folder, *messages):
-    """A bag of (topic, message)."""
+    """A bag of (topic, message), or of (topic, message, time of receipt)."""
     topics = {}
     with rosbag2.Writer(folder / "take", version=9) as writer:
-        for topic, message in messages:
+        for topic, message, *received in messages:
             kind = message.__msgtype__
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(topics[topic], 1, STORE.serialize_cdr(message, kind))
+            at = round(1e9 * sum(received)) or 1
+            writer.write(topics[topic], at, STORE.serialize_cdr(message, kind))
     return [folder / "take"]
 
 
@@ -142,3 +144,50 @@ def test_a_transform_without_a_rotation_is_left_out(tmp_path):
     sent = [("/tf", tf(t, "world", "hand", STILL * (k > 0))) for k, t in enumerate(T)]
     hand = read_recording(written(tmp_path, *sent)).of("body")["hand"]
     assert hand.values == pytest.approx(np.tile(STILL, (len(T) - 1, 1)))
+
+
+NOW = 1.7e9  # s
+
+
+@pytest.mark.parametrize("unset", ["all", "the first"])
+def test_stamps_that_are_not_set_are_replaced_by_the_times_of_receipt(unset, tmp_path):
+    """Of all messages, or of one among others with stamps since 1970; both are told."""
+    sent = [
+        ("/a", markers(NOW + t if unset != "all" and k else 0.0, "world", POINTS + x), NOW + t)
+        for k, (t, x) in enumerate(zip(T, STEP, strict=True))
+    ]
+    recording = read_recording(written(tmp_path, *sent))
+    for stream in recording.of("marker").values():
+        assert stream.t == pytest.approx(NOW + T, abs=1e-6)
+    (told, *_) = recording.assumptions
+    assert f"of {len(T) if unset == 'all' else 1} of {len(T)} messages are zero" in told
+
+
+def test_what_is_deleted_or_a_line_is_no_marker(tmp_path):
+    def message(t, name, place, **changed):
+        found = marker_message(MSG, header(t, "world"), name, pose([*place, *STILL[3:]]))
+        for key, value in changed.items():
+            setattr(found, key, value)
+        return found
+
+    sent = []
+    for t, x in zip(T, STEP, strict=True):
+        array = [message(t, f"m{k}", p + x) for k, p in enumerate(POINTS)]
+        array.insert(0, message(t, "", np.zeros(3), action=3))
+        array.append(message(t, "strip", np.zeros(3), type=4))
+        sent.append(("/a", MSG["MarkerArray"](array)))
+    recording = read_recording(written(tmp_path, *sent))
+    assert [*recording.of("marker")] == ["m0_0", "m1_0", "m2_0"]
+    assert recording.assumptions[0] == "markers strip_0 are left out: lines, lists or texts"
+
+
+def test_markers_of_a_bag_may_be_in_millimetres(tmp_path):
+    """They are scaled before TF, which is in metres, moves them."""
+    mount = ("/tf_static", tf(0.0, "world", "mocap", MOUNT))
+    sent = [("/a", markers(t, "mocap", 1e3 * (POINTS + x))) for t, x in zip(T, STEP, strict=True)]
+    files = written(tmp_path, mount, *sent)
+    with pytest.raises(MeasurementError, match=r"m from the origin.*\n  Try: --units mm"):
+        read_recording(files)
+    found = read_recording(files, view=CloudView(units="mm")).of("marker")
+    place = Rotation.from_quat(MOUNT[3:]).apply(POINTS[1]) + MOUNT[:3]
+    assert found["a_01"].values[0] == pytest.approx(place)

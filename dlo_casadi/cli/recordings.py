@@ -60,7 +60,7 @@ def _vector(name: str, axes: str, text: str) -> Option:
     _vector("--camera", "X Y Z", "m, place of the camera that saw the clouds"),
     _vector("--color", "R G B", "of the cable in clouds, 0 to 255"),
     _vector("--box", "X Y Z X Y Z", "m, two corners between which the cable is in clouds"),
-    option("--units", choices=("m", "mm"), default="m", help="of clouds; default %(default)s"),
+    option("--units", choices=("m", "mm"), default="m", help="of bags and clouds; %(default)s"),
     option("--hold", type=float, default=0.5, metavar="S", help="shortest pose; %(default)s s"),
     option("--held-out", type=int, default=4, metavar="N", help="one in N; default %(default)s"),
     *(

@@ -9,14 +9,14 @@ from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.recordings.bags import read_bag
 from dlo_casadi.recordings.clouds import CloudView, read_cloud
 from dlo_casadi.recordings.mocap import read_c3d, read_mocap_csv
-from dlo_casadi.recordings.recording import Cloud, Recording, Stream, together
+from dlo_casadi.recordings.recording import METRES, Cloud, Recording, Stream, together
 from dlo_casadi.recordings.session import FREE, Imported, Wishes, make_session
 
 Record = TypeVar("Record", Stream, Cloud)
 WHOLE = CloudView()  # all points of clouds, in metres
 
 # File extension -> reader.
-FORMATS: dict[str, Callable[[Path], Recording]] = {
+FORMATS: dict[str, Callable[..., Recording]] = {
     ".csv": read_mocap_csv,
     ".c3d": read_c3d,
     ".mcap": read_bag,
@@ -53,7 +53,7 @@ def read_recording(
     for path, name in zip(paths, names, strict=True):
         label = name if names.count(name) == 1 else str(path)
         try:
-            read = _read(path)
+            read = _read(path, METRES[view.units])
             streams = tuple(_of_file(stream, label) for stream in read.streams)
             clouds = tuple(_of_file(view.of(cloud), label) for cloud in read.clouds)
             found.append(replace(read, streams=streams, clouds=clouds).with_z_up(up))
@@ -62,24 +62,28 @@ def read_recording(
         except DloError:  # a library that is not installed
             raise
         except Exception as error:  # what readers of damaged files raise is not documented
+            again = "export it again, whole" + "; `ros2 bag reindex`" * (_reader(path) is read_bag)
             raise MeasurementError(
                 f"cannot be read as a {path.suffix or 'bag'} recording: {type(error).__name__}: "
-                f"{str(error).rstrip('.')}.\n  Try: export it again, whole; `ros2 bag reindex` "
-                "for a bag.",
+                f"{str(error).rstrip('.')}.\n  Try: {again}.",
                 pose=label,
             ) from error
     return together(found)
 
 
-def _read(path: Path) -> Recording:
-    """What the reader of a file's format finds in it."""
-    reader = FORMATS.get("" if path.is_dir() else path.suffix.lower())
+def _reader(path: Path) -> Callable[..., Recording] | None:
+    return FORMATS.get("" if path.is_dir() else path.suffix.lower())
+
+
+def _read(path: Path, scale: float) -> Recording:
+    """What the reader of a file's format finds in it; `scale` is that of files without a unit."""
+    reader = _reader(path)
     if reader is None:
         kinds = ", ".join(filter(None, FORMATS))
         raise MeasurementError(f"files of this kind are not read.\n  Try: {kinds}")
     if not path.exists():
         raise MeasurementError(f"there is no {path}.\n  Try: another name or folder.")
-    return reader(path)
+    return reader(path, scale) if reader in (read_bag, read_cloud) else reader(path)
 
 
 def _of_file(record: Record, file: str) -> Record:

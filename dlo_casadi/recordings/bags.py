@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, library
 from dlo_casadi.recordings.clouds import cloud_of
-from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream
+from dlo_casadi.recordings.lost import without_zeros
+from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream, checked_times
 
 _NANO = 1e-9
 # NumPy types of a message's fields, by their numbers in sensor_msgs/PointField.
@@ -20,28 +21,37 @@ _WANTED = (
     "marker arrays (visualization_msgs/MarkerArray, geometry_msgs/PoseArray, or any message with "
     "`markers`), PoseStamped, TransformStamped, Odometry or TF, WrenchStamped, PointCloud2"
 )
+# Types of visualization_msgs/Marker whose pose is a place of something: arrow, cube, sphere,
+# cylinder, mesh. Lines, lists and texts have their own points or none.
+_PLACED = {0, 1, 2, 3, 10}
+_SINCE_1970 = 1e6  # s; stamps beyond it are not counted from the start of a simulation
 _ORIGIN = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 Rows = list[tuple[float, list[float]]]  # times [s] and values
+Sent = list[tuple[float, float, list[float]]]  # times of headers and of receipt [s], and values
 Links = dict[str, tuple[str, Rows]]  # frame -> its parent in TF, and its poses there
 
 
-def read_bag(path: Path) -> Recording:
+def read_bag(path: Path, scale: float = 1.0) -> Recording:
     """Read a bag: markers, poses and TF of grippers, wrenches, and clouds of points.
 
-    Times are those of the messages' headers. Markers and clouds share one clock, grippers and force
-    sensors another. A body is named after its topic or, in TF, its frame. Markers, bodies and
-    clouds are transformed from the frames of their headers to the roots of these in TF; a wrench
-    stays in the axes of its sensor. Raises MeasurementError if the bag holds none of these.
+    Times are those of the messages' headers; where these are zero, of their receipt. Markers and
+    clouds share one clock, grippers and force sensors another. A body is named after its topic or,
+    in TF, its frame. Markers, bodies and clouds are transformed from the frames of their headers to
+    the roots of these in TF; a wrench stays in the axes of its sensor. `scale` converts markers and
+    clouds to metres; all else is in metres in ROS. Raises MeasurementError if the bag holds none of
+    these.
     """
     highlevel = library("rosbags.highlevel", "recordings", "reading this file")
     typesys = library("rosbags.typesys", "recordings", "reading this file")
-    rows: dict[tuple[Kind, str, str, str], Rows] = {}  # of kind, name, topic, frame
-    links: Links = {}
+    sent: dict[tuple[Kind, str, str, str], Sent] = {}  # of kind, name, topic, frame
+    moved: dict[str, tuple[str, Sent]] = {}
+    left_out: set[str] = set()
     clouds: list[Any] = []
     store = typesys.get_typestore(typesys.Stores.LATEST)
     with highlevel.AnyReader([path], default_typestore=store) as reader:
         topics = {item.topic: item.msgtype for item in reader.connections}
-        for connection, _, raw in reader.messages():
+        for connection, nanoseconds, raw in reader.messages():
+            received = _NANO * nanoseconds
             topic = connection.topic.strip("/")
             kind = connection.msgtype.rsplit("/", 1)[-1]
             if kind not in _HANDLED and "arker" not in kind:
@@ -49,17 +59,28 @@ def read_bag(path: Path) -> Recording:
             message = reader.deserialize(raw, connection.msgtype)
             if kind == "TFMessage":
                 for link in message.transforms:
-                    _add(link, links, topic.endswith("tf_static"))
+                    _add(link, moved, received, topic.endswith("tf_static"))
             elif kind == "PointCloud2":
                 clouds.append(message)
             elif kind in _BODIES:
                 of, row = _BODIES[kind]
                 key = of, topic, topic, _frame(message)
-                rows.setdefault(key, []).append((_time(message), row(message)))
+                sent.setdefault(key, []).append((_time(message), received, row(message)))
             else:
-                for name, sent, place in _markers(message, kind, topic):
-                    key = "marker", name, topic, _frame(sent)
-                    rows.setdefault(key, []).append((_time(sent), place))
+                for name, holder, place in _markers(message, kind, topic):
+                    if place is None:
+                        left_out.add(name)
+                        continue
+                    key = "marker", name, topic, _frame(holder)
+                    place = [scale * x for x in place]
+                    sent.setdefault(key, []).append((_time(holder), received, place))
+    remarks = [f"markers {', '.join(sorted(left_out))} are left out: lines, lists or texts"]
+    remarks *= bool(left_out)
+    rows = {key: _dated(items, key[1], remarks) for key, items in sent.items()}
+    links = {
+        name: (parent, _dated(items, f"TF of {name}", remarks))
+        for name, (parent, items) in moved.items()
+    }
     if not rows and not links and not clouds:
         held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "no topics"
         raise MeasurementError(f"holds {held}.\n  Try: record one or more of {_WANTED}.")
@@ -67,21 +88,35 @@ def read_bag(path: Path) -> Recording:
     for name in links:  # a frame is a body at its own origin, as often as what moves it most often
         times = max((links[below][1] for below in _chain(name, links)[:-1]), key=len)
         rows["body", name, "tf", name] = [(t, _ORIGIN) for t, _ in times]
-    streams = [
-        _stream(kind, name, frame, items, links) for (kind, name, _, frame), items in rows.items()
-    ]
-    seen = tuple(_cloud(message, links) for message in clouds)
+    sources = [_stream(kind, name, frame, items) for (kind, name, _, frame), items in rows.items()]
+    seen_markers, zeros = without_zeros([x for x in sources if x.kind == "marker"])
+    others = [x for x in sources if x.kind != "marker"]
+    streams = [_rooted(stream, links) for stream in (*seen_markers, *others)]
+    seen = tuple(_cloud(message, links, scale) for message in clouds)
     roots = {x.frame for x in streams if x.kind != "wrench"} | {x.frame for x in seen}
     roots -= {x.name for x in streams if x.kind == "body"}
     told = tuple(
         replace(x, frame="") if x.kind == "wrench" and x.frame in roots else x for x in streams
     )
-    return Recording(told, seen, up_by="as ROS has it (REP 103)")
+    return Recording(told, seen, (*remarks, *zeros), up_by="as ROS has it (REP 103)")
 
 
 def _time(message: Any) -> float:
     stamp = message.header.stamp
     return float(stamp.sec + _NANO * stamp.nanosec)
+
+
+def _dated(items: Sent, name: str, remarks: list[str]) -> Rows:
+    """Rows with the times of their headers; where these are not set, with those of receipt."""
+    stamps, received, values = zip(*items, strict=True)
+    unset = np.equal(stamps, 0.0)
+    if len(items) > 1 and (unset.all() or (unset.any() and np.median(stamps) > _SINCE_1970)):
+        remarks.append(
+            f"{name}: the header stamps of {unset.sum()} of {len(items)} messages are zero; "
+            "the times at which the bag received them are taken"
+        )
+        stamps = tuple(np.where(unset, received, stamps).tolist())
+    return list(zip(stamps, values, strict=True))
 
 
 def _frame(message: Any) -> str:
@@ -110,22 +145,27 @@ _BODIES: dict[str, tuple[Kind, Callable[[Any], list[float]]]] = {
 _HANDLED = {"TFMessage", "PointCloud2", "PoseArray", *_BODIES}
 
 
-def _markers(message: Any, kind: str, topic: str) -> Iterator[tuple[str, Any, list[float]]]:
-    """Name of each marker in a message, what holds its header, and its position."""
+def _markers(message: Any, kind: str, topic: str) -> Iterator[tuple[str, Any, list[float] | None]]:
+    """Name of each marker in a message, what holds its header, and its position if it has one.
+
+    Those that a message deletes are left out.
+    """
     items = message.poses if kind == "PoseArray" else getattr(message, "markers", [message])
     for k, item in enumerate(items):
         pose = getattr(item, "pose", item)
         place = getattr(pose, "position", None) or getattr(item, "translation", None)
-        if place is None:
+        if place is None or getattr(item, "action", 0) != 0:
             continue
         texts = [getattr(item, key, "") for key in ("ns", "marker_name", "name")]
         named = [text for text in texts if text]
         number = getattr(item, "id", "" if named else f"{k:02d}")
         name = "_".join(str(part) for part in (*(named or [topic]), number) if part != "")
-        yield name, item if hasattr(item, "header") else message, _vector(place)
+        placed = not hasattr(item, "action") or item.type in _PLACED
+        holder = item if hasattr(item, "header") else message
+        yield name, holder, _vector(place) if placed else None
 
 
-def _add(link: Any, links: Links, static: bool) -> None:
+def _add(link: Any, links: dict[str, tuple[str, Sent]], received: float, static: bool) -> None:
     """Add a TransformStamped to TF; of a static one only the last pose is valid."""
     pose = _pose(link.transform.translation, link.transform.rotation)
     itself = link.child_frame_id.strip("/") == _frame(link)
@@ -134,7 +174,7 @@ def _add(link: Any, links: Links, static: bool) -> None:
     _, poses = links.setdefault(link.child_frame_id.strip("/"), (_frame(link), []))
     if static:
         poses.clear()
-    poses.append((_time(link), pose))
+    poses.append((_time(link), received, pose))
 
 
 def _chain(frame: str, links: Links) -> list[str]:
@@ -167,19 +207,24 @@ def _at(items: Rows, t: FloatArray) -> tuple[FloatArray, Rotation]:
     return place, Slerp(times, Rotation.from_quat(poses[:, 3:]))(inside)
 
 
-def _stream(kind: Kind, name: str, frame: str, items: Rows, links: Links) -> Stream:
-    """The record of a topic's marker, body or sensor; all but sensors in the root of its frame."""
+def _stream(kind: Kind, name: str, frame: str, items: Rows) -> Stream:
+    """The record of a topic's marker, body or sensor, in its own frame."""
     t, values = (np.array(column) for column in zip(*items, strict=True))
     t, first = np.unique(t, return_index=True)
+    checked_times(t, [f"message {k} of {kind} {name!r}" for k in range(1, len(t) + 1)])
     clock = "markers" if kind == "marker" else "grippers"
-    stream = Stream(name, kind, t, values[first], clock, frame)
-    if kind == "wrench":
+    return Stream(name, kind, t, values[first], clock, frame)
+
+
+def _rooted(stream: Stream, links: Links) -> Stream:
+    """The stream in the root of its frame; that of a sensor as it is."""
+    if stream.kind == "wrench":
         return stream
-    root, place, turn = _in_root(frame, links, t)
+    root, place, turn = _in_root(stream.frame, links, stream.t)
     return replace(stream.moved(turn, place), frame=root)
 
 
-def _cloud(message: Any, links: Links) -> Cloud:
+def _cloud(message: Any, links: Links, scale: float) -> Cloud:
     """Read a sensor_msgs/PointCloud2."""
     order = ">" if message.is_bigendian else "<"
     kind: Any = {
@@ -193,7 +238,7 @@ def _cloud(message: Any, links: Links) -> Cloud:
     t, frame = _time(message), _frame(message)
     root, place, turn = _in_root(frame, links, np.array([t]))
     return Cloud(
-        turn[0].apply(cloud.points) + place,
+        turn[0].apply(scale * cloud.points) + place,
         cloud.colors,
         place[0] if frame in links else None,
         t,

@@ -11,7 +11,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 
 from dlo_casadi import vision
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.recordings.recording import METRES, Cloud, Recording
+from dlo_casadi.recordings.recording import Cloud, Recording
 
 _AGAIN = "Try: save it again, whole, as binary or text."
 _PLY = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
@@ -30,15 +30,14 @@ class CloudView:
     box: Sequence[float] = ()
     """x, y, z of two corners [m] between which the cable is; everywhere when empty."""
     units: str = "m"
-    """Unit of the files, which do not contain it."""
+    """Unit of markers and clouds in bags and of files of clouds, which do not contain it."""
 
     def of(self, cloud: Cloud) -> Cloud:
         """Keep only the points of the cable.
 
         Raises MeasurementError if no points are left, or if they have no colour.
         """
-        scale = METRES[self.units]
-        points = scale * cloud.points
+        points = cloud.points
         kept = np.isfinite(points).all(axis=1)
         if self.color:
             if cloud.colors is None:
@@ -54,20 +53,21 @@ class CloudView:
                 f"none of its {counted(len(points), 'point')} is finite, inside --box and of "
                 "--color.\n  Try: other corners or another colour; --units."
             )
-        camera = None if cloud.camera is None else scale * cloud.camera
-        if self.camera:
-            camera = np.array(self.camera)
+        camera = np.array(self.camera) if self.camera else cloud.camera
         return replace(cloud, points=points[kept], colors=None, camera=camera)
 
 
-def read_cloud(path: Path) -> Recording:
+def read_cloud(path: Path, scale: float = 1.0) -> Recording:
     """Read a cloud: PLY or PCD (text or binary), or NPY, an array (K, 3), or (K, 6) with colours.
 
-    Raises MeasurementError if it holds fewer points than it says, or none.
+    `scale` converts its points, and the camera's place in a PCD file, to metres. Raises
+    MeasurementError if it holds fewer points than it says, or none.
     """
     cloud = {".ply": _ply, ".pcd": _pcd, ".npy": _npy}[path.suffix.lower()](path)
     if not len(cloud.points):
         raise MeasurementError(f"holds no points.\n  {_AGAIN}")
+    camera = None if cloud.camera is None else scale * cloud.camera
+    cloud = replace(cloud, points=scale * cloud.points, camera=camera)
     return Recording(clouds=(cloud,), up_by=f"as in most {path.suffix} files")
 
 

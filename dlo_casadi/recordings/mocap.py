@@ -1,6 +1,7 @@
 """Exports of motion capture systems: CSV files and C3D files."""
 
 import csv
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from struct import unpack_from
@@ -11,12 +12,14 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError, counted, library
-from dlo_casadi.recordings.recording import Kind, Recording, Stream, factor
+from dlo_casadi.recordings.lost import without_zeros
+from dlo_casadi.recordings.recording import Kind, Recording, Stream, checked_times, factor
 
 # Sections of a Vicon file that hold positions; others (devices, model outputs) are skipped.
 _SECTIONS: dict[str, Kind] = {"Trajectories": "marker", "Objects": "body", "Segments": "body"}
 _KINDS: dict[str, Kind] = {"Marker": "marker", "Rigid Body": "body"}  # Types in Motive files
-_RADIANS = {"deg": np.pi / 180.0, "rad": 1.0}
+_RADIANS = dict.fromkeys(("deg", "degree", "degrees"), np.pi / 180.0)
+_RADIANS |= dict.fromkeys(("rad", "radian", "radians"), 1.0)
 _AGAIN = "Try: export it again, whole, as Motive (Tracking Data) or Vicon (ASCII) writes it."
 Rows = list[list[str]]
 
@@ -34,14 +37,15 @@ def read_mocap_csv(path: Path) -> Recording:
     Raises
     ------
     MeasurementError
-        If the file is neither, is damaged, or has other units.
+        If the file is neither, is damaged, has other units, or times that do not increase.
 
     References
     ----------
     OptiTrack, "Data Export: CSV". Vicon Nexus, "ASCII file format"; its rotations of segments
     with three components are rotation vectors (angle-axis).
     """
-    rows = list(csv.reader(path.read_text("utf-8-sig").splitlines()))
+    text, remarks = _text(path)
+    rows = list(csv.reader(text.splitlines()))
     head = next((row for row in rows if row and row[0].strip()), [""])
     first = head[0].strip()
     if first == "Format Version":
@@ -58,7 +62,20 @@ def read_mocap_csv(path: Path) -> Recording:
         raise MeasurementError(
             "holds no labelled marker and no rigid body.\n  Try: label them before the export."
         )
-    return Recording(tuple(streams), up=own, up_by=f"as {program} exports it")
+    seen, zeros = without_zeros(streams)
+    return Recording(seen, (), (*remarks, *zeros), up=own, up_by=f"as {program} exports it")
+
+
+def _text(path: Path) -> tuple[str, tuple[str, ...]]:
+    """Text of a file in UTF-8, UTF-16 with a byte-order mark, or Latin-1, which is remarked on."""
+    content = path.read_bytes()
+    marked = content.startswith((BOM_UTF16_LE, BOM_UTF16_BE))
+    try:
+        return content.decode("utf-16" if marked else "utf-8-sig"), ()
+    except UnicodeDecodeError as error:  # numbers and keywords are ASCII in all encodings
+        line = content.count(b"\n", 0, error.start) + 1
+        told = f"{path.name} is not UTF-8 (line {line}): its names are read as Latin-1"
+        return content.decode("latin-1"), (told,)
 
 
 def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
@@ -73,12 +90,13 @@ def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
             "Space: Global"
         )
     head, quantities = heads[0], rows[heads[0] - 1]
-    table = _table(rows[head + 1 :], len(rows[head]), head + 2)
+    lines, table = _table(rows[head + 1 :], len(rows[head]), head + 2)
     said = meta.get("Total Exported Frames", "")
     if said.isdigit() and int(said) != len(table):
         raise MeasurementError(
             f"ends after {len(table)} of {counted(int(said), 'frame')}.\n  {_AGAIN}"
         )
+    t = _times(table[:, 1], lines)
     scale = factor(meta.get("Length Units", "m"))
     columns: dict[tuple[str, str], dict[str, int]] = {}
     for c in range(2, len(rows[head])):
@@ -99,18 +117,23 @@ def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
                 )
             values = np.hstack([values, table[:, turns]])
         if label in _KINDS:
-            yield Stream(name, _KINDS[label], table[:, 1], values)
+            yield Stream(name, _KINDS[label], t, values)
 
 
 def _vicon(rows: Rows) -> Iterator[Stream]:
-    starts = [k for k, row in enumerate(rows) if row and row[0].strip() in _SECTIONS]
-    for k in starts:
-        kind = _SECTIONS[rows[k][0].strip()]
-        (rate, *_), names, axes, units = rows[k + 1 : k + 5]
-        body = rows[k + 5 :]
-        stop = next((i for i, row in enumerate(body) if not any(row)), len(body))
-        table = _table(body[:stop], len(axes), k + 6)
-        t = table[:, 0] / float(rate)
+    starts = [k for k in range(len(rows)) if _opens_section(rows, k)]
+    for k, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
+        kind = _SECTIONS.get(rows[k][0].strip())
+        if kind is None:
+            continue
+        first, names, axes, units = rows[k + 1 : k + 5]
+        rate = "".join(first[:1])
+        if not (_is_number(rate) and 0.0 < float(rate) < np.inf):
+            raise MeasurementError(
+                f"line {k + 2}: the rate is {show(rate)} frames a second.\n  {_AGAIN}"
+            )
+        lines, table = _table(rows[k + 5 : stop], len(axes), k + 6)
+        t = _times(table[:, 0] / float(rate), lines)
         heads = [c for c in range(2, len(names)) if names[c].strip()]
         for c, following in zip(heads, [*heads[1:], len(axes)], strict=True):
             at = {axes[i].strip(): i for i in range(c, following)}
@@ -124,33 +147,62 @@ def _vicon(rows: Rows) -> Iterator[Stream]:
             yield Stream(names[c].strip(), kind, t, values)
 
 
+def _opens_section(rows: Rows, k: int) -> bool:
+    """Whether row k is the name of a section: it is the first one, or below a blank one.
+
+    A blank row alone ends no section: frames may follow it.
+    """
+    name, below = ("".join(row[:1]).strip() for row in (rows[k], [*rows, []][k + 1]))
+    named = name in _SECTIONS or (name and _is_number(below) and not _is_number(name))
+    return bool(named) and not (k and any(map(str.strip, rows[k - 1])))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _quaternions(turns: FloatArray, unit: str) -> FloatArray:
     """Quaternions (n, 4) from quaternions, or from rotation vectors (n, 3) in a unit of angle."""
     if turns.shape[1] == 4:
         return turns
+    if unit.strip().lower() not in _RADIANS:
+        raise MeasurementError(
+            f"the unit of angle is {unit!r}.\n  Try: an export in one of {', '.join(_RADIANS)}."
+        )
     found = np.full((len(turns), 4), np.nan)
     seen = np.isfinite(turns).all(axis=1)
-    vectors = turns[seen] * _RADIANS.get(unit.strip(), 1.0)
+    vectors = turns[seen] * _RADIANS[unit.strip().lower()]
     found[seen] = Rotation.from_rotvec(vectors).as_quat()
     return found
 
 
-def _table(rows: Sequence[list[str]], width: int, first: int) -> FloatArray:
-    """Numbers (n, width); nan in empty cells."""
-    table = np.full((len(rows), width), np.nan)
-    for k, row in enumerate(rows):
+def _table(rows: Sequence[list[str]], width: int, first: int) -> tuple[list[int], FloatArray]:
+    """Line numbers, and numbers (n, width), of rows that are not blank; nan in empty cells."""
+    lines = [first + k for k, row in enumerate(rows) if any(cell.strip() for cell in row)]
+    table = np.full((len(lines), width), np.nan)
+    for k, line in enumerate(lines):
+        row = rows[line - first]
         if len(row) < width:
             raise MeasurementError(
-                f"line {first + k} has {len(row)} of {counted(width, 'cell')}: the file is "
+                f"line {line} has {len(row)} of {counted(width, 'cell')}: the file is "
                 f"truncated.\n  {_AGAIN}"
             )
         try:
             table[k] = [float(cell) if cell.strip() else np.nan for cell in row[:width]]
         except ValueError as error:
-            raise MeasurementError(f"line {first + k}: {error}.\n  {_AGAIN}") from None
-    if not len(rows):
+            raise MeasurementError(f"line {line}: {error}.\n  {_AGAIN}") from None
+    if not lines:
         raise MeasurementError(f"holds no frames.\n  {_AGAIN}")
-    return table
+    return lines, table
+
+
+def _times(t: FloatArray, lines: Sequence[int]) -> FloatArray:
+    """The same times [s] of frames on these lines of a file, checked."""
+    return checked_times(t, [f"line {line}" for line in lines])
 
 
 _WHOLE = "Try: export the file again, whole."
@@ -188,7 +240,7 @@ def read_c3d(path: Path) -> Recording:
             "holds no labelled points.\n  Try: label the markers before the export."
         )
     rate = float(np.ravel(point.get("RATE", [0.0]))[0])
-    if rate <= 0.0:
+    if not 0.0 < rate < np.inf:
         raise MeasurementError(f"POINT:RATE is {rate:g} Hz.\n  {_WHOLE}")
     t = np.arange(places.shape[2]) / rate
     scale = factor("".join(point.get("UNITS", [])[:1]) or "mm")  # mm by the standard
@@ -196,4 +248,5 @@ def read_c3d(path: Path) -> Recording:
     screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
     own = screen.lstrip("+") if screen.lstrip("+") in ("x", "y", "z") else "z"
     said = "as POINT:Y_SCREEN tells" if screen else "in most C3D files; POINT:Y_SCREEN is absent"
-    return Recording(tuple(streams), up=own, up_by=said)
+    seen, zeros = without_zeros(streams)
+    return Recording(seen, (), zeros, up=own, up_by=said)

@@ -19,6 +19,9 @@ _UP = {
     "z": np.eye(3),
 }
 _LARGEST = 100.0  # m, distance from the origin beyond which coordinates cannot be in metres
+# Longest time between two frames of a recording: a longer one is a wrong time, such as one that is
+# counted from 1970 beside others from the start of the recording (1.7e9 s).
+_PAUSE = 3600.0  # s
 METRES = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "centimeters": 0.01}
 METRES |= {"mm": 1e-3, "millimeters": 1e-3, "millimetres": 1e-3}
 
@@ -135,7 +138,7 @@ def together(recordings: Sequence[Recording]) -> Recording:
         if kind != "wrench" and far > _LARGEST:
             raise MeasurementError(
                 f"{kind} {name!r} is {far:.4g} m from the origin: are its coordinates in "
-                "metres?\n  Try: an export that names its units."
+                "metres?\n  Try: --units mm for a bag; an export that names its units."
             )
     return Recording(
         tuple(streams),
@@ -151,3 +154,22 @@ def factor(unit: str) -> float:
             f"the unit of length is {unit!r}.\n  Try: an export in one of {', '.join(METRES)}."
         )
     return METRES[unit.strip().lower()]
+
+
+def checked_times(t: FloatArray, places: Sequence[str]) -> FloatArray:
+    """Return times (n,) [s] as they are, if they are finite and increase without absurd pauses.
+
+    Raises MeasurementError with the first of the n `places` in the file at which they do not.
+    """
+    step = np.diff(t, prepend=t[:1] - 1.0)
+    bad = np.flatnonzero(~(np.isfinite(t) & (step > 0.0) & (step <= _PAUSE)))
+    if not len(bad):
+        return t
+    k = int(bad[0])
+    told = "has no time"
+    if np.isfinite(t[k]):
+        told = f"has the time {t[k]:.6f} s after {t[k - 1]:.6f} s in {places[k - 1]}"
+    raise MeasurementError(
+        f"{places[k]} {told}: times must increase, by less than an hour from frame to frame.\n"
+        "  Try: export it again, all frames in their order; or delete frames with wrong times."
+    )

@@ -15,6 +15,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.forces import readings_of
+from dlo_casadi.recordings.lost import without_held
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.stills import (
     Gripper,
@@ -112,7 +113,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     Called `name`. Raises MeasurementError if the recording lacks something that a session needs;
     the message says what to try.
     """
-    recording, offsets = align_clocks(recording)
+    recording, offsets = align_clocks(without_held(recording))
     stills = find_stills(recording, wishes.hold)
     start = find_gripper(wishes.start, wishes.start_offset, "start", stills, recording)
     end = None

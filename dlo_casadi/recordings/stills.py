@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, label, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, label, median_filter, uniform_filter1d
 from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +27,14 @@ _FLOOR = 1.0e-5  # m, smallest noise, below the resolution of files
 # Largest ratio of a still interval's scatter to the noise from frame to frame: filters of the
 # export raise it to about 10, slow motion to hundreds.
 _NEVER = 50.0
+_EXACT = 1.0e-7  # m, scatter of positions that are exactly constant, with its rounding
+# Share of the time in which a body is exactly constant beyond which it has no noise: a robot's pose
+# is constant whenever the cable is still; one that was tracked is if its last value was held.
+_NOISELESS = 0.3
+_SPIKE = 6.0  # noises from the median of five frames beyond which a frame does not show motion
+# Most frames of the time that all streams share: 14 h at 100 Hz; an array of three coordinates for
+# each of them has 0.12 GB.
+_MOST = 5_000_000
 _OUTLIER = 5.0  # median absolute deviations beyond which a frame is left out of a mean
 
 
@@ -130,21 +138,22 @@ def find_stills(recording: Recording, hold: float) -> tuple[Still, ...]:
     was seen, or if the recording never stands still.
     """
     shown = [stream for stream in recording.streams if stream.moves]
-    tracks = [track for stream in shown for track in _tracks(stream)]
-    tracks = [(t, x) for t, x in tracks if len(t) > 3]
+    tracks = [(t, x, s.kind == "body") for s in shown for t, x in _tracks(s)]
     if not tracks:
         raise MeasurementError(
             "no marker and no body was seen in this recording.\n  Try: label them; clouds take a "
             "recording of the grippers beside them."
         )
     dt = _period(shown)
-    begin, end = min(t[0] for t, _ in tracks), max(t[-1] for t, _ in tracks)
-    grid = np.arange(begin, end + 0.5 * dt, dt)
+    grid = _grid(shown, dt)
     width = max(3, round(_WINDOW / dt))
     total, count = np.zeros(len(grid)), np.zeros(len(grid))
-    for t, x in tracks:
+    for t, x, of_body in tracks:
         scatter, known = _scatter(t, x, grid, width)
-        noise = max(float(np.quantile(scatter[known], _QUIET)) if known.any() else 0.0, _FLOOR)
+        judged = scatter[known]
+        if of_body and (judged < _EXACT).sum() < _NOISELESS * len(judged):
+            judged = judged[judged >= _EXACT]
+        noise = max(float(np.quantile(judged, _QUIET)) if len(judged) else 0.0, _FLOOR)
         jitter = _jitter(x)
         if jitter > 0.1 * _FLOOR and noise > _NEVER * jitter:
             raise MeasurementError(
@@ -212,13 +221,24 @@ def _same(one: Still, other: Still) -> bool:
 
 
 def _tracks(stream: Stream) -> list[tuple[FloatArray, FloatArray]]:
-    """Times and positions (n, 3) of points that show a stream's motion, while it is seen."""
+    """Times and positions (n, 3) of points that show a stream's motion, while it is seen.
+
+    Spikes of one or two frames, which are no motion, are left out.
+    """
     seen = np.isfinite(stream.values).all(axis=1)
     t, x = stream.t[seen], stream.values[seen, :3]
-    if stream.kind != "body" or not len(t):
-        return [(t, x)]
-    axes = Rotation.from_quat(stream.values[seen, 3:]).as_matrix()
-    return [(t, x), *((t, x + _LEVER * axes[:, :, k]) for k in (0, 1))]
+    if len(t) <= 3:
+        return []
+    points = [x]
+    if stream.kind == "body":
+        axes = Rotation.from_quat(stream.values[seen, 3:]).as_matrix()
+        points += [x + _LEVER * axes[:, :, k] for k in (0, 1)]
+    found = []
+    for x in points:
+        off = np.abs(x - median_filter(x, (5, 1), mode="nearest")).max(axis=1)
+        kept = off <= _SPIKE * max(_jitter(x), _FLOOR)
+        found.append((t[kept], x[kept]))
+    return [(t, x) for t, x in found if len(t) > 3]
 
 
 def _period(streams: Sequence[Stream]) -> float:
@@ -229,22 +249,38 @@ def _period(streams: Sequence[Stream]) -> float:
     return min(steps)
 
 
+def _grid(streams: Sequence[Stream], dt: float) -> FloatArray:
+    """Times [s] every `dt` from the first frame of all streams to the last.
+
+    Raises MeasurementError if they are too many: times that are not on one clock.
+    """
+    first, last = min(streams, key=lambda s: s.t[0]), max(streams, key=lambda s: s.t[-1])
+    begin, end = float(first.t[0]), float(last.t[-1])
+    if end - begin > _MOST * dt:
+        raise MeasurementError(
+            f"times run from {begin:.2f} s ({first.name} in {first.file}) to {end:.2f} s "
+            f"({last.name} in {last.file}): {(end - begin) / dt:.1e} frames every {dt:.3g} s are "
+            f"more than {_MOST:.0e}.\n  Try: time stamps of one clock in all topics of a bag; a "
+            "shorter recording."
+        )
+    return np.arange(begin, end + 0.5 * dt, dt)
+
+
 def _speed(streams: Sequence[Stream], dt: float) -> tuple[float, FloatArray]:
     """First time [s], and RMS speed [m/s] every `dt` of all moving streams on one clock."""
-    tracks = [track for stream in streams for track in _tracks(stream) if len(track[0]) > 3]
+    tracks = [track for stream in streams for track in _tracks(stream)]
     if not tracks:
         raise MeasurementError(
             f"nothing was seen in {streams[0].clock}: all its values are NaN.\n  Try: label "
             "markers and bodies, solve, and export again."
         )
-    begin, end = min(t[0] for t, _ in tracks), max(t[-1] for t, _ in tracks)
-    grid = np.arange(begin, end + 0.5 * dt, dt)
+    grid = _grid(streams, dt)
     squares = np.zeros(len(grid))
     for t, x in tracks:
         path = np.column_stack([np.interp(grid, t, column) for column in x.T])
         path = gaussian_filter1d(path, _SMOOTH / dt, axis=0, mode="nearest")
         squares += (np.gradient(path, dt, axis=0) ** 2).sum(axis=1)
-    return float(begin), np.sqrt(squares / len(tracks))
+    return float(grid[0]), np.sqrt(squares / len(tracks))
 
 
 def _scatter(

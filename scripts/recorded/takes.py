@@ -288,7 +288,7 @@ def _bag(take: Take, path: Path, plugin: str) -> Path:
         for k, t in enumerate(EPOCH + take.t):
             late = t + take.offset
             array = [
-                _marker(msg, header(t, "world"), name, pose(np.hstack([x[k], still])))
+                marker_message(msg, header(t, "world"), name, pose(np.hstack([x[k], still])))
                 for name, x in take.markers.items()
             ]
             put(markers, t, msg["MarkerArray"](array))
@@ -313,7 +313,7 @@ def _cloud(msg: dict[str, type], header: object, points: FloatArray, colors: Flo
     return msg["PointCloud2"](header, 1, n, fields, False, 16, 16 * n, data, True)
 
 
-def _marker(msg: dict[str, type], header: object, name: str, pose: object) -> object:
+def marker_message(msg: dict[str, type], header: object, name: str, pose: object) -> object:
     """A sphere of visualization_msgs."""
     fields = dict.fromkeys(msg["Marker"].__dataclass_fields__)
     for key in ("points", "colors", "uv_coordinates"):

@@ -1,0 +1,159 @@
+"""Recordings with wrong times, lost markers and unusual text: read whole, or refused by name."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded.takes import HOLD, MOVE, rendered, write_motive, write_vicon
+
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.recordings import Recording, Stream, Wishes, make_session, read_recording
+from dlo_casadi.recordings.stills import find_stills
+
+SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
+
+
+@pytest.fixture(scope="module")
+def take():
+    return rendered(SESSION, poses=4, rate=25.0)
+
+
+@pytest.fixture(scope="module")
+def sources(take, tmp_path_factory):
+    """Text of a take's files with its markers, by program."""
+    folder = tmp_path_factory.mktemp("take")
+    return {
+        "motive": write_motive(take, folder)[0][0].read_text(),
+        "vicon": write_vicon(take, folder)[0][0].read_text(),
+    }
+
+
+def recording_of(take):
+    """The recording of a take, without files."""
+    kinds = (("marker", take.markers), ("body", take.bodies))
+    return Recording(
+        tuple(
+            Stream(name, kind, take.t, x, "take", file="take")
+            for kind, items in kinds
+            for name, x in items.items()
+        )
+    )
+
+
+def with_cell(text, row, column, value):
+    """Text with another value in a cell of a line, counted from 1."""
+    lines = text.splitlines()
+    cells = lines[row - 1].split(",")
+    cells[column] = value
+    lines[row - 1] = ",".join(cells)
+    return "\n".join(lines) + "\n"
+
+
+def exchanged(text, first, second):
+    lines = text.splitlines()
+    lines[first - 1], lines[second - 1] = lines[second - 1], lines[first - 1]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("program", "change", "said"),
+    [
+        ("motive", lambda x: with_cell(x, 101, 1, ""), "line 101 has no time"),
+        ("motive", lambda x: with_cell(x, 8, 1, "-1700000000.0"), r"line 9 .* after -17\d+\.0+ s"),
+        ("motive", lambda x: exchanged(x, 50, 90), "line 51 has the time .* in line 50"),
+        ("vicon", lambda x: with_cell(x, 60, 0, ""), "line 60 has no time"),
+        ("vicon", lambda x: exchanged(x, 50, 90), "line 51 has the time .* in line 50"),
+        ("vicon", lambda x: with_cell(x, 2, 0, "0"), "line 2: the rate is '0' "),
+        ("vicon", lambda x: with_cell(x, 2, 0, ""), "line 2: the rate is '' "),
+    ],
+    ids=["empty", "absurd", "order", "no frame", "order of frames", "rate 0", "no rate"],
+)
+def test_wrong_times_are_refused_with_their_line(program, change, said, sources, tmp_path):
+    file = tmp_path / "cable.csv"
+    file.write_text(change(sources[program]))
+    with pytest.raises(MeasurementError, match=rf"^cable\.csv: {said}(.|\n)*\n  Try: "):
+        read_recording([file])
+
+
+def test_clocks_that_do_not_agree_need_no_memory(take):
+    first, *others = recording_of(take).streams
+    streams = (replace(first, t=first.t + 1.7e9), *others)
+    with pytest.raises(MeasurementError, match=r"(?s)times run from .* frames .*Try: "):
+        make_session("loom", Recording(streams), Wishes())
+
+
+def test_a_blank_line_ends_no_section(sources, tmp_path):
+    """Frames follow it; a section that is not read, below another blank line, is skipped."""
+    lines = sources["vicon"].splitlines()
+    file = tmp_path / "cable.csv"
+    file.write_text("\n".join([*lines[:50], "", *lines[50:], "Devices", "1000", "volts", "1"]))
+    found = read_recording([file]).of("marker").values()
+    assert {len(stream.t) for stream in found} == {len(lines) - 6}
+
+
+def in_pose(take, k):
+    """Frames from before pose k until it ends."""
+    begin = k * (HOLD + MOVE) - 0.5 * MOVE
+    return (take.t > begin) & (take.t < begin + HOLD + MOVE)
+
+
+@pytest.mark.parametrize("how", ["zero", "held"])
+def test_a_marker_that_tracking_lost_costs_no_pose(how, take, tmp_path):
+    """Zeros, or its last position: for a quarter of the time it counts as not seen, and is told."""
+    lost = in_pose(take, 2)
+    x = take.markers["m07"].copy()
+    x[lost] = 0.0 if how == "zero" else x[np.flatnonzero(lost)[0] - 1]
+    files, _ = write_motive(replace(take, markers={**take.markers, "m07": x}), tmp_path)
+    session = make_session("loom", read_recording(files), Wishes())
+    assert [len(points) for points, _ in session.points.values()] == [12, 12, 11, 12]
+    (told,) = (text for text in session.remarks if "m07 is" in text)
+    count = int(re.search(r"in (\d+) of", told)[1])
+    assert count == pytest.approx(lost.sum(), abs=1)
+
+
+def test_a_gripper_whose_last_pose_is_held_costs_no_other_pose(take):
+    lost, bodies = in_pose(take, 2), {name: x.copy() for name, x in take.bodies.items()}
+    bodies["end"][lost] = bodies["end"][np.flatnonzero(lost)[0] - 1]
+    assert len(find_stills(recording_of(replace(take, bodies=bodies)), 0.5)) == 4
+
+
+def test_spikes_are_no_motion(take):
+    """Two in a hundred frames of each marker are 0.1 m off."""
+    random = np.random.default_rng(1)
+    markers = {
+        name: x + (random.random((len(x), 1)) < 0.02) * random.normal(0.0, 0.1, x.shape)
+        for name, x in take.markers.items()
+    }
+    exact = find_stills(recording_of(take), 0.5)
+    found = find_stills(recording_of(replace(take, markers=markers)), 0.5)
+    assert len(found) == len(exact) == 4
+    for one, other in zip(found, exact, strict=True):
+        for name in take.markers:
+            key = "marker", name
+            assert one.values[key] == pytest.approx(other.values[key], abs=1.5e-4)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_text_that_is_not_utf_8(encoding, sources, tmp_path):
+    file = tmp_path / "cable.csv"
+    file.write_bytes(sources["motive"].replace("cable:m07", "Pr\u00fcfling").encode(encoding))
+    recording = read_recording([file])
+    assert "Pr\u00fcfling" in recording.of("marker")
+    told = [text for text in recording.assumptions if "is not UTF-8" in text]
+    assert len(told) == (encoding == "latin-1")
+
+
+@pytest.mark.parametrize(("unit", "size"), [("Degrees", 90.0), ("radians", np.pi / 2)])
+def test_units_of_angle(unit, size, tmp_path):
+    names, axes = ",,hand" + "," * 5, "Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ"
+    frame = f"1,0,0,0,{size:.9f},1,2,3"
+    text = "\n".join(["Objects", "100", names, axes, f",,{','.join([unit] * 3)},m,m,m", frame])
+    file = tmp_path / "hand.csv"
+    file.write_text(text)
+    (hand,) = read_recording([file]).streams
+    assert hand.values[0, 3:] == pytest.approx([0.0, 0.0, 0.5**0.5, 0.5**0.5])
+    file.write_text(text.replace(unit, "gon"))
+    with pytest.raises(MeasurementError, match=r"unit of angle is 'gon'.\n  Try: "):
+        read_recording([file])
