@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from recorded.takes import HOLD, MOVE, rendered, write_motive, write_vicon
 
+from dlo_casadi.cli import main
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings import Recording, Stream, Wishes, make_session, read_recording
 from dlo_casadi.recordings.stills import find_stills
@@ -157,3 +158,14 @@ def test_units_of_angle(unit, size, tmp_path):
     file.write_text(text.replace(unit, "gon"))
     with pytest.raises(MeasurementError, match=r"unit of angle is 'gon'.\n  Try: "):
         read_recording([file])
+
+
+def test_a_doubtful_pull_is_told_and_the_session_is_written(tmp_path, capsys):
+    """Ten of twelve markers show a pull 59 degrees off gravity: no axis of other frames."""
+    take = rendered(SESSION, poses=6, rate=25.0)
+    few = {name: x for name, x in take.markers.items() if name not in ("m10", "m11")}
+    files, _ = write_motive(replace(take, markers=few), tmp_path)
+    arguments = ["import", *map(str, files), "--output", str(tmp_path / "loom")]
+    assert main([*arguments, "--mass", "0.03", "--diameter", "0.004"]) == 0
+    assert "warning: the cable seems to be pulled along" in capsys.readouterr().out
+    assert (tmp_path / "loom" / "session.yaml").exists()

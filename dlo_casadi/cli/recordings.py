@@ -22,7 +22,7 @@ from dlo_casadi.recordings import (
     read_recording,
 )
 from dlo_casadi.session import measure
-from dlo_casadi.session.plausibility import find_suspicions
+from dlo_casadi.session.plausibility import contradictions, find_suspicions
 
 _NAME = "session.yaml"
 _CABLE = {
@@ -95,23 +95,30 @@ def import_(chosen: argparse.Namespace) -> None:
         with FolderDraft(chosen.output) as draft:
             _write(session, draft.folder)
             watch.step("compare with a cable", 2, 3)
-            mistakes = _mistakes(session, draft.folder)
+            mistakes, doubts = _mistakes(session, draft.folder)
             if mistakes:
-                raise MeasurementError(
-                    "\n".join(
-                        [
-                            "nothing is written: the recording contradicts itself.",
-                            *mistakes,
-                            "  Try: --up, the axis that points up in the files; --start-offset.",
-                        ]
+                told = ["nothing is written: the recording contradicts itself.", *mistakes]
+                if any("one frame" in text for text in mistakes):
+                    told.append(
+                        "  Try: --up, the axis that points up in the files; --start-offset, "
+                        "--end-offset."
                     )
-                )
+                raise MeasurementError("\n".join(told))
             draft.put_in_place()
         watch.step("compare with a cable", 3, 3)
     page, target = Page(chosen), chosen.output / _NAME
-    page.data({"file": str(target), "poses": len(session.poses), "remarks": session.remarks})
+    page.data(
+        {
+            "file": str(target),
+            "poses": len(session.poses),
+            "remarks": session.remarks,
+            "warnings": doubts,
+        }
+    )
     for remark in session.remarks:
         page.say(remark)
+    for doubt in doubts:
+        page.warn(doubt)
     left = to_fill_in(session.text())
     follow = f"dlo {'check' if left else 'fit'} {target}"
     filled = ", ".join(filter(None, [counted(len(session.poses), "pose"), left]))
@@ -126,16 +133,17 @@ def _write(session: Imported, folder: Path) -> None:
     write_file(folder / _NAME, session.text())
 
 
-def _mistakes(session: Imported, folder: Path) -> list[str]:
-    """Mistakes that `dlo check` finds in a written session, with stand-ins for missing values."""
+def _mistakes(session: Imported, folder: Path) -> tuple[list[str], list[str]]:
+    """Contradictions in a written session, and doubts, with stand-ins for missing values."""
     text = session.text(session.stand_ins)
     if "FILL_IN" in text.split("experiment:")[1]:
-        return []  # without fixtures there is nothing to compare
+        return [], []  # without fixtures there is nothing to compare
     stand_in = folder / "check.yaml"
     write_file(stand_in, text)
     try:
         config = load_config(stand_in)
         inputs = measure.read_inputs(config)
-        return [item.message for item in find_suspicions(config, inputs, fits=False)]
+        found = find_suspicions(config, inputs, fits=False)
+        return contradictions(found, inputs), [item.message for item in found]
     finally:
         stand_in.unlink()

@@ -75,6 +75,10 @@ class ReadSession:
         """Return the session with other values in its configuration's `experiment`."""
         return replace(self, config=self.config.changed(experiment=values))
 
+    def without(self, *names: str) -> Self:
+        """Return the session without the poses of these names."""
+        return replace(self, read=tuple(item for item in self.read if item.name not in names))
+
 
 class Hypothesis(NamedTuple, Generic[T]):
     """One thing that the user may have meant.
