@@ -49,6 +49,11 @@ class ConfigError(DloError):
         The YAML file.
     line : int, optional
         Line in that file, counted from 1.
+
+    Attributes
+    ----------
+    problem : str
+        The message without the place.
     """
 
     def __init__(self, message: str, file: Path | None = None, line: int | None = None) -> None:
@@ -56,6 +61,7 @@ class ConfigError(DloError):
             "" if file is None else f"{file}" + ("" if line is None else f", line {line}") + ": "
         )
         super().__init__(place + message)
+        self.problem = well_formed(message)
         self.file = file
         self.line = line
 

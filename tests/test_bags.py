@@ -100,7 +100,7 @@ def test_fixtures_that_never_move_hold_every_pose(tmp_path):
     for still in stills:
         assert still.values["body", "start"] == pytest.approx(STILL)
         assert still.values["body", "end"] == pytest.approx(far)
-    session = make_session("loom", recording, Wishes())
+    session = make_session("loom", recording, Wishes(at=(0.1, 0.2, 0.3)))  # it changes its length
     assert any("come from several frames (base, world)" in text for text in session.remarks)
 
 

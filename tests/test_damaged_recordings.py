@@ -9,8 +9,8 @@ import pytest
 from recorded.takes import HOLD, MOVE, rendered, write_motive, write_vicon
 
 from dlo_casadi.cli import main
-from dlo_casadi.errors import MeasurementError
-from dlo_casadi.recordings import Recording, Stream, Wishes, make_session, read_recording
+from dlo_casadi.errors import DloError, MeasurementError
+from dlo_casadi.recordings import CloudView, Recording, Stream, Wishes, make_session, read_recording
 from dlo_casadi.recordings.stills import find_stills
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
@@ -134,6 +134,91 @@ def test_spikes_are_no_motion(take):
         for name in take.markers:
             key = "marker", name
             assert one.values[key] == pytest.approx(other.values[key], abs=1.5e-4)
+
+
+@pytest.mark.parametrize(
+    ("wishes", "said"),
+    [
+        ({"held_out": 1}, "--held-out 1: .* 2 or more"),
+        ({"hold": 0.0}, "--hold 0: "),
+        ({"known": {"bending_stiffness": -1.0}}, "--bending-stiffness -1: "),
+        ({"known": {"length": np.nan}}, "--length nan: "),
+        ({"start_offset": (10.0, 0.0, 0.0)}, "--start-offset 10 0 0: .* 1 m at most"),
+        ({"at": (0.1, 0.1)}, "--at 0.1 0.1: .* each larger"),
+        ({"at": (0.1, 5.5), "known": {"length": 0.6}}, "--at 0.1 5.5: .* --length 0.6"),
+        ({"end": "start"}, "--end start: .* another body"),
+    ],
+)
+def test_impossible_options_are_refused_by_name(wishes, said):
+    with pytest.raises(DloError, match=said):
+        Wishes(**wishes)
+
+
+@pytest.mark.parametrize(
+    ("view", "said"),
+    [
+        ({"camera": (np.nan, 0.0, 0.0)}, "--camera nan 0 0: "),
+        ({"camera": (0.2, 0.1, 1300.0)}, "--camera 0.2 0.1 1300: .* metres, up to 100 m"),
+        ({"color": (1000.0, -5.0, 20.0)}, "--color 1000 -5 20: .* 0 to 255"),
+        ({"box": (np.inf, *[0.0] * 5)}, "--box inf "),
+    ],
+)
+def test_impossible_views_are_refused_by_name(view, said):
+    with pytest.raises(DloError, match=said):
+        CloudView(**view)
+
+
+def test_a_contradiction_that_only_the_recording_shows_cites_no_file(take, tmp_path, capsys):
+    files, _ = write_motive(take, tmp_path)
+    arguments = ["import", *map(str, files), "--output", str(tmp_path / "loom")]
+    assert main([*arguments, "--mass", "30", "--diameter", "0.004"]) == 2
+    told = capsys.readouterr().err
+    assert "nothing is written: cable.mass: 30 kg" in told
+    assert "check.yaml" not in told
+
+
+def test_arc_lengths_beyond_the_cable_are_refused(take):
+    at = np.linspace(0.02, 5.5, len(take.markers))
+    with pytest.raises(MeasurementError, match=r"--at ends at 5\.5 m, but the cable is 0\.6"):
+        make_session("loom", recording_of(take), Wishes(at=at.tolist()))
+
+
+def few(take, count):
+    """A take with markers evenly along the cable."""
+    exact = make_session("loom", recording_of(take), Wishes())
+    (text,) = (text for text in exact.remarks if text.startswith("markers by arc length"))
+    order = text[text.index("(") + 1 : text.index(")")].split(", ")
+    kept = [order[k] for k in np.linspace(1, 10, count).round().astype(int)]
+    return replace(take, markers={name: take.markers[name] for name in kept})
+
+
+def test_two_markers_are_too_few_for_arc_lengths(take):
+    two = recording_of(few(take, 2))
+    with pytest.raises(MeasurementError, match=r"2 markers are too few .*\n  Try: .*--at"):
+        make_session("loom", two, Wishes())
+    assert make_session("loom", two, Wishes(at=(0.075, 0.52), known={"length": 0.6})).length == 0.6
+
+
+def test_the_scatter_of_the_length_is_its_tolerance(take, tmp_path):
+    """Four markers: told, and written; none of that where the arc lengths are known."""
+    four = recording_of(few(take, 4))
+    session = make_session("loom", four, Wishes())
+    assert session.tolerances["length"] > 2e-3
+    (doubt,) = session.doubts
+    assert "Try: --length and --at" in doubt
+    assert f"tolerances: {{length: {session.tolerances['length']:.2g}}}" in session.text()
+    at = tuple(float(x) for x in (0.075, 0.225, 0.375, 0.52))
+    known = make_session("loom", four, Wishes(at=at, known={"length": 0.6}))
+    assert not known.doubts
+    assert not known.tolerances
+
+
+def test_exchanged_labels_name_their_pose(take):
+    there, markers = in_pose(take, 2), {name: x.copy() for name, x in take.markers.items()}
+    for one, other in (("m02", "m07"), ("m07", "m02")):
+        markers[one][there] = take.markers[other][there]
+    with pytest.raises(MeasurementError, match="are labels exchanged in pose 3"):
+        make_session("loom", recording_of(replace(take, markers=markers)), Wishes())
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])

@@ -9,7 +9,7 @@ from dlo_casadi.cli.options import Option, Page, command, option
 from dlo_casadi.cli.watch import Watch
 from dlo_casadi.config import load_config
 from dlo_casadi.config.template import schema_text, to_fill_in
-from dlo_casadi.errors import DloError, MeasurementError, counted
+from dlo_casadi.errors import ConfigError, DloError, MeasurementError, counted
 from dlo_casadi.io.files import FolderDraft, write_file
 from dlo_casadi.io.points import write_points
 from dlo_casadi.recordings import (
@@ -112,12 +112,12 @@ def import_(chosen: argparse.Namespace) -> None:
             "file": str(target),
             "poses": len(session.poses),
             "remarks": session.remarks,
-            "warnings": doubts,
+            "warnings": [*session.doubts, *doubts],
         }
     )
-    for remark in session.remarks:
+    for remark in session.remarks[: len(session.remarks) - len(session.doubts)]:
         page.say(remark)
-    for doubt in doubts:
+    for doubt in (*session.doubts, *doubts):
         page.warn(doubt)
     left = to_fill_in(session.text())
     follow = f"dlo {'check' if left else 'fit'} {target}"
@@ -143,6 +143,9 @@ def _mistakes(session: Imported, folder: Path) -> tuple[list[str], list[str]]:
     try:
         config = load_config(stand_in)
         inputs = measure.read_inputs(config)
+    except ConfigError as error:  # it cites a file that will not exist
+        raise DloError(f"nothing is written: {error.problem}") from None
+    else:
         found = find_suspicions(config, inputs, fits=False)
         return contradictions(found, inputs), [item.message for item in found]
     finally:

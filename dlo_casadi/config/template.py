@@ -23,6 +23,7 @@ def template(
     poses: Sequence[Mapping[str, str]] = (),
     end: str = "clamped",
     clips: Sequence[str] = (),
+    tolerances: Mapping[str, str] = {},
     remarks: Sequence[str] = (),
 ) -> str:
     """Text of a configuration with placeholders for what only the user knows.
@@ -45,6 +46,8 @@ def template(
         How the end is held in space.
     clips : sequence of str
         Kinds of the clips of every pose.
+    tolerances : mapping of str to str
+        In space: tolerances that differ from the usual ones, by key.
     remarks : sequence of str
         Comment lines at the top of the configuration.
 
@@ -64,6 +67,7 @@ def template(
         cable=cable,
         end=end,
         clips=[_clip(one, in_space) for one in clips],
+        tolerances=tolerances,
         remarks=remarks,
     )
 

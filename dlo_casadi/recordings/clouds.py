@@ -11,7 +11,8 @@ from numpy.lib.recfunctions import unstructured_to_structured
 
 from dlo_casadi import vision
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.recordings.recording import Cloud, Recording
+from dlo_casadi.recordings.recording import LARGEST, Cloud, Recording
+from dlo_casadi.recordings.wishes import require
 
 _AGAIN = "Try: save it again, whole, as binary or text."
 _PLY = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
@@ -31,6 +32,14 @@ class CloudView:
     """x, y, z of two corners [m] between which the cable is; everywhere when empty."""
     units: str = "m"
     """Unit of markers and clouds in bags and of files of clouds, which do not contain it."""
+
+    def __post_init__(self) -> None:
+        """Check the values; DloError names the option."""
+        near = all(abs(x) <= LARGEST for x in self.camera)  # False for nan
+        require(near, "camera", self.camera, f"three numbers in metres, up to {LARGEST:g} m")
+        shown = all(0.0 <= x <= 255.0 for x in self.color)
+        require(shown, "color", self.color, "red, green and blue from 0 to 255")
+        require(bool(np.isfinite(self.box).all()), "box", self.box, "six numbers in metres")
 
     def of(self, cloud: Cloud) -> Cloud:
         """Keep only the points of the cable.

@@ -18,7 +18,7 @@ _UP = {
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "z": np.eye(3),
 }
-_LARGEST = 100.0  # m, distance from the origin beyond which coordinates cannot be in metres
+LARGEST = 100.0  # m, distance from the origin beyond which coordinates cannot be in metres
 # Longest time between two frames of a recording: a longer one is a wrong time, such as one that is
 # counted from 1970 beside others from the start of the recording (1.7e9 s).
 _PAUSE = 3600.0  # s
@@ -135,7 +135,7 @@ def together(recordings: Sequence[Recording]) -> Recording:
             )
         places = stream.values[:, :3]
         far = float(np.abs(places[np.isfinite(places)]).max(initial=0.0))
-        if kind != "wrench" and far > _LARGEST:
+        if kind != "wrench" and far > LARGEST:
             raise MeasurementError(
                 f"{kind} {name!r} is {far:.4g} m from the origin: are its coordinates in "
                 "metres?\n  Try: --units mm for a bag; an export that names its units."

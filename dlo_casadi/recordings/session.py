@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.forces import readings_of
@@ -25,44 +26,21 @@ from dlo_casadi.recordings.stills import (
     find_gripper,
     find_stills,
 )
+from dlo_casadi.recordings.wishes import FREE, Wishes
+from dlo_casadi.thresholds import STRETCHED
 
-FREE = "free"
 _COLUMNS = 98  # width of a comment
 _SAMPLES = 50  # points of a spline between two markers, to compute its length: exact to 1e-5
 _LONGER = 0.03  # relative difference of declared and measured length beyond which one is a mistake
+# Scatter of the length from pose to pose beyond which arc lengths are doubtful, relative. Rendered:
+# below 0.1 % for eight markers or more, 0.15 % for six, 0.8 % for four, 2.9 % for three, and the
+# errors of the arc lengths are as large; 0.3 % for grippers that are 20 mm off.
+_DOUBTFUL = 2e-3
+_FEW = 4  # markers through which a spline is often shorter than the cable
+_LENGTH = DeclaredTolerances().length  # m
 _DENSITY = 2200.0  # kg/m^3, assumed for a cable of unknown mass, for `Imported.stand_ins`
 
 Points = tuple[FloatArray, FloatArray | None]  # (K, 3) [m], and arc lengths (K,) [m] of markers
-
-
-@dataclass(frozen=True)
-class Wishes:
-    """What the recording does not contain, and the user may add."""
-
-    start: str = "start"
-    """Name of the body that holds the start, or of three markers `o,x,y`: its place, a point along
-    its x axis, and one on the side of y."""
-    end: str = "end"
-    """The same of the end; `free` if nothing holds it."""
-    start_offset: Sequence[float] = ()
-    """Where the cable leaves the start body, in its axes [m]; at its origin when empty."""
-    end_offset: Sequence[float] = ()
-    cable: str = ""
-    """Text in the names of the cable's markers; if empty, all markers that no gripper has."""
-    at: Sequence[float] = ()
-    """Arc lengths of its markers from the start [m], ascending; measured in the poses if empty."""
-    hold: float = 0.5
-    """Shortest still stretch that is a pose [s]."""
-    held_out: int = 4
-    """One in this many poses is held out; 0 for none."""
-    known: Mapping[str, float] = field(default_factory=dict)
-    """Keys and values of the section `cable`."""
-
-    @property
-    def holders(self) -> dict[str, list[str]]:
-        """Names of the body, or of the three markers, at each fixture."""
-        sides = {"start": self.start} | ({} if self.end == FREE else {"end": self.end})
-        return {side: list(map(str.strip, name.split(","))) for side, name in sides.items()}
 
 
 @dataclass(frozen=True)
@@ -79,6 +57,10 @@ class Imported:
     poses: tuple[dict[str, str], ...]
     end: str
     remarks: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+    """Those of the remarks that may spoil the result."""
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+    """How well values of the cable are known, where that is worse than usual."""
 
     def text(self, cable: Mapping[str, str] | None = None) -> str:
         """Text of the configuration; with other values of the cable, if given."""
@@ -90,6 +72,7 @@ class Imported:
             cable=self.cable if cable is None else cable,
             poses=self.poses,
             end=self.end,
+            tolerances={key: f"{value:.2g}" for key, value in self.tolerances.items()},
             remarks=[line for remark in self.remarks for line in wrap(remark, _COLUMNS)],
         )
 
@@ -119,6 +102,8 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     end = None
     if wishes.end != FREE:
         end = find_gripper(wishes.end, wishes.end_offset, "end", stills, recording)
+    doubts: list[str] = []
+    tolerances: dict[str, float] = {}
     remarks = [*recording.assumptions, *(offset.told for offset in offsets)]
     holders = wishes.holders.values()
     used: list[Stream | Cloud] = list(recording.clouds)
@@ -159,7 +144,15 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
                     "but it takes two.\n  Try: fill their gaps, or cut the recording there."
                 )
         start, end = along_cable(start, end, lines, remarks)
-        s, length = _along(start, places, end, names, wishes, remarks)
+        s, length, scatter = _along(start, places, end, names, wishes, remarks)
+        if "length" not in wishes.known and start and end and scatter > _LENGTH:
+            tolerances["length"] = scatter
+        if scatter > _DOUBTFUL * length and not (wishes.at and "length" in wishes.known):
+            doubts.append(
+                f"the length along the markers scatters by {1e3 * scatter:.1f} mm from pose to "
+                "pose: arc lengths and length may be wrong by as much. Try: --length and --at, "
+                "measured with a tape; more markers; cable and grippers in one frame."
+            )
         points = [
             (np.round(line, 6), np.round(s[here], 6))
             for line, here in zip(lines, seen.T, strict=True)
@@ -185,7 +178,9 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             for k in range(len(stills))
         ),
         FREE if wishes.end == FREE else "clamped",
-        tuple(remarks),
+        (*remarks, *doubts),
+        tuple(doubts),
+        tolerances,
     )
 
 
@@ -329,13 +324,16 @@ def _along(
     names: Sequence[str],
     wishes: Wishes,
     remarks: list[str],
-) -> tuple[FloatArray, float]:
-    """Arc lengths (M,) [m] of the markers, and the cable's length, measured or as wished."""
+) -> tuple[FloatArray, float, float]:
+    """Arc lengths (M,) [m] of the markers; the measured length of the cable and its scatter [m]."""
     s, length, scatter = _arc_lengths(start, places, end)
+    if not wishes.at:
+        _check_arc_lengths(s, length, scatter, places, names)
     fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
     declared = wishes.known.get("length")
     longer = length / declared - 1.0 if declared else 0.0
-    if longer > _LONGER or (start and end and longer < -_LONGER):
+    slack = _LONGER + 3.0 * scatter / length  # splines through few markers are too short
+    if longer > slack or (start and end and longer < -slack):
         raise MeasurementError(
             f"the cable is {length:.4f} m long {fixtures} (a spline through the markers), but "
             f"--length is {declared:g} m.\n  Try: --length between the fixtures; "
@@ -350,14 +348,51 @@ def _along(
             f"markers by arc length ({', '.join(names)}) along that spline; --at if they were "
             "measured with a tape"
         )
-        return s, length
+        return s, length, scatter
     if len(wishes.at) != len(names):
         raise MeasurementError(
             f"--at gives {counted(len(wishes.at), 'arc length')} of "
             f"{counted(len(names), 'marker')} ({', '.join(names)})"
         )
+    longest = declared or (1.0 + _LONGER) * length
+    if start and end and wishes.at[-1] > longest:
+        raise MeasurementError(
+            f"--at ends at {wishes.at[-1]:g} m, but the cable is {length:.4f} m long {fixtures} (a "
+            "spline through the markers).\n  Try: arc lengths from the start in metres."
+        )
     remarks.append(f"markers: {', '.join(names)}, at the arc lengths of --at")
-    return np.array(wishes.at), length
+    return np.array(wishes.at), length, scatter
+
+
+def _check_arc_lengths(
+    s: FloatArray, length: float, scatter: float, places: FloatArray, names: Sequence[str]
+) -> None:
+    """Raise MeasurementError if measured arc lengths (M,) [m] are proven wrong.
+
+    No marker is farther from the next than the cable between them is long, and the length does not
+    change from pose to pose.
+    """
+    chords = np.linalg.norm(np.diff(places, axis=0), axis=2)  # (M - 1, P)
+    excess = np.nanmax(chords, axis=1, initial=0.0) - np.diff(s)
+    k = int(np.argmax(excess))
+    if excess[k] > STRETCHED * length:
+        pose = int(np.nanargmax(chords[k])) + 1
+        cause = f"{counted(len(s), 'marker')} are too few for that"
+        if len(s) > _FEW:
+            cause = f"are labels exchanged in pose {pose}?"
+        raise MeasurementError(
+            f"markers {names[k]} and {names[k + 1]} are {np.nanmax(chords[k]):.4f} m apart in pose "
+            f"{pose}, but {np.diff(s)[k]:.4f} m along a spline through the markers (mean of all "
+            f"poses): {cause}.\n  Try: --length and --at, measured with a tape; more markers; "
+            "other labels; --start-offset."
+        )
+    if scatter > _LONGER * length:
+        raise MeasurementError(
+            f"the cable's length along a spline through {counted(len(s), 'marker')} is "
+            f"{length:.4f} m with a scatter of {scatter:.4f} m from pose to pose: a cable does not "
+            "change its length.\n  Try: --length and --at, measured with a tape; the body that "
+            "holds each end: --start, --end; cable and grippers in one frame."
+        )
 
 
 def _arc_lengths(

@@ -125,13 +125,13 @@ def find_suspicions(
 ) -> tuple[Suspicion, ...]:
     """Everything in a session that looks like a mistake, see `QUESTIONS`.
 
-    Without `fits`: only questions that need no fit, and the direction of the pull on the lines.
+    Without `fits`: the direction of the pull on the lines, and questions that need no fit.
     """
     session = ReadSession(config, tuple(item for item in inputs if len(item.points)))
     found: tuple[Suspicion, ...] = ()
     if not session.lines.names:
         return found
-    for questions in QUESTIONS if fits else (*QUESTIONS[:2], ((pulled_elsewhere,),)):
+    for questions in QUESTIONS if fits else (((pulled_elsewhere,),), *QUESTIONS[:2]):
         for alternatives in questions:
             found += next(filter(None, (ask(session) for ask in alternatives)), ())
         if any(item.certain for item in found):
