@@ -15,6 +15,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.errors import MeasurementError, VisionError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.recordings import CloudView, read_recording
+from dlo_casadi.recordings.stills import Gripper, along_cable
 from dlo_casadi.vision import KnownCable, line_in_cloud, of_color
 
 DATA = Path(__file__).parent / "data"
@@ -255,3 +256,22 @@ def test_a_cloud_of_too_few_points(length, diameter):
     cable = KnownCable(np.zeros(3), np.array([length, 0.0, 0.0]), diameter, length)
     with pytest.raises(VisionError, match=r"have the 5 points per cm .* Try: "):
         line_in_cloud(points, cable, None)
+
+
+def test_a_cloud_of_a_whole_room_is_refused_before_memory_ends():
+    x, y = np.meshgrid(np.arange(0.0, 2.0, 0.005), np.arange(0.0, 2.0, 0.005))
+    wall = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    cable = KnownCable(np.zeros(3), None, 0.007, 0.9)
+    with pytest.raises(VisionError, match=r"160000 points fill \d+ cubes .* Try: --color or --box"):
+        line_in_cloud(wall, cable, None)
+
+
+def test_the_axis_of_a_gripper_is_not_that_of_the_nearest_points():
+    """The line begins 3 mm beside the gripper, where the direction to it is across the cable."""
+    line = np.column_stack([np.linspace(0.0, 0.9, 91), np.full(91, 0.003), np.zeros(91)])
+    remarks: list[str] = []
+    start = Gripper(np.zeros((1, 3)), np.eye(3)[None])
+    end = Gripper(np.array([[0.9, 0.0, 0.0]]), np.eye(3)[None])
+    for gripper in along_cable(start, end, [line], remarks)[:2]:
+        assert gripper.frames[0, :, 0] == pytest.approx([1.0, 0.0, 0.0])
+    assert "its x axis is taken along the cable (3 degrees off" in remarks[0]

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d, label, median_filter, uniform_filte
 from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import BoolArray, FloatArray, unit
+from dlo_casadi.arrays import BoolArray, FloatArray, length_of, unit
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings.recording import Kind, Recording, Stream
 
@@ -307,6 +307,7 @@ def _jitter(x: FloatArray) -> float:
 
 # ---- grippers ------------------------------------------------------------------------------------
 
+_INSIDE = 0.05  # share of a line's length, beyond the noise and the hidden ends of lines in clouds
 _STRAY = 0.5  # smallest cosine at which a gripper's axis may be the cable's
 
 
@@ -368,16 +369,15 @@ def along_cable(
 ) -> tuple[Gripper | None, Gripper | None]:
     """Grippers with x along the cable from start to end, and the least roll between them.
 
-    Of a body's six axes, x is the one closest to the direction of the nearest marker. Of the four
+    Of a body's six axes, x is the one closest to the cable's direction, see `_ways`. Of the four
     ways to roll the end about it, the one with the smallest twist of the cable over all poses is
     chosen. The remaining roll is a nuisance of the fit, `end_roll`.
     """
     if start is not None:
-        ways = np.array([line[0] for line in lines]) - start.places
-        start = _aimed(start, ways, "start", remarks)
+        start = _aimed(start, _ways(start, lines), "start", remarks)
     if end is not None:
-        ways = end.places - np.array([line[-1] for line in lines])
-        end = _aimed(end, ways, "end", remarks)
+        back = _ways(end, [line[::-1] for line in lines])
+        end = _aimed(end, -back, "end", remarks)
     if start is not None and end is not None:
         rolls = [Rotation.from_rotvec([k * np.pi / 2, 0, 0]).as_matrix() for k in range(4)]
         twists = [_twist(start, lines, end.turned(roll)) for roll in rolls]
@@ -387,6 +387,19 @@ def along_cable(
             "finds what is left as end_roll"
         )
     return start, end
+
+
+def _ways(gripper: Gripper, lines: Sequence[FloatArray]) -> FloatArray:
+    """Vectors (P, 3) [m] from a gripper to the first point of each line that is well inside it.
+
+    That is a twentieth of its length away: the first points of a line in a cloud are at the place
+    of the gripper, where the direction to them is noise.
+    """
+    found = []
+    for place, line in zip(gripper.places, lines, strict=True):
+        inside = np.linalg.norm(line - place, axis=1) >= _INSIDE * length_of(line)
+        found.append(line[int(np.argmax(inside))] - place)
+    return np.array(found)
 
 
 def _aimed(gripper: Gripper, ways: FloatArray, side: str, remarks: list[str]) -> Gripper:
@@ -399,13 +412,13 @@ def _aimed(gripper: Gripper, ways: FloatArray, side: str, remarks: list[str]) ->
     if abs(cosines[k]) < _STRAY:
         raise MeasurementError(
             f"no axis of the body at the {side} is directed along the cable: the nearest is "
-            f"{'-' if sign < 0 else ''}{'xyz'[k]}, {angle:.0f} degrees off the way to the nearest "
-            f"marker.\n  Try: a body whose x axis is the cable's direction in the clamp; --up; "
+            f"{'-' if sign < 0 else ''}{'xyz'[k]}, {angle:.0f} degrees off the direction of the "
+            "cable there.\n  Try: a body whose x axis is the cable's direction in the clamp; --up; "
             "cable and grippers in one frame."
         )
     remarks.append(
         f"{side} gripper: its {'-' if sign < 0 else ''}{'xyz'[k]} axis is taken along the cable "
-        f"({angle:.0f} degrees off the way to the nearest marker)"
+        f"({angle:.0f} degrees off the cable's direction there)"
     )
     axes = np.zeros((3, 3))
     axes[k, 0], axes[(k + 1) % 3, 1], axes[(k + 2) % 3, 2] = sign, sign, 1.0
