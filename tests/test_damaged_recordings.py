@@ -11,6 +11,7 @@ from recorded.takes import HOLD, MOVE, rendered, write_motive, write_vicon
 from dlo_casadi.cli import main
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.recordings import CloudView, Recording, Stream, Wishes, make_session, read_recording
+from dlo_casadi.recordings.lost import without_held
 from dlo_casadi.recordings.stills import find_stills
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
@@ -112,6 +113,14 @@ def test_a_marker_that_tracking_lost_costs_no_pose(how, take, tmp_path):
     (told,) = (text for text in session.remarks if "m07 is" in text)
     count = int(re.search(r"in (\d+) of", told)[1])
     assert count == pytest.approx(lost.sum(), abs=1)
+
+
+def test_without_noise_a_marker_may_be_constant(take):
+    """Simulated: all markers are constant in each pose, and one beside the fixture throughout."""
+    at = np.clip(take.t - 3.0, 0.0, 1.0)[:, None] * [0.0, 0.1, 0.0]
+    exact = {f"m{k}": (k > 0) * at + [0.1 * k, 0.2, 0.3] for k in range(4)}
+    recording = recording_of(replace(take, markers=exact))
+    assert without_held(recording).assumptions == ()
 
 
 def test_a_gripper_whose_last_pose_is_held_costs_no_other_pose(take):

@@ -74,13 +74,16 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
                     key = "marker", name, topic, _frame(holder)
                     place = [scale * x for x in place]
                     sent.setdefault(key, []).append((_time(holder), received, place))
+    unset: set[str] = set()  # topics
+    rows = {key: _dated(items, key[2], unset) for key, items in sent.items()}
+    links = {name: (parent, _dated(x, "tf", unset)) for name, (parent, x) in moved.items()}
     remarks = [f"markers {', '.join(sorted(left_out))} are left out: lines, lists or texts"]
     remarks *= bool(left_out)
-    rows = {key: _dated(items, key[1], remarks) for key, items in sent.items()}
-    links = {
-        name: (parent, _dated(items, f"TF of {name}", remarks))
-        for name, (parent, items) in moved.items()
-    }
+    if unset:
+        remarks.append(
+            f"header stamps in {', '.join(sorted(unset))} are zero: the times at which the bag "
+            "received these messages are taken"
+        )
     if not rows and not links and not clouds:
         held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "no topics"
         raise MeasurementError(f"holds {held}.\n  Try: record one or more of {_WANTED}.")
@@ -106,16 +109,16 @@ def _time(message: Any) -> float:
     return float(stamp.sec + _NANO * stamp.nanosec)
 
 
-def _dated(items: Sent, name: str, remarks: list[str]) -> Rows:
-    """Rows with the times of their headers; where these are not set, with those of receipt."""
+def _dated(items: Sent, topic: str, unset: set[str]) -> Rows:
+    """Rows with the times of their headers; where these are zero, of receipt: `unset` gets topic.
+
+    Among stamps from the start of a simulation a zero is a time like others.
+    """
     stamps, received, values = zip(*items, strict=True)
-    unset = np.equal(stamps, 0.0)
-    if len(items) > 1 and (unset.all() or (unset.any() and np.median(stamps) > _SINCE_1970)):
-        remarks.append(
-            f"{name}: the header stamps of {unset.sum()} of {len(items)} messages are zero; "
-            "the times at which the bag received them are taken"
-        )
-        stamps = tuple(np.where(unset, received, stamps).tolist())
+    zero = np.equal(stamps, 0.0)
+    if len(items) > 1 and (zero.all() or (zero.any() and np.median(stamps) > _SINCE_1970)):
+        unset.add(topic)
+        stamps = tuple(np.where(zero, received, stamps).tolist())
     return list(zip(stamps, values, strict=True))
 
 

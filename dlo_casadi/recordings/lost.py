@@ -10,6 +10,7 @@ from dlo_casadi.arrays import BoolArray
 from dlo_casadi.recordings.recording import Recording, Stream
 
 _HELD = 0.4  # s, shortest stretch in which an exactly constant marker is a held one
+_CHANGES = 0.8  # share of the frames in which a marker with noise changes; one without moves less
 _EQUAL = 1e-9  # m, above the rounding of a change of axes, below the resolution of all files
 
 
@@ -33,7 +34,7 @@ def without_zeros(streams: Sequence[Stream]) -> tuple[tuple[Stream, ...], tuple[
 def without_held(recording: Recording) -> Recording:
     """The recording, markers nan where their last position is held while most others change.
 
-    A recording without noise, in which all markers are constant at once, stays as it is.
+    A recording without noise, in which others change only while they move, stays as it is.
     """
     markers = [*recording.of("marker").values()]
     found, remarks = [], []
@@ -52,7 +53,7 @@ def without_held(recording: Recording) -> Recording:
 
 
 def _most_change(markers: Sequence[Stream], held: Stream, begin: float, end: float) -> bool:
-    """Whether most of the other markers on the same clock change between two times [s]."""
+    """Whether most other markers on the same clock change all the time between two times [s]."""
     changes = []
     for other in markers:
         if other is held or other.clock != held.clock:
@@ -60,7 +61,8 @@ def _most_change(markers: Sequence[Stream], held: Stream, begin: float, end: flo
         inside = other.values[(other.t >= begin) & (other.t <= end)]
         inside = inside[np.isfinite(inside).all(axis=1)]
         if len(inside) > 1:
-            changes.append(bool(np.ptp(inside, axis=0).max() > _EQUAL))
+            steps = np.abs(np.diff(inside, axis=0)).max(axis=1)
+            changes.append(bool(np.mean(steps > _EQUAL) > _CHANGES))
     return 2 * sum(changes) > len(changes)
 
 

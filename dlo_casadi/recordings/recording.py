@@ -21,7 +21,7 @@ _UP = {
 LARGEST = 100.0  # m, distance from the origin beyond which coordinates cannot be in metres
 # Longest time between two frames of a recording: a longer one is a wrong time, such as one that is
 # counted from 1970 beside others from the start of the recording (1.7e9 s).
-_PAUSE = 3600.0  # s
+_PAUSE = 86400.0  # s
 METRES = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "centimeters": 0.01}
 METRES |= {"mm": 1e-3, "millimeters": 1e-3, "millimetres": 1e-3}
 
@@ -170,6 +170,6 @@ def checked_times(t: FloatArray, places: Sequence[str]) -> FloatArray:
     if np.isfinite(t[k]):
         told = f"has the time {t[k]:.6f} s after {t[k - 1]:.6f} s in {places[k - 1]}"
     raise MeasurementError(
-        f"{places[k]} {told}: times must increase, by less than an hour from frame to frame.\n"
+        f"{places[k]} {told}: times must increase, by less than a day from frame to frame.\n"
         "  Try: export it again, all frames in their order; or delete frames with wrong times."
     )
