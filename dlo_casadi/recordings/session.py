@@ -32,9 +32,9 @@ from dlo_casadi.thresholds import STRETCHED
 _COLUMNS = 98  # width of a comment
 _SAMPLES = 50  # points of a spline between two markers, to compute its length: exact to 1e-5
 _LONGER = 0.03  # relative difference of declared and measured length beyond which one is a mistake
-# Scatter of the length from pose to pose beyond which arc lengths are doubtful, relative. Rendered:
-# below 0.1 % for eight markers or more, 0.15 % for six, 0.8 % for four, 2.9 % for three, and the
-# errors of the arc lengths are as large; 0.3 % for grippers that are 20 mm off.
+# Scatter of the length from pose to pose beyond which arc lengths are doubtful, relative. Rendered
+# from one session: below 0.1 % for eight markers or more, up to 0.15 % for six, 0.9 % for four, 2.9
+# % for three; errors of arc lengths are 0.5 to 1.6 times the scatter. Grippers 20 mm off: 0.3 %.
 _DOUBTFUL = 2e-3
 _FEW = 4  # markers through which a spline is often shorter than the cable
 _LENGTH = DeclaredTolerances().length  # m

@@ -60,8 +60,8 @@ _FEW, _HANGING = 2, 5
 # a factor of five or more, are then recognised.
 _SIZED = 0.5
 # Largest angle [rad] between the pull and an axis other than gravity, and smallest pull along it in
-# standard deviations, at which that axis is certain. Rendered poses in wrong axes: 16 degrees, 3.3
-# deviations; correct ones with few markers: 44 to 49 degrees, 1.1 to 4.0 deviations.
+# standard deviations, at which that axis is certain. Set on one session, rendered: in wrong axes 16
+# degrees, 3.3 deviations; correct with few markers 44 to 49 degrees, 1.1 to 4.0 deviations.
 _AXIS_OFF, _SURE = 0.5, 2.5
 # What is exchanged -> the pose's keys.
 _EXCHANGED = {
