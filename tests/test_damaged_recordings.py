@@ -254,12 +254,12 @@ def test_units_of_angle(unit, size, tmp_path):
         read_recording([file])
 
 
-def test_a_doubtful_pull_is_told_and_the_session_is_written(tmp_path, capsys):
-    """Ten of twelve markers show a pull 59 degrees off gravity: no axis of other frames."""
+def test_few_markers_whose_bends_look_like_another_pull_are_no_mistake(tmp_path, capsys):
+    """Ten of twelve markers show a pull 59 degrees off gravity; fits tell that it is none."""
     take = rendered(SESSION, poses=6, rate=25.0)
     few = {name: x for name, x in take.markers.items() if name not in ("m10", "m11")}
     files, _ = write_motive(replace(take, markers=few), tmp_path)
     arguments = ["import", *map(str, files), "--output", str(tmp_path / "loom")]
     assert main([*arguments, "--mass", "0.03", "--diameter", "0.004"]) == 0
-    assert "warning: the cable seems to be pulled along" in capsys.readouterr().out
+    assert "warning" not in capsys.readouterr().out
     assert (tmp_path / "loom" / "session.yaml").exists()

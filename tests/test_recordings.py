@@ -26,7 +26,7 @@ def take():
 
 
 def imported(files, output, *options):
-    arguments = ["import", *map(str, files), "--output", str(output), "--quiet", *options]
+    arguments = ["import", *map(str, files), "--output", str(output), *options]
     return main(arguments)
 
 
@@ -66,17 +66,13 @@ def damaged(kind, how, take, folder):
         file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     if how == "empty":
         file.write_bytes(b"")
-    if how == "other axes":
-        options = [*options, "--up", "x"]
     if how == "other names":
         options = [*options, "--end", "hand"]
     return files, options
 
 
 @pytest.mark.parametrize("kind", ["motive", "vicon", "c3d", "mcap"])
-@pytest.mark.parametrize(
-    "how", ["truncated", "empty", "never seen", "no gripper", "other axes", "other names"]
-)
+@pytest.mark.parametrize("how", ["truncated", "empty", "never seen", "no gripper", "other names"])
 def test_broken_files_are_told_and_nothing_is_written(kind, how, take, tmp_path, capsys):
     files, options = damaged(kind, how, take, tmp_path)
     before = sorted(tmp_path.iterdir())
@@ -95,15 +91,33 @@ def swapped(take, axes, signs=(1.0, 1.0, 1.0)):
 
 
 @pytest.mark.parametrize(
-    ("axes", "signs"),
-    [([1, 0, 2], (1, 1, 1)), ([0, 2, 1], (1, 1, 1)), ([0, 1, 2], (1, 1, -1))],
+    ("axes", "signs", "told"),
+    [
+        ([1, 0, 2], (1, 1, 1), "no axis of the body at the end is directed along the cable"),
+        pytest.param(
+            [0, 2, 1], (1, 1, 1), "warning: pose_04: its end_orientation", marks=pytest.mark.long
+        ),
+        pytest.param(
+            [0, 1, 2], (1, 1, -1), "warning: pose_01: its end_orientation", marks=pytest.mark.long
+        ),
+    ],
     ids=["x and y", "y and z", "z mirrored"],
 )
-def test_places_in_other_axes_than_rotations(axes, signs, take, tmp_path, capsys):
+def test_places_in_other_axes_than_rotations(axes, signs, told, take, tmp_path, capsys):
     files, options = WRITERS["vicon"](swapped(take, axes, signs), tmp_path)
-    assert imported(files, tmp_path / "loom", *options, *CABLE) == 2
-    assert "Try: " in capsys.readouterr().err
-    assert not (tmp_path / "loom").exists()
+    code = imported(files, tmp_path / "loom", *options, *CABLE)
+    said = capsys.readouterr()
+    assert told in said.out + said.err
+    assert (tmp_path / "loom").exists() == (code == 0)
+
+
+def test_a_wrong_axis_upwards_is_doubted(take, tmp_path, capsys):
+    """A few poses do not prove it: a cable whose shape at rest is curved may look the same."""
+    files, options = WRITERS["motive"](take, tmp_path)
+    assert imported(files, tmp_path / "loom", *options, "--up", "x", *CABLE) == 0
+    told = capsys.readouterr().out
+    assert "warning: the cable does not hang along gravity" in told
+    assert "warning: Try: --up" in told
 
 
 def test_one_world_frame_is_assumed_and_said(take, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -98,12 +99,7 @@ def import_(chosen: argparse.Namespace) -> None:
             mistakes, doubts = _mistakes(session, draft.folder)
             if mistakes:
                 told = ["nothing is written: the recording contradicts itself.", *mistakes]
-                if any("one frame" in text for text in mistakes):
-                    told.append(
-                        "  Try: --up, the axis that points up in the files; --start-offset, "
-                        "--end-offset."
-                    )
-                raise MeasurementError("\n".join(told))
+                raise MeasurementError("\n".join([*told, *_advice(mistakes)]))
             draft.put_in_place()
         watch.step("compare with a cable", 3, 3)
     page, target = Page(chosen), chosen.output / _NAME
@@ -117,7 +113,7 @@ def import_(chosen: argparse.Namespace) -> None:
     )
     for remark in session.remarks[: len(session.remarks) - len(session.doubts)]:
         page.say(remark)
-    for doubt in (*session.doubts, *doubts):
+    for doubt in (*session.doubts, *doubts, *_advice(doubts)):
         page.warn(doubt)
     left = to_fill_in(session.text())
     follow = f"dlo {'check' if left else 'fit'} {target}"
@@ -133,6 +129,13 @@ def _write(session: Imported, folder: Path) -> None:
     write_file(folder / _NAME, session.text())
 
 
+def _advice(texts: Sequence[str]) -> list[str]:
+    """What to try if frames are in doubt."""
+    if not any("one frame" in text for text in texts):
+        return []
+    return ["Try: --up, the axis that points up in the files; --start-offset, --end-offset."]
+
+
 def _mistakes(session: Imported, folder: Path) -> tuple[list[str], list[str]]:
     """Contradictions in a written session, and doubts, with stand-ins for missing values."""
     text = session.text(session.stand_ins)
@@ -146,7 +149,7 @@ def _mistakes(session: Imported, folder: Path) -> tuple[list[str], list[str]]:
     except ConfigError as error:  # it cites a file that will not exist
         raise DloError(f"nothing is written: {error.problem}") from None
     else:
-        found = find_suspicions(config, inputs, fits=False)
+        found = find_suspicions(config, inputs)
         return contradictions(found, inputs), [item.message for item in found]
     finally:
         stand_in.unlink()

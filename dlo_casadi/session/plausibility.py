@@ -59,10 +59,6 @@ _FEW, _HANGING = 2, 5
 # Largest relative standard deviation at which stiffness over weight counts as known: wrong units,
 # a factor of five or more, are then recognised.
 _SIZED = 0.5
-# Largest angle [rad] between the pull and an axis other than gravity, and smallest pull along it in
-# standard deviations, at which that axis is certain. Set on one session, rendered: in wrong axes 16
-# degrees, 3.3 deviations; correct with few markers 44 to 49 degrees, 1.1 to 4.0 deviations.
-_AXIS_OFF, _SURE = 0.5, 2.5
 # What is exchanged -> the pose's keys.
 _EXCHANGED = {
     "start and end exchanged": ("",),
@@ -120,18 +116,13 @@ def contradictions(found: Sequence[Suspicion], inputs: Sequence[PoseInput]) -> l
     return refused
 
 
-def find_suspicions(
-    config: Config, inputs: Sequence[PoseInput], *, fits: bool = True
-) -> tuple[Suspicion, ...]:
-    """Everything in a session that looks like a mistake, see `QUESTIONS`.
-
-    Without `fits`: the direction of the pull on the lines, and questions that need no fit.
-    """
+def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
+    """Everything in a session that looks like a mistake, see `QUESTIONS`."""
     session = ReadSession(config, tuple(item for item in inputs if len(item.points)))
     found: tuple[Suspicion, ...] = ()
     if not session.lines.names:
         return found
-    for questions in QUESTIONS if fits else (((pulled_elsewhere,),), *QUESTIONS[:2]):
+    for questions in QUESTIONS:
         for alternatives in questions:
             found += next(filter(None, (ask(session) for ask in alternatives)), ())
         if any(item.certain for item in found):
@@ -363,31 +354,6 @@ def hangs_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
         + ("" if found.certain else " A strap that lifts the cable would look the same.")
     )
     return (Suspicion(text, found.certain),)
-
-
-def pulled_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Whether the lines seem to be pulled along another axis than gravity; without any fit."""
-    gravity = np.array(session.config.experiment.gravity)
-    pull = shown_pull(session)
-    axes = np.vstack([np.eye(len(gravity)), -np.eye(len(gravity))])
-    if pull is None or not gravity.any():
-        return ()
-    nearest = axes[int(np.argmax(axes @ pull))]
-    if _angle(pull, gravity) < np.pi / 4 or _angle(pull, nearest) > HEADING_OFF:
-        return ()
-    text = (
-        f"the cable seems to be pulled along ({listed(nearest + 0.0, 'g')}), "
-        f"{np.degrees(_angle(pull, gravity)):.0f} degrees off gravity "
-        f"({listed(gravity + 0.0, 'g')}) m/s^2. Try: points, start, end and gravity in one frame."
-    )
-    pulls = [shown_pull(session.without(item.name)) for item in session.read]
-    along = np.array([np.nan if rest is None else rest @ nearest for rest in pulls])
-    std = np.sqrt((len(along) - 1) * along.var())  # of a jackknife
-    certain = bool(len(along) > 2 and pull @ nearest > _SURE * std)
-    certain &= _angle(pull, nearest) < _AXIS_OFF
-    if not certain:
-        text += " Few markers, or a cable that hardly bends under its weight, look the same."
-    return (Suspicion(text, certain),)
 
 
 def _other_gravity(

@@ -54,7 +54,7 @@ experiment:
 """
     (folder / "session.yaml").write_text(text)
     config = load_config(folder / "session.yaml")
-    found = find_suspicions(config, read_inputs(config), fits=False)
+    found = find_suspicions(config, read_inputs(config))
     return [item for item in found if "first" in item.message or "saddle" in item.message]
 
 
