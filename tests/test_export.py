@@ -84,6 +84,19 @@ def test_what_effects_are_to_a_rod():
     )
 
 
+@pytest.mark.parametrize("place", [0.0, PLACE, 0.8])
+def test_a_compact_mass_at_an_end_makes_no_link_lighter(place):
+    """Shared by two neighbours, its moment is kept; within h / 2 of an end one link has all."""
+    rod = replace(Rod.of(CASES["overhang"](), 40), lumps=np.array([[MASS, place]]))
+    middles = (rod.s[1:] + rod.s[:-1]) / 2
+    for points in (middles, rod.s):
+        shares = rod.lumps_at(points)
+        assert shares.min() >= 0
+        assert shares.sum() == pytest.approx(MASS)
+        assert shares @ points / MASS == pytest.approx(np.clip(place, points[0], points[-1]))
+    assert (rod.link_masses >= rod.masses).all()
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_mujoco_rests_where_we_predict(case):
     pytest.importorskip("mujoco", reason="the extra `peers` is not installed")

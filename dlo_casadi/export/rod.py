@@ -237,9 +237,14 @@ class Rod:
         return courant * largest, inertia
 
     def lumps_at(self, s: FloatArray) -> FloatArray:
-        """Compact masses [kg] carried by points at arc lengths s: each by its two neighbours."""
+        """Compact masses [kg] carried by points at arc lengths s: each by its two neighbours.
+
+        Beyond the first or the last point that one carries all of it, up to h / 2 from its place.
+        """
         out = np.zeros(len(s))
-        for mass, place in self.lumps:
+        for mass, place in zip(
+            self.lumps[:, 0], np.clip(self.lumps[:, 1], s[0], s[-1]), strict=True
+        ):
             k = int(np.clip(np.searchsorted(s, place) - 1, 0, len(s) - 2))
             share = (place - s[k]) / (s[k + 1] - s[k])
             out[[k, k + 1]] += mass * np.array([1 - share, share])
