@@ -85,7 +85,8 @@ def symbols_of(
 
 def search_sizes(model: CableModel) -> list[tuple[int, int]]:
     """Sizes of the outputs of a search: x, multipliers, status, 1 or NaN."""
-    return [(model.node.coordinates, model.chain.n_nodes), (model.n_border, 1), (1, 1), (1, 1)]
+    x = (model.node.coordinates, model.chain.n_nodes)
+    return [x, (model.n_multipliers, 1), (1, 1), (1, 1)]
 
 
 class _SearchCallback(ca.Callback):
@@ -118,7 +119,8 @@ class _SearchCallback(ca.Callback):
         numbers, known = np.frombuffer(pose), np.frombuffer(p)
         found = _solved(self.model, known, self.rest, numbers, self.branch)
         if isinstance(found, Equilibrium):
-            return [ca.DM(found.x.T), ca.DM(found.multipliers), ca.DM(0), ca.DM(1)]
+            multipliers = found.multipliers[self.model.are_multipliers]
+            return [ca.DM(found.x.T), ca.DM(multipliers), ca.DM(0), ca.DM(1)]
         none = [ca.DM.nan(*size) for size in self._sizes]
         return [*none[:2], ca.DM(found), none[3]]
 
@@ -163,6 +165,22 @@ def detached(function: ca.Function) -> ca.Function:
         "never_inline": True,
     }
     return ca.Function(function.name(), given, function.call(given), options)
+
+
+def border_of(model: CableModel, rest: FloatArray) -> ca.Function:
+    """(x, multipliers (n_multipliers,), pose, p) -> (n_border,): places of springs put in.
+
+    A spring's place y has the condition r(s) - y = 0: with y = 0 this is y. Without derivatives.
+    """
+    x = ca.MX.sym("x", model.node.coordinates, model.chain.n_nodes)
+    found, pose = ca.MX.sym("multipliers", model.n_multipliers), ca.MX.sym("pose", pose_size(model))
+    p, border = ca.MX.sym("p", len(model.names)), ca.MX.zeros(model.n_border)
+    border[np.flatnonzero(model.are_multipliers).tolist()] = found
+    if model.n_springs:
+        rows = balance(model, symbols_of(model, rest, x, border, pose, p))[-model.n_border :]
+        pulls = [row for rows_of_one in model.pulls[: model.n_springs] for row in rows_of_one]
+        border[[row - model.node.dimension for row in pulls]] = rows[pulls]
+    return detached(ca.Function("border", [x, found, pose, p], [border]))
 
 
 def chord(model: CableModel, rest: FloatArray) -> ca.Function:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.equilibrium import continued
 from dlo_casadi.equilibrium.implicit import (
+    border_of,
     chord,
     detached,
     pose_of,
@@ -144,6 +145,7 @@ class CasadiCable:
             self._check_search(search, with_others=bool(parameters or branch))
             found = detached(search)(pose)
         x, multipliers, status, there = found
+        multipliers = border_of(self.model, self.rest)(x, multipliers, pose, p)
         x, multipliers, step = chord(self.model, self.rest)(x, multipliers, pose, p)
         there = ca.if_else(step < FARTHEST, there, np.nan)
         status = ca.if_else(ca.logic_or(step < FARTHEST, status != 0), status, 6)

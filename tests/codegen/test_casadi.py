@@ -9,7 +9,7 @@ from solvers import QUICK
 
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import compile_library
-from dlo_casadi.effects import CableData, ClampCompliance, ClampRotation
+from dlo_casadi.effects import AxialStretch, CableData, ClampCompliance, ClampRotation, Tether
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
@@ -95,6 +95,28 @@ def test_an_optimiser_needs_no_python(tmp_path):
         ends.append(np.array(solver(x0=[0.3, -0.4], lbg=0.25, ubg=0.25)["x"]).ravel())
         assert solver.stats()["success"]
     np.testing.assert_allclose(*ends, atol=1e-6)
+
+
+def test_the_search_in_c_knows_tethers(tmp_path):
+    """Their forces come from C; in Python their places are those of the cable."""
+    effects = (AxialStretch(), Tether(), Tether(label="tether_2"))
+    model, p, rest = cable("plane", start="clamped", effects=effects)
+    for name, value in {
+        "tether.stiffness": 3.0,
+        "tether.position": 0.3,
+        "tether_2.stiffness": 0.0,
+        "tether_2.position": 0.6,
+    }.items():
+        p[model.names.index(name)] = value
+    library = compile_library(generate(model, p, rest.ravel()), tmp_path, QUICK)
+    known, u = CasadiCable(model, p, rest.ravel()), ca.MX.sym("u", 6)
+    found = []
+    for search in (None, ca.external("dlo_equilibrium", str(library))):
+        outs = ca.veccat(*known.function(search=search)(u))
+        every = ca.Function("every", [u], [outs, ca.jacobian(outs, u)])
+        found.append([np.array(value) for value in every(POSES["plane"])])
+    for by_python, by_c in zip(*found, strict=True):
+        np.testing.assert_allclose(by_c, by_python, atol=1e-8 * np.abs(by_python).max())
 
 
 @pytest.fixture(scope="module")
