@@ -105,6 +105,15 @@ def test_what_has_no_equilibrium_is_nan_with_its_derivatives_and_raises_nothing(
         assert not np.array(of_status).any()
 
 
+@pytest.mark.parametrize("stiffness", [0.0, -1.0])
+def test_a_cable_without_stiffness_has_a_status(stiffness):
+    model, p, rest = cable(False, plain=True)
+    function = CasadiCable(model, p, rest).function(parameters=["bending_stiffness"])
+    *outs, status = function(PLANE, stiffness)
+    assert status == 2
+    assert all(np.isnan(np.array(out)).all() for out in outs)
+
+
 def test_turns_and_quaternions_that_cannot_be_have_a_status_wherever_the_end_is():
     model, p, rest = cable(True, plain=True)
     function = CasadiCable(model, p, rest).function()

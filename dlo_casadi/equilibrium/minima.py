@@ -412,7 +412,10 @@ def _balanced(
         now = start
         for _ in range(NEWTON_STEPS):
             force, matrix = linearized(now, moments)
-            step = matrix.factor().solve(Vector(-force.x, -force.y))
+            try:
+                step = matrix.factor().solve(Vector(-force.x, -force.y))
+            except np.linalg.LinAlgError:  # not finite: a cable without stiffness
+                return None
             size = float(np.abs(step.x).max())
             if not size < NEARBY:
                 break
