@@ -228,7 +228,7 @@ class _PlaneCase(Case):
         count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
         # Each first guess starts one free descent, and one guided by springs in 15 stages; a
         # descent takes 100 steps, and 6 more off saddles; each may land on obstacles, in 100. The
-        # template checks the number.
+        # template checks the number. The lowest stretches between saddles are joined in 10.
         guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
         held = 0
         if self.holds:
@@ -236,6 +236,7 @@ class _PlaneCase(Case):
             held += (self.border - 2) * count + 2 * self.held_doubles
         if spans := len(model.clips) and len(model.clips) + 1:
             guesses = (2**spans if spans <= 4 else spans + 2) * (3 if model.sliding else 1)
+        mixing = 10 if model.clamped_between and not self.obstacles else 0
         landings = 2 + 4 * (guesses + self.obstacles) if self.obstacles else 0
         return {
             "WORKSPACE": self.doubles * (count + 1) + held,
@@ -248,7 +249,7 @@ class _PlaneCase(Case):
             "GIVES_END": gives[1],
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
-            "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings,
+            "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings + mixing,
             "SPRUNG": kernels.ends is not None,
         }
 

@@ -358,22 +358,24 @@ def by_ipopt(
     solver = _solver(model, clamped_nodes(model.chain, pose.clips))
     deviation = np.zeros(len(model.deviation_names))
     others = border_of(model, pose, phi[:, None])[~model.are_multipliers]
-    inner = np.zeros(solver.size1_in("x0") - len(phi) - len(others))
-    x0 = np.concatenate([phi, others, inner])
     rows, most = np.flatnonzero(model.are_multipliers)[:conditions], np.full(touching, np.inf)
     held = np.where(np.isin(rows, model.no_pull), np.inf, 0.0)
     bent = np.full(count - 1, JOINT_BOUND)
     lower = np.concatenate([-held, -bent, np.zeros(touching)])
     upper = np.concatenate([held, bent, most])
-    parameters = np.concatenate([p, rest, pose.vector, deviation])
-    out, stats = run_ipopt(solver, x0=x0, p=parameters, lbg=lower, ubg=upper)
+    numbers, given = (p, rest, pose.vector), Inputs.of(p, rest, pose.vector[None])
+    first = Shapes(phi[None, :, None], np.zeros((1, model.n_border)), deviation[None])
+    clipped, x0 = assembly_of(model).clipped(first, given), np.zeros(solver.size1_in("x0"))
+    x0[:count], x0[count : count + len(others)] = clipped.in_frames(first.x)[0, :, 0], others
+    room = np.where(np.isin(np.arange(len(x0)), clipped.clamped[0]), 0.0, np.inf)
+    bounds = {"lbx": x0 - room, "ubx": x0 + room, "lbg": lower, "ubg": upper}
+    out, stats = run_ipopt(solver, x0=x0, p=np.concatenate([*numbers, deviation]), **bounds)
     multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))
     border = np.zeros(model.n_border)
     bounded, pressed = np.split(multipliers[conditions:], [count - 1])
     border[model.are_multipliers] = np.concatenate([multipliers[:conditions], -pressed])
     border[~model.are_multipliers] = coordinates[count:][: np.sum(~model.are_multipliers)]
     start = Shapes(coordinates[None, :count, None], border[None], deviation[None])
-    given = Inputs.of(p, rest, pose.vector[None])
     if model.surfaces:
         start = descend(assembly_of(model), start, given).shapes
     return _balanced(model, start, bounded, given, stats["iter_count"])
@@ -400,10 +402,10 @@ def _balanced(
         arms = np.zeros((1, model.chain.n_nodes, 1, len(active)))
         arms[0, active, 0, np.arange(len(active))] = -1.0
         arms[0, active + 1, 0, np.arange(len(active))] = 1.0
+        arms[0, assembly.clipped(shapes, given).clamped[0]] = 0.0
         gap = (bends(shapes)[active] - bound)[None, :, None]
-        nodes = force.x + (arms @ moments)[..., None]
-        whole = Vector(nodes, np.concatenate([force.y, gap], axis=1))
-        return whole, matrix.with_border(arms)
+        conditions = np.concatenate([force.y, gap], axis=1)
+        return Vector(force.x + (arms @ moments)[..., None], conditions), matrix.with_border(arms)
 
     bent = bends(start)
     active = np.flatnonzero(np.abs(bent) > JOINT_BOUND - AT_BOUND)
@@ -419,8 +421,8 @@ def _balanced(
             size = float(np.abs(step.x).max())
             if not size < NEARBY:
                 break
-            x, lam = node.moved(now.x, step.x[..., 0]), step.y[:, : model.n_border, 0]
-            now = replace(now, x=x, lam=now.lam + lam)
+            lam = now.lam + step.y[:, : model.n_border, 0]
+            now = replace(now, x=node.moved(now.x, step.x[..., 0]), lam=lam)
             moments = moments + step.y[0, model.n_border :, 0]
             if size < 1e-12:
                 break

@@ -134,6 +134,23 @@ def test_clips_in_a_plane(held):
         assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
 
 
+@pytest.fixture(scope="module")
+def with_saddle():
+    model = CableModel(
+        CableData(0.8, 0.05, 0.005, 0.01), 20, start="clamped", end="clamped", clips=("clamped",)
+    )
+    return compiled(model)
+
+
+def test_stretches_between_saddles_are_the_lowest_one_by_one(with_saddle):
+    """From guesses of the whole cable one stretch was found in the other of its two shapes."""
+    solver, p, rest = with_saddle
+    saddle = HeldClip("clamped", (0.2315, -0.1665), 0.4, heading=-0.4994)
+    held = {"start_heading": -0.0807, "end_heading": -0.3785}
+    pose = HeldPose((0.0, 0.0), (0.577, -0.1951), clips=(saddle,), **held)
+    assert_agree(solver.solve(pose), solve_equilibrium(solver.model, p, rest, pose))
+
+
 def test_a_cable_in_a_plane_that_stretches():
     model, pose = flat(FLAT_SADDLE, FLAT_CLIPS[1], effects=(AxialStretch(),))
     solver, p, rest = compiled(model, {"axial_stretch.compliance": 2e-3})
@@ -229,6 +246,27 @@ def test_slopes_by_clips_and_ends_are_differences(two, case):
             own = work(shape)
         change = (ahead.energy - back.energy) / (2 * step)
         assert own == pytest.approx(change, abs=1e-6), column
+
+
+def test_joints_at_their_bounds_beside_a_saddle(with_saddle):
+    """A stretch turns by more than its joints may: they press, and the saddle does not give way."""
+    solver, p, rest = with_saddle
+    saddle = HeldClip("clamped", (0.1, 0.11), 0.25, heading=-1.3)
+    pose = HeldPose((0.0, 0.0), (0.5, 0.1), start_heading=-1.0, end_heading=0.3, clips=(saddle,))
+    shape, step = solver.solve(pose), 1e-6
+    x = np.ravel(shape.x)
+    assert abs(x[6] - x[5]) == pytest.approx(np.pi / 2, abs=1e-9)  # node 6 is the saddle's
+    eq = solve_equilibrium(solver.model, p, rest, pose)
+    assert shape.energy == pytest.approx(eq.energy, rel=1e-8)
+    assert x == pytest.approx(np.ravel(eq.x), abs=1e-7)
+    slope = solver.sensitivity(shape, pose)
+    for column, move, _ in moves_of(solver.model, pose):
+        ahead, back = (solver.solve(move(h), warm=shape) for h in (step, -step))
+        for name in ("points", "end_force", "clip_forces", "clip_moments"):
+            change = (np.array(getattr(ahead, name)) - getattr(back, name)) / (2 * step)
+            size = max(np.abs(change).max(), 1.0)
+            own = getattr(slope, name)[..., column]
+            assert own == pytest.approx(change, abs=1e-5 * size), (column, name)
 
 
 def test_a_pinned_clip_grips_by_the_force_along_the_cable(two):
