@@ -26,6 +26,7 @@ from dlo_casadi.errors import DloError, counted
 from dlo_casadi.fleet import parquet_library
 from dlo_casadi.io.files import LOCK, only_run, write_file
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.runtime.parallel import Tally, map_as_completed
 
 # Columns of a pose, as the compiled solver takes them [m, m, m, m, rad, rad].
@@ -123,9 +124,15 @@ class PoseList:
 
     @property
     def count(self) -> int:
-        """Number of poses."""
+        """Number of poses; without any, there is no table."""
         with self._explained():
-            return int(self._data.count_rows())
+            rows = int(self._data.count_rows())
+        if not rows:
+            raise DloError(
+                f"--list {self.path}: no poses: the file names its columns and has no rows.\n"
+                "  Try: one row per pose"
+            )
+        return rows
 
     @property
     def identity(self) -> Mapping[str, Any]:
@@ -396,6 +403,7 @@ def table_of(
 
     lost, ends = statuses != 0, ("start", "end")
     clamped = [side for side in ends if getattr(model, side) == "clamped"]
+    turned = functions_of(model).moment_ends  # clamps, and pins with springs
     known = {
         *("start_x", "start_y", *([] if model.end == "free" else ["end_x", "end_y"])),
         *(f"{side}_heading" for side in clamped),
@@ -407,7 +415,7 @@ def table_of(
             for side in ends
             for k, axis in enumerate("xy")
         },
-        **{f"moment_on_{side}": records["moments"][:, ends.index(side), 0] for side in clamped},
+        **{f"moment_on_{side}": records["moments"][:, ends.index(side), 0] for side in turned},
         "min_bend_radius": records["min_bend_radius"],
     }
     points = pa.array(records["points"].astype(np.float32).ravel())

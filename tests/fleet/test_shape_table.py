@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from dlo_casadi import predict
 from dlo_casadi.cli import main
-from dlo_casadi.effects import CableData
+from dlo_casadi.effects import CableData, EndSpring
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
@@ -177,13 +177,26 @@ def test_what_belongs_to_something_else_is_refused(tmp_path, small_chunks):
         ("end_x_m\n0.1\n", "end_y_m missing"),
         ("end_x_m,end_y_m,speed\n0.1,0.2,3\n", "speed unknown"),
         ("end_x_m,end_y_m\n0.1,far\n", "far"),
+        ("end_x_m,end_y_m\n", "ends.csv: no poses"),
     ],
 )
 def test_bad_lists(text, message, tmp_path):
     path = tmp_path / "ends.csv"
     path.write_text(text)
     with pytest.raises(DloError, match=message):
-        list(PoseList(path).chunks(10))
+        assert PoseList(path).count == len(list(PoseList(path).chunks(10)))
+
+
+def test_the_moment_of_a_pin_with_a_spring_is_a_column(tmp_path):
+    plan = plan_of(tmp_path, effects=(EndSpring(),))
+    plan.p[plan.model.names.index("end_spring.stiffness")] = 0.1
+    assert shape_table(plan, Grid((0.3, 0.3, 1), (0.1, 0.1, 1)), InProcess()) == {"ok": 1}
+    (row,) = pq.read_table(plan.output).to_pylist()
+    pose = HeldPose((0.0, 0.0), (0.3, 0.1))
+    found = solve_equilibrium(plan.model, plan.p, plan.rest, pose)
+    assert abs(found.moments[1]) > 1e-3
+    assert row["moment_on_end"] == pytest.approx(found.moments[1], rel=1e-6)
+    assert "moment_on_start" not in row
 
 
 def test_a_long_bad_list_is_no_bug(tmp_path):
