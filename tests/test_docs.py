@@ -180,6 +180,13 @@ def test_every_public_name_has_its_entry():
         assert home is None or {f"{home}.{name}", home} & objects, f"::: {home}.{name}"
 
 
+def test_outputs_of_the_casadi_function_are_listed_in_their_order():
+    rope = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+    cable = dlo.known_cable(rope, gravity=(0, -9.81), boundary=("pinned", "pinned"))
+    table = TEXTS["docs/pages/how-to/casadi.md"].split("| output |")[1].split("\n\n")[0]
+    assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == cable.function().name_out()
+
+
 def test_every_example_is_shown():
     shown = TEXTS["docs/pages/how-to/examples.md"]
     names = {script.stem for script in (ROOT / "scripts/examples").glob("*.py")}

@@ -258,6 +258,16 @@ def test_sensitivities_are_central_differences(element, start, end, effects):
             assert rise == pytest.approx(-shape.moments[k - 2, 0], abs=1e-6)
 
 
+def test_nodes_turn_on_from_the_largest_heading(clamped):
+    pose = at((0.5, 0.1), headings=(1e6, 1e6 - 0.1))
+    shape = clamped.solve(pose)
+    assert shape.x.max() > 1e6
+    assert clamped.step(shape, pose).energy == pytest.approx(shape.energy, abs=1e-9)
+    assert np.isfinite(clamped.sensitivity(shape, pose).points).all()
+    beyond = at((0.5, 0.1), headings=(1e6 + 1e-9, 1e6))
+    assert clamped.solve(beyond, throw=False).status == "bad_argument"
+
+
 @pytest.mark.parametrize("solver", ["links", "clamped"])
 def test_a_step_stays_on_its_branch_within_its_bound_on_the_work(solver, request):
     solver = request.getfixturevalue(solver)
