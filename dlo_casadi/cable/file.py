@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.config import Limits
@@ -110,7 +111,7 @@ class _Cable(OpenSection):
 
 class _Value(OpenSection):
     value: Number
-    std: float | None = None
+    std: NonNegative | None = None
     lower: float | None = None
     upper: float | None = None
     tolerance: float | None = None
@@ -118,6 +119,13 @@ class _Value(OpenSection):
     identifiable: bool | None = None
     unit: str = ""
     fitted: bool = False
+
+    @property
+    def complaint(self) -> str:
+        low, high = self.interval_95 or (None, None)
+        if low is None or high is None or low <= high:
+            return ""
+        return f"interval_95 is [low, high], found [{low:.12g}, {high:.12g}]"
 
     @property
     def estimate(self) -> Estimate:
@@ -178,11 +186,11 @@ class _Own(OpenSection):
 
 
 class _Scatter(OpenSection):
-    fixtures: dict[str, float | None] | None = None
-    rest_curvature_std: float = PoseScatter().std
-    rest_curvature_smoothness: float = PoseScatter().smoothness
+    fixtures: dict[str, NonNegative | None] | None = None
+    rest_curvature_std: NonNegative = PoseScatter().std
+    rest_curvature_smoothness: NonNegative = PoseScatter().smoothness
     from_pose_to_pose: Annotated[_Own, checked(lambda found: found.complaint)] = _Own()
-    hanging: float = 0.0
+    hanging: NonNegative = 0.0
 
 
 class ParametersFile(OpenSection):
@@ -197,9 +205,9 @@ class ParametersFile(OpenSection):
     n: Elements
     n_rest: RestCoefficients
     effects: tuple[Annotated[dict[str, Any], checked(_wrong_effect)], ...]
-    parameters: dict[str, _Value]
+    parameters: dict[str, Annotated[_Value, checked(lambda found: found.complaint)]]
     rest_curvature: _Fitted
-    state: _State
+    state: _State | None = None
     covariance: Annotated[_Covariance, checked(lambda found: found.complaint)]
     scatter: _Scatter | None = None
     fixtures: _Fixtures = _Fixtures()
@@ -265,7 +273,7 @@ def load(path: str | Path) -> FittedCable:
         raise document.error(problems, _DAMAGED, _REMEDY)
     p = np.array([file.parameters[name].value for name in model.names])
     metadata = metadata_of(data, source, file)
-    return FittedCable(model, p, np.array(file.state.rest_curvature), metadata)
+    return FittedCable(model, p, _rest(file, model), metadata)
 
 
 def _results_near(path: Path) -> str:
@@ -306,6 +314,13 @@ def _effect(row: Mapping[str, Any]) -> Effect:
     return kind(**options)
 
 
+def _rest(file: ParametersFile, model: CableModel) -> FloatArray:
+    """Rest strains (n_rests,) [1/m]: the state, or without one those of the coefficients."""
+    if file.state is not None:
+        return np.array(file.state.rest_curvature, dtype=float)
+    return model.rest_basis @ np.array(file.rest_curvature.coefficients, dtype=float)
+
+
 def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
     """Contradictions to the model: names and numbers of parameters, and their bounds."""
     if strange := set(file.parameters) ^ set(model.names):
@@ -317,13 +332,14 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
         if wrong := _beyond(q, file.parameters[q.name]):
             name = f"parameters.{q.name}.value"
             yield ConfigProblem(("parameters", q.name, "value"), f"{name}: {wrong}")
-    for key, size, found in (
-        ("rest_curvature", model.n_coefficients, file.rest_curvature.coefficients),
-        ("state", model.chain.n_rests, file.state.rest_curvature),
-    ):
-        if len(found) != size:
-            text = f"{counted(size, 'number')} belong here, found {len(found)}"
-            yield ConfigProblem((key,), f"{key}: {text}")
+    own = file.parameters.get(BENDING_STIFFNESS)
+    if own and not (own.fitted or math.isclose(own.value, file.cable.bending_stiffness)):
+        text = (
+            f"cable.bending_stiffness is {file.cable.bending_stiffness:.12g}, "
+            f"parameters.{BENDING_STIFFNESS}.value, which is used, {own.value:.12g}"
+        )
+        yield ConfigProblem(("cable", BENDING_STIFFNESS), text)
+    yield from _other_rest(file, model)
     start = file.fixtures.start
     if start is not None and len(start) != len(file.gravity):
         text = f"{counted(len(file.gravity), 'number')} belong here, found {len(start)}"
@@ -332,6 +348,31 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
     for name in set(file.covariance.names) - {*model.names, *coefficients}:
         text = f"covariance.names: nothing is called {show(name)}"
         yield ConfigProblem(("covariance", "names"), text)
+
+
+def _other_rest(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
+    """Rest curvatures of the wrong number, or that contradict each other."""
+    wrong = False
+    for key, size, found in (
+        ("rest_curvature", model.n_coefficients, file.rest_curvature.coefficients),
+        ("state", model.chain.n_rests, file.state.rest_curvature if file.state else None),
+    ):
+        if found is not None and len(found) != size:
+            wrong = True
+            text = f"{counted(size, 'number')} belong here, found {len(found)}"
+            yield ConfigProblem((key,), f"{key}: {text}")
+    if model.has_state and file.state is None:
+        yield ConfigProblem((), "'state' is missing: effects change the rest shape")
+    if wrong or model.has_state or file.state is None:
+        return
+    state, fitted = _rest(file, model), _rest(file.model_copy(update={"state": None}), model)
+    gap = float(np.abs(state - fitted).max(initial=0.0))
+    if gap > _DIGITS * float(np.abs(state).max(initial=0.0)):
+        text = (
+            f"state.rest_curvature, which is used, and rest_curvature.coefficients differ by "
+            f"{gap:.3g} 1/m; without `state` the coefficients are used"
+        )
+        yield ConfigProblem(("state",), text)
 
 
 def _beyond(q: Parameter, row: _Value) -> str:
@@ -382,7 +423,7 @@ def parameters_hash(document: Mapping[str, Any]) -> str:
 
     The file has it as `model_hash`. A generated solver has a separate hash: `codegen.solver_hash`.
     """
-    content = {key: document[key] for key in _MODEL_KEYS}
+    content = {key: document.get(key) for key in _MODEL_KEYS}
     content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
     content["coefficients"] = document["rest_curvature"]["coefficients"]
     text = json.dumps(_as_floats(content), sort_keys=True, separators=(",", ":"))

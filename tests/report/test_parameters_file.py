@@ -202,6 +202,17 @@ def test_a_file_changed_by_hand_is_noticed(file, tmp_path):
     assert load(edited).metadata.edited
 
 
+def test_coefficients_changed_by_hand_are_used_without_the_state(file, tmp_path):
+    def double(document):
+        rows = document["rest_curvature"]["coefficients"]
+        document["rest_curvature"]["coefficients"] = [2 * value for value in rows]
+        del document["state"]
+
+    cable = load(damaged(file, tmp_path, double))
+    assert cable.metadata.edited
+    assert cable.rest == pytest.approx(2 * load(file).rest, rel=1e-9)
+
+
 def damaged(file, tmp_path, change):
     document = read_yaml(file)
     change(document)
@@ -231,6 +242,26 @@ def damaged(file, tmp_path, change):
         (lambda d: d["effects"].append({"name": "magic", "label": "x"}), "called 'magic'"),
         (lambda d: d["effects"].pop(), "do not belong together: image_scale.factor"),
         (lambda d: d["state"]["rest_curvature"].pop(), "20 numbers belong here, found 19"),
+        (
+            lambda d: d["rest_curvature"]["coefficients"].__setitem__(0, 3.0),
+            "state.rest_curvature, which is used, and rest_curvature.coefficients differ by",
+        ),
+        (
+            lambda d: d["parameters"]["bending_stiffness"].update(fitted=False),
+            "parameters.bending_stiffness.value, which is used,",
+        ),
+        (
+            lambda d: d["parameters"]["end_offset.dx"].update(interval_95=[0.02, 0.01]),
+            "parameters.end_offset.dx: interval_95 is [low, high], found [0.02, 0.01]",
+        ),
+        (
+            lambda d: d["parameters"]["end_offset.dx"].update(std=-1),
+            "parameters.end_offset.dx.std: must not be smaller than 0, found -1",
+        ),
+        (
+            lambda d: d["scatter"].update(rest_curvature_std=-5.0),
+            "scatter.rest_curvature_std: must not be smaller than 0, found -5",
+        ),
         (lambda d: d["parameters"]["end_offset.dx"].update(value=None), "found nothing"),
         (
             lambda d: d["parameters"]["bending_stiffness"].update(value="soft"),
