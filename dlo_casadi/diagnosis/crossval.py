@@ -275,7 +275,12 @@ def _predicted(
         by_theta = fit.linearization.shapes.rest[j][:, : unknowns.size]
         rest[j] += by_theta @ (thetas[k] - fit.point.theta)
     start = _declared(fit) if start is None else start
-    solved, converged = equilibria.solve_or_descend(start, p, rest)
+    # Without its random moment a pose is far off. Any other pose that Newton's method loses is at
+    # the edge of stability: a descent would end in another equilibrium, an error of any model.
+    random = fit.problem.random_std.any()
+    solved, converged = (equilibria.solve_or_descend if random else equilibria.solve)(
+        start, p, rest
+    )
     seen = equilibria.seen(solved, p, rest)
     return {k: seen[j] if converged[j] else None for k, j in at.items()}
 
