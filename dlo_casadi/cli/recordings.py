@@ -111,7 +111,7 @@ def import_(chosen: argparse.Namespace) -> None:
             "warnings": [*session.doubts, *doubts],
         }
     )
-    for remark in session.remarks[: len(session.remarks) - len(session.doubts)]:
+    for remark in (one for one in session.remarks if one not in session.doubts):
         page.say(remark)
     for doubt in (*session.doubts, *doubts, *_advice(doubts)):
         page.warn(doubt)
