@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 import dlo_casadi as dlo
 from dlo_casadi.config import read_yaml
 from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.model.assembly import Inputs, assembly_of

@@ -12,8 +12,8 @@ from scipy.special import ellipe, ellipk
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, ClipAngle, ClipOffset, ClipSlip
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
-from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import first_guesses

@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis.candidates import candidates_of
 from dlo_casadi.diagnosis.refits import scored_by_refit
 from dlo_casadi.effects import CableData, ContactPlane, ObstacleOffset
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.minima import by_ipopt
+from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import beside_bars
 from dlo_casadi.equilibrium.solve import solve_equilibrium

@@ -21,9 +21,9 @@ from dlo_casadi.effects import (
     LumpedMass,
     PointForce,
 )
+from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.guesses import guesses
-from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError

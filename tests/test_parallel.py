@@ -24,7 +24,7 @@ from tasks import (
     threads,
 )
 
-from dlo_casadi.equilibrium.minima import run_ipopt
+from dlo_casadi.equilibrium.by_ipopt import run_ipopt
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.runtime import parallel
 from dlo_casadi.runtime.executors import InProcess, interrupts_held

@@ -1,4 +1,4 @@
-"""Minima of the energy from distant starts: Newton's method on many poses at once, and IPOPT.
+"""Minima of the energy from distant starts: Newton's method on many poses at once.
 
 Each step of Newton's method on many poses or first guesses solves
 
@@ -7,8 +7,7 @@ Each step of Newton's method on many poses or first guesses solves
 
 tau is the least value found for which the matrix has as many negative eigenvalues as there are
 multipliers. Then dx lowers the energy along the end conditions, and a shape that converges with
-tau = 0 is a strict minimum under them. IPOPT solves the remaining poses, for which this finds no
-minimum within the bounds of the joints.
+tau = 0 is a strict minimum under them.
 
 References
 ----------
@@ -16,32 +15,16 @@ Inertia-corrected Newton steps: Nocedal and Wright, Numerical Optimization, 2006
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
-from dlo_casadi.equilibrium.equilibrium import (
-    BALANCE,
-    END_TOLERANCE,
-    JOINT_BOUND,
-    NEARBY,
-    Equilibrium,
-    equilibria_of,
-)
-from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spans import border_of
-from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import clamped_nodes
-from dlo_casadi.model.contact import DEPTH, gap_per_force, outwards
-from dlo_casadi.model.whole_pose import potential
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
+from dlo_casadi.model.contact import DEPTH, gap_per_force
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
 from dlo_casadi.rod.obstacles import bars_of
-from dlo_casadi.runtime.executors import interrupts_held
 
 # Longest step of a node [rad].
 LONGEST_STEP = 0.5
@@ -70,12 +53,6 @@ SHORTER, SAME_SIZE = 0.5, 0.75
 SHORTENED = 6
 # Depth [lengths] of a node in hard obstacles above which there is no room for the cable.
 NO_ROOM = 1e-6
-# Maximum number of Newton steps after IPOPT.
-NEWTON_STEPS = 8
-# Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
-IPOPT_ITERATIONS = 300
-# Distance within which a joint is at its bound [rad].
-AT_BOUND = 1e-6
 
 
 @dataclass(frozen=True)
@@ -290,161 +267,3 @@ def _on_their_sides(
             break
         size = np.where(through, 2 * size, size)
     return x, lam
-
-
-# ---- by IPOPT ------------------------------------------------------------------------------------
-
-
-def ipopt(name: str, problem: dict[str, ca.SX], tolerance: float, iterations: int) -> ca.Function:
-    """A silent IPOPT solver."""
-    options: dict[str, Any] = {
-        "print_time": False,
-        # Multipliers of p are not needed; without an equilibrium they gave a warning of CasADi.
-        "no_nlp_grad": True,
-        "calc_lam_p": False,
-        "ipopt.print_level": 0,
-        "ipopt.sb": "yes",
-        "ipopt.tol": tolerance,
-        "ipopt.max_iter": iterations,
-    }
-    return ca.nlpsol(name, "ipopt", problem, options)
-
-
-@lru_cache(maxsize=32)
-def _solver(model: CableModel, clamped: tuple[int, ...]) -> ca.Function:
-    problem, count, gaps = potential(model, clamped), model.chain.n_nodes, []
-    x, start = problem.coordinates, problem.parameters[len(model.names) + model.chain.n_rests :][:2]
-    if model.surfaces:
-        touching = model.n_contacts // len(model.surfaces)
-        places = start + ca.cumsum(problem.by_segment[model.end_pull, :touching], 1)
-        offsets = ca.DM(outwards(model)) @ problem.parameters[: len(model.names)]
-        clearance = offsets + model.cable.diameter / 2
-        gaps = [one.symbolic(places).T - clearance[k] for k, one in enumerate(model.surfaces)]
-    conditions = ca.vertcat(problem.conditions, x[1:count] - x[: count - 1], *gaps)
-    stated = {"x": x, "p": problem.parameters, "f": problem.energy, "g": conditions}
-    return ipopt("equilibrium", stated, 1e-11, IPOPT_ITERATIONS)
-
-
-def run_ipopt(solver: ca.Function, **given: Any) -> tuple[dict[str, ca.DM], dict[str, Any]]:
-    """Outputs and statistics of one run of an IPOPT solver.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After an interrupted run, which CasADi reports as a failure of the solver.
-    """
-    with interrupts_held():
-        out = solver(**given)
-    return out, solver.stats()
-
-
-def by_ipopt(
-    model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose, phi: FloatArray
-) -> Equilibrium | None:
-    """Equilibrium of a planar cable that IPOPT reaches from one first guess; None if it does not.
-
-    IPOPT minimises the potential under the end conditions and the bounds of the joints. It uses the
-    same functions of segments as the rest, assembled to one problem of the whole pose; inequalities
-    keep nodes out of obstacles. Newton's method on the Lagrangian then converges to rounding.
-
-    Parameters
-    ----------
-    p, rest
-        As in `solve.solve_equilibrium`.
-    phi : (n_nodes,) [rad]
-    """
-    count, touching = model.chain.n_nodes, model.n_contacts
-    conditions = model.n_multipliers - touching
-    solver = _solver(model, clamped_nodes(model.chain, pose.clips))
-    deviation = np.zeros(len(model.deviation_names))
-    others = border_of(model, pose, phi[:, None])[~model.are_multipliers]
-    rows, most = np.flatnonzero(model.are_multipliers)[:conditions], np.full(touching, np.inf)
-    held = np.where(np.isin(rows, model.no_pull), np.inf, 0.0)
-    bent = np.full(count - 1, JOINT_BOUND)
-    lower = np.concatenate([-held, -bent, np.zeros(touching)])
-    upper = np.concatenate([held, bent, most])
-    numbers, given = (p, rest, pose.vector), Inputs.of(p, rest, pose.vector[None])
-    first = Shapes(phi[None, :, None], np.zeros((1, model.n_border)), deviation[None])
-    clipped, x0 = assembly_of(model).clipped(first, given), np.zeros(solver.size1_in("x0"))
-    x0[:count], x0[count : count + len(others)] = clipped.in_frames(first.x)[0, :, 0], others
-    room = np.where(np.isin(np.arange(len(x0)), clipped.clamped[0]), 0.0, np.inf)
-    bounds = {"lbx": x0 - room, "ubx": x0 + room, "lbg": lower, "ubg": upper}
-    out, stats = run_ipopt(solver, x0=x0, p=np.concatenate([*numbers, deviation]), **bounds)
-    multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))
-    border = np.zeros(model.n_border)
-    bounded, pressed = np.split(multipliers[conditions:], [count - 1])
-    border[model.are_multipliers] = np.concatenate([multipliers[:conditions], -pressed])
-    border[~model.are_multipliers] = coordinates[count:][: np.sum(~model.are_multipliers)]
-    start = Shapes(coordinates[None, :count, None], border[None], deviation[None])
-    if model.surfaces:
-        start = descend(assembly_of(model), start, given).shapes
-    return _balanced(model, start, bounded, given, stats["iter_count"])
-
-
-def _balanced(
-    model: CableModel, start: Shapes, bound_multipliers: FloatArray, given: Inputs, iterations: int
-) -> Equilibrium | None:
-    """Newton's method from IPOPT's minimum, on a Lagrangian that keeps compressed bubbles stiff.
-
-    Joints at their bound are held there, and released if their multiplier has the wrong sign. The
-    status of IPOPT is ignored, because on fine meshes of stiff cables its tolerance lies below
-    rounding. Only the balance of the shape counts: the result is None if it does not balance.
-    """
-    assembly, node = assembly_of(model), model.node
-
-    def bends(shapes: Shapes) -> FloatArray:
-        """Angles (n_nodes - 1,) [rad] between neighbouring nodes."""
-        return node.difference(shapes.x[0, :-1], shapes.x[0, 1:])[:, 0]
-
-    def linearized(shapes: Shapes, moments: FloatArray) -> tuple[Vector, BandMatrix]:
-        """Imbalance and tangent with the active joints as further conditions."""
-        _, force, matrix = assembly.balance(shapes, given)
-        arms = np.zeros((1, model.chain.n_nodes, 1, len(active)))
-        arms[0, active, 0, np.arange(len(active))] = -1.0
-        arms[0, active + 1, 0, np.arange(len(active))] = 1.0
-        arms[0, assembly.clipped(shapes, given).clamped[0]] = 0.0
-        gap = (bends(shapes)[active] - bound)[None, :, None]
-        conditions = np.concatenate([force.y, gap], axis=1)
-        return Vector(force.x + (arms @ moments)[..., None], conditions), matrix.with_border(arms)
-
-    bent = bends(start)
-    active = np.flatnonzero(np.abs(bent) > JOINT_BOUND - AT_BOUND)
-    while True:
-        bound, moments = np.copysign(JOINT_BOUND, bent[active]), bound_multipliers[active]
-        now = start
-        for _ in range(NEWTON_STEPS):
-            force, matrix = linearized(now, moments)
-            try:
-                step = matrix.factor().solve(Vector(-force.x, -force.y))
-            except np.linalg.LinAlgError:  # not finite: a cable without stiffness
-                return None
-            size = float(np.abs(step.x).max())
-            if not size < NEARBY:
-                break
-            lam = now.lam + step.y[:, : model.n_border, 0]
-            now = replace(now, x=node.moved(now.x, step.x[..., 0]), lam=lam)
-            moments = moments + step.y[0, model.n_border :, 0]
-            if size < 1e-12:
-                break
-        if not np.any(moments * np.sign(bound) < 0):
-            break
-        active = active[moments * np.sign(bound) >= 0]
-    force, matrix = linearized(now, moments)
-    residual = float(np.abs(force.y).max(initial=0.0))
-    imbalance = float(np.abs(force.x).max())
-    inside = bool(np.abs(bends(now)).max() < JOINT_BOUND + AT_BOUND)
-    balanced = imbalance <= BALANCE * float(matrix.scale[0]) < np.inf
-    inside = inside and bool(assembly.clipped(now, given).in_order[0])
-    if not (inside and balanced and residual <= END_TOLERANCE):
-        return None
-    stable = int(matrix.negative()[0]) == model.n_multipliers + len(active)
-    bound_lam = np.zeros((1, len(bent)))
-    bound_lam[0, active] = moments
-    return equilibria_of(
-        model,
-        now,
-        given,
-        stable=np.array([stable]),
-        iterations=np.array([iterations]),
-        bound_multipliers=bound_lam,
-    )[0]

@@ -8,13 +8,14 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.effects import ContactEffect
+from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import (
     JOINT_BOUND,
     NEARBY,
     Equilibrium,
     equilibria_of,
 )
-from dlo_casadi.equilibrium.minima import KEEPING_SIDE, Minima, by_ipopt, descend_to_contact
+from dlo_casadi.equilibrium.minima import KEEPING_SIDE, Minima, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
 from dlo_casadi.equilibrium.sides import (
     beside_bars,

@@ -23,8 +23,8 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.by_ipopt import run_ipopt
 from dlo_casadi.equilibrium.curve import ObservedChange
-from dlo_casadi.equilibrium.minima import run_ipopt
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.point import Point, Values
 from dlo_casadi.estimation.problem import Problem

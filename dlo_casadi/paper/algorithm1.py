@@ -26,9 +26,9 @@ from scipy.optimize import least_squares, minimize
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.by_ipopt import ipopt, run_ipopt
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import arc_headings
-from dlo_casadi.equilibrium.minima import ipopt, run_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import out_of_reach
 from dlo_casadi.errors import EstimationError, counted

@@ -20,9 +20,9 @@ from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.codegen.generate import generate, table_of
 from dlo_casadi.codegen.shapes import pose_table, records_of
 from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses, limited
-from dlo_casadi.equilibrium.minima import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel, EndKind, StartKind
