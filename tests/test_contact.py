@@ -20,8 +20,9 @@ from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import begin
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.contact import Touching
 from dlo_casadi.rod.obstacles import Capsule, Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
@@ -51,6 +52,29 @@ def solved(cable, pose, *obstacles, n=20, x_init=None, **held):
 def loom():
     """A cable in space that hangs over a bar and lies on a ramp."""
     return solved(LOOM, HELD_IN_SPACE, *IN_SPACE, start="clamped", end="clamped")
+
+
+def test_what_touches_is_found_once_for_the_same_shapes(loom, monkeypatch):
+    """Also for some of the poses; shapes changed in place are others."""
+    model, found = loom
+    shapes = found.shapes.subset([0, 0, 0])
+    poses = np.tile(HELD_IN_SPACE.vector, (3, 1))
+    given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), poses)
+    shapes.lam[:, :3] += [[0.0], [0.3], [0.6]]  # which turn the normals of the bar
+    calls, of = [], Touching.of
+    monkeypatch.setattr(Touching, "of", lambda *args: calls.append(args) or of(*args))
+    assembly, fresh = Assembly(model), Assembly(model)
+    all_poses = assembly.touching(shapes, given)
+    two = assembly.touching(shapes.subset([2, 0]), given.subset([2, 0]))
+    assert len(calls) == 1
+    np.testing.assert_array_equal(two.normal, all_poses.normal[[2, 0]])
+    assert not np.array_equal(*two.normal)
+    shapes.lam[0, 0] += 0.3
+    again = assembly.touching(shapes, given)
+    assert len(calls) == 2
+    for name in ("border", "gap", "normal", "active"):
+        own = getattr(again, name)
+        np.testing.assert_array_equal(own, getattr(fresh.touching(shapes, given), name))
 
 
 def test_a_heavy_beam_laid_on_a_table_lifts_off_where_beam_theory_says():

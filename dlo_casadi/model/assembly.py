@@ -18,7 +18,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
-from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
+from dlo_casadi.model.contact import DEPTH, Contact, LastTouching, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.stacked import Inputs as Inputs
@@ -51,18 +51,20 @@ class Assembly:
         self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self.depth, self.everywhere, self._outwards = DEPTH, False, outwards(model)
+        self._touched = LastTouching()
+
+    def _changed(self, **values: Any) -> Assembly:
+        other = copy(self)
+        vars(other).update(values, _touched=LastTouching())
+        return other
 
     def softened(self, depth: float) -> Assembly:
         """A copy with softer obstacles, see `contact.DEPTH`."""
-        other = copy(self)
-        other.depth = depth
-        return other
+        return self._changed(depth=depth)
 
     def felt_everywhere(self) -> Assembly:
         """A copy in which forces of obstacles act whatever the gaps."""
-        other = copy(self)
-        other.everywhere = True
-        return other
+        return self._changed(everywhere=True)
 
     @cached_property
     def turn_per_slip(self) -> FloatArray:
@@ -125,9 +127,10 @@ class Assembly:
             some = shapes.subset(rows), given.subset(rows)
             return self._under(lam, "segment_curve", *some)[0][:, :, :d, 0]
 
-        start, offsets = given.poses[:, :d], given.p @ self._outwards.T
+        every = shapes.x, shapes.lam, shapes.deviation, given.p, given.rest, given.poses
+        nodes = shapes.lam.copy(), given.poses[:, :d], given.p @ self._outwards.T
         soft = self.depth, self.everywhere
-        return Touching.of(self.model, shapes.lam, start, offsets, *soft, advances)
+        return self._touched.of(every, lambda: Touching.of(self.model, *nodes, *soft, advances))
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, from (m, n_nodes, k, ...)."""
@@ -234,9 +237,8 @@ class Assembly:
 
     def work(self, shapes: Shapes, gradient: Vector) -> FloatArray:
         """Work (m,) [J] of the multipliers in the Lagrangian, given its gradient."""
-        return np.asarray(
-            (shapes.lam * gradient.y[:, :, 0] * self.model.are_multipliers).sum(axis=1)
-        )
+        pulls = shapes.lam * self.model.are_multipliers
+        return np.asarray((pulls * gradient.y[:, :, 0]).sum(axis=1))
 
     def balance_slopes(self, shapes: Shapes, given: Inputs) -> BalanceSlopes:
         """Parts of the derivatives of the gradient at fixed nodes and multipliers."""

@@ -20,8 +20,8 @@ Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002): primal-dual active sets a
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -141,6 +141,11 @@ class Touching:
                 settled = np.abs(gap[rows] - before) < SAME_GAP * model.cable.length
                 rows = rows[~settled.all(axis=1)]
         return cls(model, border, start, offsets, depth, normal, bends, gap, active)
+
+    def subset(self, index: IntArray) -> Touching:
+        """The nodes of some of the poses."""
+        each = "border", "start", "offsets", "normal", "bends", "gap", "active"
+        return replace(self, **{name: getattr(self, name)[index] for name in each})
 
     @property
     def sizes(self) -> FloatArray:
@@ -322,6 +327,22 @@ class Touching:
         y = np.concatenate([change.y, rows], axis=1)
         y[:, self.model.no_pull] = 0.0
         return Vector(change.x, y)
+
+
+class LastTouching:
+    """The last result of `Touching.of`: a Newton step asks three times about the same shapes."""
+
+    def __init__(self) -> None:
+        self._known: dict[bytes, int] = {}
+        self._found: Touching | None = None
+
+    def of(self, poses: Sequence[FloatArray], find: Callable[[], Touching]) -> Touching:
+        """The kept result for poses, rows (m, ...) of all that decides; else it is found anew."""
+        rows = np.concatenate([one.reshape((len(one), -1)) for one in poses], axis=1)
+        names = [row.tobytes() for row in rows]
+        if self._found is None or not self._known.keys() >= set(names):
+            self._known, self._found = {name: k for k, name in enumerate(names)}, find()
+        return self._found.subset(np.array([self._known[name] for name in names], dtype=int))
 
 
 def _inwards(force: FloatArray, h: float) -> float:
