@@ -30,7 +30,7 @@ def config(tmp_path_factory):
         pose["file"] = str(SESSION.parent / pose["file"])
     poses[4]["file"] = "lost.csv"
     data["experiment"]["poses"] = poses
-    data["model"] = {"n": 20}
+    data["model"] = {"n": 12}
     path = tmp_path_factory.mktemp("config") / "rope.yaml"
     path.write_text(dump_yaml(data))
     return path
@@ -79,7 +79,7 @@ def test_fit_prints_tables_and_progress_apart(run):
 
 def test_what_may_take_long_is_told_first(config, monkeypatch, capsys):
     many = config.with_name("many.yaml")
-    many.write_text(config.read_text().replace("n: 20", "n: 300"))
+    many.write_text(config.read_text().replace("n: 12", "n: 300"))
     monkeypatch.setattr("dlo_casadi.session.run_session", lambda *_: 1 / 0)
 
     assert main(["fit", str(many), "--output", str(many.with_name("out")), "--jobs", "1"]) == 1

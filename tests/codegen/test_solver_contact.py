@@ -116,7 +116,7 @@ def test_a_place_slides_to_where_the_cable_is_lowest(own):
 def test_cables_in_the_plane_land_on_tables(mass):
     """Also heavy ones, whose mesh is coarse: they slide until they lie."""
     model = replace(cable(2), cable=CableData(1.0, mass, 0.008, 0.01))
-    solver, found = compiled(model, "-O2"), []
+    solver, found = compiled(model), []
     for level in np.linspace(-0.25, -0.05, 21):
         for tilt in (-0.2, 0.0, 0.2):
             normal = (-np.sin(tilt), np.cos(tilt))
