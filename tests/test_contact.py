@@ -314,7 +314,7 @@ def test_a_pose_names_the_side_of_a_bar(bar, ends):
     assert lowest == pytest.approx(energies[False], abs=1e-12)
 
 
-@pytest.mark.parametrize("height", [-0.05, -0.1])
+@pytest.mark.parametrize("height", [pytest.param(-0.05, marks=pytest.mark.long), -0.1])
 def test_a_cable_pressed_on_a_table_has_the_energy_of_hard_contacts(height):
     """Forces of fifty weights: IPOPT with inequalities on the same energy."""
     cable = CableData(1.0, 0.1 / 9.81, 2 * RADIUS, 0.1)

@@ -201,7 +201,9 @@ def node_error(name: str, n: int, element: str) -> float:
     return max(np.hypot(*(coarse - exact[:: 80 // n]).T).max() for coarse, exact in pairs)
 
 
-@pytest.mark.parametrize("name", ["taper", "thin", "long", "clamped"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("taper", marks=pytest.mark.long), "thin", "long", "clamped"]
+)
 def test_ten_elements_are_five_times_closer_than_ten_links(name):
     """Also where the rest curvature has features as short as an element."""
     bowed, link = node_error(name, 10, "quadratic"), node_error(name, 10, "link")

@@ -35,7 +35,7 @@ def test_the_end_is_held_best_from_any_side_and_against_other_places():
     )
     np.testing.assert_allclose(*ends, atol=1e-5)
     assert max(counts) <= 40
-    for x, y in np.random.default_rng(0).uniform(low, high, (12, 2)):
+    for x, y in np.random.default_rng(0).uniform(low, high, (6, 2)):
         found = shape(pose=[0, 0, x, y, script.DOWN, script.UP])
         if float(found["min_bend_radius"]) >= script.RADIUS:
             assert float(ca.norm_2(found["end_force"])) > pulls[0]
@@ -123,6 +123,6 @@ def test_clips_of_a_door_keep_limits_at_openings_between_those_they_were_placed_
 
 def test_the_cable_rests_on_the_table_but_not_on_the_hot_plate():
     script = example("rest_on_the_table")
-    found = script.moved(script.cable(), np.linspace(-0.3, 0.3, 9))
+    found = script.moved(script.cable(), np.linspace(-0.3, 0.3, 5))
     assert all(shape.obstacle_forces[0, 2] < 0.0 for shape, _, _ in found)
-    assert [allowed for _, _, allowed in found] == [True] * 8 + [False]
+    assert [allowed for _, _, allowed in found] == [True] * 4 + [False]

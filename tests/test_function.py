@@ -232,7 +232,7 @@ def test_a_pose_of_another_size_is_refused():
         CasadiCable(*cable(False, plain=True)).initial(SPACE)
 
 
-@pytest.mark.parametrize("position", [0.3, 0.4, 0.405])
+@pytest.mark.parametrize("position", [pytest.param(0.3, marks=pytest.mark.long), 0.4, 0.405])
 @pytest.mark.parametrize(
     ("name", "gravity"), [("lumped_mass", (0, -9.81)), ("tether", (0, 0, -9.81))]
 )

@@ -415,7 +415,7 @@ def test_a_session_checks_its_poses_and_shows_where_they_are_tight(tmp_path):
     session = yaml.safe_load(path.read_text().replace("file: ", f"file: {path.parent}/"))
     session["experiment"]["poses"] = session["experiment"]["poses"][:4]
     session |= {"limits": {"bend_radius": 0.1}, "estimation": {"algorithm1": False}}
-    session["model"] = session.get("model", {}) | {"n": 20}
+    session["model"] = session.get("model", {}) | {"n": 12}
     (tmp_path / "session.yaml").write_text(yaml.safe_dump(session))
     result = Session.load(tmp_path / "session.yaml").fit(diagnosis=False)
     rows = report_dict(result)["limits"]

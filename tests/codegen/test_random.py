@@ -1,4 +1,4 @@
-"""A few thousand random problems; scripts/benchmark.py solves a hundred thousand."""
+"""Two thousand random problems; scripts/benchmark.py solves a hundred thousand."""
 
 import shutil
 
@@ -38,7 +38,7 @@ def test_random_cables_have_stable_equilibria(element):
     rng = np.random.default_rng(2)
     solver = any_cable(rng, element)
     failed = total = 0
-    for _ in range(10 if element == "quadratic" else 20):
+    for _ in range(5 if element == "quadratic" else 10):
         problem = random_problem(rng, 60, element=element)
         shapes, statuses, _ = solver.solve(problem)
         failed, total = failed + np.count_nonzero(statuses), total + len(statuses)
@@ -53,15 +53,15 @@ def test_the_equilibrium_is_that_of_ipopt_or_a_lower_one():
     rng = np.random.default_rng(3)
     solver = any_cable(rng)
     words = []
-    for _ in range(15):
+    for _ in range(8):
         problem = random_problem(rng, 2)
         shapes, _, _ = solver.solve(problem)
         words += [
             compare_with_ipopt(problem, shape, end)
             for shape, end in zip(shapes, problem.ends, strict=True)
         ]
-    assert words.count("higher") <= 1
-    assert words.count("same") + words.count("lower") > 25
+    assert words.count("higher") == 0
+    assert words.count("same") + words.count("lower") > 13
 
 
 @pytest.mark.parametrize("branch", [1, 2])
@@ -71,7 +71,7 @@ def test_a_named_branch_is_found_where_there_is_one_and_never_the_other(branch):
     solver = any_cable(rng)
     sign = {1: 1, 2: -1}[branch]
     refused = 0
-    for _ in range(10):
+    for _ in range(5):
         problem = random_problem(rng, 60)
         lowest, _, _ = solver.solve(problem)
         shapes, statuses, _ = solver.solve(problem, branch)

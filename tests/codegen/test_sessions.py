@@ -61,7 +61,13 @@ def session(name, n):
     return model, np.array(p), rest, [pose.held for pose in config.experiment.poses]
 
 
-@pytest.mark.parametrize("name", SESSIONS)
+def sessions():
+    """One with a state, clamps, a free end, several effects; test_agreement.py has all effects."""
+    few = ("drift", "held_askew", "overhang", "two_effects")
+    return [pytest.param(x, marks=[pytest.mark.long] * (x not in few)) for x in SESSIONS]
+
+
+@pytest.mark.parametrize("name", sessions())
 def test_session(name):
     model, p, rest, poses = session(name, n=12)
     solver = CompiledSolver(model, p, rest, flags=QUICK)

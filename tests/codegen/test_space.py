@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from benchmarks import memory
 from scipy.spatial.transform import Rotation
-from solvers import QUICK, STRICT, all_zero, moved
+from solvers import QUICK, STRICT, WARNINGS, all_zero, moved
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate
 from dlo_casadi.codegen.cases import case_of
@@ -404,24 +404,37 @@ KINDS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("compiler", "element", "ends"),
-    [("gcc", *KINDS[0]), *(pytest.param("clang", *kind, marks=pytest.mark.long) for kind in KINDS)],
-)
-def test_compiles_without_a_warning_and_with_another_prefix(tmp_path, compiler, ends, element):
-    if shutil.which(compiler) is None:
-        pytest.skip(f"{compiler} is not installed")
-    generate(*problem(element, 8, *ends), "harness").write(tmp_path)
-    run = subprocess.run(
-        [compiler, "-std=c99", *STRICT, "example.c", "harness_solver.c", "-lm", "-o", "example"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-    )
+def build_and_run(folder, compiler, *files):
+    """Build an example without a warning, and run it."""
+    flags = ("-std=c99", *STRICT)
+    for command in ([compiler, *flags, "example.c", *files, "-lm", "-o", "example"], ["./example"]):
+        run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
+    assert "bend radius" in run.stdout
+
+
+@pytest.fixture(scope="module")
+def optimised(tmp_path_factory):
+    """Folder of a solver with another prefix that is compiled with -O2 without a warning."""
+    folder = tmp_path_factory.mktemp("optimised")
+    generate(*problem(n=8, effects=(AxialStretch(),)), "harness").write(folder)
+    command = ["cc", "-std=c99", "-O2", *WARNINGS, "-c", "harness_solver.c"]
+    run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    shown = subprocess.run(["./example"], cwd=tmp_path, capture_output=True, text=True)
-    assert shown.returncode == 0, shown.stderr
-    assert "bend radius" in shown.stdout
+    return folder
+
+
+def test_the_example_runs_with_another_prefix(optimised):
+    build_and_run(optimised, "cc", "harness_solver.o")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("element", "ends"), KINDS)
+def test_clang_compiles_without_a_warning(tmp_path, ends, element):
+    if shutil.which("clang") is None:
+        pytest.skip("clang is not installed")
+    generate(*problem(element, 8, *ends), "harness").write(tmp_path)
+    build_and_run(tmp_path, "clang", "harness_solver.c")
 
 
 CALLER = """
@@ -475,13 +488,12 @@ def test_sanitizers_and_threads_with_a_workspace_each_are_silent(tmp_path, end):
     assert memory.build_and_run(tmp_path, flags, [], 5, threads=8).startswith("silent")
 
 
-def test_links_nothing_but_libm(tmp_path):
-    generate(*problem(n=8, effects=(AxialStretch(),))).write(tmp_path)
-    subprocess.run(["cc", "-O2", "-c", "dlo_solver.c"], cwd=tmp_path, check=True)
-    size = subprocess.run(["size", "dlo_solver.o"], cwd=tmp_path, capture_output=True, text=True)
-    told = re.search(r"CODE_SIZE (\d+)", (tmp_path / "dlo_solver.h").read_text())
+def test_links_nothing_but_libm(optimised):
+    output = {"cwd": optimised, "capture_output": True, "text": True}
+    size = subprocess.run(["size", "harness_solver.o"], **output)
+    told = re.search(r"CODE_SIZE (\d+)", (optimised / "harness_solver.h").read_text())
     assert int(size.stdout.splitlines()[1].split()[0]) == pytest.approx(int(told[1]), rel=0.15)
-    names = subprocess.run(["nm", "dlo_solver.o"], cwd=tmp_path, capture_output=True, text=True)
+    names = subprocess.run(["nm", "harness_solver.o"], **output)
     needed = set(re.findall(r" U (\w+)", names.stdout))
     allowed = {"sin", "cos", "sincos", "sqrt", "atan2", "ceil", "memset", "memcpy", "memmove"}
     assert needed - allowed <= {"__stack_chk_fail", "_GLOBAL_OFFSET_TABLE_"}
