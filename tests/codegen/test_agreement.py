@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -126,8 +127,15 @@ def test_springs_of_pins():
     assert np.all(slope[:, 2:] == 0)
 
 
-@pytest.mark.parametrize(("start", "end"), BOUNDARIES)
-@pytest.mark.parametrize("element", ["link", "arc", "quadratic"])
+def kinds():
+    """The default element with all ends; others with those that have most effects."""
+    few = [("arc", "clamped", "clamped"), ("link", "pinned", "pinned")]
+    for element, ends in product(("link", "arc", "quadratic"), BOUNDARIES):
+        more = element != "quadratic" and (element, *ends) not in few
+        yield pytest.param(element, *ends, marks=[pytest.mark.long] * more)
+
+
+@pytest.mark.parametrize(("element", "start", "end"), list(kinds()))
 def test_all_effects_together(element, start, end):
     of_ends = {"clamp_angle": "clamped", "clamp_compliance": "clamped"}
     of_ends |= {"start_spring": "pinned", "end_spring": "pinned"}

@@ -165,7 +165,7 @@ def test_a_cable_in_a_plane_that_stretches():
         ((SWIVEL,), {"end": "free"}),
         ((CLIPS[0], EYELET), {"end": "pinned"}),
         ((CLIPS[0], NEARBY), {"end": "pinned"}),
-        ((HeldClip("eyelet", CLIPS[0].place), NEARBY), {}),
+        pytest.param((HeldClip("eyelet", CLIPS[0].place), NEARBY), {}, marks=pytest.mark.long),
     ],
 )
 def test_saddles_and_eyelets_in_space(clips, held):
@@ -386,7 +386,10 @@ MOVED = {"clip_offset.dx": 0.01, "clip_slip.ds": 0.02}
 
 @pytest.mark.parametrize(
     ("clips", "effects", "more"),
-    [((), (), {}), (CLIPS[:1], (Tether(), ClipOffset(), ClipSlip()), TETHER | MOVED)],
+    [
+        pytest.param((), (), {}, marks=pytest.mark.long),
+        (CLIPS[:1], (Tether(), ClipOffset(), ClipSlip()), TETHER | MOVED),
+    ],
     ids=["alone", "with a tether beside a clip that has moved"],
 )
 def test_clamps_in_space_that_give_way(clips, effects, more):
