@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 PLANNER = Path(__file__).parents[2] / "scripts" / "planner"
-# OMPL's headers compile in half the time without an optimiser.
+# OMPL's headers compile more quickly without an optimiser.
 QUICK = {"CMAKE_BUILD_TYPE": "None", "CFLAGS": "-O1", "CXXFLAGS": "-O0"}
 
 
