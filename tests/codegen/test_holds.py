@@ -165,7 +165,7 @@ def test_a_cable_in_a_plane_that_stretches():
         ((SWIVEL,), {"end": "free"}),
         ((CLIPS[0], EYELET), {"end": "pinned"}),
         ((CLIPS[0], NEARBY), {"end": "pinned"}),
-        pytest.param((HeldClip("eyelet", CLIPS[0].place), NEARBY), {}, marks=pytest.mark.long),
+        ((HeldClip("eyelet", CLIPS[0].place), NEARBY), {}),
     ],
 )
 def test_saddles_and_eyelets_in_space(clips, held):
