@@ -79,14 +79,19 @@ def test_a_model_that_misses_the_shapes_is_fitted_to_its_misfit(base):
 
 
 @pytest.fixture(scope="module")
-def near(base):
-    """The same model, relaxed at the measured shapes."""
-    return from_data(base)[0]
+def relaxed_fit(base):
+    """The same model, relaxed at the measured shapes, and its softness."""
+    return from_data(base)
 
 
 @pytest.fixture(scope="module")
-def screened(base):
-    near, softness = from_data(base)
+def near(relaxed_fit):
+    return relaxed_fit[0]
+
+
+@pytest.fixture(scope="module")
+def screened(relaxed_fit):
+    near, softness = relaxed_fit
     listed = [x for x in candidates(near.model, setup_of(near.model, n_poses=6)) if x.name in TRIED]
     return {item.candidate.name: item for item in screened_from_data(near, softness, listed)}
 
@@ -97,9 +102,9 @@ def test_a_relaxed_model_has_the_measured_shapes(base, near):
 
 
 @pytest.mark.parametrize("relaxed", [False, True])
-def test_a_score_does_not_depend_on_what_is_scanned_beside_it(base, relaxed):
+def test_a_score_does_not_depend_on_what_is_scanned_beside_it(base, relaxed_fit, relaxed):
     """Candidates with 1, 5, 23 and 46 trial values share models, but not their scores."""
-    fit, softness = from_data(base) if relaxed else (base, 0.0)
+    fit, softness = relaxed_fit if relaxed else (base, 0.0)
     names = ("plastic_set", "tether", "stiff_section", "side_load")
     listed = [x for x in candidates(fit.model, setup_of(fit.model, n_poses=6)) if x.name in names]
     assert sorted(len(x.scans) for x in listed) == [1, 5, 23, 46]
@@ -136,8 +141,8 @@ def test_with_another_effect_the_misfit_stays(base, near, screened):
     assert found is None or found.fit.noise.source == "misfit"
 
 
-def test_no_pair_is_tried_where_one_effect_may_be_added(base, screened, monkeypatch):
-    near, softness = from_data(base)
+def test_no_pair_is_tried_where_one_effect_may_be_added(relaxed_fit, screened, monkeypatch):
+    near, softness = relaxed_fit
     asked = []
     monkeypatch.setattr(RelaxedStart, "and_second", lambda start, **_: asked.append(start) or [])
     wrong = [RelaxedStart.of(near, screened["stiffness_gradient"])]

@@ -169,9 +169,15 @@ def misfit():
 
 
 @pytest.fixture(scope="module")
-def near(misfit):
+def shapes(misfit):
+    """The misfit's model, relaxed at the measured shapes."""
+    return from_data(misfit[1])[0]
+
+
+@pytest.fixture(scope="module")
+def near(misfit, shapes):
     """The same with clamps that turn at random, found from the measured shapes."""
-    return with_loose_poses(misfit[1], from_data(misfit[1])[0])
+    return with_loose_poses(misfit[1], shapes)
 
 
 def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
@@ -242,10 +248,10 @@ def test_moments_of_pins_are_written_in_newton_metres_and_read_back(rubbed):
     assert (read.source, read.std) == (own.source, pytest.approx(own.std))
 
 
-def test_a_kept_mesh_is_that_of_the_misfit(misfit, near):
+def test_a_kept_mesh_is_that_of_the_misfit(misfit, shapes, near):
     fit = misfit[1]
     finer = SimpleNamespace(model=fit.model.with_mesh(near.model.n + 2))
-    assert with_loose_poses(finer, from_data(fit)[0]).model.n == near.model.n + 2
+    assert with_loose_poses(finer, shapes).model.n == near.model.n + 2
 
 
 def test_a_scatter_may_be_of_the_rest_shape_if_a_rival_is(near):
