@@ -504,7 +504,7 @@ def test_a_pose_at_a_fold_ends_a_fit_with_an_error_that_says_so(base):
         base.problem.normal_equations(base.point, replace(lin, by_deviation=beyond))
 
 
-@pytest.mark.parametrize("count", [6, 10])
+@pytest.mark.parametrize("count", [6, pytest.param(10, marks=pytest.mark.long)])
 def test_a_limp_cable_rests_where_its_lowest_markers_are(count):
     """A smooth curve through few markers passes below a table: 20 mm with six of them."""
     true = CableData(0.8, 0.15, 0.006, bending_stiffness=0.002)

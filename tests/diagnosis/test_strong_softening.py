@@ -27,12 +27,12 @@ STIFFNESS, SOFTNESS = 0.0128, 0.25
 
 def test_a_strong_softening_is_reached_from_the_shapes():
     true = CableData(1.0, 0.06, 0.006, bending_stiffness=STIFFNESS, torsional_stiffness=0.011)
-    soft = CableModel(true, 24, "quadratic", n_rest=0, effects=(BendingSoftening(),), **HELD)
+    soft = CableModel(true, 16, "quadratic", n_rest=0, effects=(BendingSoftening(),), **HELD)
     p = soft.nominal.copy()
     p[soft.names.index("bending_softening.softness")] = SOFTNESS
     rng, s = np.random.default_rng(3), np.linspace(0.04, 0.96, 12)
     measured = []
-    for _ in range(10):
+    for _ in range(6):
         frames = [Rotation.from_rotvec(rng.uniform(-0.7, 0.7, 3)).as_quat() for _ in range(2)]
         way = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3))
         end = tuple(way.apply([rng.uniform(0.5, 0.8), 0.0, 0.0]))
@@ -43,14 +43,14 @@ def test_a_strong_softening_is_reached_from_the_shapes():
         (shape,) = predict_poses(soft, p, np.zeros(soft.chain.n_rests), [pose])
         points = shape.curve.at(s) + rng.normal(scale=FIRST_STD, size=(len(s), 3))
         measured.append(MeasuredPose.of_points(pose, points))
-    plain = CableModel(true, 14, "quadratic", n_rest=0, **HELD)
+    plain = CableModel(true, 10, "quadratic", n_rest=0, **HELD)
     unknowns = Unknowns(plain, np.ones(len(plain.names), dtype=bool), plain.nominal)
     noise = NoiseModel(FIRST_STD, source="declared")
     problem = Problem(unknowns, tuple(measured), noise, Priors.of(Tolerances(), plain))
     problem, values = begin(problem, unknowns.pack(plain.nominal, np.zeros(0)))
     misfit = replace(noise.doubted(7e-3), source="misfit", before=noise)
     near, _ = from_data(Fit(replace(problem, noise=misfit), problem.evaluate(values)))
-    listed = candidates(near.model, setup_of(near.model, n_poses=10))
+    listed = candidates(near.model, setup_of(near.model, n_poses=6))
     softening = next(x for x in listed if x.name == "bending_softening")
 
     start = RelaxedStart.of(near, Screened(softening, 0.0, 1.0, dict(softening.scans[0])))

@@ -32,7 +32,7 @@ def fitted(points, poses=8, std=None):
     return fit_model(nuisances(truth, Tolerances()), measured, Tolerances(), std)
 
 
-@pytest.mark.parametrize("points", [12, 9, 5])
+@pytest.mark.parametrize("points", [12, pytest.param(9, marks=pytest.mark.long), 5])
 def test_noise_of_few_points(points):
     """Five points leave some twenty degrees of freedom in all, good to a factor of two."""
     fit = fitted(points)

@@ -114,10 +114,21 @@ def test_what_is_random_is_a_deviation_of_each_pose():
         assert scatter.within(larger) == larger
 
 
+def drawn(*choice):
+    """A simulated session on its first mesh, which is fine enough here."""
+
+    def on_first(model, *others):
+        return model, hidden_sets._shapes(model, *others)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(hidden_sets, "_finely", on_first)
+        return simulated(*choice)
+
+
 @pytest.fixture(scope="module", params=["clamp_angle", "length_error"])
 def varied(request):
     """A session in the plane whose clamps turn, or lengths differ, with its declared fit."""
-    found = simulated(generator_of(7, 1), 2, 0, request.param)
+    found = drawn(generator_of(7, 1), 2, 0, request.param)
     measured = measured_poses(found.session, read_inputs(found.session))
     return found, fit_declared(found.session, declared_model(found.session), measured)[0]
 
@@ -163,7 +174,7 @@ def test_what_is_random_is_named_and_leaves_the_stiffness_alone(varied):
 @pytest.fixture(scope="module")
 def misfit():
     """A session in space whose clamps turn from pose to pose, and its declared fit: a misfit."""
-    found = simulated(generator_of(3306, 6), 3, 0, "clamp_rotation")
+    found = drawn(generator_of(3306, 6), 3, 0, "clamp_rotation")
     measured = measured_poses(found.session, read_inputs(found.session))
     return found, fit_declared(found.session, declared_model(found.session), measured)[0]
 
@@ -199,7 +210,7 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
 @pytest.fixture(scope="module")
 def rubbed():
     """A session in the plane with friction at its pins, a misfit, fitted from the shapes."""
-    found = simulated(generator_of(3306, 20), 2, 0, "pin_moment")
+    found = drawn(generator_of(3306, 20), 2, 0, "pin_moment")
     measured = measured_poses(found.session, read_inputs(found.session))
     fit, _ = fit_declared(found.session, declared_model(found.session), measured)
     assert fit.noise.source == "misfit"
@@ -284,7 +295,7 @@ def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_w
 
 def searched(seed, index, count, random="", among=()):
     """A simulated session and the search in its declared fit, among these effects or all."""
-    found = simulated(generator_of(seed, index), 2, count, random)
+    found = drawn(generator_of(seed, index), 2, count, random)
     measured = measured_poses(found.session, read_inputs(found.session))
     fit, _ = fit_declared(found.session, declared_model(found.session), measured)
     exclude = [name for name in EFFECTS if among and name not in among]
@@ -339,7 +350,7 @@ def test_the_first_effect_is_judged_again_beside_the_second():
 
 
 def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():
-    session = simulated(generator_of(3301, 7), 2, 0, "rest_curvature").session
+    session = drawn(generator_of(3301, 7), 2, 0, "rest_curvature").session
     measured = measured_poses(session, read_inputs(session))
     fit, _ = fit_declared(session, declared_model(session), measured)
     shape = fit_stage("batch", fit, measured, {}, ()).shapes["pose_02"]

@@ -80,7 +80,7 @@ def test_stiffness_roll_and_twists_are_found_from_any_stiffness(rolled, factor):
     np.testing.assert_allclose(MODEL.node.turning(found.shapes.x), twist, atol=0.5)
 
 
-@pytest.mark.parametrize("factor", [0.02, 50.0])
+@pytest.mark.parametrize("factor", [0.02, pytest.param(50.0, marks=pytest.mark.long)])
 def test_a_spring_and_a_stiffness_far_off_are_found_together(factor):
     """The spring pulls with many times the weight; nothing is known but its place."""
     spring = Tether()

@@ -29,7 +29,7 @@ from dlo_casadi.runtime.parallel import open_executor
 
 CABLE = CableData(length=0.5, mass=0.1, diameter=0.01, bending_stiffness=0.02)
 REST = np.zeros(10)
-GRID = Grid((-0.4, 0.4, 9), (-0.3, 0.3, 7))
+GRID = Grid((-0.4, 0.4, 5), (-0.3, 0.3, 5))
 
 
 def plan_of(tmp_path, **options):
@@ -47,8 +47,8 @@ def parameters(tiny, tmp_path_factory):
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    """Some ten poses a chunk."""
-    monkeypatch.setattr(shape_table_module, "CHUNK_BYTES", 4000)
+    """Some four poses a chunk."""
+    monkeypatch.setattr(shape_table_module, "CHUNK_BYTES", 1600)
 
 
 def test_rows_are_predictions_in_the_order_of_the_grid(parameters, tmp_path, capsys):

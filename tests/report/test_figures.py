@@ -253,8 +253,15 @@ def with_readings(outcome):
     return replace(outcome, stages=stages, measurement=measurement)
 
 
-@pytest.mark.parametrize("size", [1.0, 0.1])
-@pytest.mark.parametrize("count", [1, 8, 21])
+@pytest.mark.parametrize(
+    ("count", "size"),
+    [
+        (1, 1.0),
+        (8, 0.1),
+        (21, 1.0),
+        *(pytest.param(*x, marks=pytest.mark.long) for x in ((1, 0.1), (8, 1.0), (21, 0.1))),
+    ],
+)
 def test_all_names_lie_on_the_page(outcome, tmp_path, monkeypatch, count, size):
     pages = []
     monkeypatch.setattr(

@@ -47,8 +47,15 @@ def repeats(model, p, poses, scatter, marked, rng, near=None):
     ]
 
 
-@pytest.mark.parametrize("marked", [False, True])
-@pytest.mark.parametrize("model", [PLANE, SPACE], ids=["plane", "space"])
+@pytest.mark.parametrize(
+    ("model", "marked"),
+    [
+        pytest.param(PLANE, False, id="plane-lines"),
+        pytest.param(PLANE, True, id="plane-markers"),
+        pytest.param(SPACE, False, id="space-lines", marks=pytest.mark.long),
+        pytest.param(SPACE, True, id="space-markers"),
+    ],
+)
 def test_expected_distances_are_those_of_drawn_hangings(model, marked):
     """Mean square ratio 1: of lines across the cable, of markers along it, too."""
     rng, poses = np.random.default_rng(0), poses_of(model)

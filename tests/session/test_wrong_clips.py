@@ -28,7 +28,7 @@ BENDS = (1.0, 1.15, 1.3, 1.45)
 
 @pytest.fixture
 def without_fits(monkeypatch):
-    """Questions after those about clips fit the lines: these are no equilibria, and it takes long."""
+    """Leave out the questions after those about clips: they fit lines, and these do not balance."""
     (at,) = (k for k, asked in enumerate(plausibility.QUESTIONS) if (wrong_clips,) in asked)
     monkeypatch.setattr(plausibility, "QUESTIONS", plausibility.QUESTIONS[: at + 1])
 

@@ -143,7 +143,13 @@ def test_the_line_in_a_photograph(pictures, searched_once, name, where):
 
 @pytest.mark.parametrize("name", CURVES)
 @pytest.mark.parametrize(
-    "places", [("left", "ahead", "right"), ("left", "ahead"), ("ahead", "right"), ("left", "right")]
+    "places",
+    [
+        ("left", "ahead", "right"),
+        ("left", "right"),
+        pytest.param(("left", "ahead"), marks=pytest.mark.long),
+        pytest.param(("ahead", "right"), marks=pytest.mark.long),
+    ],
 )
 def test_the_line_in_space(pictures, name, places):
     curve = CURVES[name]
