@@ -137,7 +137,7 @@ def test_predict_names_the_kinds_of_figure(run, tmp_path, capsys):
     assert main(["predict", *arguments, str(tmp_path / "shape.gif")]) == 2
     assert "must end in .png, .pdf, .svg, .jpg" in capsys.readouterr().err
     assert main(["predict", *arguments, str(tmp_path / "no" / "shape.png")]) == 2
-    assert "cannot be written: No such file or directory" in capsys.readouterr().err
+    assert f"there is no folder {tmp_path / 'no'}.\n  Try: mkdir" in capsys.readouterr().err
 
 
 def test_fit_reports_bad_input_without_a_traceback(tmp_path, capsys):

@@ -251,6 +251,11 @@ def test_the_tangent_is_the_derivative_of_the_balance():
             ],
             "nearer to each other than an element",
         ),
+        ([HeldClip("eyelet", (0.0, 0.0), name="ring")], "the start and ring are at the same place"),
+        (
+            [HeldClip("pinned", (0.4, 0.1), 0.6, name="pin"), HeldClip("eyelet", (0.4, 0.1))],
+            "pin and clip are at the same place",
+        ),
     ],
 )
 def test_clips_that_leave_no_room(clips, said):

@@ -401,6 +401,7 @@ def test_a_session_with_obstacles(tmp_path):
         ("point: [0, -0.1]", "point: [0, 0, -0.1]", r"table: point: \[x, y\] belongs here"),
         ("kind: sphere", "kind: sphere, a: [0, 0]", "obstacle_2: a sphere has no a, it has center"),
         ("kind: sphere", "kind: sphere, name: table", "two obstacles are called table"),
+        ("over: true", "over: 'false'", "over: "),
         ("over: true", "over: {tabel: true}", "did you mean 'table'"),
         ("over: true", "over: {table: true}", "over: table: with gravity a cable passes"),
         ("gravity: [0, -9.81]", "gravity: [0, 0]", "over: with gravity .*; there is none here"),

@@ -238,6 +238,8 @@ def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
         (ROPE, {"rest_curvature": "round"}, "one number or (K,) [1/m], K <= 64, belong here"),
         (ROPE, {"rest_curvature": [[1.0, 2.0]]}, "rest_curvature: one number or (K,) [1/m], K <="),
         (ROPE, {"rest_curvature": [1.0, np.nan]}, "belong here, found [1.0, nan]"),
+        (ROPE, {"rest_curvature": ["1", "2"]}, "one number or (K,) [1/m], K <= 64, belong here"),
+        (ROPE, {"rest_curvature": True}, "one number or (K,) [1/m], K <= 64, belong here"),
         (ROPE, {"rest_curvature": []}, "rest_curvature: one number or (K,) [1/m], K <= 64"),
         (ROPE, {"rest_curvature": np.ones(65)}, "rest_curvature: one number or (K,) [1/m], K <="),
         (ROPE, {"rest_curvature": 400.0}, "400 1/m bends it more sharply than it is thick"),

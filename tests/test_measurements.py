@@ -145,6 +145,6 @@ def test_writing_keeps_the_old_file_if_it_fails(tmp_path):
     with pytest.raises(MeasurementError, match=r"points of shape \(3,\)"):
         write_points(path, [1, 2, 3])
     np.testing.assert_array_equal(read_points(path, START).points, LINE)
-    with pytest.raises(OutputError, match="cannot be written: No such file"):
+    with pytest.raises(OutputError, match="cannot be written: there is no folder"):
         write_points(tmp_path / "none" / "a.csv", LINE)
     assert [file.name for file in tmp_path.iterdir()] == ["a.csv"]

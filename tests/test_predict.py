@@ -166,7 +166,7 @@ def test_an_end_out_of_reach_is_told_with_numbers(pinned):
     assert caught.value.p_des == (0.9, 0.0)
     said = caught.value.message
     assert said.startswith("short_clean: no equilibrium")
-    assert said.endswith("Try: an end in metres, nearer to the start; other headings or branch.")
+    assert said.endswith("Try: an end in metres, nearer to the start.")
 
 
 def test_what_a_fit_has_found_of_the_fixtures_is_told(pinned):

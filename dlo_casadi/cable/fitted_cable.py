@@ -37,7 +37,6 @@ from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
 from dlo_casadi.model.contact import Contact, surfaces_at
-from dlo_casadi.rod.node import Heading
 from dlo_casadi.show.text import bend_radius, html_table
 
 # Number of points of a shape.
@@ -136,11 +135,12 @@ class FittedCable(EstimatedCable):
         except EquilibriumError as error:
             happened, _, advice = error.message.partition("\n  Try: ")
             # A call has no configuration whose keys could be changed.
-            if "cable.length" in advice or "model.n" in advice:
-                other = (
-                    "headings or branch" if pose.node is Heading else "orientations, fewer turns"
-                )
-                advice = f"an end in metres, nearer to the start; other {other}."
+            turn = max(abs(x or 0.0) for x in (pose.start_heading, pose.end_heading))
+            if "cable.length" in advice:
+                advice = "an end in metres, nearer to the start."
+            elif turn > 2 * np.pi:
+                advice = f"headings in radians: {turn:g} degrees are {np.radians(turn):.4g}."
+            advice = advice.replace("(model.n)", f"(`with_mesh({2 * self.model.n})`)")
             raise EquilibriumError(f"{happened}\n  Try: {advice}", p_des=error.p_des) from None
         beyond, known = eq.other_side, self.metadata.uncertainty
         if beyond is None:

@@ -219,11 +219,13 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
                 try:
                     numbers = [float(row[column]) for column in columns]
                 except (KeyError, TypeError, ValueError):
+                    numbers = []
+                if not numbers or not np.isfinite(numbers).all():
                     cells = ", ".join(f"{x}={row.get(x)!r}" for x in columns)
                     raise DloError(
-                        f"{path}, pose {k}: numbers belong here, found {cells}.\n"
+                        f"{path}, pose {k}: finite numbers belong here, found {cells}.\n"
                         "  Try: one number in each cell"
-                    ) from None
+                    )
                 given[key] = numbers if len(columns) > 1 else numbers[0]
         out[name] = given
     return out

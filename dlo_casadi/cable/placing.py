@@ -303,7 +303,7 @@ class _Search:
         if not trials:
             happened = lost.message.partition("\n  Try:")[0]
             what = f"no shapes were found with {clips} in the region: {happened}"
-            raise DloError(f"{what}.\n  Try: another region, ends nearer to the start.")
+            raise DloError(f"{what}\n  Try: fewer clips, another region, ends nearer to the start.")
         firsts = sorted(trials, key=lambda one: one.merit)[:STARTS]
         best = min((self._improved(one, scales) for one in firsts), key=self._order)
         if best.margin < 0:

@@ -160,8 +160,8 @@ def fit_many(chosen: argparse.Namespace) -> int:
     page.data(rows)
     odd = [item for item in judge(rows) if item.reasons]
     for item in odd[:10]:
-        heading = str(item.row["message"]).partition("\n")[0]
-        page.say(": ".join(filter(None, [item.row["session"], ", ".join(item.reasons), heading])))
+        message = str(item.row["message"]).replace("\n", "\n  ")
+        page.say(": ".join(filter(None, [item.row["session"], ", ".join(item.reasons), message])))
     if len(odd) > 10:
         page.say(f"and {len(odd) - 10} more")
     failed = sum(row["status"] != "done" for row in rows)

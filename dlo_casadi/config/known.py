@@ -79,9 +79,12 @@ def _without_values(config: Config) -> Iterator[ConfigProblem]:
 def _curvatures(given: Any, axes: int) -> FloatArray | None:
     """A rest curvature as rows (axes, K) [1/m]; None if it is not one."""
     try:
-        values = np.atleast_1d(np.array(given, dtype=float))
-    except (TypeError, ValueError):
+        values = np.atleast_1d(np.array(given))
+    except ValueError:  # rows of different lengths
         return None
+    if values.dtype.kind not in "iuf":  # a text, or true
+        return None
+    values = values.astype(float)
     if values.ndim > axes or (axes == 2 and len(values) != 2) or not np.isfinite(values).all():
         return None
     rows = values.reshape(axes, -1)

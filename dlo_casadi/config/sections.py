@@ -10,7 +10,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    StrictBool,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.options import (
@@ -197,7 +204,7 @@ class Pose(ConfigSection):
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
     clips: tuple[Clip, ...] = ()
     """What holds the cable between its ends, in the order along it."""
-    over: bool | dict[str, bool] | None = None
+    over: StrictBool | dict[str, StrictBool] | None = None
     """Whether the cable passes over (true) or under (false) the bars among the obstacles, or some
     of them, {bar: true}: whether it crosses the half-plane that stands on a bar's axis, or the one
     that hangs from it. Without it, the side of lower energy."""

@@ -228,7 +228,7 @@ def obstacle_problems(
 
 def _no_sides(over: Sides, names: list[str], bars: list[str], axes: int) -> Iterator[str]:
     what = "a disc or a stadium" if axes == 2 else "a capsule whose axis is not upright"
-    have = f"those here are {', '.join(bars)}" if bars else "there is none here"
+    have = f"those here are {', '.join(bars)}" if bars else "there is none here, or no gravity"
     belongs = f"with gravity a cable passes over or under {what}; {have}"
     if not isinstance(over, Mapping):
         if over is not None and not bars:

@@ -414,8 +414,9 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
     """Nodes (n_nodes, coordinates) along a measured line, from its chords.
 
     The chords are some hundredths of the length; `places` (K,) [m] are the points' arc lengths. In
-    a plane headings are continuous along the cable. In space the rolls of clamped clips, and the
-    roll of the end clamp nearest to `turns`, are spread evenly.
+    a plane headings are continuous along the cable, with the full turns of the first clamp. In
+    space the rolls of clamped clips, and the roll of the end clamp nearest to `turns`, are spread
+    evenly.
     """
     last = [] if pose.end is None else [chain.length]
     at = np.maximum.accumulate(np.concatenate([[0.0], places, last]))
@@ -424,9 +425,10 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
     middles = (grid[1:] + grid[:-1]) / 2
     if chain.kind.node is not Frame:
         headings = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
-        if pose.start_heading is not None:
-            turns = np.round((pose.start_heading - headings[0]) / (2 * np.pi))
-            headings = headings + 2 * np.pi * turns
+        first = pose.start_heading if chain.start_clamped else None
+        heading, there = (pose.end_heading, -1) if first is None else (first, 0)
+        if heading is not None:
+            headings += 2 * np.pi * np.round((heading - headings[there]) / (2 * np.pi))
         return np.interp(chain.places, middles, headings)[:, None]
     tangents = np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1)
     tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)

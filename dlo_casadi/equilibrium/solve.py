@@ -194,6 +194,10 @@ def _chosen(
                 "fewer turns (a twisted cable loops), a finer mesh (model.n), or check the "
                 "stiffnesses and orientations."
             )
+        beside = [*(clip.name for clip in pose.clips), *(one.name for one in model.surfaces)]
+        if beside:
+            where += f", beside {', '.join(beside)}"
+            hint = f"more room between them, {hint}"
         what = f"no equilibrium found from its first guesses with {where}"
         return no_equilibrium(pose, what, hint)
     if named is not None and (model.start, model.end) == ("pinned", "pinned"):

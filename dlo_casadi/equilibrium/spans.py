@@ -41,6 +41,8 @@ from dlo_casadi.rod.node import Frame
 _TAUT = 0.3
 # Maximum number of combinations of sides of the spans in a plane.
 MOST_SIDES = 16
+# Distance [lengths] within which two places are one; eyelets 1 mm apart are no difficulty.
+ONE_PLACE = 1e-6
 # Shares of the slack between two fixed arc lengths that the first of two spans gets.
 _SLACK = (0.5, 0.15, 0.85)
 # Smallest length of a span beside an eyelet, relative to its chord.
@@ -416,6 +418,11 @@ def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str,
     held = holders(model, p, pose) if pose.clips and not model.extensible else []
     names = ["the start", *(clip.name for clip in pose.clips), "the end"]
     apart = chords(held)
+    for k, (one, other) in enumerate(pairwise(held)):
+        free = other.place is None or (one.at is not None and other.at is not None)
+        if not free and apart[k] < ONE_PLACE * model.cable.length:
+            what = f"no equilibrium: {names[k]} and {names[k + 1]} are at the same place, where any"
+            return f"{what} length of cable may lie in a loop", "one of them, or places apart."
     *_, true_length = true_ends(model, p, pose)
     for low, high, declared in fixed_stretches(held):
         length = declared * true_length / model.cable.length

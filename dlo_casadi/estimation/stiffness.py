@@ -96,14 +96,17 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     # Some poses may have left their measured branch on the way.
     near = _cold(model, at(best), rest, used) or grid[best][0]
 
+    # If a pose is lost, return a finite value worse than any other, so a parabola fits.
+    lost = max(total for _, total in grid.values() if np.isfinite(total))
+
     def cost(log_ei: float) -> float:
-        # If a pose is lost, return a finite value worse than any neighbour, so a parabola fits.
-        return min(follow(near, best, log_ei)[1], 10 * grid[best][1])
+        total = follow(near, best, log_ei)[1]
+        return total if np.isfinite(total) else lost
 
     found = minimize_scalar(
         cost, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-3}
     )
-    log_ei, total = float(found.x), float(found.fun)
+    total, log_ei = min((float(found.fun), float(found.x)), (cost(best), best))
     width = 0.02
     bend = (cost(log_ei + width) - 2 * total + cost(log_ei - width)) / width**2
     variance = total / max(n_points - 1, 1)

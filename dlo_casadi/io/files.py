@@ -5,6 +5,7 @@ unchanged, no draft is left, and the error names the place, the system's reason 
 What is written as JSON goes through `finite`.
 """
 
+import errno
 import math
 import os
 import secrets
@@ -239,11 +240,12 @@ def _explained(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written: {error.strerror or error}.\n"
-            "  Try: another place, or check its permissions and the free space.",
-            path,
-        ) from None
+        why = error.strerror or str(error)
+        cure = "another place, or check its permissions and the free space"
+        if error.errno == errno.ENOENT and not path.parent.exists():
+            why, cure = f"there is no folder {path.parent}", f"mkdir -p {path.parent}"
+        text = f"{path} cannot be written: {why}.\n  Try: {cure}."
+        raise OutputError(text, path) from None
 
 
 def _sync_folder(folder: Path) -> None:

@@ -11,12 +11,15 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.errors import counted
 from dlo_casadi.session.hypotheses import (
+    NEAR_AXES,
     Hypothesis,
     ReadSession,
     Suspicion,
     axes_of,
+    exchanges,
     likeliest,
     listed,
+    read_as,
 )
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import (
@@ -67,6 +70,10 @@ _RULE = {
     "heading": "headings in radians, counter-clockwise from x, along the cable",
     "orientation": "unit quaternions [qx, qy, qz, qw], x along the cable; start and end exchanged",
 }
+_UNLIKE = (
+    "{} is {:.0%} off what the shapes need, and no other way to read it is near. Try: the fixture, "
+    "axes and sign of its sensor. A large effect that the model lacks could look the same."
+)
 # Possible units of sensor readings, relative to newtons and newton metres.
 _UNITS: Mapping[str, Mapping[str, float]] = {
     "force": {"grams-force": 101.97, "kilograms-force": 0.10197, "millinewtons": 1e3},
@@ -176,8 +183,10 @@ def _shown(session: ReadSession, side: str) -> Iterator[_Shown]:
             value = getattr(pose, key)
             ways = [] if value is None else _ways(pose, item, side, cable.length, reach)
             if len(ways):
-                end = key == "end_heading" and abs(value) > _TURN
-                turned = _turned_to(pose, item.points, cable.length) if end else None
+                # Behind a pinned start no turns are counted: full turns mean nothing there.
+                turns = experiment.boundary.start == "clamped" and key == "end_heading"
+                far = turns and abs(value) > _TURN
+                turned = _turned_to(pose, item.points, cable.length) if far else None
                 yield _Shown(item.name, key, value, np.asarray(ways), turned)
 
 
@@ -212,12 +221,12 @@ def _ways(
 
 def _turned_to(pose: Pose, points: FloatArray, length: float) -> float | None:
     """Heading [rad] at the end of a line, full turns included; None if it is unknown."""
+    assert pose.start_heading is not None
     pieces = _pieces(points, _STEP * length)
     heading = np.unwrap(np.arctan2(pieces[:, 1], pieces[:, 0]))
     if np.abs(np.diff(heading)).max(initial=0.0) > _TELLING:
         return None
-    begin = heading[0] if pose.start_heading is None else pose.start_heading
-    turns = round((begin - heading[0]) / (2 * np.pi))
+    turns = round((pose.start_heading - heading[0]) / (2 * np.pi))
     return float(heading[-1] + 2 * np.pi * turns)
 
 
@@ -277,6 +286,7 @@ def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple
             # A general rotation or lever arm fits at least as well as its special cases.
             meant = likeliest(_otherwise(one), one.misfit, MUCH_BETTER * own, READ_OTHERWISE)
             if meant is None:
+                found += [Suspicion(_UNLIKE.format(one.name, own), False)] * (own > TURNED)
                 continue
             (said, rows, certain), left = meant
             text = f"{one.name} is {own:.0%} off what the shapes need, but {left:.0%} {said}"
@@ -315,9 +325,15 @@ def _fitted(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
     if one.forces is not None:
         yield from _about_elsewhere(one, one.forces)
     if size > 1:
+        for axes in exchanges(size)[1:]:
+            text = f"once read as ({read_as(axes)}). Try: the axes of start and end."
+            if not np.array_equal(axes, -np.eye(size)):  # the other sign
+                yield Hypothesis(text, a @ axes.T, one.misfit(a) > TURNED)
         u, _, v = np.linalg.svd(a.T @ one.model)
         hand = np.diag([*np.ones(size - 1), np.sign(np.linalg.det(u @ v))])
         turn, whole = (u @ hand @ v).T, np.eye(3)
+        if min(np.linalg.norm(turn - axes) for axes in exchanges(size)[1:]) < NEAR_AXES:
+            return
         whole[:size, :size] = turn
         vector = Rotation.from_matrix(whole).as_rotvec()
         angle = np.degrees(np.linalg.norm(vector) if size > 2 else vector[2])

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.errors import counted
 from dlo_casadi.session.hypotheses import (
+    NEAR_AXES,
     Hypothesis,
     Lines,
     ReadSession,
@@ -39,8 +40,6 @@ from dlo_casadi.thresholds import (
 )
 
 UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
-# Angle [rad] within which a rotation is described as an exchange of axes.
-_NAMED = 0.3
 # Iterations of fitting a frame and then choosing which end of each line is the start.
 _FITS_OF_FRAME = 4
 
@@ -203,7 +202,7 @@ def _described(turn: FloatArray, shift: FloatArray) -> str:
     """Describe a frame: by its exchanged axes, or by how far it is rotated and moved."""
     d, moved = len(turn), f"moved by ({listed(shift, '.3g')}) m"
     near = min(exchanges(d), key=lambda axes: float(np.linalg.norm(turn - axes)))
-    if np.linalg.norm(turn - near) < _NAMED * np.sqrt(2) and not np.allclose(near, np.eye(d)):
+    if np.linalg.norm(turn - near) < NEAR_AXES and not np.allclose(near, np.eye(d)):
         return f"{named(near)} and {moved}"
     hand = np.sign(np.linalg.det(turn))
     # A mirrored axis is mirrored before the rotation: y in a plane, all axes in space.

@@ -36,6 +36,8 @@ _PIECES = 16
 _PART = 0.9
 # Number of points used to measure a line's length: noise lengthens a line of many points.
 _SPARSE = 60
+# Largest difference (Frobenius norm) of a rotation from exchanged axes that describe it: 0.3 rad.
+NEAR_AXES = 0.3 * np.sqrt(2)
 
 
 class Suspicion(NamedTuple):
@@ -134,13 +136,17 @@ def listed(values: Any, form: str = ".3f") -> str:
     return ", ".join(format(x, form) for x in np.atleast_1d(values))
 
 
+def read_as(axes: FloatArray) -> str:
+    """The components that exchanged axes (d, d) take, such as y, -x."""
+    signs = ("-" if row.min() < 0 else "" for row in axes)
+    return ", ".join(
+        sign + "xyz"[int(np.abs(row).argmax())] for sign, row in zip(signs, axes, strict=True)
+    )
+
+
 def named(axes: FloatArray) -> str:
     """Describe what may have happened to points whose axes are exchanged."""
-    names = "xyz"[: len(axes)]
-    signs = ("-" if row.min() < 0 else "" for row in axes)
-    read = ", ".join(
-        sign + names[int(np.abs(row).argmax())] for sign, row in zip(signs, axes, strict=True)
-    )
+    names, read = "xyz"[: len(axes)], read_as(axes)
     if read in _IN_A_PLANE:
         return _IN_A_PLANE[read]
     hand = ", mirrored (a left-handed frame)" if np.linalg.det(axes) < 0 else ""

@@ -59,6 +59,8 @@ _FEW, _HANGING = 2, 5
 # Largest relative standard deviation at which stiffness over weight counts as known: wrong units,
 # a factor of five or more, are then recognised.
 _SIZED = 0.5
+# Gravity on Earth [m/s^2].
+EARTH = 9.81
 # What is exchanged -> the pose's keys.
 _EXCHANGED = {
     "start and end exchanged": ("",),
@@ -144,7 +146,7 @@ class Coarse(NamedTuple):
     rms : float [m]
         RMS residual; without a fit the distance at which ends count as contradicting a pose.
     weight : bool
-        Whether the shapes determine stiffness over weight.
+        Whether the shapes determine stiffness over weight, or there is no weight.
     """
 
     fit: Fit | None
@@ -238,7 +240,7 @@ def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
     except EstimationError:
         return Coarse(None, CONTRADICTS * length, False)
     known = fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS)
-    return Coarse(fit, fit.residual_rms, bool(known))
+    return Coarse(fit, fit.residual_rms, bool(known) or not any(model.gravity))
 
 
 def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
@@ -333,10 +335,10 @@ def hangs_elsewhere(session: ReadSession) -> tuple[Suspicion, ...]:
     Nothing is fitted where the lines seem to be pulled along gravity.
     """
     gravity = np.array(session.config.experiment.gravity)
-    if not (len(session.read) and gravity.any()):
+    if not len(session.read):
         return ()
     pull = shown_pull(session)
-    if pull is not None and _angle(pull, gravity) < HEADING_OFF:
+    if pull is not None and gravity.any() and _angle(pull, gravity) < HEADING_OFF:
         return ()
     found = compare(session, list(_other_gravity(session, pull)), _HANGING)
     if found is None or not (found.better or found.shows_weight):
@@ -365,16 +367,19 @@ def _other_gravity(
     """
     experiment, length = session.config.experiment, session.config.cable.length
     gravity = np.array(experiment.gravity)
+    weightless = not gravity.any()
+    if weightless:
+        gravity = EARTH * np.eye(len(gravity))[-1]
     frames = [
         axes for axes in exchanges(len(gravity)) if _angle(pull, gravity @ axes) < HEADING_OFF
     ]
-    tried = [gravity]
+    tried = [] if weightless else [gravity]
     for way in (gravity @ axes for axes in frames):
         if not any(np.allclose(way, other) for other in tried):
             tried.append(way)
             meant = session.with_experiment(gravity=tuple(way.tolist()))
             yield Hypothesis(f"gravity ({listed(way + 0.0, 'g')}) m/s^2", meant)
-    if experiment.boundary.start == experiment.boundary.end == "pinned":
+    if weightless or experiment.boundary.start == experiment.boundary.end == "pinned":
         return  # between pins, rotating the points equals rotating gravity
     kept = [_kept_by_turning(session.declared[item.name], length) for item in session.read]
     for axes in frames:

@@ -283,9 +283,10 @@ def fit_warnings(
             f"others), {_beside(fit, floor)}: repeatability limits any prediction"
         )
     if fit.noise.source == "misfit":
+        read = any(item.reactions for item in fit.problem.measured)
         lines.append(
-            "the model misses the points by far more than their noise: the fit weighs them as if "
-            f"that were {1e3 * fit.noise.std:.2g} mm"
+            f"the model misses the points{' or readings' * read} by far more than their noise: the "
+            f"fit weighs the points as if that were {1e3 * fit.noise.std:.2g} mm"
         )
     rest = fit.problem.priors.pose_scatter
     if rest.std > 0 and rest.shown:
@@ -343,7 +344,8 @@ def _beyond_tolerances(fit: Fit) -> Iterator[str]:
     hidden = tuple(f"{effect.label}." for effect in fit.model.effects if not effect.shown)
     for q in fit.model.parameters:
         tolerance = fit.model.priors.get(q.name)
-        if tolerance is None or q.name.startswith(hidden):
+        of_sensor = q.unit in ("N", "N m")  # its bias tells of wrong readings
+        if tolerance is None or (q.name.startswith(hidden) and not of_sensor):
             continue
         moved = fit.value(q.name) - q.nominal
         if abs(moved) > BEYOND_TOLERANCE * tolerance:

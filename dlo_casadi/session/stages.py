@@ -395,22 +395,25 @@ def fitted_parameters(
             unit,
             (ends[0], ends[1]) if ends else None,
             interval.identifiable if interval else None,
+            at_bound=_at_bound(fit, full),
             fixed=full not in fit.problem.unknowns.names,
         )
     roll = [END_ROLL] if END_ROLL in model.names else []
     for qualified in (*roll, *reported):
-        q = model.parameters[model.names.index(qualified)]
-        value = fit.value(qualified)
-        at_bound = abs(min(value - q.lower, q.upper - value)) < 1e-9 * q.scale
         parameters[qualified] = Estimate(
-            value,
+            fit.value(qualified),
             fit.std(qualified),
-            q.unit,
+            model.parameters[model.names.index(qualified)].unit,
             identifiable=fit.is_determined(qualified),
-            at_bound=at_bound,
+            at_bound=_at_bound(fit, qualified),
             fixed=qualified not in fit.problem.unknowns.names,
         )
     return parameters
+
+
+def _at_bound(fit: Fit, name: str) -> bool:
+    q, value = fit.model.parameters[fit.model.names.index(name)], fit.value(name)
+    return bool(abs(min(value - q.lower, q.upper - value)) < 1e-9 * q.scale)
 
 
 def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from dlo_casadi.effects import CableData, LengthError
+from dlo_casadi.effects.nuisances import SensorBias
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.variances import first_reading_noise
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.remarks import fit_warnings
 
@@ -68,6 +71,25 @@ def test_a_misfit_is_told_as_the_noise_that_the_fit_assumes():
     (said,) = (line for line in fit_warnings(fit, 0.0) if line.startswith("the model misses"))
     assert said.endswith(f"as if that were {1e3 * noise.std:.2g} mm")
     assert said.count(" mm") == 1
+
+
+def test_a_bias_of_a_sensor_far_beyond_its_tolerance_is_told():
+    """Forces that are read 0.5 N too large, with a tolerance of 0.02 N."""
+    prior = {"sensor_bias.end_force_x": 0.02, "sensor_bias.end_force_y": 0.02}
+    bias = SensorBias(start_force=False, start_moment=False, end_moment=False)
+    model = MODEL.with_effect(bias, prior)
+    poses = [HeldPose((0.0, 0.0), end) for end in ((0.4, 0.0), (0.3, -0.2), (0.35, 0.1))]
+    shapes = predict_poses(model, np.array([0.05, 0.5, 0.0]), REST, poses)
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.nodes[1:-1]).with_readings(
+            {"end_force": tuple(shape.seen.readings[reaction_rows(model.node)["end_force"]])}
+        )
+        for pose, shape in zip(poses, shapes, strict=True)
+    ]
+    known = first_reading_noise(model, force=0.01)
+    said = fit_warnings(fit_model(model, measured, Tolerances(), NOISE, readings=known), 0.0)
+    (line,) = (line for line in said if "times its tolerance" in line)
+    assert line.startswith("sensor_bias.end_force_x is 0.")
 
 
 @pytest.mark.parametrize(("longer", "told"), [(0.0, False), (8e-3, True)])

@@ -97,8 +97,9 @@ def test_a_run_opens_one_pool_of_workers(tmp_path, monkeypatch, capsys):
         return open_executor(*options)
 
     monkeypatch.setattr(fit, "open_executor", opens)
-    assert main(["fit-many", str(tmp_path), "--output", str(tmp_path / "out"), "--quiet"]) == 2
+    assert main(["fit-many", str(tmp_path), "--output", str(tmp_path / "out")]) == 2
     assert len(opened) == 1
+    assert "unknown key 'lenght' in cable" in capsys.readouterr().out
 
 
 @pytest.mark.long

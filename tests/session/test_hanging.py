@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import dlo_casadi as dlo
 from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
@@ -80,6 +81,17 @@ def test_gravity_along_another_axis_is_named_of_two_poses(curved, gravity):
     declared = "(0, 0, 9.81)" if gravity[2] else "(0, -9.81, 0)"
     assert f"does not hang along gravity {declared} m/s^2" in found.message
     assert "m with gravity (0, 0, -9.81) m/s^2" in found.message
+
+
+def test_lines_that_hang_although_gravity_is_zero():
+    cable, pins = dlo.Cable(length=0.8, mass=0.05, diameter=0.006, bending_stiffness=0.01), "pinned"
+    true = dlo.known_cable(cable, gravity=(0, -9.81), boundary=(pins, pins), model={"n": 20})
+    ends = ((0.6, 0.0), (0.4, -0.1), (0.5, 0.2), (0.3, 0.1))
+    poses = [dlo.Pose((0, 0), end, points=true.solve(end=end).points[2:-2]) for end in ends]
+    session = dlo.Session(cable, poses, gravity=(0, 0), boundary=(pins, pins))
+    (found,) = plausibility.find_suspicions(session, read_inputs(session))
+    assert "does not hang along gravity (0, 0) m/s^2" in found.message
+    assert "m with gravity (0, -9.81) m/s^2" in found.message
 
 
 def test_what_is_seen_at_a_glance_refuses_nothing_that_a_fit_explains(curved, monkeypatch):

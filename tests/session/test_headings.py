@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
+from dlo_casadi.equilibrium.guesses import line_nodes
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session.clamps import wrong_directions
 from dlo_casadi.session.ends import single_poses
+from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import ReadSession
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import without_implausible
@@ -92,6 +94,25 @@ def test_the_heading_of_a_pinned_side_is_not_used(tmp_path):
         wrong_directions(ReadSession(config.model_copy(update={"experiment": experiment}), inputs))
         == ()
     )
+
+
+@pytest.mark.parametrize("turns", [-1, 0, 1])
+def test_behind_a_pinned_start_full_turns_mean_nothing(turns, tmp_path):
+    """Neither in what looks like a mistake nor in the first guess along a line."""
+
+    def change(pose, k):
+        pose["end_heading"] += 2 * np.pi * turns * (k > 0)
+
+    config, inputs = session(tmp_path, change)
+    boundary = config.experiment.boundary.model_copy(update={"start": "pinned"})
+    experiment = config.experiment.model_copy(update={"boundary": boundary})
+    bare = config.model_copy(update={"experiment": experiment})
+    assert wrong_directions(ReadSession(bare, inputs)) == ()
+    chain = declared_model(bare).model.chain
+    for pose, item in zip(config.experiment.poses, inputs, strict=True):
+        places = np.linspace(0.0, LENGTH, len(item.points))
+        nodes = line_nodes(item.points, pose.held, chain, places)
+        assert abs(nodes[-1, 0] - pose.end_heading) < 0.3
 
 
 def test_one_wrong_heading_leaves_its_pose_out(tmp_path):

@@ -138,6 +138,23 @@ def test_axes_of_another_world(read, degrees):
     assert degrees > 17 or said_of(read, *turned) == []
 
 
+def test_exchanged_axes_are_named(read):
+    force, moment, _ = read
+    exchanged = force[:, [1, 0, 2][: force.shape[1]]]
+    (found,) = said_of(read, exchanged, moment)
+    assert f"once read as ({'y, x, z'[: 3 * force.shape[1] - 2]}). Try: the axes" in found
+
+
+def test_readings_that_nothing_explains_are_doubted(read):
+    """Of another fixture, say: a force that follows another law."""
+    force, moment, _ = read
+    other = force[:, :1] ** 2 * np.arange(1.0, 1 + force.shape[1]) + 1.0
+    (found,) = said_of(read, other, moment, certain=False)
+    assert found.startswith("end_force is")
+    assert "no other way to read it is near" in found
+    assert said_of(read, other, moment) == []
+
+
 def test_a_session_whose_readings_have_the_other_sign():
     """Forces of a straight cable of the declared stiffness, a guess, are near enough to tell."""
     config = load_config(ROOT / "tests/data/bench/short_clean/session.yaml")

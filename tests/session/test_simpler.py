@@ -1,12 +1,16 @@
 """The simpler fits that a batch estimate stands beside."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dlo_casadi.config import load_config
+from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.fitting import declared_model, simpler_fits
+from dlo_casadi.session.fitting import declared_model, simpler_fits, straight
 from dlo_casadi.session.measure import measured_poses, read_inputs
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
@@ -28,6 +32,22 @@ def test_a_reading_of_a_sensor_leaves_the_papers_loop_its_lines(session):
     assert [stage.name for stage in stages] == ["initial", "stiffness_only", "algorithm1"]
     assert found.loop is not None
     assert found.missing == ""
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 30.0])
+def test_the_stiffness_alone_is_found_from_any_guess(session, factor):
+    """Also from the exact one, about which all other stiffnesses are many times worse."""
+    _, model, measured = session
+    model = straight(model).with_mesh(10)
+    poses = [item.pose for item in measured]
+    shapes = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), poses)
+    exact = [
+        MeasuredPose.of_points(pose, shape.curve.nodes[1:-1])
+        for pose, shape in zip(poses, shapes, strict=True)
+    ]
+    true = model.cable.bending_stiffness
+    guess = replace(model, cable=replace(model.cable, bending_stiffness=factor * true))
+    assert pytest.approx(true, rel=2e-3) == fit_stiffness(guess, exact).EI
 
 
 def test_markers_do_not(session):
