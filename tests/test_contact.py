@@ -69,6 +69,8 @@ def test_what_touches_is_found_once_for_the_same_shapes(loom, monkeypatch):
     assert len(calls) == 1
     np.testing.assert_array_equal(two.normal, all_poses.normal[[2, 0]])
     assert not np.array_equal(*two.normal)
+    none = np.zeros(0, dtype=int)
+    assert assembly.touching(shapes.subset(none), given.subset(none)).gap.shape[0] == 0
     shapes.lam[0, 0] += 0.3
     again = assembly.touching(shapes, given)
     assert len(calls) == 2

@@ -20,6 +20,7 @@ Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002): primal-dual active sets a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -338,7 +339,8 @@ class LastTouching:
 
     def of(self, poses: Sequence[FloatArray], find: Callable[[], Touching]) -> Touching:
         """The kept result for poses, rows (m, ...) of all that decides; else it is found anew."""
-        rows = np.concatenate([one.reshape((len(one), -1)) for one in poses], axis=1)
+        flat = [one.reshape((len(one), math.prod(one.shape[1:]))) for one in poses]
+        rows = np.concatenate(flat, axis=1)
         names = [row.tobytes() for row in rows]
         if self._found is None or not self._known.keys() >= set(names):
             self._known, self._found = {name: k for k, name in enumerate(names)}, find()
