@@ -338,7 +338,10 @@ class LastTouching:
         self._found: Touching | None = None
 
     def of(self, poses: Sequence[FloatArray], find: Callable[[], Touching]) -> Touching:
-        """The kept result for poses, rows (m, ...) of all that decides; else it is found anew."""
+        """The kept result for some poses, or a new one.
+
+        `poses`: arrays (m, ...) of everything on which it depends.
+        """
         flat = [one.reshape((len(one), math.prod(one.shape[1:]))) for one in poses]
         rows = np.concatenate(flat, axis=1)
         names = [row.tobytes() for row in rows]

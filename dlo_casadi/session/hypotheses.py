@@ -137,7 +137,7 @@ def listed(values: Any, form: str = ".3f") -> str:
 
 
 def read_as(axes: FloatArray) -> str:
-    """The components that exchanged axes (d, d) take, such as y, -x."""
+    """The components that are read as x, y, z if axes (d, d) are exchanged, such as y, -x."""
     signs = ("-" if row.min() < 0 else "" for row in axes)
     return ", ".join(
         sign + "xyz"[int(np.abs(row).argmax())] for sign, row in zip(signs, axes, strict=True)
