@@ -334,8 +334,8 @@ class LastTouching:
     """The last result of `Touching.of`: a Newton step asks three times about the same shapes."""
 
     def __init__(self) -> None:
-        self._known: dict[bytes, int] = {}
-        self._found: Touching | None = None
+        # Replaced as a whole: threads share the assembly of a model.
+        self._last: tuple[dict[bytes, int], Touching] | None = None
 
     def of(self, poses: Sequence[FloatArray], find: Callable[[], Touching]) -> Touching:
         """The kept result for some poses, or a new one.
@@ -345,9 +345,11 @@ class LastTouching:
         flat = [one.reshape((len(one), math.prod(one.shape[1:]))) for one in poses]
         rows = np.concatenate(flat, axis=1)
         names = [row.tobytes() for row in rows]
-        if self._found is None or not self._known.keys() >= set(names):
-            self._known, self._found = {name: k for k, name in enumerate(names)}, find()
-        return self._found.subset(np.array([self._known[name] for name in names], dtype=int))
+        last = self._last
+        if last is None or not last[0].keys() >= set(names):
+            self._last = last = {name: k for k, name in enumerate(names)}, find()
+        known, found = last
+        return found.subset(np.array([known[name] for name in names], dtype=int))
 
 
 def _inwards(force: FloatArray, h: float) -> float:
