@@ -126,6 +126,12 @@ def test_two_clips(two):
     assert_agree(shape, solve_equilibrium(solver.model, p, rest, POSE))
 
 
+def test_two_pinned_clips_in_a_plane():
+    model, pose = flat(*FLAT_CLIPS)
+    solver, p, rest = compiled(model)
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+
+
 @pytest.mark.parametrize("held", [{}, {"start": "pinned", "end": "pinned"}, {"end": "free"}])
 def test_clips_in_a_plane(held):
     """One of each kind: a saddle, an eyelet, a pinned one."""
@@ -164,6 +170,7 @@ def test_a_cable_in_a_plane_that_stretches():
         ((SADDLE, CLIPS[1]), {"start": "pinned"}),
         ((SWIVEL,), {"end": "free"}),
         ((CLIPS[0], EYELET), {"end": "pinned"}),
+        ((SADDLE, EYELET), {}),
         ((CLIPS[0], NEARBY), {"end": "pinned"}),
         ((HeldClip("eyelet", CLIPS[0].place), NEARBY), {}),
     ],
