@@ -149,6 +149,7 @@ STRETCHED = FITS / 2
 MISREAD = 0.15
 # The same for forces that fit once turned, below which a missing effect may be the cause: softening
 # and a wrong mass turned those of a simulated cable by 9 degrees (0.16). The sine of 17 degrees.
+# Readings beyond it that no other way to read them explains are doubted.
 TURNED = 0.3
 # Fewest poses with wrench measurements to which turned axes or another reference point are fitted:
 # with two and three poses, 2 of 21 clean simulated sessions were refused, for -12 and 73 degrees.

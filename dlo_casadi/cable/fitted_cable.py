@@ -138,8 +138,8 @@ class FittedCable(EstimatedCable):
             turn = max(abs(x or 0.0) for x in (pose.start_heading, pose.end_heading))
             if "cable.length" in advice:
                 advice = "an end in metres, nearer to the start."
-            elif turn > 2 * np.pi:
-                advice = f"headings in radians: {turn:g} degrees are {np.radians(turn):.4g}."
+            if turn > 2 * np.pi:
+                advice += f" Headings in degrees? {turn:g} degrees are {np.radians(turn):.4g} rad."
             advice = advice.replace("(model.n)", f"(`with_mesh({2 * self.model.n})`)")
             raise EquilibriumError(f"{happened}\n  Try: {advice}", p_des=error.p_des) from None
         beyond, known = eq.other_side, self.metadata.uncertainty

@@ -315,7 +315,7 @@ def _oddities(config: Config) -> Iterator[str]:
             f"the cable is {cable.length:g} m long, but its ends are never more than "
             f"{max(spans):g} m apart: all in metres?"
         )
-    if math.hypot(*experiment.gravity) > 30.0:
+    if math.hypot(*experiment.gravity) > 30.0:  # Jupiter has 25
         yield f"gravity is {math.hypot(*experiment.gravity):g} m/s^2, on Earth 9.81: in m/s^2?"
     if std is not None and std > 0.02 * cable.length:
         yield f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?"
