@@ -1,6 +1,5 @@
 """Contact with obstacles against closed forms, balance of forces, and differences."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -78,20 +77,6 @@ def test_what_touches_is_found_once_for_the_same_shapes(loom, monkeypatch):
     for name in ("border", "gap", "normal", "active"):
         own = getattr(again, name)
         np.testing.assert_array_equal(own, getattr(fresh.touching(shapes, given), name))
-
-
-def test_threads_that_share_an_assembly_get_their_own_contacts(loom):
-    model, found = loom
-    poses = HELD_IN_SPACE.vector[None]
-    given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), poses)
-    lam = found.shapes.lam + np.linspace(0.0, 0.3, 4)[:, None, None]
-    several = [replace(found.shapes, lam=own) for own in lam]
-    assembly = Assembly(model)
-    alone = [assembly.touching(one, given).border for one in several]
-    with ThreadPoolExecutor(4) as pool:
-        for _ in range(20):
-            together = pool.map(lambda one: assembly.touching(one, given).border, several)
-            np.testing.assert_array_equal(list(together), alone)
 
 
 def test_a_heavy_beam_laid_on_a_table_lifts_off_where_beam_theory_says():
