@@ -422,6 +422,8 @@ def test_a_fit_from_arrays_is_that_of_the_file(tmp_path):
 
     reports = [report_dict(found) for found in (of_file, result)]
     assert [report.pop("config") for report in reports] == ["session", tree["cable"]["name"]]
+    paths = [report.pop("config_path") for report in reports]
+    assert paths == [str(tmp_path / "session.yaml"), None]
     for report in reports:
         del report["timing_s"]
     assert reports[0] == reports[1]

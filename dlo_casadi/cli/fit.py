@@ -91,6 +91,9 @@ def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
         results = nullcontext() if output is None else ResultsFolder(output, config)
         with results as folder, Watch(quiet=chosen.quiet) as watch, ended_first(executor):
             watch.warn(config.warnings)
+            if folder is not None and folder.of_another:
+                said = f"{output} holds results of {folder.of_another}, which this run replaces"
+                watch.warn([f"{said}. Try: --output DIR"])
             outcome = run_session(config, watch, executor)
             if folder is not None:
                 watch.step("write the results", 0, 1)

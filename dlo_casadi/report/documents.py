@@ -52,6 +52,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
     document = {
         "schema": "dlo-report/1",
         "config": outcome.config.name,
+        "config_path": None if outcome.config.path is None else str(outcome.config.path),
         "versions": outcome.versions,
         "warnings": [*outcome.doubts, *all_warnings(outcome)],
         "timing_s": outcome.timing,

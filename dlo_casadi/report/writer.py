@@ -6,7 +6,7 @@ from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, OutputError
@@ -55,9 +55,15 @@ class ResultsFolder(FolderDraft):
         super().__init__(path)
         self.config = config
 
+    @property
+    def of_another(self) -> str | None:
+        """Path of another configuration whose results the folder holds; else None."""
+        earlier, own = _report(self.path).get("config_path"), self.config and self.config.path
+        return earlier if earlier and own and earlier != str(own) else None
+
     def __enter__(self) -> Self:
         taken = [name for name in OWNED if os.path.lexists(self.path / name)]
-        if _is_ours(self.path / "report.json"):
+        if _report(self.path):
             taken = []
         if not is_marked(self.path / FAILURE, GENERATOR):
             taken.append(FAILURE)
@@ -147,9 +153,10 @@ def draw_summary(folder: Path, outcome: Outcome) -> None:
     write_figures(folder / "figures", drawn)
 
 
-def _is_ours(report: Path) -> bool:
+def _report(folder: Path) -> dict[str, Any]:
+    """The report of an earlier run in a folder; empty if there is none of this program."""
     try:
-        schema = json.loads(report.read_text(encoding="utf-8"))["schema"]
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        return report if str(report["schema"]).startswith("dlo-report/") else {}
     except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return str(schema).startswith("dlo-report/")
+        return {}

@@ -19,6 +19,7 @@ from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 KEYS = {
     "schema": str,
     "config": str,
+    "config_path": str,
     "versions": dict,
     "warnings": list,
     "timing_s": dict,

@@ -13,6 +13,7 @@ from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.io.files import write_file
 from dlo_casadi.io.points import read_points
 from dlo_casadi.report import writer
+from dlo_casadi.report.documents import report_text
 from dlo_casadi.report.page import GENERATOR
 from dlo_casadi.report.writer import OWNED, ResultsFolder
 from dlo_casadi.runtime.parallel import open_executor
@@ -60,6 +61,17 @@ def test_earlier_results_are_replaced_and_other_files_kept(outcome, quick, earli
     assert (earlier / "notes.txt").read_text() == "mine"
     assert {path.name for path in earlier.iterdir()} == {*OWNED, "notes.txt"}
     assert "versions" in json.loads((earlier / "report.json").read_text())
+
+
+def test_results_of_another_configuration_are_known(earlier, outcome):
+    config = outcome.config
+    other = config.noted(path=config.path.with_name("other.yaml"))
+    assert ResultsFolder(earlier, other).of_another is None
+    (earlier / "report.json").write_text(report_text(outcome))
+
+    assert ResultsFolder(earlier, config).of_another is None
+    assert ResultsFolder(earlier, other).of_another == str(config.path)
+    assert ResultsFolder(earlier / "empty", other).of_another is None
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
