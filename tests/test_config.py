@@ -234,6 +234,13 @@ def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, message):
     assert f"test.yaml, line {line}: " in text or f"\n  line {line}: " in text
 
 
+def test_a_mistake_in_a_value_that_overrides_a_merged_one_has_its_own_line(tmp_path):
+    poses = "    - &first {file: a.csv, start: [0, 0], end: [0.5, 0.1]}\n"
+    poses += "    - <<: *first\n      file: b.csv\n      end: 3\n"
+    with pytest.raises(ConfigError, match=r"line 15: pose 2 \(b.csv\).end: two numbers"):
+        load(tmp_path, text=GOOD.split("    - ")[0] + poses)
+
+
 def test_both_stiffnesses(tmp_path):
     with pytest.raises(ConfigError, match=r"line 7: .*found both"):
         load(tmp_path, ("4.55e8\n", "4.55e8\n  bending_stiffness: 1\n"))

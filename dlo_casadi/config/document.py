@@ -170,7 +170,7 @@ class Document(Source):
                 found = [(k, v) for k, v in node.value if getattr(k, "value", None) == str(part)]
                 if not found:
                     continue
-                key, node = found[0]
+                key, node = found[-1]  # a merge (<<) puts the values that it overrides first
                 line = key.start_mark.line + 1
             elif isinstance(node, yaml.SequenceNode) and isinstance(part, int):
                 if part >= len(node.value):
