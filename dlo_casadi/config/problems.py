@@ -256,7 +256,7 @@ def explain(
         context = error.get("ctx", {})
         section, label = _section_at(place[:-1], sections), source.label(place)
         key = place[-1] if place else ""
-        if found == PLACEHOLDER:
+        if isinstance(found, str) and found == PLACEHOLDER:  # other types may not compare
             text = f"{label} is still to be filled in{_help(section, key)}"
         elif kind == "missing" and isinstance(key, int):
             text = f"{label} has only {key} of its values"

@@ -165,9 +165,11 @@ _SHOWN = 6
 
 
 def plain(value: Any) -> Any:
-    """Convert arrays, CasADi matrices and NumPy numbers to Python numbers as in a file."""
+    """Convert arrays, tables, CasADi matrices and NumPy numbers to Python numbers as in a file."""
     if hasattr(value, "full"):  # a CasADi matrix
         value = value.full()
+    if hasattr(value, "to_numpy"):  # a table of pandas
+        value = value.to_numpy()
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -319,11 +321,12 @@ def _table(words: str, *columns: int) -> BeforeValidator:
         belongs = f"{words} belong here"
         try:
             array = np.asarray(value)
-        except ValueError:  # rows of different lengths
+            # What is masked, or empty in a table, is None.
+            if all(x is None or isinstance(x, float) or type(x) is int for x in array.flat):
+                array = array.astype(float)
+        # Rows of different lengths; an integer beyond all floats; symbols.
+        except (ValueError, OverflowError, TypeError):
             array = np.zeros(0, object)
-        # What is masked, or empty in a table, is None.
-        if all(item is None or isinstance(item, float) or type(item) is int for item in array.flat):
-            array = array.astype(float)
         if array.dtype.kind not in "fiu" or not array.size or not isinstance(value, list | tuple):
             file = ". Try: file, for the name of a file" if isinstance(value, str) else ""
             raise ValueError(f"{belongs}, found {show(value)}{file}")

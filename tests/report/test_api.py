@@ -10,6 +10,7 @@ from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
+import casadi as ca
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -292,6 +293,8 @@ LINE = [[0.0, 0.0], [0.1, -0.1], [0.2, 0.0]]
         ("pose_01.csv", "found 'pose_01.csv'. Try: file, for the name of a file"),
         (np.ma.masked_less(LINE, 0.0), "[0.1, nan] in place 2 is not finite; leave out the points"),
         ([[0, 0], [1, None], [2, 0]], "[1.0, nan] in place 2 is not finite"),
+        (ca.SX.sym("points", 3, 2), "points: numbers [[x, y], ...], in space"),
+        ([[10**400, 0], [1, 0]], "points: numbers [[x, y], ...], in space"),
     ],
 )
 def test_points_that_are_none_say_what_to_try(points, said):
@@ -302,3 +305,9 @@ def test_points_that_are_none_say_what_to_try(points, said):
 
 def test_a_masked_array_without_masked_values_has_points():
     assert dlo.Pose((0, 0), (0.2, 0), points=np.ma.masked_less(LINE, -1.0)).points[1] == (0.1, -0.1)
+
+
+def test_a_table_of_pandas_has_points():
+    pandas = pytest.importorskip("pandas")
+    pose = dlo.Pose((0, 0), (0.2, 0), points=pandas.DataFrame(LINE, columns=["x_m", "y_m"]))
+    assert pose.points == tuple(map(tuple, LINE))
