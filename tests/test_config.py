@@ -641,6 +641,11 @@ def test_several_photographs_are_of_space(tmp_path):
         load(tmp_path, *IN_SPACE, (f"{CAMERA}, {BOARD}", REFERENCE))
 
 
+def test_two_files_of_points_are_not_one_pose(tmp_path):
+    with pytest.raises(ConfigError, match=r"\(a.csv, d.csv\): .*one CSV belongs here, as file"):
+        load(tmp_path, *IN_SPACE[:3], ("file: a.csv", "files: [a.csv, d.csv]"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

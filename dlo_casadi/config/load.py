@@ -191,20 +191,22 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
     """Problems with the files of a pose, each with its key."""
     if len(pose.name.encode()) > _LONGEST_NAME:
         yield f"results are named after the file, at most {_LONGEST_NAME} bytes long", None
-    endings = {path.suffix.lower() for path in pose.paths}
+    endings, kind = {path.suffix.lower() for path in pose.paths}, experiment.measurement.kind
     # In space one session may mix photographs, lines and markers.
     mixed = experiment.in_space and pose.file is not None
-    if experiment.measurement.kind == "images" and ".csv" in endings and not mixed:
+    if kind == "images" and ".csv" in endings and not mixed:
         yield "a CSV is not a photograph; measurement kind: centerlines?", None
-    if experiment.measurement.kind == "centerlines" and endings & _IMAGE_ENDINGS:
+    if kind == "centerlines" and endings & _IMAGE_ENDINGS:
         yield "a photograph is not a CSV; measurement kind: images?", None
     if pose.points is not None:
         own = AXES[len(experiment.gravity)]
         if len(pose.points[0]) != len(experiment.gravity):
             yield f"points: [{own.place}, ...] belong here ({own.gravity} of gravity)", "points"
-        if experiment.measurement.kind == "images" and not experiment.in_space:
+        if kind == "images" and not experiment.in_space:
             yield "points are not a photograph; measurement kind: centerlines?", "points"
-    if len(pose.files) > 1 and not experiment.in_space:
+    if len(pose.files) > 1 and not endings & _IMAGE_ENDINGS and kind == "centerlines":
+        yield "files are photographs of one pose; one CSV belongs here, as file", "files"
+    elif len(pose.files) > 1 and not experiment.in_space:
         yield "several photographs are of a cable in space; gravity: two numbers", "files"
 
 
