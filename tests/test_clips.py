@@ -408,3 +408,14 @@ def test_clips_that_cannot_be_declared_so(tmp_path, old, new, said):
     (tmp_path / "session.yaml").write_text(SESSION.replace(old, new))
     with pytest.raises(ConfigError, match=said):
         load_config(tmp_path / "session.yaml")
+
+
+def test_an_eyelet_before_a_free_end_is_within_reach(tmp_path):
+    """0.3 m to the pin, then 0.5 m of cable of which 0.6 m would have to pass the eyelet."""
+    (tmp_path / "a.csv").touch()
+    free = SESSION.replace("end: pinned", "end: free").replace("      end: [0.6, 0.1]\n", "")
+    (tmp_path / "session.yaml").write_text(free)
+    assert not load_config(tmp_path / "session.yaml").skipped
+    (tmp_path / "session.yaml").write_text(free.replace("[0.45, 0.0]", "[0.85, 0.05]"))
+    with pytest.raises(ConfigError, match=r"first and clip_2 are 0\.6 m .*eyelets, with 0\.5 m"):
+        load_config(tmp_path / "session.yaml")

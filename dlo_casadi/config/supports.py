@@ -123,15 +123,15 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
 
 def too_short(pose: _Clipped, length: float, slack: float) -> str:
     """Why a pose is impossible: a span exceeds its cable by more than a slack [m]; empty if not."""
-    names = ["the start", *(clip.name for clip in pose.held.clips), "the end"]
-    places = [pose.start, *(clip.place for clip in pose.clips), pose.end]
+    names = ["the start", *(clip.name for clip in pose.held.clips)]
+    places = [pose.start, *(clip.place for clip in pose.clips)]
+    # A free end is at the last clip at best.
+    names.append(names[-1] if pose.end is None else "the end")
+    places.append(places[-1] if pose.end is None else pose.end)
     at = [0.0, *(clip.at for clip in pose.clips), length]
     low, straight = 0, 0.0
     for k in range(1, len(places)):
-        here, before = places[k], places[k - 1]
-        if here is None or before is None:
-            return ""
-        straight += math.dist(before, here)
+        straight += math.dist(places[k - 1], places[k])
         s, start = at[k], at[low]
         if s is None or start is None:
             continue
