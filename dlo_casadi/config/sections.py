@@ -107,6 +107,9 @@ class Cable(ConfigSection):
     def _plausible(self) -> Self:
         declared, young = self.bending_stiffness, self.youngs_modulus
         problems = implausible_sizes(self.length, self.prior_mass, self.diameter)
+        if self.mass is None and ("mass",) in [place for place, _ in problems]:
+            text = f"{self.diameter:g} m: a solid cable has {self.prior_mass:.2g} kg: in metres?"
+            problems = [ConfigProblem(("diameter",), text)]
         if declared is not None and (wrong := STIFFNESS.complaint(declared)):
             problems.append(ConfigProblem(("bending_stiffness",), wrong))
         if (young is None) == (declared is None):
@@ -250,10 +253,8 @@ class Pose(ConfigSection):
     @field_validator("file", mode="before")
     @classmethod
     def _absolute(cls, value: object, info: ValidationInfo) -> Path:
-        if not isinstance(value, str | Path) or not str(value).strip():
+        if not isinstance(value, str | Path) or str(value).strip() in ("", PLACEHOLDER):
             raise ValueError(f"a file name belongs here, found {show(value)}")
-        if value == PLACEHOLDER:
-            raise ValueError("a file name belongs here")
         folder = (info.context or {}).get("folder", Path())
         return (folder / value).absolute()
 
