@@ -196,13 +196,13 @@ def _help(section: type[BaseModel], key: object) -> str:
 
 def _about_number(value: object) -> str:
     """Guess why a number was written as text."""
-    text = str(value).strip()
-    if isinstance(value, str) and re.fullmatch(_NUMBER, text):
+    text = value.strip() if isinstance(value, str) else ""
+    if re.fullmatch(_NUMBER, text):
         return "; write it without quotes"
     if re.fullmatch(r"[-+]?[0-9]+,[0-9]+", text):
         return f"; the decimal sign is a point: {text.replace(',', '.')}"
-    if found := re.fullmatch(rf"({_NUMBER})\s*[a-zA-Z/^*0-9]+", text):
-        return f"; write it in SI units without the unit, such as {found[1]}"
+    if re.fullmatch(rf"{_NUMBER}\s*[a-zA-Z][a-zA-Z/^*0-9]*", text):
+        return "; write the number alone, in SI units"
     return ""
 
 
@@ -215,7 +215,7 @@ def _allowed(section: type[BaseModel], key: object) -> str:
     return "; {minimum:g} to {maximum:g} is possible".format(**ends) if len(ends) == 2 else ""
 
 
-_NUMBER = r"[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?"
+_NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 _MAPPING = "a mapping of keys and values belongs here, found {kind}{object}"
 _NUMBER_TYPE = "a number belongs here, found {input}{number}"
