@@ -292,9 +292,18 @@ def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple
             text = f"{one.name} is {own:.0%} off what the shapes need, but {left:.0%} {said}"
             found.append(Suspicion(text, certain))
         scales[one.name] = float((rows * one.model).sum() / (one.model**2).sum())
+    # Forces in a known other unit count in newtons.
+    forces = [
+        scale / _UNITS["force"].get(_unit_of(name, scale) if sized else "", 1.0)
+        for name, scale in scales.items()
+        if name.endswith("force")
+    ]
+    beside = float(np.median(forces)) if forces else 1.0
     for name, scale in scales.items():
-        if sized or (name.endswith("moment") and any(x.endswith("force") for x in scales)):
-            found += _other_unit(name, scale, scales)
+        if name.endswith("moment") and forces:
+            found += _other_unit(name, scale / beside, "forces")
+        elif sized:
+            found += _other_unit(name, scale, "mass")
     return tuple(found)
 
 
@@ -364,15 +373,19 @@ def _about_elsewhere(one: ComparedReading, forces: FloatArray) -> Iterator[Hypot
     )
 
 
-def _other_unit(name: str, scale: float, scales: Mapping[str, float]) -> Iterator[Suspicion]:
-    """A scale that no mass explains; for moments, compared with that of the same cable's forces."""
-    kind = name.split("_")[-1]
-    forces = [known for other, known in scales.items() if other.endswith("force")]
-    beside = float(np.median(forces)) if forces and kind == "moment" else 1.0
-    if 1 / READ_SCALE < scale / beside < READ_SCALE:
-        return
-    units = _UNITS[kind]
+def _unit_of(name: str, scale: float) -> str:
+    """The unit that a scale of readings is near; empty if there is none."""
+    units = _UNITS[name.split("_")[-1]]
     unit = min(units, key=lambda one: abs(np.log(scale / units[one])))
-    known = 0.5 < scale / units[unit] < 2.0
-    cure = f": in {unit}? Try: divide by {units[unit]:g}." if known else ". Try: N and N m."
-    yield Suspicion(f"{name} is {scale:.3g} times what shapes and mass need{cure}", known)
+    return unit if 0.5 < scale / units[unit] < 2.0 else ""
+
+
+def _other_unit(name: str, scale: float, beside: str) -> Iterator[Suspicion]:
+    """A scale of readings that no mass explains; of moments beside the forces, if there are any."""
+    if 1 / READ_SCALE < scale < READ_SCALE:
+        return
+    cure = ". Try: N and N m."
+    if unit := _unit_of(name, scale):
+        cure = f": in {unit}? Try: divide by {_UNITS[name.split('_')[-1]][unit]:g}."
+    text = f"{name} is {scale:.3g} times what shapes and {beside} need{cure}"
+    yield Suspicion(text, bool(unit))

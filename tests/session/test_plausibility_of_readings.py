@@ -114,6 +114,26 @@ def test_other_units(read, unit, of_force, of_moment):
     assert any(f"in {unit}?" in text for text in found), found
 
 
+@pytest.mark.parametrize("scale", [0.1, 50.0])
+def test_a_moment_in_another_unit_where_shapes_leave_the_stiffness_open(read, scale):
+    """Readings are then known up to a common factor; 0.1 N mm look like N cm without the forces."""
+    force, moment, axes = read
+    readings = [
+        ComparedReading("end_force", scale * force, force, axes),
+        ComparedReading("end_moment", 1e3 * scale * moment, moment, axes, force),
+    ]
+    (found,) = misread(readings, sized=False)
+    assert "1e+03 times what shapes and forces need: in N mm?" in found.message
+
+
+def test_moments_beside_forces_in_another_unit_are_no_mistake(read):
+    force, moment, _ = read
+    assert said_of(read, 9 * force, 9 * moment) == []  # nine times the mass, not kgf cm
+    (found,) = said_of(read, 101.97 * force, moment)
+    assert "in grams-force?" in found
+    assert said_of(read, 101.97 * force, moment, certain=False) == []
+
+
 def test_moments_about_the_sensor(read):
     force, moment, axes = read
     arms = axes @ ARM[: force.shape[1]]
