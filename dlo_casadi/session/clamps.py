@@ -33,6 +33,7 @@ from dlo_casadi.thresholds import (
     READ_OTHERWISE,
     READ_SCALE,
     TURNED,
+    UNSEEN,
 )
 
 # A full turn [rad] with room for rounding; a declared heading beyond it needs a line that turns.
@@ -256,6 +257,8 @@ class ComparedReading:
         Axes of the clamp in the world, as columns; None at a pin.
     forces : (m, d) or None [N]
         Only for moments: the model's forces on the same side.
+    std : float [N] or [N m]
+        Of one component: noise and a constant offset, as far as they are declared.
     """
 
     name: str
@@ -263,6 +266,13 @@ class ComparedReading:
     model: FloatArray
     frames: FloatArray | None = None
     forces: FloatArray | None = None
+    std: float = 0.0
+
+    @property
+    def noise(self) -> float:
+        """Noise of the readings relative to their size."""
+        size = np.sqrt(np.mean(self.measured**2))
+        return self.std / max(float(size), 1e-300)
 
     def misfit(self, measured: FloatArray) -> float:
         """Distance from the nearest multiple of the model, relative to the size of the readings."""
@@ -282,6 +292,8 @@ def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple
         if len(one.measured) * one.measured.shape[1] < 3 or not one.model.any():
             continue
         own, rows = one.misfit(one.measured), one.measured
+        if MISREAD < own < UNSEEN * one.noise:
+            continue
         if own > MISREAD:
             # A general rotation or lever arm fits at least as well as its special cases.
             meant = likeliest(_otherwise(one), one.misfit, MUCH_BETTER * own, READ_OTHERWISE)

@@ -255,6 +255,11 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
         return ()
     felt = fit.problem.equilibria.readings(*fit.problem.state(fit.point))
     rows = reaction_rows(fit.model.node, len(fit.model.clips))
+    measurement, known = session.config.experiment.measurement, session.config.experiment.tolerances
+    stds = {
+        "force": np.hypot(measurement.force_std or 0.0, known.force_bias),
+        "moment": np.hypot(measurement.moment_std or 0.0, known.moment_bias),
+    }
     compared = []
     for name, at in rows.items():
         side, _, kind = name.rpartition("_")
@@ -271,6 +276,7 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
                 felt[own, at],
                 np.array([clamp_axes(poses[k], side) for k in own]) if held else None,
                 forces if kind == "moment" else None,
+                float(stds[kind]),
             )
         )
     return misread(compared, sized=sized)

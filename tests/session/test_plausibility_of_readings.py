@@ -175,6 +175,16 @@ def test_readings_that_nothing_explains_are_doubted(read):
     assert said_of(read, other, moment) == []
 
 
+def test_readings_within_their_noise_are_not_doubted(read):
+    force, _, axes = read
+    std = 2 * np.abs(force).max()
+    noise = np.random.default_rng(2).normal(scale=std, size=force.shape)
+    one = ComparedReading("end_force", force + noise, force, axes)
+    assert misread([one])
+    assert misread([replace(one, std=std)]) == ()
+    assert misread([replace(one, measured=-force, std=std / 10)])  # the sign is still told
+
+
 def test_a_session_whose_readings_have_the_other_sign():
     """Forces of a straight cable of the declared stiffness, a guess, are near enough to tell."""
     config = load_config(ROOT / "tests/data/bench/short_clean/session.yaml")
