@@ -219,7 +219,7 @@ def compare(
     tried = []
     for way in hypotheses:
         tried.append(Comparison(way.said, own, coarse_fit(way.meant, most), length))
-        if tried[-1].certain and tried[-1].other.rms < UNEXPLAINED * length:
+        if tried[-1].certain:
             break
     return min(tried, key=lambda found: found.other.rms)
 
