@@ -96,14 +96,18 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
     reachable = tuple(pose.without(unused) for pose in poses if pose.name not in unreachable)
     absent = {pose.name: [_absent(path) for path in pose.paths] for pose in reachable if pose.paths}
     reasons = unreachable | {name: "; ".join(told) for name, told in absent.items() if all(told)}
-    n_fit = sum(pose.role == "fit" and pose.name not in reasons for pose in poses)
-    if n_fit == 0:
+    left = tuple(pose for pose in poses if pose.name not in reasons)
+    n_fit = sum(pose.role == "fit" for pose in left)
+    weightless = [*_weightless(config.changed(experiment={"poses": left}))]
+    if n_fit == 0 or weightless:
         lost = [
             ConfigProblem(("experiment", "poses", i), f"{_called(i, pose)}: {reasons[pose.name]}")
             for i, pose in enumerate(poses)
-            if pose.role == "fit"
+            if pose.role == "fit" and pose.name in reasons
         ]
-        raise source.error(lost, "no pose to fit is left")
+        if n_fit == 0:
+            raise source.error(lost, "no pose to fit is left")
+        raise source.error([*lost, *weightless])
     warnings = [*_oddities(config)]
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
