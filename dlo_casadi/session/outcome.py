@@ -247,11 +247,12 @@ class Repeatability:
     Parameters
     ----------
     expected_spread : float [m]
-        RMS distance of two repeats of a pose, at the measured points.
+        RMS distance at the measured points. If the source is "poses", of two repeats of a pose,
+        without noise; if it is "repeats", of each repeat from the mean of the others, noise
+        included.
     source : "repeats", "poses" or None
-        "repeats": repeats of few poses, see `with_repeats`, each compared with the mean of the
-        others. "poses": the scatter between poses that nothing common to all of them explains.
-        None: it could not be estimated.
+        "repeats": repeats of few poses, see `with_repeats`. "poses": the scatter between poses that
+        nothing common to all of them explains. None: it could not be estimated.
     """
 
     expected_spread: float
