@@ -137,7 +137,7 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
 
 
 class Coarse(NamedTuple):
-    """A quick fit of the declared cable without effects to a few poses.
+    """A quick fit of the declared cable, its effects kept, to a few poses.
 
     Parameters
     ----------
@@ -225,7 +225,10 @@ def compare(
 
 
 def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
-    """Quick fit of at most `most` poses, evenly spaced, held-out ones included."""
+    """Quick fit of at most `most` poses, evenly spaced, held-out ones included.
+
+    Declared effects keep their declared values; one that changes from pose to pose is left out.
+    """
     measured, length = [], session.config.cable.length
     for k in spread(len(session.read), most):
         item = session.read[k]
@@ -233,10 +236,21 @@ def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
         s = None if item.s is None else item.s[kept]
         pose = session.declared[item.name].held
         measured.append(MeasuredPose.of_points(pose, item.points[kept], s=s))
-    model = declared_model(session.config).model
-    model = replace(model, effects=(), priors={}, n=_MESH, n_rest=_REST)
+    declared = declared_model(session.config, known=True)
+    # A set depends on the poses between those that are fitted here.
+    effects = tuple(x for x in declared.model.effects if x.kind != "state")
+    model = replace(declared.model, effects=effects, priors={}, n=_MESH, n_rest=_REST)
+    given = dict(zip(declared.model.names, declared.start, strict=True))
     try:
-        fit = fit_model(model, measured, Tolerances(), UNEXPLAINED * length, refined=False)
+        fit = fit_model(
+            model,
+            measured,
+            Tolerances(),
+            UNEXPLAINED * length,
+            free=replace(model, effects=()).names,
+            values=np.array([given[name] for name in model.names]),
+            refined=False,
+        )
     except EstimationError:
         return Coarse(None, CONTRADICTS * length, False)
     known = fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS)

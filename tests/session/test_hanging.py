@@ -7,8 +7,11 @@ import pytest
 
 import dlo_casadi as dlo
 from dlo_casadi.config import dump_yaml, load_config
+from dlo_casadi.effects import CableData, LumpedMass
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.session import plausibility
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import ReadSession, load_over_stiffness, shown_pull
@@ -154,3 +157,33 @@ def test_gravity_upwards_is_named_of_a_wire_that_does_not_repeat():
     (found,) = plausibility.find_suspicions(under(config, (0.0, 9.81)), inputs)
     assert "the lines show no weight" in found.message
     assert not found.certain
+
+
+def test_a_cable_hangs_along_gravity_with_the_weight_that_is_declared():
+    """A connector of six times the cable's mass, in four poses between clamps."""
+    cable = {"length": 0.8, "mass": 0.05, "diameter": 0.006, "bending_stiffness": 0.05}
+    model = CableModel(CableData(**cable), 20, start="clamped", end="clamped")
+    model, parameters = model.with_effect(LumpedMass()), {"mass": 0.3, "position": 0.3}
+    p = model.nominal.copy()
+    p[[model.names.index(f"lumped_mass.{name}") for name in parameters]] = [*parameters.values()]
+    held = (((0.5, 0.1), 0.3), ((0.6, -0.1), -0.2), ((0.45, 0.0), 0.5), ((0.4, 0.1), 0.2))
+    poses = [HeldPose((0.0, 0.0), end, 0.0, heading) for end, heading in held]
+    shapes = predict_poses(model, p, np.zeros(model.chain.n_rests), poses)
+    fixed = {name: {"value": value, "fixed": True} for name, value in parameters.items()}
+    config = dlo.Session(
+        dlo.Cable(**cable),
+        [
+            dlo.Pose(
+                x.start,
+                x.end,
+                start_heading=0.0,
+                end_heading=x.end_heading,
+                points=found.curve.at(np.linspace(0.02, 0.78, 60)),
+            )
+            for x, found in zip(poses, shapes, strict=True)
+        ],
+        gravity=(0, -9.81),
+        boundary=("clamped", "clamped"),
+        model={"effects": [{"name": "lumped_mass", "parameters": fixed}]},
+    )
+    assert plausibility.find_suspicions(config, read_inputs(config)) == ()
