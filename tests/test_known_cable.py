@@ -243,6 +243,11 @@ def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
         (ROPE, {"rest_curvature": []}, "rest_curvature: one number or (K,) [1/m], K <= 64"),
         (ROPE, {"rest_curvature": np.ones(65)}, "rest_curvature: one number or (K,) [1/m], K <="),
         (ROPE, {"rest_curvature": 400.0}, "400 1/m bends it more sharply than it is thick"),
+        (
+            WIRE,
+            {"gravity": (0, 0, -9.81), "rest_curvature": (300.0, 300.0)},
+            "424.264 1/m bends it more sharply",
+        ),
         (STRAIGHT, {"rest_curvature": 1.0}, "rest_curvature: the cable is declared straight"),
         (
             WIRE,

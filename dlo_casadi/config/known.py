@@ -51,8 +51,8 @@ def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config,
         text = f"{form} [1/m], K <= {REST_COEFFICIENTS.most}, belong here, found {show(rest)}"
     elif values.size and cable.rest_shape == "straight":
         text = "the cable is declared straight. Try: one of rest_curvature and rest_shape"
-    elif values.size and np.abs(values).max() * cable.diameter >= 2.0:
-        text = f"{np.abs(values).max():g} 1/m bends it more sharply than it is thick: units are SI"
+    elif (sharpest := np.linalg.norm(values, axis=0).max(initial=0.0)) * cable.diameter >= 2.0:
+        text = f"{sharpest:g} 1/m bends it more sharply than it is thick: units are SI"
     problems += [ConfigProblem((), f"rest_curvature: {text}")] if text else []
     if problems or values is None:
         raise source.error(problems)
