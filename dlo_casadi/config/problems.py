@@ -146,7 +146,7 @@ class Source:
         return ""
 
     def label(self, place: Place) -> str:
-        """Name a place in words: cable.length, pose 4 (pose_04.jpg) end."""
+        """Name a place in words: cable.length, pose 4 (pose_04.jpg).end."""
         data, words = self.data, []
         for part in place:
             if isinstance(data, dict) and part in data:
