@@ -654,6 +654,7 @@ def test_two_files_of_points_are_not_one_pose(tmp_path):
         ("1: [1, 0]", "50: [1, 0]", "DICT_4X4_50 has no marker 50: its ids end at 49"),
         ("1: [1, 0]", "1: [0.01, 0]", "markers 0 and 1 are 0.01 m apart, closer than their size"),
         ("1: [1, 0]", "1: [1e30, 0]", r"marker_centers.1: 1e\+30 m: -1000 to 1000 m is possible"),
+        ("0.012", "1e30", r"standoff: 1e\+30 m: 0 to 1000 m is possible"),
         ("0.08", "1e-30", "marker_size: 1e-30 m: 0.0001 to 10 m is possible"),
         ("[[900, 0, 6", "[[900, 0, 1e3", r"matrix: 1e\+300 px: -1e\+06 to 1e\+06 px is possible"),
         ("[[900", "[[1e300", r"matrix: 1e\+300 px: 1 to 1e\+06 px is possible"),

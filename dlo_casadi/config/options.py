@@ -117,9 +117,9 @@ class Limits(ConfigSection):
 
     bend_radius: Annotated[Positive, within(LENGTH._replace(least=1.0e-4))] | None = None
     """Least radius of curvature [m]."""
-    force: Annotated[Positive, within(FORCE)] | None = None
+    force: Annotated[Positive, within(FORCE._replace(least=0.0))] | None = None
     """Greatest force of the cable on each of its fixtures [N]."""
-    moment: Annotated[Positive, within(MOMENT)] | None = None
+    moment: Annotated[Positive, within(MOMENT._replace(least=0.0))] | None = None
     """Greatest moment of the cable on each clamp [N m]."""
     twist: Annotated[Positive, within(_TWIST)] | None = None
     """Greatest twist in space, the angle about the axis per length [1/m]."""
@@ -227,7 +227,7 @@ class DeclaredBoard(ConfigSection):
     """OpenCV's name of the marker dictionary, such as DICT_4X4_50."""
     marker_size: Annotated[Positive, within(MARKER)]
     """Side of the black square of a marker [m]."""
-    standoff: Annotated[NonNegative, within(COORDINATE)] = 0.0
+    standoff: Annotated[NonNegative, within(COORDINATE._replace(least=0.0))] = 0.0
     """Distance of the cable's axis in front of the board [m]; other than 0 needs a camera, or
     photographs from several directions that show it."""
     marker_centers: Annotated[_Centers, Field(min_length=1, max_length=_MOST_MARKERS)]
