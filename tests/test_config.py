@@ -225,6 +225,7 @@ def test_a_configuration_cannot_be_changed(tmp_path):
         ("b.csv", "a.csv", 13, r"pose 2 \(a.csv\): pose 1 is called 'a' too"),
         ("a.csv", "a.jpg", 12, "a photograph is not a CSV; measurement kind: images?"),
         ("file: a.csv, ", "", 12, "pose 1: 'file' is missing"),
+        ("a.csv, ", "a.csv, at: [0.1], ", 12, "1 arc length for 0 points.*of a CSV .* column s_m"),
         ("role: fit", "role: held_out", 11, "no pose has role: fit"),
     ],
 )

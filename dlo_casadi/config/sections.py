@@ -292,6 +292,7 @@ class Pose(ConfigSection):
         if self.at is not None and len(self.at) != len(self.points or ()):
             points = counted(len(self.points or ()), "point")
             text = f"{counted(len(self.at), 'arc length')} for {points}: each point has one"
+            text += "" if self.points else "; those of a CSV are its column s_m"
             raise Contradiction(ConfigProblem(("at",), text))
         if self.points is not None and len(self.points) == 1:
             raise Contradiction(
