@@ -138,6 +138,11 @@ class _BatchNlp:
         lower, upper = unknowns.bounds
         free = np.full(self.stride * len(self.poses), np.inf)
         self.lower, self.upper = np.concatenate([lower, -free]), np.concatenate([upper, free])
+        # As in `descend`, deviations of poses that are not fitted stay: no prior of them counts.
+        held = np.zeros((len(self.poses), self.stride), dtype=bool)
+        unfitted = ~np.isin(self.poses, problem.used)
+        held[unfitted, self.n_x + self.n_lam : self.stride - self.n_rest] = True
+        self.held = np.concatenate([np.zeros(unknowns.size, dtype=bool), held.ravel()])
         self._assemble()
 
     def _differentiate(self) -> None:
@@ -305,12 +310,13 @@ class _BatchNlp:
             if problem.equilibria.model.has_state:
                 parts.append(rests[j])
             own.append(np.concatenate(parts))
+        x0 = np.concatenate([point.theta, *own])
         out, stats = run_ipopt(
             self.solver,
-            x0=np.concatenate([point.theta, *own]),
+            x0=x0,
             p=np.concatenate([np.concatenate([r.ravel(order="F") for r in rows]), *targets]),
-            lbx=self.lower,
-            ubx=self.upper,
+            lbx=np.where(self.held, x0, self.lower),
+            ubx=np.where(self.held, x0, self.upper),
             lbg=0.0,
             ubg=0.0,
         )

@@ -8,7 +8,9 @@ import pytest
 from dlo_casadi.effects import CableData, RestCurvatureDrift
 from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.constrained import _predicted_next
+from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -60,6 +62,15 @@ def test_another_minimum_may_not_move_a_pose_that_no_point_holds(drifting):
     x[HELD_OUT, 4:8] += 1.0
     elsewhere = replace(lower, shapes=replace(lower.shapes, x=x))
     assert confirmed(drifting, Minimum(elsewhere)) is drifting
+
+
+def test_ipopt_does_not_move_the_ends_of_a_pose_that_is_held_out(drifting):
+    """Without a prior they would move by centimetres, for whatever rest shape they leave behind."""
+    fit = descend(drifting)
+    point, _ = solve_batch(fit.problem, fit.point)
+    own, found = fit.point.shapes.deviation[HELD_OUT], point.shapes.deviation[HELD_OUT]
+    np.testing.assert_allclose(found, own, rtol=1e-12)
+    assert point.objective == pytest.approx(fit.point.objective, abs=1e-2)
 
 
 def test_a_pose_in_another_equilibrium_leads_no_later_one_astray(drifting):
