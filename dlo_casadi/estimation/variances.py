@@ -286,7 +286,7 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
             way = rest[k][kept[k]]
             slow = np.concatenate([slow, way / np.abs(way).max()], axis=1)
         basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
-        basis = basis[:, values > 1e-3 * values[0]]
+        basis = basis[:, values > 1e-3 * values.max(initial=0.0)]
         shared = directions[:, :size] / np.maximum(scale, 1e-300)
         bases.append(basis)
         left_over.append(shared - basis @ (basis.T @ shared))

@@ -11,11 +11,14 @@ from test_problem import CABLE, STD, measured_from
 
 from dlo_casadi.diagnosis.selection import p_with_new_noise, with_new_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import threshold
 from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import nuisances
 from dlo_casadi.session.remarks import fit_warnings
 
@@ -116,6 +119,17 @@ def test_fewer_points_than_unknowns():
         r"measurement.std, or rest_shape: straight.",
     ):
         fitted(1, poses=4)
+
+
+def test_noise_of_three_points_each_of_a_cable_whose_ends_have_no_tolerance():
+    """It hangs from a pin: nothing but the unknowns of all poses may change a curve."""
+    model, pose = CableModel(CABLE, 8, end="free", n_rest=3), HeldPose((0.0, 0.0))
+    assert model.deviations == ()
+    (shape,) = predict_poses(model, model.nominal, model.rest_basis @ np.array([4, 5, 2]), [pose])
+    seen = shape.curve.at(np.array([0.3, 0.6, 0.9]) * CABLE.length)
+    noise = np.random.default_rng(0).normal(scale=STD, size=(4, *seen.shape))
+    fit = fit_model(model, [MeasuredPose.of_points(pose, seen + e) for e in noise], Tolerances())
+    assert STD / 2 < fit.noise.std < 2 * STD
 
 
 def test_an_effect_that_leaves_no_point_over_is_not_significant():
