@@ -48,6 +48,9 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     equilibria = BatchEquilibrium(model, [item.pose for item in used], wrenches=False)
     rest = np.zeros(model.chain.n_rests)
     n_points = sum(len(item.traced.points) for item in used)
+    # Several squares for each marker, and for each point of a line in space.
+    compared = (item.traced if item.has_line else item for item in used)
+    n_squares = sum(int(item.on_points.sum()) for item in compared)
 
     stiff, search = model.stiffness_indices, SearchSettings.of(model)
 
@@ -109,7 +112,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     total, log_ei = min((float(found.fun), float(found.x)), (cost(best), best))
     width = 0.02
     bend = (cost(log_ei + width) - 2 * total + cost(log_ei - width)) / width**2
-    variance = total / max(n_points - 1, 1)
+    variance = total / max(n_squares - 1, 1)
     log_std = float(np.sqrt(2 * variance / bend)) if bend > 0 else float("inf")
     return StiffnessFit(float(np.exp(log_ei)), log_std, float(np.sqrt(total / n_points)))
 

@@ -50,6 +50,24 @@ def test_the_stiffness_alone_is_found_from_any_guess(session, factor):
     assert pytest.approx(true, rel=2e-3) == fit_stiffness(guess, exact).EI
 
 
+def test_the_std_of_the_stiffness_alone_is_that_of_every_coordinate_of_a_marker(session):
+    """To first order noise / |d x / d log EI| over both coordinates of all markers."""
+    _, model, measured = session
+    model, noise = straight(model).with_mesh(10), 3e-4
+    poses, s = [item.pose for item in measured], np.linspace(0.05, 0.95, 60) * model.cable.length
+
+    def places(log_ratio):
+        p = model.nominal * np.exp(log_ratio)
+        shapes = predict_poses(model, p, np.zeros(model.chain.n_rests), poses)
+        return np.array([shape.curve.at(s) for shape in shapes])
+
+    seen = places(0.0) + np.random.default_rng(0).normal(scale=noise, size=(len(poses), 60, 2))
+    marked = [MeasuredPose.of_points(*one, s=s) for one in zip(poses, seen, strict=True)]
+    slope = np.linalg.norm(places(1e-3) - places(-1e-3)) / 2e-3
+    # 360 squares tell the noise to a twentieth.
+    assert fit_stiffness(model, marked).log_std == pytest.approx(noise / slope, rel=0.15)
+
+
 def test_markers_do_not(session):
     options, model, measured = session
     points = measured[0].points[[20, 60, 100]]
