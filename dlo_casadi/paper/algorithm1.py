@@ -124,9 +124,14 @@ class Target:
 
     @classmethod
     def of(cls, measured: MeasuredPose, gap: float) -> Self:
-        """Take the points of a pose; neighbours farther apart than `gap` [m] enclose a gap."""
+        """Take the points of a pose.
+
+        Neighbours enclose a gap if they are farther apart than `gap` [m] and than twice the median
+        distance of neighbours, so that a sparse line is not all gaps.
+        """
         line = measured.pose.joined(measured.points) - np.array(measured.pose.start)
-        wide = np.hypot(*np.diff(line, axis=0).T) > gap
+        steps = np.hypot(*np.diff(line, axis=0).T)
+        wide = steps > max(gap, 2 * float(np.median(steps)))
         return cls(line[1:-1], wide[:-1] | wide[1:], line[-1])
 
     def nearest(self, nodes: FloatArray) -> tuple[IntArray, BoolArray]:

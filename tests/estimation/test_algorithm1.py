@@ -143,6 +143,16 @@ def test_distance_of_nodes_to_their_nearest_points():
     assert target.residual(nodes) == pytest.approx(2e-4, rel=1e-9)
 
 
+def test_points_of_a_sparse_line_have_no_gaps_beside_them():
+    """Spaced by more than half a link, none of ten points entered r_p."""
+    x = np.delete(np.linspace(0.0, 1.0, 14)[1:-1], [6, 7])
+    line = MeasuredPose.of_points(HeldPose((0.0, 0.0), (1.0, 0.0)), np.stack([x, 0 * x], axis=1))
+    target = Target.of(line, gap=0.05)
+    nodes = np.stack([np.linspace(0.1, 0.9, 9), np.zeros(9)], axis=1)
+    seen = target.nearest(nodes)[1]
+    np.testing.assert_array_equal(np.flatnonzero(~seen), [4, 5, 6])
+
+
 def test_both_minimisers_reach_the_same_minimum():
     problem = InnerProblem(CABLE, GRAVITY, n=5)
     (item,) = measured(0.3, ENDS[1:2])
