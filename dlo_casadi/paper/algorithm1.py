@@ -263,7 +263,8 @@ class InnerProblem:
 
 def applies(model: CableModel) -> bool:
     """Whether the paper's method applies: a cable in a plane, pinned at both ends, nothing else."""
-    return model.node is Heading and model.start == model.end == "pinned" and not model.clips
+    held = model.start == model.end == "pinned" and not (model.clips or model.surfaces)
+    return model.node is Heading and held
 
 
 def gravity_slopes(phi: FloatArray, weight: FloatArray, h: float) -> FloatArray:

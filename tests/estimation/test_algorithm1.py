@@ -26,6 +26,7 @@ from dlo_casadi.paper.algorithm1 import (
     gravity_slopes,
     run_algorithm1,
 )
+from dlo_casadi.rod.obstacles import Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
@@ -304,6 +305,7 @@ def test_only_pins_are_known():
     assert applies(CableModel(CABLE))
     assert not applies(CableModel(CABLE, start="clamped"))
     assert not applies(CableModel(CABLE, end="free"))
+    assert not applies(CableModel(CABLE, obstacles=(Plane((0.0, -0.3), (0.0, 1.0)),)))
     in_space = replace(CABLE, torsional_stiffness=CABLE.bending_stiffness)
     assert not applies(CableModel(in_space, gravity=(0.0, 0.0, -9.81)))
     clamped = MeasuredPose.of_points(
