@@ -250,7 +250,7 @@ def _white_noise(fit: Fit) -> NoiseModel:
     on_points = np.concatenate([item.on_points for item in items])
     free = 1 - np.concatenate(fit.leverages)
     spare = problem.n_residuals - fit.determined_unknowns - float(free[~on_points].sum())
-    if spare < LEAST_SPARE:
+    if round(spare, 1) < LEAST_SPARE:  # as the message shows it
         raise EstimationError(
             f"the {counted(int(on_points.sum()), 'distance')} of "
             f"{counted(len(problem.used), 'fit pose')} determine "

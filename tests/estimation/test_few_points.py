@@ -132,6 +132,17 @@ def test_noise_of_three_points_each_of_a_cable_whose_ends_have_no_tolerance():
     assert STD / 2 < fit.noise.std < 2 * STD
 
 
+def test_as_many_points_as_are_needed_are_enough():
+    """Weak priors took a ten-thousandth: "3.0 degrees of freedom are left, 3 are needed"."""
+    straight = replace(CABLE, straight=True)
+    model, pose = CableModel(straight, 8, start="clamped", end="free"), HeldPose((0, 0), None, 0.0)
+    (shape,) = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), [pose])
+    s = np.array([0.4, 0.8]) * CABLE.length
+    seen = shape.curve.at(s) + np.random.default_rng(1).normal(scale=STD, size=(2, 2))
+    fit = fit_model(model, [MeasuredPose.of_points(pose, seen, s=s)], Tolerances())
+    assert fit.noise.slow_dof == pytest.approx(3, abs=0.05)
+
+
 def test_an_effect_that_leaves_no_point_over_is_not_significant():
     fit = fitted(1, poses=4, std=STD)
     noise = replace(fit.noise, source="estimated")
