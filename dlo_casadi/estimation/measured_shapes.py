@@ -21,6 +21,10 @@ _KINEMATIC_STEPS = 8
 # Evidence: eight poses with one photograph each, from two starts. Between 8 and 12 steps the
 # residual of 8 of the 16 fell by more than a tenth; between 12 and 20 steps that of 3.
 _STEPS_WITHOUT_DEPTH = 20
+# Damping of a step, relative to the mean diagonal: nothing holds the roll of a cable between ball
+# joints about its axis, and undamped steps of 20 to 1e10 rad in it left no room for the others. It
+# moves no shape in a plane or between clamps by a micrometre.
+_DAMPING = 1e-6
 # Maximum number of results kept: a session asks for about twenty, many of them repeatedly.
 _KINEMATICS = 24
 
@@ -184,6 +188,8 @@ def _kinematic_step(
             system.append(rows)
             target.append(0.01 * node.difference(x[index], frame))
     stacked, left = np.concatenate(system), np.concatenate(target)
-    step = np.linalg.solve(stacked.T @ stacked, stacked.T @ left)
+    matrix = stacked.T @ stacked
+    matrix.flat[:: len(matrix) + 1] += _DAMPING * np.trace(matrix) / len(matrix)
+    step = np.linalg.solve(matrix, stacked.T @ left)
     step *= min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-12))
     return step.reshape((n, b)), float(left @ left)
