@@ -326,10 +326,10 @@ class Fit:
         """
         if self.converged:
             return False
-        lower, upper = self.problem.unknowns.bounds
-        inside = (self.point.theta > lower) & (self.point.theta < upper)
-        slope = self.normal.gradient[inside]
-        hessian = self.normal.hessian[np.ix_(inside, inside)]
+        (lower, upper), theta = self.problem.unknowns.bounds, self.point.theta
+        slope = self.normal.gradient
+        free = np.where(slope > 0, theta > lower, theta < upper)
+        slope, hessian = slope[free], self.normal.hessian[np.ix_(free, free)]
         step = np.linalg.solve(hessian + NO_INFORMATION * np.eye(len(slope)), slope)
         return bool(slope @ step > self.inflation**2)
 

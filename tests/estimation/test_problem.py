@@ -419,6 +419,18 @@ def start_without_a_mass():
     return Fit(problem, problem.evaluate(values))
 
 
+@pytest.mark.parametrize("mass", [0.0, 1e-3])
+def test_a_fit_has_failed_if_it_may_leave_a_bound_downhill(mass):
+    """The objective falls from 20 to 0.1 along a mass, also from its bound of zero."""
+    start = descend(start_without_a_mass())
+    model, where = start.model.with_effect(LumpedMass()), {"lumped_mass.position": 0.3}
+    problem = start.problem_in(model, where | {"lumped_mass.mass": mass})
+    theta = problem.unknowns.pack(problem.unknowns.fixed, start.coefficients)
+    point = problem.balanced(Values(theta, start.point.shapes, start.point.projections))
+    assert Fit(problem, point).failed
+    assert not descend(Fit(problem, point)).failed
+
+
 def test_a_descent_is_given_up_if_its_minimum_is_above_a_ceiling():
     start = start_without_a_mass()
     found = descend(start)
