@@ -141,7 +141,7 @@ class ScatterLikelihood:
     def deviance(
         self, noise: float, std: float, systematic: float, smoothness: float, range_: float
     ) -> InformedDeviance:
-        """Restricted deviance by the logarithms of the three sizes, see `sensing.restricted`.
+        """Restricted deviance by the logarithms of the three sizes, see `Deviance`.
 
             V = V_0 + Z B Z^T,   V_0 = noise^2 1 + U U^T,   P = V^-1 - V^-1 X (...)^-1 X^T V^-1
 
