@@ -334,7 +334,7 @@ def _not_applicable(
     if not options.algorithm1:
         return "switched off"
     if not applies(model):
-        return "the paper's loop needs a plane and two pinned ends"
+        return "the paper's loop needs a plane and two pinned ends, without clips or obstacles"
     sensors = [sensor for item in measured for sensor in item.sensors]
     if any(sensor.marked and sensor.per_point for sensor in sensors):
         return "the paper's loop needs lines along the cable, not single markers"
