@@ -51,6 +51,13 @@ def test_what_can_be_one_is_said_so(tmp_path):
     assert counter._text(Tally(1200, 0, 2400, 0.0, None)) == "1 200 of 2 400 poses"
 
 
+@pytest.mark.parametrize(("done", "text"), [(0, "60"), (1, "70"), (4, "95")])
+def test_a_continued_run_counts_what_an_earlier_one_has_finished(done, text):
+    """Of ten tasks six are finished, and the last one has five poses."""
+    counter = Counter(Console(), noun="pose", size=10, count=95)
+    assert counter._text(Tally(done, 0, 4, 0.0, None)) == f"{text} of 95 poses"
+
+
 def test_no_message_counts_without_it():
     """`{n} poses` reads "1 poses" one day; a share of several is `{k} of {counted(n, ...)}`."""
     found = [

@@ -140,8 +140,10 @@ class Counter(Shown):
 
     def _text(self, tally: Tally) -> str:
         done, total = self.size * tally.done, self.size * (tally.total or tally.done)
-        if self.count is not None:
-            done, total = min(done, self.count), self.count
+        if self.count is not None and tally.total is not None:
+            # An earlier run may have finished the tasks that are not counted.
+            earlier = -(-self.count // self.size) - tally.total
+            done, total = min(done + self.size * earlier, self.count), self.count
         text = f"{done:,} of {counted(total, self.noun, ',')}".replace(",", " ")
         if tally.failed:
             text += f", {tally.failed} lost"
