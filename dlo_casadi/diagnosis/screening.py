@@ -168,7 +168,6 @@ class Screen:
         self.fit = fit
         self.listed = list(listed)
         self.model = extended(fit, listed)
-        self.p = fit.values_in(self.model)
 
     @property
     def n_scans(self) -> int:
@@ -261,11 +260,11 @@ class Screen:
         single = survival(score, max(dof, 1), noise_dof)
         p_value = sidak(single, n_places)
         values = dict(candidate.scans[normal.k])
+        # The fitted value of a nuisance counts only once: beside a copy without a prior, the copy
+        # that has one returns to its mean.
         for name, change in zip(candidate.screened, step, strict=True):
-            i = self.model.names.index(name)
-            parameter = self.model.parameters[i]
-            value = self.p[i] + change * parameter.scale
-            values[name] = float(np.clip(value, parameter.lower, parameter.upper))
+            q = self.model.parameters[self.model.names.index(name)]
+            values[name] = float(np.clip(q.nominal + change * q.scale, q.lower, q.upper))
         return Screened(candidate, score, p_value, candidate.of_linear(self.model.cable, values))
 
     def _below(self, candidate: Candidate, step: FloatArray) -> NDArray[np.bool_]:
@@ -275,9 +274,8 @@ class Screen:
         """
         below = []
         for name, change in zip(candidate.screened, step, strict=True):
-            i = self.model.names.index(name)
-            q = self.model.parameters[i]
-            below.append(q.lower == q.nominal and self.p[i] + change * q.scale < q.lower)
+            q = self.model.parameters[self.model.names.index(name)]
+            below.append(q.lower == q.nominal and change < 0)
         return np.array(below)
 
 

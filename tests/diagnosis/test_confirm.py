@@ -11,7 +11,7 @@ from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.unknown_force import _Search
-from dlo_casadi.effects import CableData, LumpedMass, UnknownPull
+from dlo_casadi.effects import CableData, LengthError, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
@@ -73,6 +73,25 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
     smaller = refit_without(larger, taper, base)
     assert kept(smaller) == FIXED
     assert "lumped_mass.mass" not in smaller.problem.unknowns.names
+
+
+def test_the_one_step_estimate_of_a_nuisance_is_the_minimum_without_its_prior():
+    """The cable is 2 mm longer than declared, four tolerances of which the prior takes a part."""
+    name = "length_error.length_difference"
+    model = PLAIN.with_effect(LengthError(), {name: 5e-4})
+    poses = [HeldPose((0.0, 0.0), (x, y)) for x, y in ((0.3, 0.0), (0.2, -0.2), (0.35, 0.1))]
+    p, s = model.nominal.copy(), np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
+    p[model.names.index(name)] = 2e-3
+    shapes = predict_poses(model, p, np.zeros(model.chain.n_cells), poses)
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.at(s))
+        for pose, shape in zip(poses, shapes, strict=True)
+    ]
+    fit = fit_model(model, measured, Tolerances(), NOISE)
+    assert fit.value(name) > 0.5e-3
+    length = next(c for c in candidates(model, setup_of(model)) if c.name == "length_error")
+    (screened,) = Screen(fit, [length]).run(np.inf)
+    assert screened.start[name] == pytest.approx(refit_with(fit, screened).value(name), rel=0.05)
 
 
 def test_a_fixed_effect_stays_on_another_mesh_and_beside_an_unknown_pull(base):
