@@ -156,7 +156,7 @@ class PoseList:
         pyarrow, _ = parquet_library()
         try:
             yield
-        except (OSError, pyarrow.ArrowException) as error:
+        except (OSError, UnicodeDecodeError, pyarrow.ArrowException) as error:
             text = f"--list {self.path}: {error}.\n  Try: a CSV or Parquet file of numbers"
             raise DloError(text) from None
 

@@ -209,6 +209,13 @@ def test_a_long_bad_list_is_no_bug(tmp_path):
             read()
 
 
+def test_a_header_that_is_no_utf8_is_no_bug(tmp_path):
+    path = tmp_path / "ends.csv"
+    path.write_bytes("end_x_m,end_y_m,größe\n0.1,0.2,3\n".encode("latin-1"))
+    with pytest.raises(DloError, match=r"(?s)ends.csv: .* Try: a CSV or Parquet file"):
+        PoseList(path)
+
+
 def test_a_model_is_pickled_without_its_expressions():
     model = CableModel(CABLE, n=10)
     before = solve_equilibrium(model, model.nominal, REST, HeldPose((0.0, 0.0), (0.3, 0.0)))
