@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,6 +33,8 @@ class Candidate:
         is screened at each of them.
     nuisance : bool
         True if the model already has the effect, held within its tolerance by a prior.
+    alike : int
+        Number of candidates of this name, such as one for each clip; only the best one counts.
     """
 
     effect: Effect
@@ -39,6 +42,7 @@ class Candidate:
     screened: tuple[str, ...]
     scans: tuple[dict[str, float], ...]
     nuisance: bool
+    alike: int = 1
 
     @property
     def name(self) -> str:
@@ -108,7 +112,8 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
         tested = (prefix + q.name for q in effect.linear().parameters(model.cable))
         screened = tuple(name for name in tested if name not in scans[0])
         found.append(Candidate(effect, frees, screened, scans, nuisance=False))
-    return found
+    count = Counter(x.name for x in found)
+    return [replace(x, alike=count[x.name]) for x in found]
 
 
 def candidates_of(

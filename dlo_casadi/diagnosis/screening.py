@@ -51,7 +51,7 @@ class Screened:
     score : float
         T, the predicted decrease of twice the objective, at the best scan.
     p_value : float
-        Corrected for the number of places scanned, not for that of candidates.
+        Corrected for the numbers of places scanned and of candidates alike, not for that of others.
     start : dict
         One-step estimate of the candidate's parameters.
     fit : Fit, optional
@@ -258,7 +258,7 @@ class Screen:
         step = step / scale
         n_places = max(1.0, len(candidate.scans) / SCANS_PER_TEST)
         single = survival(score, max(dof, 1), noise_dof)
-        p_value = sidak(single, n_places)
+        p_value = sidak(single, n_places * candidate.alike)
         values = dict(candidate.scans[normal.k])
         # The fitted value of a nuisance counts only once: beside a copy without a prior, the copy
         # that has one returns to its mean.

@@ -258,7 +258,8 @@ def p_with_new_noise(before: Fit, after: Fit, winner: Confirmed, tried: int) -> 
         return 0.0
     gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
     dof = len(winner.candidate.frees)
-    return sidak(survival(gain, dof, noise_degrees(larger)), tried)
+    p_value = survival(gain, dof, noise_degrees(larger))
+    return sidak(p_value, tried * winner.candidate.alike)
 
 
 def p_of_removal(fit: Fit, smaller: Fit, candidate: Candidate, tried: int) -> float:
