@@ -113,7 +113,7 @@ def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
     headings, differences = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False), []
     for heading in headings:
         pose = replace(base, start_heading=float(heading), branch=None)
-        pair = [predict_poses(one.model, one.p, one.rest, [pose])[0] for one in (fit, other)]
+        pair = [predict_poses(one.model, one.p, one.rest_now, [pose])[0] for one in (fit, other)]
         curves = [
             item.curve.at(places)
             for item in pair

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from dlo_casadi.diagnosis import next_measurement
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
-from dlo_casadi.effects import EFFECTS, CableData, LumpedMass
+from dlo_casadi.effects import EFFECTS, CableData, LumpedMass, RestCurvatureDrift
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model
@@ -18,7 +19,7 @@ EI, MASS = 0.06, 0.35
 MODEL = CableModel(CableData(0.65, 0.4, 0.015, 0.03), 10, start="clamped", end="free", n_rest=3)
 
 
-def fitted(std, points, mass):
+def fitted(std, points, mass, model=MODEL, **options):
     """A cable with a weight near its middle, fitted without it; std of the points [m]."""
     heavy, rng = MODEL.with_effect(LumpedMass()), np.random.default_rng(0)
     p, rest = np.array([EI, mass, 0.3]), np.zeros(MODEL.chain.n_cells)
@@ -30,7 +31,7 @@ def fitted(std, points, mass):
         )
         for pose, shape in zip(poses, predict_poses(heavy, p, rest, poses), strict=True)
     ]
-    return fit_model(MODEL, measured, Tolerances(), std)
+    return fit_model(model, measured, Tolerances(), std, **options)
 
 
 def test_a_weight_that_fits_as_well_as_none_widens_the_interval_of_the_stiffness():
@@ -60,3 +61,21 @@ def test_a_weight_that_fits_as_well_as_none_widens_the_interval_of_the_stiffness
 def test_a_weight_that_shows_is_not_hidden():
     """Sixty points a pose to 0.1 mm tell a twentieth of the cable's mass."""
     assert hidden_weight(fitted(1e-4, 60, 0.0)) is None
+
+
+def test_the_pose_that_would_tell_follows_those_of_the_session(monkeypatch):
+    """A cable that takes a set is predicted as the last pose leaves it."""
+    model = MODEL.with_effect(RestCurvatureDrift())
+    values = model.nominal + np.isin(model.names, ["rest_curvature_drift.rate"]) * 0.1
+    free = ["bending_stiffness"]
+    fit = fitted(6e-3, 2, 0.0, model, values=values, free=free, refined=False)
+    rests, predict = [], next_measurement.predict_poses
+
+    def predicted(model, p, rest, poses):
+        rests.append(rest)
+        return predict(model, p, rest, poses)
+
+    monkeypatch.setattr(next_measurement, "predict_poses", predicted)
+    next_measurement._pose_that_tells(fit, fit)
+    assert np.abs(fit.rest_now - fit.rest).max() > 0.01
+    assert all((rest == fit.rest_now).all() for rest in rests)
