@@ -259,7 +259,7 @@ class Search:
                     winner, current, tried.p_values, self._starts_at_shapes(current)
                 )
                 if p_value > self.significance:
-                    names = [item.candidate.name for item in chosen]
+                    names = [x.candidate.name for item in chosen for x in item.each]
                     lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
                     if better is current:
                         lost |= dict.fromkeys((x.candidate.name for x in winner.each), RAN_AWAY)

@@ -324,9 +324,10 @@ def choose(
     validation: CrossValidation,
     doubt: float | None,
 ) -> tuple[list[Confirmed], dict[str, str]]:
-    """The best refit by `support` and its rivals; by name, why the others are not among them.
+    """The best refit by `support` and its rivals; by name, why other candidates are in none.
 
-    Both gains have to be positive. Rivals fall short of the best by less than EVIDENCE_APART.
+    Both gains have to be positive. Rivals fall short of the best by less than EVIDENCE_APART. Of a
+    candidate in several refits the likeliest one's reason counts.
     """
     why = {item.name: shortcoming(item, base, validation, doubt) for item in refits}
     order = {item.name: support(item, base, validation) for item in refits}
@@ -339,7 +340,13 @@ def choose(
             chosen.append(item)
         else:
             why[item.name] = f"log likelihood {behind:.3g} behind {better[0].name}"
-    return chosen, {name: reason for name, reason in why.items() if reason}
+    reasons = {
+        x.candidate.name: why[item.name]
+        for item in sorted(refits, key=lambda item: order[item.name])
+        for x in item.each
+    }
+    kept = {x.candidate.name for item in chosen for x in item.each}
+    return chosen, {name: reason for name, reason in reasons.items() if name not in kept}
 
 
 def added_by(

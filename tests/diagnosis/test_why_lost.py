@@ -64,6 +64,22 @@ def test_each_reason_has_its_number():
     }
 
 
+def test_both_candidates_of_a_pair_have_its_reason():
+    """Unless another pair with one of them is chosen."""
+
+    def pair(first, second, *gains):
+        return replace(refit(second, *gains), beside=(refit(first, *gains).screened,))
+
+    tried = [pair("one", "two", 50.0, 50.0), pair("one", "other", 30.0, 30.0)]
+    tried += [pair("other", "last", 20.0, 20.0), refit("last", -1.0, -1.0)]
+    chosen, why = choose(tried, BASE, DECLARED, None)
+    assert chosen == tried[:1]
+    assert why == {
+        "other": "log likelihood 20 behind one and two",
+        "last": "log likelihood 30 behind one and two",
+    }
+
+
 @pytest.mark.parametrize(
     ("gains", "expected"),
     [((30.0, 60.0), 40.0), ((60.0, 30.0), 40.0), ((20.0, 20.0), 20.0), ((50.0, -4.0), -4.0)],
