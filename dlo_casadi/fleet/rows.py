@@ -131,10 +131,10 @@ def _parameters(items: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def last_error(row: Row) -> float | None:
-    """Error of the last stage [m]: of held-out poses if there are any."""
-    errors = ("rmse_held_out", "rmse_fit")
-    names = [f"{stage}_{what}" for stage in ("closed", "batch") for what in errors]
-    return next((row[name] for name in names if row[name] is not None), None)
+    """Error of the last stage [m]: of held-out poses if there are any; None without predictions."""
+    stage = "batch" if row["closed_chi2_per_dof"] is None else "closed"
+    error: float | None = row[f"{stage}_rmse_{'held_out' if row['poses_held_out'] else 'fit'}"]
+    return error
 
 
 def _row_file(output: Path, key: str) -> Path:

@@ -19,7 +19,15 @@ from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import fit, main
 from dlo_casadi.errors import DloError
-from dlo_casadi.fleet.rows import COLUMNS, empty_row, judge, overview_html, robust_z, row_of
+from dlo_casadi.fleet.rows import (
+    COLUMNS,
+    empty_row,
+    judge,
+    last_error,
+    overview_html,
+    robust_z,
+    row_of,
+)
 from dlo_casadi.fleet.run import digest_of, find_sessions, fit_fleet
 from dlo_casadi.io.files import only_run
 from dlo_casadi.runtime.executors import InProcess
@@ -269,6 +277,16 @@ def test_the_odd_ones_come_first():
     assert reasons["stiff"] == ("stiffer",)
     assert reasons["poor"] == ("larger error",)
     assert all(not reasons[f"plain_{k}"] for k in range(7))
+
+
+def test_the_error_of_held_out_poses_is_not_replaced_by_another():
+    """One of them has no prediction with the effects that were found."""
+    row = fake("one", 0.3) | {"batch_rmse_held_out": 2e-3, "poses_held_out": 2}
+    assert last_error(row) == 2e-3
+    closed = {"closed_chi2_per_dof": 1.0, "closed_rmse_fit": 1e-4}
+    assert last_error(row | closed) is None
+    assert last_error(row | closed | {"closed_rmse_held_out": 3e-3}) == 3e-3
+    assert last_error(row | closed | {"poses_held_out": 0}) == 1e-4
 
 
 def test_a_session_without_a_diagnosis_is_not_called_complete(tmp_path):
