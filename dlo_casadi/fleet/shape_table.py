@@ -29,6 +29,9 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.runtime.parallel import Tally, map_as_completed
 
+if TYPE_CHECKING:
+    import pyarrow
+
 # Columns of a pose, as the compiled solver takes them [m, m, m, m, rad, rad].
 COLUMNS = ("start_x", "start_y", "end_x", "end_y", "start_heading", "end_heading")
 # Names of the same columns in the header of a list.
@@ -157,7 +160,8 @@ class PoseList:
         try:
             yield
         except (OSError, UnicodeDecodeError, pyarrow.ArrowException) as error:
-            text = f"--list {self.path}: {error}.\n  Try: a CSV or Parquet file of numbers"
+            why = "no such file" if isinstance(error, FileNotFoundError) else error
+            text = f"--list {self.path}: {why}.\n  Try: a CSV or Parquet file of numbers"
             raise DloError(text) from None
 
     def chunks(self, size: int) -> Iterator[FloatArray]:
@@ -179,10 +183,6 @@ class PoseList:
 
 def _fixed(count: int, fixed: Mapping[str, float]) -> FloatArray:
     return np.tile([float(fixed.get(name, 0.0)) for name in COLUMNS], (count, 1))
-
-
-if TYPE_CHECKING:
-    import pyarrow
 
 
 SCHEMA = "dlo-shapes/1"

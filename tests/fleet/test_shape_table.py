@@ -209,6 +209,11 @@ def test_a_long_bad_list_is_no_bug(tmp_path):
             read()
 
 
+def test_a_list_that_does_not_exist_is_told(tmp_path):
+    with pytest.raises(DloError, match=r"ends.csv: no such file"):
+        PoseList(tmp_path / "ends.csv")
+
+
 def test_a_header_that_is_no_utf8_is_no_bug(tmp_path):
     path = tmp_path / "ends.csv"
     path.write_bytes("end_x_m,end_y_m,größe\n0.1,0.2,3\n".encode("latin-1"))
