@@ -142,7 +142,7 @@ def fit_many(chosen: argparse.Namespace) -> int:
     counter = Counter(quiet=chosen.quiet, noun="session")
 
     def begin(taken_over: int, left: int) -> None:
-        before = f", finished of them {taken_over}" if taken_over else ""
+        before = f", {taken_over} of them finished before" if taken_over else ""
         counter.message(f"{counted(len(sessions), 'session')}{before}; results in {output}")
 
     try:
