@@ -383,7 +383,7 @@ def _as_measured(
 def _stiffnesses(near: Fit) -> list[dict[str, float]]:
     """Stiffnesses by name for each of STIFFNESSES_OF_CONTACT, in their declared ratio.
 
-    None if the stiffnesses are not estimated.
+    Empty if the stiffnesses are not estimated.
     """
     model = near.model
     if not near.problem.unknowns.free[model.stiffness_indices].any():

@@ -44,8 +44,6 @@ class UnknownForce:
     position : float [m]
     interval : (float, float) [m]
         95 %.
-    gain : float
-        Decrease of twice the objective compared with the fit without it.
     poses : tuple of str
         Names of the fit poses.
     """
@@ -53,7 +51,6 @@ class UnknownForce:
     force_per_pose: FloatArray
     position: float
     interval: tuple[float, float]
-    gain: float
     fit: Fit
     poses: tuple[str, ...] = ()
 
@@ -91,9 +88,8 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
     position = best.value(name)
     half = NORMAL_95 * max(best.std(name), 1e-4 * length)
     interval = (float(max(0.0, position - half)), float(min(length, position + half)))
-    gain = 2 * (base.point.objective - best.point.objective)
     names = tuple(best.problem.measured[j].pose.name for j in best.problem.used)
-    return UnknownForce(forces, position, interval, gain, best, names)
+    return UnknownForce(forces, position, interval, best, names)
 
 
 def _columns(model: CableModel) -> list[int]:

@@ -118,7 +118,7 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     stiffness, position, *anchor = TETHER
     seen = fit.problem.observed(fit.point)
     places = [seen[j].curve.at(np.array([position]))[0] for j in fit.problem.used]
-    pull = UnknownForce(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), 0.0, fit)
+    pull = UnknownForce(stiffness * (anchor - np.array(places)), position, (0.4, 0.5), fit)
     listed = {c.name: c for c in candidates(fit.model, setup_of(fit.model, n_poses=len(ENDS)))}
     given = pull.fit, pull.position, pull.force_per_pose
     start = start_from(*given, listed["tether"])

@@ -42,7 +42,7 @@ EFFECT = FoundEffect(
 def pull(*forces):
     """A load of so much in the first poses."""
     poses = tuple(f"pose_{k:02d}" for k in range(1, 1 + len(forces)))
-    return UnknownForce(np.array(forces), 0.3, (0.28, 0.32), 0.0, None, poses)
+    return UnknownForce(np.array(forces), 0.3, (0.28, 0.32), None, poses)
 
 
 LOAD = pull((0.0, 1.0), (0.0, 1.0))
