@@ -257,7 +257,7 @@ class RelaxedStart:
         listed = candidates_of(near, center, exclude)
         likely = likeliest(screened_from_data(near, softness, listed))[:SECOND]
         second = partial(RelaxedStart.of, near, beside=(*self.beside, self.screened))
-        return list(map_in_order(executor, second, likely))
+        return map_in_order(executor, second, likely)
 
     def fit(self) -> Fit | None:
         """Fit reached from this start; None if some pose has no equilibrium there."""

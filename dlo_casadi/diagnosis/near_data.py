@@ -82,7 +82,7 @@ def near_data(
     likely = likeliest(screened)
     contacts = [x for x in screened if not x.candidate.effect.gradual]
     first = [*contacts, *likely[:REFITTED]]
-    begun = list(map_in_order(executor, partial(RelaxedStart.of, near), first))
+    begun = map_in_order(executor, partial(RelaxedStart.of, near), first)
     touches, singles = begun[: len(contacts)], begun[len(contacts) :]
     most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
     touches = [start for start in touches if start.left <= most]
@@ -143,7 +143,7 @@ def confirmed(
         explained = any(explains(item.fit) for item in tried)
         close = [x for x in group if not explained or x.left < REACHED * starts[0].left]
         fitted += close
-        found = list(map_in_order(executor, partial(confirm_from_data, base), close))
+        found = map_in_order(executor, partial(confirm_from_data, base), close)
         for k, start in enumerate(close) if rolls and not explained else ():
             item = found[k] = confirm_rolled(base, start, found[k])
             if item is not None and explains(item.fit):

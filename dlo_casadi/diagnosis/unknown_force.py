@@ -20,7 +20,6 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin, fit_from
 from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import NORMAL_95
 
@@ -60,13 +59,13 @@ class UnknownForce:
         return np.asarray(self.force_per_pose.mean(axis=0))
 
 
-def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> UnknownForce | None:
+def estimate_unknown_force(base: Fit, executor: Executor) -> UnknownForce | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 
     The fit without the load may be too far off to start from. Places along the cable are therefore
     tried from the measured shapes on a coarse mesh; the best are refitted with the place free, and
     the best of those on the base's mesh. `base`: fit without the load. `executor`: runs the trial
-    places, a second or two each; in this process by default.
+    places, a second or two each.
     """
     effect = UnknownPull()
     model = base.model.with_effect(effect)
@@ -74,7 +73,7 @@ def estimate_unknown_force(base: Fit, executor: Executor | None = None) -> Unkno
     search = _Search(base, model.with_mesh(coarse), f"{effect.label}.position")
     length, name = model.cable.length, search.position
     best: Fit | None = None
-    for fit in search.run(executor or InProcess()):
+    for fit in search.run(executor):
         try:
             best = refit(fit, model, steps=MOST_STEPS)
             break

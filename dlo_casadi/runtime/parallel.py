@@ -199,16 +199,10 @@ def map_as_completed(
 
 
 def map_in_order(
-    executor: Executor, function: Callable[[Item], Result], items: Sequence[Item], **options: Any
+    executor: Executor, function: Callable[[Item], Result], items: Sequence[Item]
 ) -> list[Result]:
-    """Results of all items in their order; the first exception is raised.
-
-    Parameters
-    ----------
-    options
-        Those of `map_as_completed`.
-    """
-    ended = list(map_as_completed(executor, function, items, **options))
+    """Results of all items in their order; the first exception is raised."""
+    ended = map_as_completed(executor, function, items)
     return [item.value for item in sorted(ended, key=lambda item: item.index)]
 
 
