@@ -113,8 +113,14 @@ def _from_data_on(base: Fit, mesh: int) -> tuple[Fit, float]:
 
 def _beside(base: Fit, model: CableModel) -> Problem:
     """The problem of another model, with a base's noise and with priors without any scatter."""
-    priors = Priors.of(base.problem.priors.tolerances, model)
-    return replace(base.problem_in(model), priors=priors)
+    return replace(base.problem_in(model), priors=priors_without_scatter(base, model))
+
+
+def priors_without_scatter(base: Fit, model: CableModel) -> Priors:
+    """Priors of a model as if nothing differed at random; a single pose's ends do not differ."""
+    known = base.problem.priors
+    priors = Priors.of(known.tolerances, model)
+    return replace(priors, scatter=known.scatter) if len(base.problem.used) == 1 else priors
 
 
 def expected_left(near: Fit) -> float:

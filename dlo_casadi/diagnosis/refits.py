@@ -27,6 +27,7 @@ from dlo_casadi.diagnosis.from_data import (
     RelaxedStart,
     from_data,
     left_without,
+    priors_without_scatter,
 )
 from dlo_casadi.diagnosis.screening import (
     Screen,
@@ -39,7 +40,6 @@ from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import NEARLY, refit
 from dlo_casadi.estimation.fit import misfits
-from dlo_casadi.estimation.problem import Priors
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import refine
 from dlo_casadi.model.cable_model import CableModel
@@ -222,8 +222,7 @@ def ceiling_beside(fit: Fit) -> float:
 
 def at_noise(fit: Fit, noise: NoiseModel) -> Fit:
     """A fit that meets its points, weighed by their noise instead of that of a misfit."""
-    priors = Priors.of(fit.problem.priors.tolerances, fit.model)
-    return refine(fit.reweighed(noise, priors), first=True)
+    return refine(fit.reweighed(noise, priors_without_scatter(fit, fit.model)), first=True)
 
 
 def followed(

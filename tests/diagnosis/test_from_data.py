@@ -23,7 +23,7 @@ from dlo_casadi.diagnosis.near_data import (
     confirm_rolled,
     near_data,
 )
-from dlo_casadi.diagnosis.refits import scored, scored_by_refit
+from dlo_casadi.diagnosis.refits import at_noise, scored, scored_by_refit
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screen, Screened
 from dlo_casadi.effects import BendingAnisotropy, CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -76,6 +76,18 @@ def test_a_model_that_misses_the_shapes_is_fitted_to_its_misfit(base):
     assert base.noise.source == "misfit"
     assert base.noise.before.std == NOISE
     assert misfits(base)
+
+
+def test_a_single_pose_keeps_the_priors_of_its_ends():
+    """Its ends do not differ: with tolerances as scatter their errors would count twice."""
+    model = CableModel(CableData(0.5, 0.03, 0.006, 0.01), 8, n_rest=0)
+    pose = HeldPose((0.0, 0.0), (0.35, 0.05))
+    (shape,) = predict_poses(model, model.nominal, np.zeros(model.chain.n_rests), [pose])
+    points = shape.curve.at(np.linspace(0.02, 0.48, 20))
+    measured = [MeasuredPose.of_points(pose, points)]
+    base = fit_model(model, measured, Tolerances(), NOISE, refined=False)
+    for fit in (from_data(base)[0], at_noise(base, base.noise)):
+        assert fit.problem.deviation_std == pytest.approx(base.problem.deviation_std)
 
 
 @pytest.fixture(scope="module")
