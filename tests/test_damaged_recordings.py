@@ -222,6 +222,20 @@ def test_the_scatter_of_the_length_is_its_tolerance(take, tmp_path):
     assert not known.tolerances
 
 
+def test_a_marker_at_the_place_of_a_gripper_moves_no_other(take):
+    """Exactly there at the end, and 1 mm across the cable at the start."""
+    exact = make_session("loom", recording_of(take), Wishes())
+    beside = {"m_start": take.bodies["start"][:, :3] + [0.0, 0.0, 1e-3]}
+    beside["m_end"] = take.bodies["end"][:, :3]
+    found = make_session(
+        "loom", recording_of(replace(take, markers={**take.markers, **beside})), Wishes()
+    )
+    assert found.length == pytest.approx(exact.length, abs=1e-5)
+    for (_, s), (_, known) in zip(found.points.values(), exact.points.values(), strict=True):
+        assert s[1:-1] == pytest.approx(known, abs=1e-5)
+        assert s[[0, -1]] == pytest.approx([1e-3, found.length], abs=1e-4)
+
+
 def test_exchanged_labels_name_their_pose(take):
     there, markers = in_pose(take, 2), {name: x.copy() for name, x in take.markers.items()}
     for one, other in (("m02", "m07"), ("m07", "m02")):

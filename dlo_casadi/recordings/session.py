@@ -3,10 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
-from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +13,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.recordings.arc_lengths import arc_lengths
 from dlo_casadi.recordings.forces import readings_of
 from dlo_casadi.recordings.lost import without_held
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
@@ -30,7 +29,6 @@ from dlo_casadi.recordings.wishes import FREE, Wishes
 from dlo_casadi.thresholds import STRETCHED
 
 _COLUMNS = 98  # width of a comment
-_SAMPLES = 50  # points of a spline between two markers, to compute its length: exact to 1e-5
 _LONGER = 0.03  # relative difference of declared and measured length beyond which one is a mistake
 # Scatter of the length from pose to pose beyond which arc lengths are doubtful, relative. Rendered
 # from one session: below 0.1 % for eight markers or more, up to 0.15 % for six, 0.9 % for four, 2.9
@@ -326,7 +324,7 @@ def _along(
     remarks: list[str],
 ) -> tuple[FloatArray, float, float]:
     """Arc lengths (M,) [m] of the markers; the measured length of the cable and its scatter [m]."""
-    s, length, scatter = _arc_lengths(start, places, end)
+    s, length, scatter = arc_lengths(start, places, end)
     if not wishes.at:
         _check_arc_lengths(s, length, scatter, places, names)
     fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
@@ -393,47 +391,3 @@ def _check_arc_lengths(
             "change its length.\n  Try: --length and --at, measured with a tape; the body that "
             "holds each end: --start, --end; cable and grippers in one frame."
         )
-
-
-def _arc_lengths(
-    start: Gripper | None, places: FloatArray, end: Gripper | None
-) -> tuple[FloatArray, float, float]:
-    """Arc lengths (M,) [m] of markers from the start; length of the cable and its scatter [m].
-
-    They are means over all poses of lengths along a cubic spline through fixtures and markers,
-    clamped in the grippers' directions.
-    """
-    knots = places
-    if start is not None:
-        knots = np.concatenate([start.places[None], knots])
-    if end is not None:
-        knots = np.concatenate([knots, end.places[None]])
-    spans = np.full((knots.shape[1], len(knots) - 1), np.nan)
-    for k, row in enumerate(spans):
-        seen = np.flatnonzero(np.isfinite(knots[:, k]).all(axis=1))
-        if len(seen) < 2:
-            continue
-        x = knots[seen, k]
-        ends: Any = tuple(
-            (1, gripper.frames[k, :, 0]) if gripper is not None else (2, np.zeros(3))
-            for gripper in (start, end)
-        )
-        lengths = np.linalg.norm(np.diff(x, axis=0), axis=1)
-        for _ in range(3):  # the parameter converges to the arc length
-            t = np.concatenate([[0.0], np.cumsum(lengths)])
-            curve = CubicSpline(t, x, bc_type=ends)
-            fine = np.linspace(t[:-1], t[1:], _SAMPLES + 1, axis=1)
-            lengths = np.linalg.norm(np.diff(curve(fine), axis=1), axis=2).sum(axis=1)
-        for i, j, span in zip(seen, seen[1:], lengths, strict=False):
-            if j == i + 1:
-                row[i] = span
-    if np.isnan(spans).all(axis=0).any():
-        raise MeasurementError(
-            "two neighbouring markers of the cable are seen together in no pose.\n  Try: fill "
-            "their gaps, or leave one of them out: --cable"
-        )
-    found = np.nanmean(spans, axis=0)
-    s = np.concatenate([[0.0], np.cumsum(found)])
-    first = 0 if start is None else 1
-    scatter = float(np.where(np.isnan(spans), found, spans).sum(axis=1).std())
-    return s[first : first + len(places)], float(s[-1]), scatter

@@ -430,7 +430,7 @@ def _twist(start: Gripper, lines: Sequence[FloatArray], end: Gripper) -> float:
     total = 0j
     for k, (first, last) in enumerate(zip(start.frames, end.frames, strict=True)):
         steps = np.diff(np.vstack([start.places[k], lines[k], end.places[k]]), axis=0)
-        ways = [first[:, 0], *(steps / np.linalg.norm(steps, axis=1)[:, None]), last[:, 0]]
+        ways = [first[:, 0], *unit(steps), last[:, 0]]
         side = first[:, 1]
         for a, b in pairwise(ways):
             side = side - (side @ b) / (1.0 + a @ b) * (a + b)
