@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recorded.takes import HOLD, MOVE, rendered, write_motive, write_vicon
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.cli import main
 from dlo_casadi.errors import DloError, MeasurementError
@@ -234,6 +235,23 @@ def test_a_marker_at_the_place_of_a_gripper_moves_no_other(take):
     for (_, s), (_, known) in zip(found.points.values(), exact.points.values(), strict=True):
         assert s[1:-1] == pytest.approx(known, abs=1e-5)
         assert s[[0, -1]] == pytest.approx([1e-3, found.length], abs=1e-4)
+
+
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_gripper_at_the_end_alone_tells_the_order(way, take):
+    """In whatever order the markers are listed."""
+    place, q = np.split(take.bodies["end"], [3], axis=1)
+    axes = 0.05 * np.swapaxes(Rotation.from_quat(q).as_matrix(), 1, 2)
+    trio = {"o": place, "x": place + axes[:, 0], "y": place + axes[:, 1]}
+    markers = dict([*take.markers.items()][::way]) | trio
+    alone = recording_of(replace(take, markers=markers, bodies={}))
+    session = make_session("loom", alone, Wishes(end="o,x,y"))
+    whole = make_session("loom", recording_of(take), Wishes())
+    for (points, s), (known, at) in zip(
+        session.points.values(), whole.points.values(), strict=True
+    ):
+        assert points == pytest.approx(known)
+        assert s - s[0] == pytest.approx(at - at[0], abs=2e-3)
 
 
 def test_exchanged_labels_name_their_pose(take):

@@ -131,7 +131,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     else:
         told = [still.told for still in stills]
         markers = _cable_markers(recording, stills, wishes)
-        order = _in_order(markers, None if start is None else start.places)
+        order = _in_order(markers, start, end)
         names, places = [list(markers)[k] for k in order], np.array([*markers.values()])[order]
         seen = np.isfinite(places).all(axis=2)
         lines = [places[here, k] for k, here in enumerate(seen.T)]
@@ -283,7 +283,9 @@ def _cable_markers(
     return found
 
 
-def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> list[int]:
+def _in_order(
+    markers: Mapping[str, FloatArray], start: Gripper | None, end: Gripper | None
+) -> list[int]:
     """Order of the markers from the start to the end of the cable.
 
     The largest distance of two markers over all poses approximates their distance along the cable.
@@ -304,8 +306,10 @@ def _in_order(markers: Mapping[str, FloatArray], starts: FloatArray | None) -> l
             "the names of the cable's own markers."
         )
     tips = np.flatnonzero(neighbours <= 1).tolist()
-    if starts is not None:
-        tips = sorted(tips, key=lambda k: away(places[k], starts))
+    if start is not None:
+        tips.sort(key=lambda k: away(places[k], start.places))
+    elif end is not None:
+        tips.sort(key=lambda k: -away(places[k], end.places))
     order, _ = depth_first_order(tree, tips[0], directed=False)
     if len(order) < len(places):
         raise MeasurementError(
