@@ -326,6 +326,17 @@ def test_forces_that_belong_nowhere_are_left_out_with_a_remark(sensor, said, end
     assert any(f"force sensor {sensor[0]}" in x and said in x for x in session.remarks)
 
 
+def test_a_force_sensor_with_another_clock_is_left_out_with_a_remark(take):
+    """One that counts from 1970, beside markers that count from the start of the recording."""
+    recording = recorded(take, [("start/wrench", "", 1.0)])
+    *others, sensor = recording.streams
+    late = replace(sensor, t=sensor.t + 1.7e9, clock="forces")
+    session = make_session("loom", replace(recording, streams=(*others, late)), Wishes())
+    assert not any("start_force" in pose for pose in session.poses)
+    (told,) = (text for text in session.remarks if "start/wrench" in text)
+    assert "is left out: nothing of it was seen in any pose. Try: " in told
+
+
 def test_a_pose_without_the_cables_markers_is_named(take):
     """The grippers alone are still in the last one: five markers are fewer than half of all."""
     last = (take.t > take.t[-1] - HOLD - 0.5)[:, None]

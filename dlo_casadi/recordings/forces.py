@@ -46,6 +46,12 @@ def readings_of(
                 turn = Rotation.from_quat([0.0, 0.0, 0.0, 1.0] if body is None else body[3:])
                 row[f"{side}_force"] = turn.apply(wrench[:3])
                 row[f"{side}_moment"] = turn.apply(wrench[3:])
+        if not any(f"{side}_force" in row for row in found):
+            remarks.append(
+                f"force sensor {name} (frame {stream.frame!r}) is left out: nothing of it was seen "
+                "in any pose. Try: a recording in which it shares the clock of markers or grippers"
+            )
+            continue
         remarks.append(
             f"{side}_force, {side}_moment: means of {name}, in axes of "
             f"{stream.frame or 'the world'}; taken as those of the cable on its fixture, about its "
