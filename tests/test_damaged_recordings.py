@@ -1,6 +1,7 @@
 """Recordings with wrong times, lost markers and unusual text: read whole, or refused by name."""
 
 import re
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.cli import main
 from dlo_casadi.errors import DloError, MeasurementError
-from dlo_casadi.recordings import CloudView, Recording, Stream, Wishes, make_session, read_recording
+from dlo_casadi.recordings import (
+    CloudView,
+    Recording,
+    Stream,
+    Wishes,
+    make_session,
+    mocap,
+    read_recording,
+)
 from dlo_casadi.recordings.lost import without_held
 from dlo_casadi.recordings.stills import find_stills
 
@@ -94,6 +103,17 @@ def test_a_blank_line_ends_no_section(sources, tmp_path):
     file.write_text("\n".join([*lines[:50], "", *lines[50:], "Devices", "1000", "volts", "1"]))
     found = read_recording([file]).of("marker").values()
     assert {len(stream.t) for stream in found} == {len(lines) - 6}
+
+
+def test_a_row_of_a_long_vicon_file_is_judged_without_a_copy_of_all_rows():
+    """Which made the time to read a file grow with the square of its length."""
+    rows = [["Trajectories"], ["100"], *[["1", "0", "0.5"]] * 100_000]
+    tracemalloc.start()
+    opened = [mocap._opens_section(rows, k) for k in (0, 1, 50_000, len(rows) - 1)]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert opened == [True, False, False, False]
+    assert peak < 100_000  # bytes; the pointers to all rows take 800 kB
 
 
 def in_pose(take, k):

@@ -152,7 +152,7 @@ def _opens_section(rows: Rows, k: int) -> bool:
 
     A blank row alone ends no section: frames may follow it.
     """
-    name, below = ("".join(row[:1]).strip() for row in (rows[k], [*rows, []][k + 1]))
+    name, below = ("".join(row[:1]).strip() for row in [*rows[k : k + 2], []][:2])
     named = name in _SECTIONS or (name and _is_number(below) and not _is_number(name))
     return bool(named) and not (k and any(map(str.strip, rows[k - 1])))
 
