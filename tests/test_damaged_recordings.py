@@ -22,7 +22,7 @@ from dlo_casadi.recordings import (
     read_recording,
 )
 from dlo_casadi.recordings.lost import without_held
-from dlo_casadi.recordings.stills import find_stills
+from dlo_casadi.recordings.stills import align_clocks, find_stills
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
 
@@ -94,6 +94,16 @@ def test_clocks_that_do_not_agree_need_no_memory(take):
     streams = (replace(first, t=first.t + 1.7e9), *others)
     with pytest.raises(MeasurementError, match=r"(?s)times run from .* frames .*Try: "):
         make_session("loom", Recording(streams), Wishes())
+
+
+def test_a_fast_force_sensor_makes_no_recording_too_long(take):
+    """Speeds are compared at the rate of what moves."""
+    t = np.arange(0.0, 1e-3, 1e-6)
+    sensor = Stream("ft", "wrench", t, np.zeros((len(t), 6)), "take", file="take")
+    recording = recording_of(take)
+    moved, _ = align_clocks(replace(recording, streams=(*recording.streams, sensor)))
+    exact, _ = align_clocks(recording)
+    assert moved.streams[0].t == pytest.approx(exact.streams[0].t)
 
 
 def test_a_blank_line_ends_no_section(sources, tmp_path):

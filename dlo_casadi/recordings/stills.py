@@ -103,8 +103,8 @@ def align_clocks(recording: Recording) -> tuple[Recording, tuple[Offset, ...]]:
     clocks = tuple(dict.fromkeys(s.clock for s in recording.streams if s.moves))
     if not clocks:
         return recording, ()
-    dt = _period(recording.streams)
     moving = [stream for stream in recording.streams if stream.moves]
+    dt = _period(moving)
     speeds = [_speed([s for s in moving if s.clock == c], dt) for c in clocks]
     first, reference = speeds[0]
     offsets = []
