@@ -1,5 +1,7 @@
 """Bags whose frames, forces and clouds are given in other ways than the rendered takes do it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from recorded.takes import marker_message
@@ -190,3 +192,18 @@ def test_markers_of_a_bag_may_be_in_millimetres(tmp_path):
     found = read_recording(files, view=CloudView(units="mm")).of("marker")
     place = Rotation.from_quat(MOUNT[3:]).apply(POINTS[1]) + MOUNT[:3]
     assert found["a_01"].values[0] == pytest.approx(place)
+
+
+def test_clouds_without_a_stamp_have_the_times_of_receipt(tmp_path):
+    """Like the gripper beside them."""
+    bare = replace(cloud(), header=header(0.0, "world"))
+    hand = MSG["PoseStamped"](header(0.0, "world"), pose(STILL))
+    sent = [
+        (topic, message, t)
+        for t in (1.0, 2.0)
+        for topic, message in (("/depth", bare), ("/hand", hand))
+    ]
+    recording = read_recording(written(tmp_path, *sent))
+    assert [found.t for found in recording.clouds] == pytest.approx([1.0, 2.0])
+    assert recording.of("body")["hand"].t == pytest.approx([1.0, 2.0])
+    assert any("header stamps in depth, hand are zero" in text for text in recording.assumptions)

@@ -46,7 +46,7 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
     sent: dict[tuple[Kind, str, str, str], Sent] = {}  # of kind, name, topic, frame
     moved: dict[str, tuple[str, Sent]] = {}
     left_out: set[str] = set()
-    clouds: list[Any] = []
+    clouds: dict[str, Sent] = {}  # of topics; messages in place of values
     store = typesys.get_typestore(typesys.Stores.LATEST)
     with highlevel.AnyReader([path], default_typestore=store) as reader:
         topics = {item.topic: item.msgtype for item in reader.connections}
@@ -61,7 +61,7 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
                 for link in message.transforms:
                     _add(link, moved, received, topic.endswith("tf_static"))
             elif kind == "PointCloud2":
-                clouds.append(message)
+                clouds.setdefault(topic, []).append((_time(message), received, message))
             elif kind in _BODIES:
                 of, row = _BODIES[kind]
                 key = of, topic, topic, _frame(message)
@@ -77,6 +77,7 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
     unset: set[str] = set()  # topics
     rows = {key: _dated(items, key[2], unset) for key, items in sent.items()}
     links = {name: (parent, _dated(x, "tf", unset)) for name, (parent, x) in moved.items()}
+    messages = [row for topic, items in clouds.items() for row in _dated(items, topic, unset)]
     remarks = [f"markers {', '.join(sorted(left_out))} are left out: lines, lists or texts"]
     remarks *= bool(left_out)
     if unset:
@@ -95,7 +96,7 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
     seen_markers, zeros = without_zeros([x for x in sources if x.kind == "marker"])
     others = [x for x in sources if x.kind != "marker"]
     streams = [_rooted(stream, links) for stream in (*seen_markers, *others)]
-    seen = tuple(_cloud(message, links, scale) for message in clouds)
+    seen = tuple(_cloud(message, t, links, scale) for t, message in messages)
     roots = {x.frame for x in streams if x.kind != "wrench"} | {x.frame for x in seen}
     roots -= {x.name for x in streams if x.kind == "body"}
     told = tuple(
@@ -227,8 +228,8 @@ def _rooted(stream: Stream, links: Links) -> Stream:
     return replace(stream.moved(turn, place), frame=root)
 
 
-def _cloud(message: Any, links: Links, scale: float) -> Cloud:
-    """Read a sensor_msgs/PointCloud2."""
+def _cloud(message: Any, t: float, links: Links, scale: float) -> Cloud:
+    """Read a sensor_msgs/PointCloud2 of the time t [s]."""
     order = ">" if message.is_bigendian else "<"
     kind: Any = {
         "names": [f.name for f in message.fields],
@@ -238,7 +239,7 @@ def _cloud(message: Any, links: Links, scale: float) -> Cloud:
     }
     shape, steps = (message.height, message.width), (message.row_step, message.point_step)
     cloud = cloud_of(np.ndarray(shape, np.dtype(kind), bytes(message.data), 0, steps).ravel())
-    t, frame = _time(message), _frame(message)
+    frame = _frame(message)
     root, place, turn = _in_root(frame, links, np.array([t]))
     return Cloud(
         turn[0].apply(scale * cloud.points) + place,
