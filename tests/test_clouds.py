@@ -14,7 +14,8 @@ from dlo_casadi.cli import main
 from dlo_casadi.config import load_config
 from dlo_casadi.errors import MeasurementError, VisionError
 from dlo_casadi.io.points import read_points
-from dlo_casadi.recordings import CloudView, read_recording
+from dlo_casadi.recordings import CloudView, Recording, Stream, Wishes, make_session, read_recording
+from dlo_casadi.recordings.recording import Cloud
 from dlo_casadi.recordings.stills import Gripper, along_cable
 from dlo_casadi.vision import KnownCable, line_in_cloud, of_color
 
@@ -256,6 +257,24 @@ def test_a_cloud_of_too_few_points(length, diameter):
     cable = KnownCable(np.zeros(3), np.array([length, 0.0, 0.0]), diameter, length)
     with pytest.raises(VisionError, match=r"have the 5 points per cm .* Try: "):
         line_in_cloud(points, cable, None)
+
+
+def test_clouds_from_two_sides_are_not_moved_along_one_line_of_sight(clouds, take):
+    """The second camera sees the cable's other side: its clouds are left out, which is said."""
+    streams = [Stream(name, "body", take.t, x) for name, x in take.bodies.items()]
+    seen, random = [], np.random.default_rng(1)
+    for k, (points, colors) in enumerate(clouds):
+        middle = SHAPES[POSES[k].name].mean(axis=0)
+        other, painted = depth_cloud(SHAPES[POSES[k].name], 0.0035, 2 * middle - PLACE, UP, random)
+        t = k * (HOLD + MOVE) + 0.5 * HOLD
+        seen.append(Cloud(points[of_color(colors, CABLE)], None, PLACE, t))
+        seen.append(Cloud(other[of_color(painted, CABLE)], None, 2 * middle - PLACE, t))
+    known = {"length": 0.9, "diameter": 0.007}
+    session = make_session("loom", Recording((*streams,), (*seen,)), Wishes(known=known))
+    sight = (PLACE - SHAPES[POSES[0].name].mean(axis=0)) / 1.2
+    off = errors(session.points["pose_01.csv"][0], POSES[0].name)
+    assert abs((off @ sight).mean()) < 0.15e-3
+    assert "1 cloud from another place of the camera left out" in session.poses[0]["remark"]
 
 
 def test_a_cloud_of_a_whole_room_is_refused_before_memory_ends():
