@@ -207,3 +207,13 @@ def test_clouds_without_a_stamp_have_the_times_of_receipt(tmp_path):
     assert [found.t for found in recording.clouds] == pytest.approx([1.0, 2.0])
     assert recording.of("body")["hand"].t == pytest.approx([1.0, 2.0])
     assert any("header stamps in depth, hand are zero" in text for text in recording.assumptions)
+
+
+def test_a_cloud_without_the_cable_costs_no_other(tmp_path):
+    """Something hid it between two poses; that no cloud of a bag shows it is told."""
+    seen, hidden = cloud(), replace(cloud(), data=np.zeros_like(cloud().data))
+    bag = written(tmp_path, ("/depth", seen), ("/depth", hidden))
+    (found,) = read_recording(bag, view=CloudView(box=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))).clouds
+    assert len(found.points) == 2
+    with pytest.raises(MeasurementError, match=r"none of its 8 points is finite, inside --box"):
+        read_recording(bag, view=CloudView(box=(7.0, 7.0, 7.0, 7.5, 7.5, 7.5)))

@@ -56,7 +56,7 @@ def read_recording(
         try:
             read = _read(path, METRES[view.units])
             streams = tuple(_of_file(stream, label) for stream in read.streams)
-            clouds = tuple(_of_file(view.of(cloud), label) for cloud in read.clouds)
+            clouds = tuple(_of_file(cloud, label) for cloud in view.of_all(read.clouds))
             found.append(replace(read, streams=streams, clouds=clouds).with_z_up(up))
         except MeasurementError as error:
             raise MeasurementError(error.message, pose=label) from error

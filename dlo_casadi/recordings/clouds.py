@@ -41,11 +41,21 @@ class CloudView:
         require(shown, "color", self.color, "red, green and blue from 0 to 255")
         require(bool(np.isfinite(self.box).all()), "box", self.box, "six numbers in metres")
 
-    def of(self, cloud: Cloud) -> Cloud:
-        """Keep only the points of the cable.
+    def of_all(self, clouds: Sequence[Cloud]) -> tuple[Cloud, ...]:
+        """Keep only the points of the cable; clouds without any are left out.
 
-        Raises MeasurementError if no points are left, or if they have no colour.
+        Raises MeasurementError if no points are left in any cloud, or if they have no colour.
         """
+        found = tuple(kept for kept in map(self._of, clouds) if len(kept.points))
+        if clouds and not found:
+            points = counted(sum(len(cloud.points) for cloud in clouds), "point")
+            raise MeasurementError(
+                f"none of its {points} is finite, inside --box and of --color.\n"
+                "  Try: other corners or another colour; --units."
+            )
+        return found
+
+    def _of(self, cloud: Cloud) -> Cloud:
         points = cloud.points
         kept = np.isfinite(points).all(axis=1)
         if self.color:
@@ -57,11 +67,6 @@ class CloudView:
         if self.box:
             corners = np.sort(np.reshape(self.box, (2, 3)), axis=0)
             kept &= ((points >= corners[0]) & (points <= corners[1])).all(axis=1)
-        if not kept.any():
-            raise MeasurementError(
-                f"none of its {counted(len(points), 'point')} is finite, inside --box and of "
-                "--color.\n  Try: other corners or another colour; --units."
-            )
         camera = np.array(self.camera) if self.camera else cloud.camera
         return replace(cloud, points=points[kept], colors=None, camera=camera)
 
