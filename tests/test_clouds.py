@@ -277,6 +277,13 @@ def test_clouds_from_two_sides_are_not_moved_along_one_line_of_sight(clouds, tak
     assert "1 cloud from another place of the camera left out" in session.poses[0]["remark"]
 
 
+def test_options_for_markers_are_refused_beside_clouds(take):
+    streams = [Stream(name, "body", take.t, x) for name, x in take.bodies.items()]
+    recording = Recording((*streams,), (Cloud(np.zeros((1, 3))),))
+    with pytest.raises(MeasurementError, match=r"--cable and --at tell of markers, .*\n  Try: "):
+        make_session("loom", recording, Wishes(cable="m", at=(0.1, 0.2)))
+
+
 def test_a_cloud_of_a_whole_room_is_refused_before_memory_ends():
     x, y = np.meshgrid(np.arange(0.0, 2.0, 0.005), np.arange(0.0, 2.0, 0.005))
     wall = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)

@@ -219,6 +219,12 @@ def _cloud_lines(
 ) -> tuple[list[FloatArray], list[str]]:
     """Line of the cable (K, 3) [m] in each pose, from all its clouds, and remarks on it."""
     clouds = recording.clouds
+    asked = " and ".join(f"--{key}" for key in ("cable", "at") if getattr(wishes, key))
+    if asked:
+        raise MeasurementError(
+            f"{asked} tell of markers, but the cable is found in the clouds of this recording.\n"
+            f"  Try: without {asked}; or without the clouds."
+        )
     missing = [key for key in ("length", "diameter") if key not in wishes.known]
     if missing or start is None:
         raise MeasurementError(
