@@ -29,9 +29,16 @@ _CHECKED: dict[str, tuple[str, str, float]] = {
 _OPTIONAL = ("seen", "confidence", "pixel", "markers")
 
 
+class _Verbatim(Table):
+    """A table that prints text as it is: brackets in a name are no markup."""
+
+    def add_row(self, *cells: RenderableType | None, **style: Any) -> None:
+        super().add_row(*(Text(x) if isinstance(x, str) else x for x in cells), **style)
+
+
 def plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -> Table:
     """A table with columns of words, then of numbers."""
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    table = _Verbatim(title=Text(title, "bold"), title_justify="left", box=box.SIMPLE_HEAD)
     for column in words:
         table.add_column(column)
     for column in numbers:

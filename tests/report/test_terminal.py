@@ -1,6 +1,7 @@
 """What the terminal says, word for word where it matters."""
 
 from dataclasses import replace
+from io import StringIO
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import page_data
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.tables import describe, stage_rows, unidentified
-from dlo_casadi.report.terminal import print_summary
+from dlo_casadi.report.terminal import plain_table, print_summary
 from dlo_casadi.report.words import finding_of, separation_text, structure_lines
 from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.show.text import plus_minus
@@ -253,3 +254,13 @@ def test_digits_follow_the_standard_deviation(value, std, text):
 
 def test_an_unbounded_parameter_has_no_number():
     assert unidentified(Estimate(1.0, 1.0, "m")) == "unknown"
+
+
+def test_brackets_in_a_name_are_no_markup():
+    console = Console(width=120, record=True, file=StringIO())
+    table = plain_table("loom [/v2]: limits", ["pose"])
+    table.add_row("take [a]", style="red")
+    console.print(table)
+    text = " ".join(console.export_text().split())
+    assert "loom [/v2]: limits" in text
+    assert "take [a]" in text
