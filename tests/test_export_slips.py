@@ -1,5 +1,8 @@
 """Exports of simple cables: nothing is lost without a reason, and wrong numbers are refused."""
 
+import ast
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 
@@ -52,3 +55,12 @@ def test_numbers_that_are_too_small(options, said, tmp_path):
     rope = dlo.known_cable(ROPE, gravity=(0, -9.81), boundary={"start": "pinned", "end": "pinned"})
     with pytest.raises(dlo.DloError, match=said):
         rope.export("mujoco", tmp_path / "rope.xml", end=(0.5, 0.1), **options)
+
+
+@pytest.mark.parametrize("target", ["mujoco", "pyelastica", "newton"])
+def test_a_name_of_two_lines_breaks_no_file(target, tmp_path):
+    known = ROPE | {"name": "rope\nb = 1 / 0\x07"}
+    rope = dlo.known_cable(known, gravity=(0, -9.81), boundary={"start": "pinned", "end": "pinned"})
+    (path,) = rope.export(target, tmp_path / "rope", end=(0.5, 0.1), segments=6)
+    read = ElementTree.fromstring if target == "mujoco" else ast.parse
+    read(path.read_text())

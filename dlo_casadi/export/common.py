@@ -19,6 +19,11 @@ def rounded(values: FloatArray) -> list:
     return np.vectorize(lambda x: float(f"{x:.12g}"))(values).tolist()
 
 
+def printable(text: str) -> str:
+    """Text in one line: a line break would end the comment of Python that holds it."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
 def array(values: FloatArray) -> str:
     """Format an array in Python, one row a line."""
     rows = ",\n    ".join(map(str, rounded(values)))

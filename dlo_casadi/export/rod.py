@@ -26,6 +26,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.export.common import printable
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import node_places
@@ -183,7 +184,7 @@ class Rod:
         features |= {"clips": ()} if pose.clips else {}
         features |= {"obstacles": ()} if model.surfaces else {}
         return cls(
-            name=model.cable.name,
+            name=printable(model.cable.name),
             node=model.node,
             h=h * stretch,
             s=s,

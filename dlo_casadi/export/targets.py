@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.errors import DloError, EquilibriumError, OutputError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
-from dlo_casadi.export.common import Relaxed
+from dlo_casadi.export.common import Relaxed, printable
 from dlo_casadi.export.rod import Feature, Rod, SolvedCable
 from dlo_casadi.io.files import is_marked, write_file
 
@@ -212,7 +212,7 @@ def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence
     costs = [f"{feature}: {cost}" for feature, cost in lost.items()]
     return [
         f"{rod.name}: {MARK} {target.title}",
-        *origin,
+        *map(printable, origin),
         "SI units: m, kg, s, N, rad.",
         "",
         *known,
