@@ -1,6 +1,7 @@
 """Bags whose frames, forces and clouds are given in other ways than the rendered takes do it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings import CloudView, Wishes, make_session, read_recording
+from dlo_casadi.recordings.bags import _markers
 from dlo_casadi.recordings.stills import align_clocks, find_stills
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
@@ -180,6 +182,21 @@ def test_what_is_deleted_or_a_line_is_no_marker(tmp_path):
     recording = read_recording(written(tmp_path, *sent))
     assert [*recording.of("marker")] == ["m0_0", "m1_0", "m2_0"]
     assert recording.assumptions[0] == "markers strip_0 are left out: lines, lists or texts"
+
+
+def test_markers_without_a_name_keep_their_number_when_one_is_lost():
+    """As mocap4r2_msgs has them: only those that are seen are in a message."""
+    names = []
+    for seen in ((0, 1, 2), (0, 2)):
+        items = [
+            SimpleNamespace(
+                id_type=1, marker_index=k, marker_name="", translation=MSG["Point"](0.1 * k, 0, 0)
+            )
+            for k in seen
+        ]
+        found = _markers(SimpleNamespace(markers=items), "Markers", "mocap")
+        names.append([(name, place[0]) for name, _, place in found])
+    assert names[1] == [names[0][0], names[0][2]]
 
 
 def test_markers_of_a_bag_may_be_in_millimetres(tmp_path):

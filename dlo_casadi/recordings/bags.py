@@ -24,6 +24,7 @@ _WANTED = (
 # Types of visualization_msgs/Marker whose pose is a place of something: arrow, cube, sphere,
 # cylinder, mesh. Lines, lists and texts have their own points or none.
 _PLACED = {0, 1, 2, 3, 10}
+_BY_INDEX = 1  # id_type of a mocap4r2_msgs/Marker that has no name, but a `marker_index`
 _SINCE_1970 = 1e6  # s; stamps beyond it are not counted from the start of a simulation
 _ORIGIN = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 Rows = list[tuple[float, list[float]]]  # times [s] and values
@@ -162,7 +163,8 @@ def _markers(message: Any, kind: str, topic: str) -> Iterator[tuple[str, Any, li
             continue
         texts = [getattr(item, key, "") for key in ("ns", "marker_name", "name")]
         named = [text for text in texts if text]
-        number = getattr(item, "id", "" if named else f"{k:02d}")
+        index = item.marker_index if getattr(item, "id_type", 0) == _BY_INDEX else k
+        number = getattr(item, "id", "" if named else f"{index:02d}")
         name = "_".join(str(part) for part in (*(named or [topic]), number) if part != "")
         placed = not hasattr(item, "action") or item.type in _PLACED
         holder = item if hasattr(item, "header") else message
