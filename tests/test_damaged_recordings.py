@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded.takes import HOLD, MOVE, rendered, write_motive, write_vicon
+from recorded.takes import HOLD, MOVE, rendered, write_c3d, write_motive, write_vicon
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.cli import main
@@ -290,6 +290,14 @@ def test_exchanged_labels_name_their_pose(take):
         markers[one][there] = take.markers[other][there]
     with pytest.raises(MeasurementError, match="are labels exchanged in pose 3"):
         make_session("loom", recording_of(replace(take, markers=markers)), Wishes())
+
+
+def test_a_screen_axis_that_is_not_read_is_not_said_to_be_followed(take, tmp_path):
+    pytest.importorskip("ezc3d", reason="the extra `recordings` is not installed")
+    file = write_c3d(take, tmp_path)[0][0]
+    file.write_bytes(file.read_bytes().replace(b"+Y", b"-Y"))
+    (told,) = (text for text in read_recording([file]).assumptions if "--up" in text)
+    assert told == "z is up, in most C3D files; POINT:Y_SCREEN is -Y; or --up"
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])

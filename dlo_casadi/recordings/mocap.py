@@ -246,7 +246,8 @@ def read_c3d(path: Path) -> Recording:
     scale = factor("".join(point.get("UNITS", [])[:1]) or "mm")  # mm by the standard
     streams = [Stream(labels[k], "marker", t, scale * places[:, k].T) for k in named]
     screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
-    own = screen.lstrip("+") if screen.lstrip("+") in ("x", "y", "z") else "z"
-    said = "as POINT:Y_SCREEN tells" if screen else "in most C3D files; POINT:Y_SCREEN is absent"
+    own, said = screen.lstrip("+"), "as POINT:Y_SCREEN tells"
+    if own not in ("x", "y", "z"):
+        own, said = "z", f"in most C3D files; POINT:Y_SCREEN is {screen.upper() or 'absent'}"
     seen, zeros = without_zeros(streams)
     return Recording(seen, (), zeros, up=own, up_by=said)
