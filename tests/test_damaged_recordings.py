@@ -284,6 +284,19 @@ def test_a_gripper_at_the_end_alone_tells_the_order(way, take):
         assert s - s[0] == pytest.approx(at - at[0], abs=2e-3)
 
 
+@pytest.mark.parametrize("third", ["y", "x"])
+def test_markers_of_a_gripper_in_one_line_are_refused(third, take):
+    """Their noise would turn it about that line; a marker that is named twice is in it, too."""
+    place = take.bodies["start"][:, :3]
+    ways = {"o": [0.0, 0.0, 0.0], "x": [0.05, 0.0, 0.0], "y": [0.1, 1e-4, 0.0]}
+    markers = take.markers | {name: place + np.array(way) for name, way in ways.items()}
+    recording = recording_of(replace(take, markers=markers))
+    with pytest.raises(
+        MeasurementError, match=rf"markers o,x,{third} at the start are in one line"
+    ):
+        make_session("loom", recording, Wishes(start=f"o,x,{third}"))
+
+
 def test_exchanged_labels_name_their_pose(take):
     there, markers = in_pose(take, 2), {name: x.copy() for name, x in take.markers.items()}
     for one, other in (("m02", "m07"), ("m07", "m02")):

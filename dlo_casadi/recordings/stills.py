@@ -308,6 +308,7 @@ def _jitter(x: FloatArray) -> float:
 # ---- grippers ------------------------------------------------------------------------------------
 
 _INSIDE = 0.05  # share of a line's length, beyond the noise and the hidden ends of lines in clouds
+_IN_LINE = 0.05  # smallest sine of the angle at the first of three markers on a gripper
 _STRAY = 0.5  # smallest cosine at which a gripper's axis may be the cable's
 
 
@@ -330,7 +331,14 @@ def find_gripper(
     if name.count(",") == 2:
         o, x, y = (_means(stills, "marker", part.strip(), recording) for part in name.split(","))
         first = unit(x - o)
-        third = unit(np.cross(first, y - o))
+        across = np.cross(first, unit(y - o))
+        sines = np.linalg.norm(across, axis=1)
+        if sines.min() < _IN_LINE:
+            raise MeasurementError(
+                f"markers {name} at the {side} are in one line in pose {sines.argmin() + 1}: they "
+                "do not tell how the gripper is turned about it.\n  Try: a third marker beside it."
+            )
+        third = unit(across)
         frames = np.stack([first, np.cross(third, first), third], axis=2)
         return Gripper(o + frames @ np.array(offset or np.zeros(3)), frames)
     bodies = recording.of("body")
