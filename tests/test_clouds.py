@@ -15,6 +15,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.errors import MeasurementError, VisionError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.recordings import CloudView, Recording, Stream, Wishes, make_session, read_recording
+from dlo_casadi.recordings.clouds import cloud_of
 from dlo_casadi.recordings.recording import Cloud
 from dlo_casadi.recordings.stills import Gripper, along_cable
 from dlo_casadi.vision import KnownCable, line_in_cloud, of_color
@@ -282,6 +283,13 @@ def test_options_for_markers_are_refused_beside_clouds(take):
     recording = Recording((*streams,), (Cloud(np.zeros((1, 3))),))
     with pytest.raises(MeasurementError, match=r"--cable and --at tell of markers, .*\n  Try: "):
         make_session("loom", recording, Wishes(cable="m", at=(0.1, 0.2)))
+
+
+def test_packed_colours_may_have_an_opacity():
+    """As PCL and depth cameras write them: the first byte is the opacity."""
+    table = np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("rgba", "u4")])
+    table["rgba"] = 0xFF102030
+    assert cloud_of(table).colors == pytest.approx(np.tile([16.0, 32.0, 48.0], (2, 1)))
 
 
 def test_a_cloud_of_a_whole_room_is_refused_before_memory_ends():

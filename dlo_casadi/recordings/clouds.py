@@ -86,7 +86,7 @@ def read_cloud(path: Path, scale: float = 1.0) -> Recording:
 
 
 def cloud_of(table: Any) -> Cloud:
-    """Cloud of a structured array: x, y, z, and red, green, blue or PCL's packed `rgb` if any."""
+    """Cloud of a structured array: x, y, z; red, green, blue or packed `rgb` or `rgba`, if any."""
     names = table.dtype.names
     if not {"x", "y", "z"} <= set(names):
         raise MeasurementError(
@@ -96,8 +96,9 @@ def cloud_of(table: Any) -> Cloud:
     colors = None
     if {"red", "green", "blue"} <= set(names):
         colors = np.column_stack([table[name].astype(float) for name in ("red", "green", "blue")])
-    elif "rgb" in names:
-        packed = table["rgb"].astype("f4" if table["rgb"].dtype.kind == "f" else "u4").view("u4")
+    elif both := {"rgb", "rgba"} & set(names):
+        packed = table[both.pop()]
+        packed = packed.astype("f4" if packed.dtype.kind == "f" else "u4").view("u4")
         colors = np.column_stack([(packed >> shift) & 255 for shift in (16, 8, 0)]).astype(float)
     return Cloud(points, colors)
 
