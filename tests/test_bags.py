@@ -234,3 +234,12 @@ def test_a_cloud_without_the_cable_costs_no_other(tmp_path):
     assert len(found.points) == 2
     with pytest.raises(MeasurementError, match=r"none of its 8 points is finite, inside --box"):
         read_recording(bag, view=CloudView(box=(7.0, 7.0, 7.0, 7.5, 7.5, 7.5)))
+
+
+def test_a_frame_that_changes_its_parent_is_left_out_with_a_remark(tmp_path):
+    """A plug that is taken from a table by a hand: its poses in both do not mix."""
+    held = [("/tf_static", tf(0.0, "world", name, MOUNT)) for name in ("table", "hand")]
+    moved = [("/tf", tf(t, "table" if t < 4.0 else "hand", "plug", STILL)) for t in T]
+    recording = read_recording(written(tmp_path, *held, *moved, *cable()))
+    assert set(recording.of("body")) == {"table", "hand"}
+    assert "frames plug of TF have several parents: left out" in recording.assumptions

@@ -46,6 +46,7 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
     typesys = library("rosbags.typesys", "recordings", "reading this file")
     sent: dict[tuple[Kind, str, str, str], Sent] = {}  # of kind, name, topic, frame
     moved: dict[str, tuple[str, Sent]] = {}
+    torn: set[str] = set()  # frames with several parents
     left_out: set[str] = set()
     clouds: dict[str, Sent] = {}  # of topics; messages in place of values
     store = typesys.get_typestore(typesys.Stores.LATEST)
@@ -60,7 +61,7 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
             message = reader.deserialize(raw, connection.msgtype)
             if kind == "TFMessage":
                 for link in message.transforms:
-                    _add(link, moved, received, topic.endswith("tf_static"))
+                    _add(link, moved, torn, received, topic.endswith("tf_static"))
             elif kind == "PointCloud2":
                 clouds.setdefault(topic, []).append((_time(message), received, message))
             elif kind in _BODIES:
@@ -75,12 +76,15 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
                     key = "marker", name, topic, _frame(holder)
                     place = [scale * x for x in place]
                     sent.setdefault(key, []).append((_time(holder), received, place))
+    moved = {name: link for name, link in moved.items() if name not in torn}
     unset: set[str] = set()  # topics
     rows = {key: _dated(items, key[2], unset) for key, items in sent.items()}
     links = {name: (parent, _dated(x, "tf", unset)) for name, (parent, x) in moved.items()}
     messages = [row for topic, items in clouds.items() for row in _dated(items, topic, unset)]
     remarks = [f"markers {', '.join(sorted(left_out))} are left out: lines, lists or texts"]
     remarks *= bool(left_out)
+    if torn:
+        remarks.append(f"frames {', '.join(sorted(torn))} of TF have several parents: left out")
     if unset:
         remarks.append(
             f"header stamps in {', '.join(sorted(unset))} are zero: the times at which the bag "
@@ -171,13 +175,20 @@ def _markers(message: Any, kind: str, topic: str) -> Iterator[tuple[str, Any, li
         yield name, holder, _vector(place) if placed else None
 
 
-def _add(link: Any, links: dict[str, tuple[str, Sent]], received: float, static: bool) -> None:
-    """Add a TransformStamped to TF; of a static one only the last pose is valid."""
+def _add(
+    link: Any, links: dict[str, tuple[str, Sent]], torn: set[str], received: float, static: bool
+) -> None:
+    """Add a TransformStamped to TF; of a static one only the last pose is valid.
+
+    `torn` gets the name of a frame that has another parent than before: its poses do not mix.
+    """
     pose = _pose(link.transform.translation, link.transform.rotation)
-    itself = link.child_frame_id.strip("/") == _frame(link)
-    if itself or not np.isfinite(pose).all() or not any(pose[3:]):
+    frame, parent = link.child_frame_id.strip("/"), _frame(link)
+    if frame == parent or not np.isfinite(pose).all() or not any(pose[3:]):
         return
-    _, poses = links.setdefault(link.child_frame_id.strip("/"), (_frame(link), []))
+    known, poses = links.setdefault(frame, (parent, []))
+    if known != parent:
+        torn.add(frame)
     if static:
         poses.clear()
     poses.append((_time(link), received, pose))
