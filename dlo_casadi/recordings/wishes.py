@@ -51,7 +51,7 @@ class Wishes:
             )
         if len(self.at):
             longest = self.known.get("length", np.inf)
-            ordered = all(np.diff([0.0, *self.at])[1:] > 0.0) and self.at[0] >= 0.0
+            ordered = all(np.diff(self.at) > 0.0) and self.at[0] >= 0.0
             wanted = "arc lengths in metres, each larger than the one before"
             if "length" in self.known:
                 wanted += f", from 0 to --length {longest:g}"
