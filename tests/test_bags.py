@@ -243,3 +243,14 @@ def test_a_frame_that_changes_its_parent_is_left_out_with_a_remark(tmp_path):
     recording = read_recording(written(tmp_path, *held, *moved, *cable()))
     assert set(recording.of("body")) == {"table", "hand"}
     assert "frames plug of TF have several parents: left out" in recording.assumptions
+
+
+def test_a_frame_without_a_name_is_told_as_such(tmp_path):
+    fixed = [
+        ("/tf_static", tf(0.0, "base", "start", STILL)),
+        ("/tf_static", tf(0.0, "base", "end", np.array([0.4, *STILL[1:]]))),
+    ]
+    recording = read_recording(written(tmp_path, *fixed, *cable("")))
+    session = make_session("loom", recording, Wishes(at=(0.1, 0.2, 0.3)))
+    told = "come from several frames (base, one without a name)"
+    assert any(told in text for text in session.remarks)

@@ -111,10 +111,9 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     used += [s for s in recording.streams if s.kind == "marker" or [s.name] in holders]
     frames = {(item.file, item.frame) for item in used}
     if start is not None and len(frames) > 1:
-        files = {item.file for item in used}
-        origin = (
-            "files" if len(files) > 1 else f"frames ({', '.join(sorted(x for _, x in frames))})"
-        )
+        origin = "files"
+        if len({item.file for item in used}) == 1:
+            origin = f"frames ({', '.join(sorted(x or 'one without a name' for _, x in frames))})"
         remarks.append(
             "world frame: cable and grippers are taken to have the same origin and axes, though "
             f"they come from several {origin}, and nothing here registers them. If theirs differ, "
