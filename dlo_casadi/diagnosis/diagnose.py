@@ -344,8 +344,9 @@ class Search:
                 tried = len(candidates_of(smaller, self.center, self.exclude))
                 needless = p_of_removal(fit, smaller, effect.candidate, tried) > self.significance
             if needless:
-                fit = settle(smaller)
-                added = [item for item in added if item is not effect]
+                with suppress(EstimationError):  # else there is no fit without it
+                    fit = settle(smaller)
+                    added = [item for item in added if item is not effect]
             elif effect.after is not added[-1].after and (effect.rivals or not misfits(smaller)):
                 fit, chosen = self._judged_again(fit, smaller, effect)
                 added = [chosen if item is effect else item for item in added]
