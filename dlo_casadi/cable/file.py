@@ -238,7 +238,7 @@ def load(path: str | Path) -> FittedCable:
     source = Path(path)
     if os.path.isdir(source):
         source = source / FILE
-        if not source.is_file():
+        if not os.path.isfile(source):
             raise ConfigError(f"no {FILE} in this folder.{_results_near(source)}", source.parent)
     elif not os.path.exists(source):
         raise ConfigError(f"no such file or folder of results.{_results_near(source)}", source)
@@ -283,7 +283,7 @@ def _results_near(path: Path) -> str:
         folder.name: folder
         for base in (wanted.parent / "results", wanted.parent)
         for folder in sorted(base.glob("*"))
-        if (folder / FILE).is_file()
+        if os.path.isfile(folder / FILE)  # False in a folder that must not be read
     }
     names = difflib.get_close_matches(wanted.name, known, 1) or list(known)[:_LISTED]
     listed = ", ".join(str(known[name]) for name in names)

@@ -1,6 +1,7 @@
 """parameters.yaml rebuilds the model exactly, and says what is wrong with a damaged file."""
 
 import math
+import os
 import pickle
 import re
 from dataclasses import replace
@@ -402,6 +403,21 @@ def test_a_fit_that_ends_at_a_bound_can_be_read(outcome, tmp_path):
 def test_a_missing_file_is_a_clear_error(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         load(tmp_path / "parameters.yaml")
+
+
+def test_a_folder_that_must_not_be_read_is_beside_a_wrong_path(tmp_path, monkeypatch):
+    (tmp_path / "locked").mkdir()
+    stat = os.stat
+
+    def refused(path, **options):
+        if "locked/" in str(path):
+            raise PermissionError(path)
+        return stat(path, **options)
+
+    monkeypatch.setattr(os, "stat", refused)
+    for path, said in (("nothing", "no such file or folder"), ("locked", "no parameters.yaml")):
+        with pytest.raises(ConfigError, match=said):
+            load(tmp_path / path)
 
 
 def test_a_configuration_is_no_parameter_file():
