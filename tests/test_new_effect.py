@@ -14,7 +14,17 @@ import yaml
 import dlo_casadi as dlo
 from dlo_casadi.cable.file import load
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import EFFECTS, CableData, Effect, Fitted, PointForce, PointLoad, Setup
+from dlo_casadi.effects import (
+    EFFECTS,
+    AxialStretch,
+    CableData,
+    Effect,
+    Fitted,
+    Kinematics,
+    PointForce,
+    PointLoad,
+    Setup,
+)
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt
 from dlo_casadi.effects.registry import Registry
@@ -228,6 +238,23 @@ def test_a_mistake_in_an_effect_is_told_when_it_is_registered(name, kind, said):
     with pytest.raises(DloError, match=f"(?s){said}"):
         EFFECTS[name] = kind
     assert EFFECTS.get(name) is not kind
+
+
+def test_a_compliance_of_ones_own_stretches_the_cable():
+    class Rubber(Kinematics):
+        name = "rubber"
+        declared = (Parameter("softness", "1/N", lower=0.0),)
+
+        def compliance(self, params):
+            return params["softness"]
+
+    cable, pose = CableData(0.8, 0.2, 0.01, 0.1), HeldPose((0.0, 0.0), (0.5, 0.1))
+    p, rest = np.array([0.1, 0.05]), np.zeros(12)
+    own, known = (
+        solve_equilibrium(CableModel(cable, 12, n_rest=0, effects=(one,)), p, rest, pose)
+        for one in (Rubber(), AxialStretch())
+    )
+    assert own.points == pytest.approx(known.points, abs=1e-12)
 
 
 def test_the_registry_accepts_the_effects_of_the_package():

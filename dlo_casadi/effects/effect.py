@@ -259,7 +259,11 @@ class Kinematics(Effect):
     """Kind `kinematics`: true length and axial strain."""
 
     kind: ClassVar[str] = "kinematics"
-    extensible: ClassVar[bool] = False
+
+    @property
+    def extensible(self) -> bool:
+        """Whether it lets the cable stretch under tension: it has a `compliance` of its own."""
+        return type(self).compliance is not Kinematics.compliance
 
     def stretch(self, cable: CableData, params: Params) -> ca.SX | float:
         """Uniform factor on the declared length. Factors multiply."""

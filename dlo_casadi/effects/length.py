@@ -51,7 +51,6 @@ class AxialStretch(Kinematics):
 
     name = "axial_stretch"
     inverses: ClassVar = {"compliance": ("axial_stiffness", "N")}
-    extensible = True
     declared = (Parameter("compliance", "1/N", scale=1e-3, lower=0.0, upper=1.0),)
 
     def compliance(self, params: Params) -> ca.SX:
