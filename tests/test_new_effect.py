@@ -26,7 +26,7 @@ from dlo_casadi.effects import (
     Setup,
 )
 from dlo_casadi.effects.cable import Parameter
-from dlo_casadi.effects.effect import Params, PointForceAt
+from dlo_casadi.effects.effect import Params, PointForceAt, SpringAt
 from dlo_casadi.effects.registry import Registry
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -221,9 +221,17 @@ class NoPlace(Plumb):
         return (PointForceAt(params["mass"] * gravity, params["position"]),)
 
 
+class Uncounted(Plumb):
+    name = "uncounted"
+
+    def springs(self, params):
+        return (SpringAt(params["mass"], ca.SX.zeros(2), ca.SX(0), params["position"]),)
+
+
 @pytest.mark.parametrize(
     ("name", "kind", "said"),
     [
+        ("uncounted", Uncounted, "its springs returns 1 spring, and n_springs is 0.*n_springs = 1"),
         ("no_place", NoPlace, "NoPlace .* one of its methods fails, KeyError: 'position'"),
         ("plumb", Plumb, "Plumb cannot be an effect: it has no law and would do nothing.*springs"),
         ("no_tuple", NoTuple, "NoTuple .* its forces must return a tuple of PointForceAt, found"),

@@ -13,7 +13,7 @@ from dlo_casadi.effects.effect import (
     PointForceAt,
     SpringAt,
 )
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, counted
 
 
 class Registry(dict[str, type[Effect]]):
@@ -79,7 +79,13 @@ def _wrong_values(kind: type[Effect]) -> Iterator[str]:
         symbols = {name: ca.SX.sym(name) for name in names}
         found = effect.forces(ca.SX(ca.DM(setup.gravity)), symbols)
         yield from _not_a_tuple("forces", found, PointForceAt)
-        yield from _not_a_tuple("springs", effect.springs(symbols), SpringAt)
+        springs = effect.springs(symbols)
+        yield from _not_a_tuple("springs", springs, SpringAt)
+        if len(springs) != effect.n_springs:
+            yield (
+                f"its springs returns {counted(len(springs), 'spring')}, and n_springs is "
+                f"{effect.n_springs}.\n  Try: n_springs = {len(springs)} in the class"
+            )
 
 
 def _not_a_tuple(method: str, found: object, item: type) -> Iterator[str]:
