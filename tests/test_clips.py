@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import CableData, ClipAngle, ClipOffset, ClipSlip
+from dlo_casadi.effects import CableData, ClipAngle, ClipOffset, ClipSlip, RestCurvatureDrift
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
@@ -338,6 +338,41 @@ def test_a_turned_saddle_and_its_derivatives(kind):
             lam.append(near.multipliers)
         assert change.curve[..., k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
         assert along.lam[0, :, k] == pytest.approx((lam[0] - lam[1]) / (2 * step), abs=1e-4)
+
+
+SADDLE = HeldClip("clamped", (0.31, 0.05), 0.365, heading=0.3)  # 0.3 elements before a node
+BENT = np.array([1.0, -2.0, 3.0, -2.0, 1.0])  # 1/m
+
+
+def test_a_drift_of_zero_leaves_the_rest_curvature_at_a_saddle_between_nodes():
+    model = CableModel(CABLE, 20, n_rest=5, clips=("clamped",), effects=(RestCurvatureDrift(),))
+    pose, rest = HeldPose((0.0, 0.0), (0.75, 0.1), clips=(SADDLE,)), model.rest_basis @ BENT
+    eq = solve_equilibrium(model, model.nominal, rest, pose)
+    given = Inputs.of(model.nominal, rest, pose.vector[None])
+    assert assembly_of(model).state_after(eq.shapes, given)[0][0] == pytest.approx(rest, abs=1e-15)
+
+
+def test_derivatives_of_what_a_pose_leaves_behind_at_a_saddle():
+    """They are those of the state after moved equilibria; slips move the edges of its cells."""
+    effects = (RestCurvatureDrift(), ClipSlip(), ClipAngle())
+    model = CableModel(CABLE, 20, n_rest=5, clips=("clamped",), effects=effects)
+    poses = [HeldPose((0.0, 0.0), end, clips=(SADDLE,)) for end in ((0.75, 0.1), (0.7, 0.15))]
+    equilibria, size = BatchEquilibrium(model, poses), len(model.names)
+    p, rest = np.array([*model.nominal[:1], 0.2, 0.003, 0.02]), model.rest_basis @ BENT
+    first = solve_equilibrium(model, p, rest, poses[0])
+    shapes, ok = equilibria.solve(first.shapes.subset([0, 0]), p, rest)
+    assert ok.all()
+    by_p, by_rest = np.eye(size, size + 5), np.hstack([np.zeros((20, size)), model.rest_basis])
+    along = equilibria.directions(shapes, p, rest, by_p, by_rest)
+    step = 1e-6
+    for k in range(1, size + 5):
+        both = []
+        for h in (step, -step):
+            varied = p + h * by_p[:, k], rest + h * by_rest[:, k]
+            there, _ = equilibria.solve(shapes, *varied, tolerance=1e-12)
+            both.append(equilibria.rests(there, *varied)[1])
+        expected = (both[0] - both[1]) / (2 * step)
+        assert along.rest[1, :, k] == pytest.approx(expected, rel=1e-5, abs=1e-4), k
 
 
 def test_the_tolerance_of_directions_is_of_saddles_too():

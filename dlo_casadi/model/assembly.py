@@ -7,7 +7,6 @@ to the derivatives of both and of the measured curve.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -21,6 +20,7 @@ from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, LastTouching, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
+from dlo_casadi.model.moved_clips import moved_clips
 from dlo_casadi.model.stacked import Inputs as Inputs
 from dlo_casadi.model.stacked import Mapped, repeated
 from dlo_casadi.model.stacked import Shapes as Shapes
@@ -29,8 +29,6 @@ from dlo_casadi.model.unheld import Unheld
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
 
-# Step of finite differences by slips of clips, relative to the length, and by their turns [rad].
-_STEP = 1e-6
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
 
@@ -94,7 +92,9 @@ class Assembly:
     def _under(self, lam: FloatArray, name: str, shapes: Shapes, given: Inputs) -> list[FloatArray]:
         """As `_call_segments`, under forces lam (m, n_segments, n_lam)."""
         count, clipped = self._segments, self.clipped(shapes, given)
-        own = clipped.rest(self.chain.rest_inside(given.rest[..., None]))[..., 0]
+        own = self.chain.rest_inside(given.rest[..., None])[..., 0]
+        if name != "segment_state":  # a state is of the even cells
+            own = clipped.rest(own[..., None])[..., 0]
         p, deviation = (repeated(one, count) for one in (given.p, shapes.deviation))
         both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
         if not self.model.clips:
@@ -246,18 +246,6 @@ class Assembly:
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
         return BalanceSlopes(self, shapes, given, segments, ends)
 
-    def moved_clips(
-        self, given: Inputs, along: Tangents
-    ) -> Iterator[tuple[FloatArray, tuple[Inputs, Inputs]]]:
-        """Central differences by slips and turns of clips: rates (m, q), and both inputs."""
-        slips, turns = functions_of(self.model).clip_slopes
-        for k in np.flatnonzero(slips.any(axis=0) | turns.any(axis=(0, 2))):
-            step = _STEP * (self.chain.length if slips[:, k].any() else 1.0)
-            unit = step * np.eye(given.p.shape[1])[k]
-            both = (replace(given, p=given.p + unit), replace(given, p=given.p - unit))
-            if along.p[:, k].any():
-                yield along.p[:, k] / (2 * step), both
-
     def add_by_numbers(
         self, total: FloatArray | float, blocks: FloatArray, along: Tangents, clipped: Clipped
     ) -> FloatArray:
@@ -360,9 +348,19 @@ class Assembly:
         The derivatives (m, n_rests, ...) are by both nodes (2b), by the cell's own rest strains
         (strains), by p (n_parameters), and by the pose's deviation (n_deviations).
         """
-        found = self._call_segments("segment_state", shapes, given)
-        after, *by = (self._stacked(part[:, self.chain.layout.bends]) for part in found)
+        after, *by = self._cells_after(shapes, given)
+        m, n_p = given.p.shape
+        # Only saddles move the edges of cells.
+        every = self.model.clamped_between * np.broadcast_to(np.eye(n_p), (m, n_p, n_p))
+        for rate, pair in moved_clips(self.model, given, every, turned=False):
+            more, less = (self._cells_after(shapes, one)[0] for one in pair)
+            by[2] = by[2] + (more - less) * rate[:, None]
         return (after[..., 0], *by)
+
+    def _cells_after(self, shapes: Shapes, given: Inputs) -> list[FloatArray]:
+        """As `state_after`, with the derivatives by p at fixed edges of the cells."""
+        found = self._call_segments("segment_state", shapes, given)
+        return [self._stacked(part[:, self.chain.layout.bends]) for part in found]
 
     def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
         """Whether poses leave the rest curvature unchanged, to first order."""
@@ -409,7 +407,7 @@ class BalanceSlopes:
         if touching := a.touching(shapes, given):
             total = touching.along(total, changed[:, :, a._pull], a._outwards @ d.p)
         clipped.hold(total, shapes.x, np.zeros(len(shapes.x)))
-        for rate, (more, less) in a.moved_clips(given, d):
+        for rate, (more, less) in moved_clips(a.model, given, d.p):
             change = a.imbalance(shapes, more) - a.imbalance(shapes, less)
             total = total + Vector(change.x * rate[:, None, None], change.y * rate[:, None])
         return total
@@ -444,7 +442,7 @@ class CurveSlopes:
         own = x[:, a.chain.layout.stations].reshape(shape)
         moved = self.by_station @ np.concatenate([places, rates, own], axis=2)
         change = clipped.evenly(moved + self.by_p @ d.p[:, None])
-        for rate, (more, less) in a.moved_clips(self.given, d):
+        for rate, (more, less) in moved_clips(a.model, self.given, d.p):
             gap = a.curve(self.shapes, more) - a.curve(self.shapes, less)
             change = change + gap[..., None] * rate[:, None, None]
         return np.asarray(change)
