@@ -107,6 +107,9 @@ def test_arc_lengths_beside_the_cable_are_refused(pinned):
     for wrong in ([-0.1, 2.0], [0.1, np.nan]):
         with pytest.raises(DloError, match=r"is not on the cable: . of 2 .* outside 0 to 0.55 m"):
             shape.curve.at(wrong)
+    for strange in (3, -1):
+        with pytest.raises(DloError, match=f"derivative: 0, 1 or 2 belongs here, found {strange}"):
+            shape.curve.at([0.1], strange)
 
 
 @pytest.mark.parametrize("end", [(0.3, -0.1), (0.02, -0.5), (0.5, 0.1)])

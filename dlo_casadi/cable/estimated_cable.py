@@ -136,11 +136,15 @@ class CableCurve(NodeCurve):
     def at(self, s: ArrayLike, derivative: int = 0) -> FloatArray:
         """Positions (K, d) [m] at arc lengths s (K,) [m] in [0, L], or derivatives by s.
 
+        `derivative`: 0 for positions, 1 for the first derivative, 2 for the second.
+
         Raises
         ------
         DloError
-            If an arc length is outside the cable.
+            If an arc length is outside the cable, or if there is no such derivative.
         """
+        if derivative not in (0, 1, 2):
+            raise DloError(f"derivative: 0, 1 or 2 belongs here, found {derivative!r}")
         try:
             places = np.atleast_1d(np.asarray(s, dtype=float)).ravel()
         except (TypeError, ValueError):
