@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.special import fresnel
 import dlo_casadi as dlo
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml
+from dlo_casadi.effects import ClipSlip
 
 ROPE = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, name="rope")
 WIRE = dlo.Cable(
@@ -54,6 +56,20 @@ def test_a_stiff_cantilever_droops_by_its_weight_and_that_at_its_tip():
     own, more = 0.02 * 9.81 * 0.5**3 / (8 * 2.0), 0.01 * 9.81 * 0.5**3 / (3 * 2.0)
     droops = [-cable.solve(start_heading=0.0).points[-1, 1] for cable in (bare, loaded)]
     assert droops == pytest.approx([own, own + more], rel=1e-4)  # slope: 0.007
+
+
+def test_frames_at_a_saddle_that_slipped_are_those_of_one_declared_there():
+    cable = dlo.known_cable(WIRE, gravity=(0, 0, -9.81), boundary=("clamped", "clamped"))
+    slipped = replace(cable, model=cable.model.with_effect(ClipSlip()), p=np.append(cable.p, 0.008))
+    rolled = (np.sin(0.6), 0.0, 0.0, np.cos(0.6))
+    saddle = {"kind": "clamped", "place": (0.3, 0.0, -0.05), "orientation": rolled}
+    ends = {"end": (0.6, 0.0, 0.0), **FORWARD, "end_orientation": (0, 0, 0, 1)}
+    own, other = (
+        one.solve(**ends, clips=[{**saddle, "at": at}])
+        for one, at in ((slipped, 0.4), (cable, 0.408))
+    )
+    assert own.points == pytest.approx(other.points, abs=1e-9)
+    assert own.frames == pytest.approx(other.frames, abs=1e-7)
 
 
 def test_two_masses_pull_like_two_forces_of_their_weights(tmp_path):

@@ -35,7 +35,7 @@ from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.export.targets import check_counts, samples_of, target_of, write_rods
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipLoad, clip_rows, node_places
+from dlo_casadi.model.clips import ClipLoad, clip_rows
 from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.show.text import bend_radius, html_table
 
@@ -257,8 +257,10 @@ class Shape:
     @cached_property
     def frames(self) -> FloatArray:
         """Material frames (101, d, d) at `s`, see `CableCurve.frames`."""
-        places = node_places(self.cable.model.chain, self.pose.clips)
-        return self.curve.frames(self.s, places, self.equilibrium.x)
+        cable, eq = self.cable, self.equilibrium
+        given = Inputs.of(cable.p, cable.rest, self.pose.vector[None])
+        clipped = assembly_of(cable.model).clipped(eq.shapes, given)
+        return self.curve.frames(self.s, clipped.places[0], eq.x)
 
     @property
     def held(self) -> SolvedCable:
