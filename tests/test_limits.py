@@ -274,6 +274,7 @@ def test_what_cannot_be_checked_says_what_to_try(fitted, capsys, words, said):
     [
         ("", "no poses"),
         ("x,y\n1,2\n", "unknown columns"),
+        ("end_x_m,end_y_m,end_x_m\n0.3,0.1,0.5\n", "two columns are called end_x_m"),
         ("end_x_m\n0.3\n", "numbers belong here"),
         ("end_x_m,end_y_m\n0.3,high\n", "pose 1: finite numbers"),
         ("end_x_m,end_y_m\n0.3,0\n0.3,nan\n", "pose 2: finite numbers"),

@@ -182,7 +182,7 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
     Columns are end_x_m, end_y_m and, where they differ from pose to pose, start_x_m, start_y_m,
     start_heading_rad, end_heading_rad; in space also end_z_m, start_z_m, start_qx to start_qw,
     end_qx to end_qw and turns; and name, by default the line's number. Raises DloError if the file
-    is missing, has other columns, has cells that are not numbers, or has a name twice.
+    is missing, has other columns or one twice, cells that are not numbers, or a name twice.
     """
     node, sides = model.node, ("start", "end")
     keys = {side: [f"{side}_{axis}_m" for axis in node.axes] for side in sides}
@@ -191,15 +191,20 @@ def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
     known = ["name", *(column for group in keys.values() for column in group)]
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.DictReader(stream, skipinitialspace=True))
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            rows, header = list(reader), list(reader.fieldnames or ())
     except (OSError, UnicodeError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error
         raise DloError(
             f"{path} cannot be read: {reason}.\n  Try: a CSV with the columns {', '.join(known)}"
         ) from None
-    if not rows or (strange := [x for x in rows[0] if x and x not in known]):
-        said = f"unknown columns {strange}" if rows else "no poses"
-        raise DloError(f"{path}: {said}.\n  Try: {', '.join(known)}; the first line names them")
+    wrong = "" if rows else "no poses"
+    if strange := [x for x in header if x and x not in known]:
+        wrong = wrong or f"unknown columns {strange}"
+    if twice := [x for x in header if x and header.count(x) > 1]:
+        wrong = wrong or f"two columns are called {twice[0]}"
+    if wrong:
+        raise DloError(f"{path}: {wrong}.\n  Try: {', '.join(known)}; the first line names them")
     out: dict[str, dict[str, Any]] = {}
     for k, row in enumerate(rows, start=1):
         name = row.get("name") or f"pose_{k:02d}"
