@@ -263,6 +263,20 @@ def test_clips_that_leave_no_room(clips, said):
         solved(clips)
 
 
+def test_saddles_with_no_node_between_them():
+    """The coarse mesh has none: its 18 elements are longer than the 40 mm between them."""
+    forward = Frame.identity
+    saddles = [
+        HeldClip("clamped", (x, 0.0, 0.0), s, orientation=forward)
+        for x, s in ((0.405, 0.455), (0.4445, 0.495))
+    ]
+    held = {"gravity": (0.0, 0.0, -9.81), "start": "clamped", "end": "clamped"}
+    held |= {"start_orientation": forward, "end_orientation": forward}
+    _, _, eq = solved(saddles, (0.9, 0.0, 0.0), 60, LOOM, **held)
+    assert eq.stable
+    assert [load.at for load in eq.clips] == [0.455, 0.495]
+
+
 def test_a_pose_with_other_clips_than_the_model():
     model, pose, _ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(EquilibriumError, match="the pose has the clips none, the model pinned"):

@@ -391,6 +391,8 @@ def frames_along(
     frames = np.zeros((len(s), 4))
     for (low, first), (high, last) in pairwise(held):
         inside = (s >= low - 1e-9) & (s <= high + 1e-9)
+        if not inside.any():  # two clamped clips between nodes of the mesh
+            continue
         u = (s[inside] - low) / (high - low)
         both = frame_rotation(first), frame_rotation(last)
         turned, roll = carried(u, axes[inside], both)
