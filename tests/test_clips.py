@@ -16,7 +16,7 @@ from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spans import first_guesses
+from dlo_casadi.equilibrium.spans import Span, _sides, first_guesses
 from dlo_casadi.equilibrium.spread import tolerances_of
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
@@ -275,6 +275,12 @@ def test_saddles_with_no_node_between_them():
     _, _, eq = solved(saddles, (0.9, 0.0, 0.0), 60, LOOM, **held)
     assert eq.stable
     assert [load.at for load in eq.clips] == [0.455, 0.495]
+
+
+def test_sides_of_a_harness_with_many_spans():
+    """Four sides of each of 32 spans are 2^64 combinations, which are too many to list."""
+    span = Span(0.0, 1.0, np.array([0.5, 0.0, 0.0]), (None, None))
+    assert len(_sides([span] * 32, 4)) == 4 + 32 * 3
 
 
 def test_a_pose_with_other_clips_than_the_model():

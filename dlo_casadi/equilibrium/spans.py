@@ -8,6 +8,7 @@ chord by quarter turns. The spans also determine whether a pose is within reach.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
+from math import prod
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -239,7 +240,7 @@ def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
 def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
     """Combinations of the spans' sides; if there are too many, those that differ in one span."""
     free = [1 if span.taut else choices for span in spans]
-    if np.prod(free) <= MOST_SIDES:
+    if prod(free) <= MOST_SIDES:  # NumPy's product overflows to zero
         return list(product(*(range(count) for count in free)))
     alike = [tuple(min(side, count - 1) for count in free) for side in range(choices)]
     single = [
