@@ -500,7 +500,7 @@ def test_the_smallest_radius_is_that_at_a_clamp(element):
 
 
 def test_a_pose_that_is_not_finite_is_named():
-    with pytest.raises(EquilibriumError, match=r"pose_08: .*not finite: start \(0.0, 0.0\) m"):
+    with pytest.raises(EquilibriumError, match=r"pose_08: .*not finite: end \(0.6, nan\)"):
         solve(CableModel(HEAVY, 8), 0.1, HeldPose((0.0, 0.0), (0.6, np.nan), name="pose_08"))
 
 

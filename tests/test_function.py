@@ -21,7 +21,7 @@ from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.equilibrium.implicit import pose_of
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.symbolic import CasadiCable
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
 
 # As dlo_pose: start, end [m], headings [rad]; or start, end, quaternions of any length, turns.
@@ -225,6 +225,21 @@ def test_equations_lead_an_optimiser_to_the_same_equilibrium(in_space):
 def test_what_is_unknown_is_refused(options, words):
     with pytest.raises(DloError, match=words):
         CasadiCable(*cable(False, plain=True)).function(**options)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (slice(10, 14), 0.0, "a quaternion of the pose is zero: end_orientation"),
+        (slice(10, 11), np.nan, r"not finite: end_orientation \[nan, "),
+        (slice(14, 15), np.nan, "not finite: turns nan"),
+    ],
+)
+def test_a_meaningless_number_of_a_pose_is_named(at, value, words):
+    pose = np.array(SPACE, dtype=float)
+    pose[at] = value
+    with pytest.raises(EquilibriumError, match=words):
+        CasadiCable(*cable(True, plain=True)).initial(pose)
 
 
 def test_a_pose_of_another_size_is_refused():

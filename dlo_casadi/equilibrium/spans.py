@@ -361,16 +361,12 @@ def no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
 
 
 def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
-    """Why a pose is out of reach: its end is missing or too far, or a number is not finite."""
+    """Why a pose is out of reach: its end is missing or too far, or a number is meaningless."""
     if pose.end is None and model.end != "free":
         what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
         return no_equilibrium(pose, what, "Pose(start, end).")
-    if not np.all(np.isfinite(pose.vector)):
-        what = (
-            f"no equilibrium: a number of the pose is not finite: start {pose.start} m, end "
-            f"{pose.end} m, headings {pose.start_heading} and {pose.end_heading} rad"
-        )
-        return no_equilibrium(pose, what, "see where these numbers come from.")
+    if wrong := _meaningless(pose):
+        return no_equilibrium(pose, *wrong)
     if wrong := _wrong_clips(model, p, pose):
         return no_equilibrium(pose, *wrong)
     if wrong := _inside(model, p, pose):
@@ -387,6 +383,23 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         f"from the start, the cable is {length:.4f} m long"
     )
     return no_equilibrium(pose, what, "end in metres? cable.length?")
+
+
+def _meaningless(pose: HeldPose) -> tuple[str, str] | None:
+    """Which number of a pose is not finite, or which quaternion zero, and what to try."""
+    camera = pose.vector[len(pose.ends) :][:3]
+    known = {"start": pose.start, "end": pose.end, **pose.directions, "camera": camera}
+    for clip in pose.clips:
+        own = {"place": clip.place, "at": clip.at, "direction": clip.frame}
+        known |= {f"{what} of {clip.name}": x for what, x in own.items()}
+    for name, x in known.items():
+        if x is not None and not np.all(np.isfinite(x)):
+            what = f"no equilibrium: a number of the pose is not finite: {name} {x}"
+            return what, "see where this number comes from."
+        if np.size(x) == 4 and not np.any(x):
+            what = f"no equilibrium: a quaternion of the pose is zero: {name}"
+            return what, "(0, 0, 0, 1), which turns nothing."
+    return None
 
 
 def _inside(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str, str] | None:
