@@ -227,6 +227,11 @@ def test_what_is_unknown_is_refused(options, words):
         CasadiCable(*cable(False, plain=True)).function(**options)
 
 
+def test_a_first_guess_of_an_unknown_branch_is_refused():
+    with pytest.raises(DloError, match="branch must be 'ccw', 'cw'"):
+        CasadiCable(*cable(False, plain=True)).initial(PLANE, branch="up")
+
+
 @pytest.mark.parametrize(
     ("at", "value", "words"),
     [

@@ -138,8 +138,7 @@ class CasadiCable:
         inputs, p = self._inputs(parameters)
         pose = inputs["pose"]
         if search is None:
-            if branch not in (None, *self.model.node.branches):
-                raise DloError(f"branch must be 'ccw', 'cw' (in a plane) or None, found {branch!r}")
+            self._check_branch(branch)
             found = detached(search_of(self.model, self.rest.tobytes(), branch))(pose, p)
         else:
             self._check_search(search, with_others=bool(parameters or branch))
@@ -220,7 +219,7 @@ class CasadiCable:
         EquilibriumError
             If the pose has no equilibrium.
         DloError
-            If the pose has the wrong number of entries.
+            If the pose has the wrong number of entries, or if the branch is unknown.
         """
         try:
             numbers = np.asarray(pose, float).ravel()
@@ -229,9 +228,14 @@ class CasadiCable:
         if len(numbers) != pose_size(self.model):
             size = counted(pose_size(self.model), "number")
             raise DloError(f"pose: {size} as in dlo_pose of the C header, found {len(numbers)}")
+        self._check_branch(branch)
         held = pose_of(self.model, numbers, branch)
         found = solve_equilibrium(self.model, self.p, self.rest, held)
         return PoseUnknowns(found.x.T, found.multipliers)
+
+    def _check_branch(self, branch: Branch | None) -> None:
+        if branch not in (None, *self.model.node.branches):
+            raise DloError(f"branch must be 'ccw', 'cw' (in a plane) or None, found {branch!r}")
 
     def _check_search(self, search: ca.Function, *, with_others: bool) -> None:
         if not isinstance(search, ca.Function):
