@@ -46,8 +46,6 @@ MOST_SIDES = 16
 ONE_PLACE = 1e-6
 # Shares of the slack between two fixed arc lengths that the first of two spans gets.
 _SLACK = (0.5, 0.15, 0.85)
-# Smallest length of a span beside an eyelet, relative to its chord.
-_LEAST = 1.0 + 1e-3
 # Number of candidate places along the axis of a bar at one of which the cable passes it.
 _ALONG = 21
 
