@@ -395,3 +395,17 @@ def test_a_cable_bent_against_its_rest_shape_is_no_minimum():
     shapes, solved = BatchEquilibrium(model, [pose]).solve(against, model.nominal, weak)
     assert solved.all()
     assert list(BatchEquilibrium(model, [pose]).stable(shapes, model.nominal, weak)) == [False]
+
+
+@pytest.mark.parametrize("effects", [(), (EFFECTS["rest_curvature_drift"](),)])
+def test_a_lost_pose_is_minimised_also_if_the_cable_takes_a_set(effects):
+    """With the rest curvature before each pose given, poses do not depend on each other."""
+    flat = replace(model(10), n_rest=0, effects=effects)
+    rest, held = np.zeros((1, flat.chain.n_rests)), pose((0.5, 0.0, 0.0))
+    found = solve_equilibrium(flat, flat.nominal, rest[0], held)
+    turned = np.zeros((1, len(flat.deviation_names)))
+    turned[0, flat.deviation_names.index("end_rotation_y")] = -2.0
+    batch = BatchEquilibrium(flat, [held])
+    start = Shapes(found.x[None], found.multipliers[None], turned), flat.nominal, rest
+    assert not batch.solve(*start)[1].any()
+    assert batch.solve_or_descend(*start)[1].all()

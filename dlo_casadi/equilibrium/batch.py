@@ -139,6 +139,10 @@ class BatchEquilibrium:
         x = self.node.moved(shapes.x, step.x[..., 0])
         return replace(shapes, x=x, lam=shapes.lam + step.y[..., 0])
 
+    def _coupled(self, rest: FloatArray) -> bool:
+        """Whether a pose's rest curvature depends on the poses before it: see `rests`."""
+        return self.model.has_state and rest.ndim == 1
+
     def solve(
         self,
         shapes: Shapes,
@@ -172,7 +176,7 @@ class BatchEquilibrium:
         """
         now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
         converged = np.zeros(self.m, dtype=bool)
-        coupled = self.model.has_state and rest.ndim == 1
+        coupled = self._coupled(rest)
         active, last = np.arange(self.m), np.full(self.m, np.inf)
         stale, matrix = np.ones(self.m, dtype=bool), None
         for _ in range(max_iterations):
@@ -211,11 +215,12 @@ class BatchEquilibrium:
     ) -> tuple[Shapes, BoolArray]:
         """As `solve`, but for lost poses the energy is minimised from their start.
 
-        Newton's method alone loses one pose in ten when frames have far to rotate.
+        Newton's method alone loses one pose in ten when frames have far to rotate. If a state
+        couples the poses, a lost one stays lost.
         """
         now, converged = self.solve(shapes, p, rest, **options)
         lost = np.flatnonzero(~converged)
-        if not len(lost) or self.model.has_state:
+        if not len(lost) or self._coupled(rest):
             return now, converged
         given = self.given(shapes, p, rest).subset(lost)
         some = shapes.subset(lost)
