@@ -409,3 +409,12 @@ def test_a_lost_pose_is_minimised_also_if_the_cable_takes_a_set(effects):
     start = Shapes(found.x[None], found.multipliers[None], turned), flat.nominal, rest
     assert not batch.solve(*start)[1].any()
     assert batch.solve_or_descend(*start)[1].all()
+
+
+def test_a_cable_twisted_by_a_quarter_turn_per_element_is_stable_among_many_poses():
+    """Five turns on 20 elements: only joints in a plane have a bound."""
+    taut, wound = model(torsion=0.2 * GJ), pose((0.999 * LENGTH, 0.0, 0.0), turns=5.0)
+    rest = np.zeros(taut.chain.n_rests)
+    found = solve_equilibrium(taut, taut.nominal, rest, wound)
+    assert found.stable
+    assert BatchEquilibrium(taut, [wound]).stable(found.shapes, taut.nominal, rest).all()

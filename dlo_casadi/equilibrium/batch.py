@@ -414,12 +414,16 @@ class BatchEquilibrium:
         return self.assembly.readings(shapes, self.given(shapes, p, rest))
 
     def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> BoolArray:
-        """Whether each pose is a strict minimum of the energy under its end conditions."""
+        """Whether each pose is a strict minimum of the energy under its end conditions.
+
+        In a plane its joints must be within their bound, too.
+        """
         _, matrix = self.balance(shapes, p, rest)
-        negative = matrix.negative()
-        bends = self.node.difference(shapes.x[:, :-1], shapes.x[:, 1:])
-        free = np.abs(bends).max(axis=(1, 2)) < JOINT_BOUND
-        return np.asarray((negative == self.model.n_multipliers) & free)
+        minimum = matrix.negative() == self.model.n_multipliers
+        if self.model.in_space:
+            return np.asarray(minimum)
+        bends = np.abs(np.diff(shapes.x[..., 0], axis=1))
+        return np.asarray(minimum & (bends.max(axis=1) < JOINT_BOUND))
 
 
 def _settled(size: FloatArray, last: FloatArray, tolerance: float, fresh: BoolArray) -> BoolArray:
