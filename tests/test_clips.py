@@ -283,6 +283,28 @@ def test_sides_of_a_harness_with_many_spans():
     assert len(_sides([span] * 32, 4)) == 4 + 32 * 3
 
 
+def test_turns_of_the_end_are_those_beyond_the_last_saddle():
+    """Four rolled saddles twist the cable by 1.7 turns, which the end's turns do not count."""
+
+    def rolled(k):
+        return tuple(Rotation.from_rotvec([k * np.radians(150), 0.0, 0.0]).as_quat())
+
+    apart = 0.2 * LENGTH
+    saddles = [
+        HeldClip("clamped", (0.999 * apart * k, 0.0, 0.0), apart * k, orientation=rolled(k))
+        for k in range(1, 5)
+    ]
+    model = CableModel(
+        replace(LOOM, mass=0.02), 20, "quadratic", "clamped", "clamped", (0.0, 0.0, -9.81)
+    )
+    model = replace(model, n_rest=0, clips=("clamped",) * 4)
+    held = {"start_orientation": rolled(0), "end_orientation": rolled(4), "turns": 1.0}
+    pose = HeldPose((0.0, 0.0, 0.0), (0.999 * LENGTH, 0.0, 0.0), clips=tuple(saddles), **held)
+    eq = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+    turns = eq.twist.reshape(5, 4).mean(axis=1) * apart / (2 * np.pi)
+    assert turns == pytest.approx([5 / 12] * 4 + [1.0], abs=5e-3)
+
+
 def test_a_pose_with_other_clips_than_the_model():
     model, pose, _ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(EquilibriumError, match="the pose has the clips none, the model pinned"):

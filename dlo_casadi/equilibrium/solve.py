@@ -34,6 +34,7 @@ from dlo_casadi.equilibrium.spans import (
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import clamped_nodes, node_places
 from dlo_casadi.rod.node import Frame
 
 # Largest move of an end in one step [lengths, rad], so that a shape can be followed up to a fold.
@@ -166,8 +167,8 @@ def _chosen(
     named = None if start is not None or pose.branch == "previous" else pose.branch
     where = "its end free" if pose.end is None else f"its end at {pose.end} m"
     if start is None and found and pose.turns:
-        twists = _twists(model, np.array([eq.twist for eq in found]))
-        kept = [eq for eq, twist in zip(found, twists, strict=True) if _holds(twist, pose.turns)]
+        twists = _twists(model, pose, np.array([eq.twist for eq in found]))
+        kept = [eq for eq, held in zip(found, _holds(pose, twists), strict=True) if held]
         if not kept:
             left = min(zip(twists, found, strict=True), key=lambda pair: pair[1].energy)[0]
             what = (
@@ -336,12 +337,12 @@ class _PoseSearch:
         )
         given, found = search._descend(poses, of, shapes, np.full(len(poses), touching))
         strains = assembly_of(coarse).strain(found.shapes, given)
-        twists = _twists(coarse, strains[:, : coarse.chain.n_cells])
-        usable = found.converged & _holds(twists, np.array([poses[j].turns for j in of]))
+        twist = strains[:, : coarse.chain.n_cells]
         x, kept = found.shapes.x, []
         points = assembly_of(coarse).nodes(found.shapes, given)
         for j, pose in enumerate(poses):
-            rows = np.flatnonzero((of == j) & usable)
+            rows = np.flatnonzero((of == j) & found.converged)
+            rows = rows[_holds(pose, _twists(coarse, pose, twist[rows]))]
             rows = rows[on_named_sides(coarse, pose, points[rows])]
             rows = rows[np.argsort(found.energy[rows], kind="stable")]
             mine = [int(rows[k]) for k in _distinct(model, x[rows])[:FEW]]
@@ -371,14 +372,20 @@ def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> Floa
     return np.concatenate([shares @ part for part in np.split(rest, len(model.node.strains))])
 
 
-def _twists(model: CableModel, twist: FloatArray) -> FloatArray:
-    """Twist (m,) [turns] of whole cables, from that of their cells (m, n_cells) [1/m]."""
-    return twist.mean(axis=1) * model.cable.length / (2 * np.pi)
+def _twists(model: CableModel, pose: HeldPose, twist: FloatArray) -> FloatArray:
+    """Twist (m,) [turns] that the end clamp gives cables, from that of their cells [1/m].
+
+    `twist` (m, n_cells). A clamped clip holds the roll: turns of the end stop there.
+    """
+    holding = [clip for clip in pose.clips if clip.kind == "clamped"]
+    first = max(clamped_nodes(model.chain, holding), default=0)
+    widths = np.diff(node_places(model.chain, pose.clips))
+    return twist[:, first:] @ widths[first:] / (2 * np.pi)
 
 
-def _holds(twist: FloatArray, turns: FloatArray | float) -> BoolArray:
-    """Whether cables of these twists [turns] have kept all the turns asked for."""
-    return (np.abs(twist - turns) <= MOST_SHED) | (turns == 0)
+def _holds(pose: HeldPose, twists: FloatArray) -> BoolArray:
+    """Whether cables of these twists (m,) [turns] have kept all the turns that a pose asks for."""
+    return (np.abs(twists - pose.turns) <= MOST_SHED) | (pose.turns == 0)
 
 
 def solve_after(
