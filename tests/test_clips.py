@@ -305,6 +305,24 @@ def test_turns_of_the_end_are_those_beyond_the_last_saddle():
     assert turns == pytest.approx([5 / 12] * 4 + [1.0], abs=5e-3)
 
 
+@pytest.mark.parametrize("turns", [0.0, 1.0])
+def test_fewer_turns_are_advised_where_there_are_turns(turns):
+    """One element between two saddles takes up no slack."""
+    forward = Frame.identity
+    saddles = [
+        HeldClip("clamped", (x, 0.0, 0.0), s, orientation=forward)
+        for x, s in ((0.4, 0.45), (0.4498, 0.5))
+    ]
+    model = CableModel(
+        LOOM, 20, "quadratic", "clamped", "clamped", (0.0, 0.0, -9.81), clips=("clamped",) * 2
+    )
+    frames = {"start_orientation": forward, "end_orientation": forward}
+    pose = HeldPose((0.0, 0.0, 0.0), (0.9, 0.0, 0.0), clips=tuple(saddles), turns=turns, **frames)
+    with pytest.raises(EquilibriumError, match="no equilibrium found") as caught:
+        solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+    assert ("turns" in str(caught.value)) == bool(turns)
+
+
 def test_a_pose_with_other_clips_than_the_model():
     model, pose, _ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(EquilibriumError, match="the pose has the clips none, the model pinned"):

@@ -188,18 +188,18 @@ def _chosen(
             return no_equilibrium(pose, what, hint)
         found = [eq for eq, kept in zip(found, passing, strict=True) if kept]
     if not found:
-        hint = "a finer mesh (model.n), or check the stiffness and the headings."
-        if pose.node is Frame:
+        space = pose.node is Frame
+        checked = "stiffnesses and orientations" if space else "stiffness and the headings"
+        hint = f"a finer mesh (model.n), or check the {checked}."
+        if pose.turns:
             where += f" and {pose.turns:g} turns"
-            hint = (
-                "fewer turns (a twisted cable loops), a finer mesh (model.n), or check the "
-                "stiffnesses and orientations."
-            )
+            hint = f"fewer turns (a twisted cable loops), {hint}"
         beside = [*(clip.name for clip in pose.clips), *(one.name for one in model.surfaces)]
         if beside:
             where += f", beside {', '.join(beside)}"
             hint = f"more room between them, {hint}"
-        what = f"no equilibrium found from its first guesses with {where}"
+        guessed = "its first guesses" if start is None else "a nearby shape"
+        what = f"no equilibrium found from {guessed} with {where}"
         return no_equilibrium(pose, what, hint)
     if named is not None and (model.start, model.end) == ("pinned", "pinned"):
         for eq in found:
