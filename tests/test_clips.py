@@ -24,6 +24,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip, clamped_nodes
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.obstacles import Plane
 
 LENGTH, EI = 1.0, 0.02  # m, N m^2
 CABLE = CableData(LENGTH, mass=0.2, diameter=0.01, bending_stiffness=EI)
@@ -321,6 +322,20 @@ def test_fewer_turns_are_advised_where_there_are_turns(turns):
     with pytest.raises(EquilibriumError, match="no equilibrium found") as caught:
         solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
     assert ("turns" in str(caught.value)) == bool(turns)
+
+
+def test_a_clearance_beside_a_saddle_between_even_places():
+    """The saddle moves a node by half an element, where the cable has another direction."""
+    at, heights = 0.524, []
+    for n in (20, 80):
+        floor = Plane((0.0, -1.0), (0.0, 1.0))
+        held = {"start": "clamped", "end": "clamped", "obstacles": (floor,)}
+        held |= {"start_heading": 0.0, "end_heading": 0.0}
+        saddle = HeldClip("clamped", (0.4, -0.15), at, heading=-0.8)
+        model, pose, eq = solved([saddle], (0.7, 0.0), n, **held)
+        given = Inputs.of(model.nominal, np.zeros((1, model.chain.n_rests)), pose.vector[None])
+        heights.append(sizes_of(model, eq.shapes, given, "clearance")[0])
+    np.testing.assert_allclose(heights[0], heights[1][::4], atol=2.5e-4)
 
 
 def test_a_pose_with_other_clips_than_the_model():

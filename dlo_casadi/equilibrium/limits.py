@@ -68,7 +68,7 @@ def places_of(
         own = [item for item in held if quantity == "force" or item.takes_moment]
         return np.array([item.at for item in own]), [item.name for item in own]
     if quantity == "clearance":
-        names, deep = _depths(model, found.points[None], found.x[None], given)
+        names, deep = _depths(model, found.shapes, given)
         along = np.linspace(0.0, model.cable.length, deep.shape[2])
         return along, [names[k] for k in deep[:, 0].argmax(axis=0)]
     clipped = assembly_of(model).clipped(found.shapes, given)
@@ -82,10 +82,10 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
 
     Curvature, twist [1/m]; force [N] and moment [N m] on fixtures; minus the clearance [m].
     """
-    assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
     if quantity == "clearance":
-        _, deep = _depths(model, assembly.nodes(shapes, given), shapes.x, given)
+        _, deep = _depths(model, shapes, given)
         return np.asarray(deep.max(axis=0))
+    assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
     if quantity in ("curvature", "twist"):
         strain = assembly.strain(shapes, given)
         if quantity == "twist":
@@ -104,18 +104,21 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
     return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
 
 
-def _depths(
-    model: CableModel, points: FloatArray, x: FloatArray, given: Inputs
-) -> tuple[list[str], FloatArray]:
+def _depths(model: CableModel, shapes: Shapes, given: Inputs) -> tuple[list[str], FloatArray]:
     """Obstacles to be avoided, and the depth (n, m, K) [m] of cables in each; outside negative."""
-    along, offsets = _along(model, points, x), given.p @ outwards(model).T
+    along, offsets = _along(model, shapes, given), given.p @ outwards(model).T
     known = [(k, one) for k, one in enumerate(model.obstacles) if not one.touch]
     deep = [offsets[:, [k]] - one.near(along).distance for k, one in known]
     return [one.name for _, one in known], np.array(deep) + model.cable.diameter / 2
 
 
-def _along(model: CableModel, points: FloatArray, x: FloatArray) -> FloatArray:
-    """Places (..., K, d) [m] along cables, four per element, interpolated from their nodes."""
+def _along(model: CableModel, shapes: Shapes, given: Inputs) -> FloatArray:
+    """Places (m, K, d) [m] along cables, four per element, interpolated from their nodes."""
+    assembly, even, x = assembly_of(model), model.chain.places, shapes.x
+    points = assembly.nodes(shapes, given)
+    if model.clamped_between:  # nodes of clamped clips are moved to these, `points` are even
+        moved = assembly.clipped(shapes, given).places
+        x = np.array([model.node.interpolated(even, *each) for each in zip(moved, x, strict=True)])
     slopes = model.chain.h * tangents(model.node, x)
     u = np.arange(4)[:, None] / 4
     start, end, out, into = (
