@@ -92,14 +92,13 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
             return np.abs(strain[:, : chain.n_cells])  # the first strain in space
         return curvatures_along(chain.curvatures(strain), assembly.clipped(shapes, given))
     found, loads = assembly.reactions(shapes, given), assembly.clip_loads(shapes, given)
-    known = ("pinned", "eyelet", *CLAMPS) if quantity == "force" else CLAMPS
     held = tuple(side for side in ("start", "end") if getattr(model, side) != "free")
     ends = held if quantity == "force" else functions_of(model).moment_ends
     each = [found[:, rows[f"{side}_{quantity}"]] for side in ends]
     each += [
         np.array([np.atleast_1d(getattr(load[k], quantity)) for load in loads])
         for k, kind in enumerate(model.clips)
-        if kind in known
+        if quantity == "force" or kind in CLAMPS
     ]
     return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
 
