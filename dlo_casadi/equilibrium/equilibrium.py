@@ -55,7 +55,8 @@ class Equilibrium:
         linearly to both ends and to all clips, see `continued`. Its error is of second order in the
         cell length.
     residual : float
-        Largest violation of an end condition [m or rad].
+        Largest violation of a condition of the border: of ends, clips and contacts [m or rad], of
+        springs and eyelets also a force that does not balance [N].
     stable : bool
         Whether the energy has a strict minimum here under the end conditions.
     iterations : int

@@ -298,7 +298,7 @@ def smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
 
 
 def sagging(along: FloatArray, down: FloatArray) -> FloatArray:
-    """Unit vector's normal (3,) along which gravity pulls; any normal if it pulls along it."""
+    """Part (3,) of gravity across a unit vector; any vector across it if there is none."""
     side = down - (down @ along) * along
     if np.linalg.norm(side) < 1e-9 * max(float(np.linalg.norm(down)), 1.0):
         return cross(along, np.eye(3)[np.argmin(np.abs(along))])

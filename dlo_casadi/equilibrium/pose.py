@@ -35,8 +35,9 @@ class HeldPose:
         Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the cable.
     turns : float
         In space, selects the twist about the cable's axis with which its end fits the clamp: the
-        one nearest to this number of full turns; +-0.5 select either direction of half a turn. For
-        0 and a clamp rolled by half a turn within 1 rad, the direction of lower energy is taken.
+        one nearest to this number of full turns; +-0.5 select either direction of half a turn. The
+        twist is that beyond the last clamped clip, if one holds the cable's roll. For 0 and a clamp
+        rolled by half a turn within 1 rad, the direction of lower energy is taken.
     branch : "ccw", "cw" or "previous", optional
         Which way the cable turns from start to end: the sign of `Equilibrium.turn`. "previous"
         is the equilibrium that follows from the pose before, see `solve.continued`.

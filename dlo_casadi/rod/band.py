@@ -23,8 +23,8 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 
-# Smallest pivot, relative to the largest entry; a smaller one is shifted by this. As it is the
-# square root of rounding, half of the digits are lost, and one step of refinement restores them.
+# Smallest pivot, relative to the largest entry; it replaces smaller ones. As it is the square root
+# of rounding, half of the digits are lost, and one step of refinement restores them.
 LEAST_PIVOT = 1e-8
 # Maximum number of steps of iterative refinement, and the relative residual at which they end.
 REFINEMENTS = 3
@@ -266,7 +266,7 @@ class BandFactor:
         return other
 
     def _inverse(self, pivots: FloatArray) -> FloatArray:
-        """Inverses of pivots (m, h, b, b); nearly singular ones are shifted by `LEAST_PIVOT`."""
+        """Inverses of pivots (m, h, b, b), whose eigenvalues are at least `LEAST_PIVOT` in size."""
         single = pivots.shape[-1] == 1
         values, vectors = (pivots[..., 0], None) if single else np.linalg.eigh(pivots)
         self._eigenvalues.append(values)

@@ -31,6 +31,8 @@ class Chain:
     element : str
         A name of ELEMENTS, or of ELEMENTS_IN_SPACE.
     start_clamped, end_clamped : bool
+    node : type of Node
+        State of its nodes: `Heading` in a plane, `Frame` in space.
     """
 
     length: float

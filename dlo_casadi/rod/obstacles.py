@@ -108,7 +108,7 @@ class Capsule:
         return ca.sqrt(ca.sum1(gap**2)) - self.radius
 
     def up(self, gravity: Sequence[float]) -> FloatArray | None:
-        """Unit vector (d,) against gravity and across the axis.
+        """Unit vector (d,) against gravity; in space its part across the axis.
 
         None if nothing passes over or under it: without gravity; in space also for a sphere or for
         an axis along gravity.
