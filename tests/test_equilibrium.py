@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.guesses import guesses
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
+from dlo_casadi.equilibrium.solve import continued, solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -502,6 +502,23 @@ def test_the_smallest_radius_is_that_at_a_clamp(element):
 def test_a_pose_that_is_not_finite_is_named():
     with pytest.raises(EquilibriumError, match=r"pose_08: .*not finite: end \(0.6, nan\)"):
         solve(CableModel(HEAVY, 8), 0.1, HeldPose((0.0, 0.0), (0.6, np.nan), name="pose_08"))
+
+
+@pytest.mark.parametrize(
+    ("x", "heading", "said"),
+    [(600.0, 0.0, "the cable is 0.8000 m long"), (0.6, np.nan, "not finite: end_heading nan")],
+)
+def test_no_way_leads_to_a_pose_out_of_reach(x, heading, said):
+    """An end in millimetres would be thousands of steps away."""
+    model = CableModel(HEAVY, 8, start="clamped", end="clamped")
+    here, there = (
+        HeldPose((0.0, 0.0), (end, 0.0), start_heading=0.0, end_heading=turn)
+        for end, turn in ((0.6, 0.0), (x, heading))
+    )
+    found = solve(model, 0.1, here)
+    rest = np.zeros(model.chain.n_rests)
+    with pytest.raises(EquilibriumError, match=said):
+        continued(model, model.nominal, rest, there, here, found.x)
 
 
 def test_a_held_end_that_a_pose_does_not_have_is_not_the_origin():

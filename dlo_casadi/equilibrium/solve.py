@@ -432,6 +432,8 @@ def continued(
     EquilibriumError
         If no equilibrium is found in the pose.
     """
+    if error := out_of_reach(model, p, pose):
+        raise error
     both, d = (before, pose), model.node.dimension
     ends = [one.ends[: 2 * d] for one in both]
     clips = [[x for clip in one.clips for x in (*clip.place, clip.at or 0.0)] for one in both]
