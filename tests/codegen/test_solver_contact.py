@@ -15,6 +15,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod import obstacles as rod
 
 TABLE = {2: rod.Plane((0.0, -0.19), (0.0, 1.0)), 3: rod.Plane((0.0, 0.0, -0.19), (0.0, 0.0, 1.0))}
@@ -233,3 +234,27 @@ def test_casadi_knows_the_obstacles_of_the_model(own, tmp_path):
     first = -d if d == 2 else 0  # the start moves against the table: columns of its place
     told = np.array(jacobian(numbers))[:, :d]
     assert told == pytest.approx(slope.end_force[:, first : first + d or None], rel=1e-9)
+
+
+def test_a_saddle_keeps_its_direction_where_the_cable_touches_beside_it():
+    saddle = HeldClip("clamped", (0.3, 0.1), 0.36, heading=0.3)
+    pose = HeldPose((0.0, 0.0), (0.7, 0.2), start_heading=0.2, end_heading=-0.3, clips=(saddle,))
+    held = {"start": "clamped", "end": "clamped", "clips": ("clamped",), "n_rest": 0}
+    model = CableModel(CableData(1.0, 0.2, 0.01, 0.02), 12, **held)
+    curved = np.full(model.chain.n_rests, 0.3)
+    solver = CompiledSolver(model, model.nominal, curved, flags=QUICK, obstacles=1)
+    free = solver.solve(pose, obstacles=[])
+    node = int(np.flatnonzero(free.places == 0.36)[0])
+    # A disc that cuts into the element behind the saddle, from the left.
+    before, after = free.points[node : node + 2]
+    along = (after - before) / np.linalg.norm(after - before)
+    center = tuple((before + after) / 2 + 0.04 * np.array([-along[1], along[0]]))
+    disc = [rod.Capsule(center, center, 0.04)]
+
+    shape = solver.solve(pose, warm=free, obstacles=disc)
+
+    touches = shape.contact_places[shape.contact_forces > 0.0]
+    assert len(touches)
+    assert np.all((touches > 0.36) & (touches < free.places[node + 1]))
+    assert shape.x[node] == pytest.approx(0.3, abs=1e-12)
+    assert shape.energy > free.energy
