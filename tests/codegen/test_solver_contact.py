@@ -236,7 +236,9 @@ def test_casadi_knows_the_obstacles_of_the_model(own, tmp_path):
     assert told == pytest.approx(slope.end_force[:, first : first + d or None], rel=1e-9)
 
 
-def test_a_saddle_keeps_its_direction_where_the_cable_touches_beside_it():
+@cache
+def beside_a_saddle():
+    """Solver, pose, a disc beside the element behind the saddle, shapes without and with it."""
     saddle = HeldClip("clamped", (0.3, 0.1), 0.36, heading=0.3)
     pose = HeldPose((0.0, 0.0), (0.7, 0.2), start_heading=0.2, end_heading=-0.3, clips=(saddle,))
     held = {"start": "clamped", "end": "clamped", "clips": ("clamped",), "n_rest": 0}
@@ -244,17 +246,27 @@ def test_a_saddle_keeps_its_direction_where_the_cable_touches_beside_it():
     curved = np.full(model.chain.n_rests, 0.3)
     solver = CompiledSolver(model, model.nominal, curved, flags=QUICK, obstacles=1)
     free = solver.solve(pose, obstacles=[])
-    node = int(np.flatnonzero(free.places == 0.36)[0])
-    # A disc that cuts into the element behind the saddle, from the left.
-    before, after = free.points[node : node + 2]
+    before, after = free.points[4:6]
     along = (after - before) / np.linalg.norm(after - before)
     center = tuple((before + after) / 2 + 0.04 * np.array([-along[1], along[0]]))
     disc = [rod.Capsule(center, center, 0.04)]
+    return solver, pose, disc, free, solver.solve(pose, warm=free, obstacles=disc)
 
-    shape = solver.solve(pose, warm=free, obstacles=disc)
 
+def test_a_saddle_keeps_its_direction_where_the_cable_touches_beside_it():
+    *_, free, shape = beside_a_saddle()
     touches = shape.contact_places[shape.contact_forces > 0.0]
     assert len(touches)
-    assert np.all((touches > 0.36) & (touches < free.places[node + 1]))
-    assert shape.x[node] == pytest.approx(0.3, abs=1e-12)
+    assert np.all((touches > free.places[4]) & (touches < free.places[5]))
+    assert free.places[4] == 0.36
+    assert shape.x[4] == pytest.approx(0.3, abs=1e-12)
     assert shape.energy > free.energy
+
+
+def test_a_step_on_a_round_obstacle_starts_with_its_normals():
+    solver, pose, disc, _, shape = beside_a_saddle()
+    near = replace(pose, end=(0.7005, 0.2))
+    stepped = solver.step(shape, near, obstacles=disc)
+    assert stepped.status == "ok"
+    solved = solver.solve(near, warm=shape, obstacles=disc)
+    assert stepped.points == pytest.approx(solved.points, abs=1e-8)
