@@ -243,7 +243,8 @@ def generate(
     Raises
     ------
     DloError
-        If the prefix is not a C identifier or an effect cannot be generated.
+        If the prefix is not a C identifier or makes one name of two, or an effect cannot be
+        generated.
     """
     check_prefix(prefix)
     p, rest = np.asarray(p, float).ravel(), np.asarray(rest, float).ravel()
@@ -277,6 +278,14 @@ def generate(
         "example.c": template("example.c.in"),
         f"{prefix}_solver.c": "".join(template(f"{name}.c.in") for name in sources),
     }
+    names = set(re.findall(r"(?<!@)\b\w+\b(?!@)", "".join(found.values())))
+    for name in sorted(names):
+        renamed = fill(name, {}, prefix)
+        if renamed != name and renamed in names:
+            raise DloError(
+                f"the prefix {prefix!r} would make {renamed} of {name}, a name that the solver has "
+                "already; choose another one, e.g. --prefix harness"
+            )
     words = case.words | among.words
     filled = {name: fill(marked(text, words), values, prefix) for name, text in found.items()}
     return Solver(prefix, digest, filled, int(values["WORKSPACE"]), among)
