@@ -388,15 +388,10 @@ class CompiledSolver:
         return np.array(list(map(row_of, obstacles)), self._records.obstacle)
 
     def _along(self, slope: Slope | None) -> Any:
-        return None if slope is None else _filled(self._records.slope, slope)
+        return None if slope is None else _filled(self._records.slope, slope, Slope)
 
     def _record_of(self, shape: CompiledShape | None) -> Any:
-        if shape is None:
-            return None
-        nodes = self._records.shape["x"].shape
-        if not isinstance(shape, CompiledShape) or np.shape(shape.x) != nodes:
-            raise DloError(f"a shape of this solver, with x of the shape {nodes}, belongs here")
-        return _filled(self._records.shape, shape)
+        return None if shape is None else _filled(self._records.shape, shape, CompiledShape)
 
     def _call(self, name: str, *arguments: Any, obstacles: Sequence[Obstacle] | None = None) -> int:
         """Call the library and return its status; functions that solve get a workspace."""
@@ -425,8 +420,17 @@ def _values(record: Any) -> dict[str, Any]:
     return {name: v.copy() if v.ndim else v.item() for name, v in values.items()}
 
 
-def _filled(record: np.dtype[Any], values: CompiledShape | Slope) -> Any:
+def _filled(record: np.dtype[Any], values: object, kind: type[CompiledShape | Slope]) -> Any:
+    """A record of the library, from a shape or a slope of this solver."""
+    if not isinstance(values, kind):
+        raise DloError(f"a {kind.__name__} of this solver belongs here, found {values!r}")
     out = np.zeros(1, record)
     for name in record.names or ():
-        out[name] = getattr(values, name)
+        value, own = getattr(values, name), out[name].shape[1:]
+        if np.shape(value) != own:
+            raise DloError(
+                f"a {kind.__name__} of this solver belongs here: its {name} has the shape {own}, "
+                f"found {np.shape(value)}"
+            )
+        out[name] = value
     return out

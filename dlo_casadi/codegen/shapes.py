@@ -396,7 +396,8 @@ def _frame(clip: HeldClip, model: CableModel) -> FloatArray:
 
 def no_equilibrium(status: str, pose: AnyPose, length: float) -> str:
     """Message for a status other than ok."""
-    start, end = (", ".join(f"{x:.4f}" for x in place or ()) for place in (pose.start, pose.end))
+    places = (() if place is None else place for place in (pose.start, pose.end))
+    start, end = (", ".join(f"{x:.4f}" for x in place) for place in places)
     hint = _HINTS.get(status)
     return (
         f"no equilibrium: {status} with the end {f'at ({end}) m' if end else 'free'}, the start at "

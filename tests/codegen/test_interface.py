@@ -110,7 +110,7 @@ def test_a_place_is_no_pose_and_three_is_no_shape(links):
         links.solve((0.3, -0.1))
     with pytest.raises(DloError, match=r"a Pose belongs here, found a CompiledShape\n"):
         links.step(at((0.3, -0.1)), links.solve(at((0.3, -0.1))))
-    with pytest.raises(DloError, match=r"a CompiledShape of this solver .* shape \(1[01], "):
+    with pytest.raises(DloError, match="a CompiledShape of this solver belongs here, found 3"):
         links.solve(at((0.3, -0.1)), warm=3)
 
 

@@ -114,3 +114,24 @@ def test_the_hash_covers_the_diameter(model):
     thick = replace(model, cable=replace(CABLE, diameter=0.02))
     rest = np.zeros(model.chain.n_rests)
     assert len({solver_hash(one, model.nominal, rest) for one in (model, thick)}) == 2
+
+
+def test_shapes_and_slopes_of_another_solver(model, solver):
+    rest = np.zeros(model.chain.n_rests)
+    bare = CompiledSolver(replace(model, clips=()), model.nominal, rest, flags=("-O0",))
+    pose = replace(POSE, clips=())
+    shape, own = bare.solve(pose), solver.solve(POSE)
+    with pytest.raises(DloError, match=r"a CompiledShape of this solver .* clip_forces has the"):
+        solver.solve(POSE, warm=shape)
+    with pytest.raises(
+        DloError, match=r"a Slope of this solver .* points has the shape \(7, 2, 9\)"
+    ):
+        solver.clearance(own, [TABLE], bare.sensitivity(shape, pose))
+    with pytest.raises(DloError, match="a Slope of this solver belongs here, found CompiledShape"):
+        solver.clearance(own, [TABLE], own)
+
+
+def test_a_pose_of_arrays_out_of_reach(solver):
+    far = replace(POSE, start=np.zeros(2), end=np.array([0.9, 0.0]))
+    with pytest.raises(EquilibriumError, match=r"unreachable with the end at \(0.9000, 0.0000\) m"):
+        solver.solve(far)
