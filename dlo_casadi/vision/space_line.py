@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray, IntArray, chord_lengths
+from dlo_casadi.arrays import FloatArray, IntArray, chord_lengths, unit
 from dlo_casadi.errors import VisionError
 from dlo_casadi.vision.board import Board, locate_camera
 from dlo_casadi.vision.camera import Camera, Picture
@@ -35,7 +35,7 @@ _SURE = 0.9  # share of pixels beyond which the first curve of a pair is good en
 _AGREE_PX = 1.0  # px, errors of the cameras' poses, added to four standard deviations
 _FAR = 0.05  # of the length: largest distance of the line's end from its fixture
 _LONGER = 1.1  # of the cable's length: largest length of a line in space up to its fixtures
-_NARROW = np.radians(5.0)  # smallest angle of two cameras: depths are then ten times less accurate
+_NARROW = np.radians(5.0)  # smallest angle at the cable: depths are ten times less accurate
 # Length of a span of the spline [diameters]: no cable bends more sharply. With half of it lines in
 # space from rendered photographs change by less than a tenth of their std.
 _SPAN = 2.0
@@ -150,7 +150,7 @@ def agreeing_fit(
     Photographs that contradict it are moved from `curves` to `problems`.
     """
     while len(curves) > 1:
-        pairs = _pairs(curves)
+        pairs = _pairs(curves, cable)
         if max(pair.angle for pair in pairs) < _NARROW:
             first, *others = curves
             for name in others:
@@ -199,7 +199,7 @@ def agreeing_fit(
 
 
 class _Pair(NamedTuple):
-    """Two photographs, their matched pixels, and the angle [rad] between their directions."""
+    """Two photographs, their matched pixels, and the angle [rad] of their cameras at the cable."""
 
     one: ImageCurve
     other: ImageCurve
@@ -209,12 +209,13 @@ class _Pair(NamedTuple):
     angle: float
 
 
-def _pairs(curves: Mapping[str, ImageCurve]) -> list[_Pair]:
+def _pairs(curves: Mapping[str, ImageCurve], cable: KnownCable) -> list[_Pair]:
     """All pairs of photographs, first those that match well and have a large angle."""
+    middle = cable.fixtures.mean(axis=0)
     pairs = []
     for one, other in combinations(curves.values(), 2):
-        ahead = float(one.viewpoint.rotation[2] @ other.viewpoint.rotation[2])
-        angle = float(np.arccos(np.clip(ahead, -1, 1)))
+        sights = unit(middle - np.array([one.viewpoint.center, other.viewpoint.center]))
+        angle = float(np.arccos(np.clip(sights[0] @ sights[1], -1, 1)))
         pairs.append(_Pair(one, other, *match_lines(one, other), angle))
     return sorted(pairs, key=lambda pair: -(pair.share**8) * np.sin(pair.angle))
 
@@ -230,7 +231,7 @@ def _agreement_of(curves: Mapping[str, ImageCurve], cable: KnownCable) -> _Agree
     shown = np.all(tips < TIP, axis=0)
     far = _FAR * cable.length + TIP * cable.diameter
     spans = int(np.clip(cable.length / (_SPAN * cable.diameter), *_SPANS))
-    for one, other, first, second, share, _ in _pairs(curves):
+    for one, other, first, second, share, _ in _pairs(curves, cable):
         if share <= _AGREE:
             continue
         along = chord_lengths(one.pixels)[first] + chord_lengths(other.pixels)[second]

@@ -5,7 +5,18 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from scene import BOARD, CAMERA, DIAMETER, PLACES, bow, length_of, loop, photograph
+from scene import (
+    BOARD,
+    CAMERA,
+    DIAMETER,
+    PLACES,
+    SHAPE,
+    bow,
+    length_of,
+    loop,
+    photograph,
+    stand,
+)
 from scipy.spatial import cKDTree
 
 from dlo_casadi.errors import VisionError
@@ -18,8 +29,8 @@ from dlo_casadi.vision import (
     see_cable,
     space_line,
 )
-from dlo_casadi.vision.camera import project_outline
-from dlo_casadi.vision.image_curve import loops_either_way, places_along
+from dlo_casadi.vision.camera import CameraPose, project_outline
+from dlo_casadi.vision.image_curve import ImageCurve, loops_either_way, places_along
 from dlo_casadi.vision.space_line import _unsure, agreeing_fit
 
 CURVES = {"bow": bow(), "loop": loop()}
@@ -238,6 +249,36 @@ def test_two_photographs_from_one_place_have_no_depth(pictures):
     found = measured(same, curve)
     assert found.line is None
     assert "nearly the same place" in found.problems["b"]
+
+
+def drawn(curve, rotation, translation):
+    """What a camera would see of a curve, to a tenth of a pixel."""
+    viewpoint = CameraPose(
+        camera=CAMERA,
+        rotation=rotation,
+        translation=translation,
+        covariance=1e-8 * np.eye(6),
+        shape=SHAPE,
+    )
+    pixels = viewpoint.to_pixels(curve)
+    std, whole = np.full(len(curve), 0.1), np.ones(len(curve), bool)
+    width, depth, spread = 6.0, 1.1, 4.0
+    return ImageCurve(
+        viewpoint, pixels, std, whole, width, 0.1, DIAMETER, depth, spread, 1.0, (), np.ones(3), 0.8
+    )
+
+
+@pytest.mark.parametrize(("apart", "aside"), [(0.4, 0.4), (0.0, 0.2)], ids=["parallel", "turned"])
+def test_the_places_of_cameras_give_depth_not_the_way_they_point(apart, aside):
+    """Parallel cameras 0.4 m apart, and one that is turned by 10 degrees about itself."""
+    curve = bow(401)
+    seen, problems = {}, {}
+    for side in (-0.5, 0.5):
+        center, target = (0.05 + side * apart, 0.0, 1.2), (0.05 + side * aside, 0.0, 0.1)
+        seen[f"at {side}"] = drawn(curve, *stand(center, target))
+    fit = agreeing_fit(seen, problems, known(curve))
+    assert (fit is not None) == (apart > 0.0)
+    assert all("nearly the same place" in problem for problem in problems.values())
 
 
 def test_a_covered_board_is_named(pictures):
