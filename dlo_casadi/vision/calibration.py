@@ -28,6 +28,7 @@ _TILTED = 20.0
 # photographs and invisible in the residuals: for drawn corners with markers off by this, three
 # photographs within 12 degrees gave errors up to 5.7 %, where the scatter alone predicted 2 %.
 _PLACED = 1e-3
+_LONGEST = 100.0  # focal length over picture size beyond which it is none: half a degree is seen
 _APART = "30 to 90 degrees apart"  # view angles that separate focal length from distance
 _FILLED = 0.5  # smallest share of the picture with corners: beyond them the lens is extrapolated
 # Lenses, by the coefficients that are fitted: none, k1, k1 k2, k1 k2 p1 p2 k3.
@@ -83,7 +84,8 @@ def calibrate_camera(photographs: Mapping[str, Picture], board: Board) -> Calibr
     Raises
     ------
     VisionError
-        If fewer than three photographs show three markers, or if they are of different sizes.
+        If fewer than three photographs show three markers, if they are of different sizes, or if
+        all face the board alike.
 
     References
     ----------
@@ -160,6 +162,12 @@ def _solve(
         score = 2 * count * np.log(solved[0]) + numbers * np.log(count)
         trials.append((score, numbers, solved))
     _, fitted, (rms, matrix, lens, turns, shifts) = min(trials, key=lambda trial: trial[0])
+    if not matrix[:2, :2].max() < _LONGEST * max(size):
+        raise VisionError(
+            f"the focal length cannot be found from these {len(seen)} photographs: all face the "
+            "board alike, where a longer focal length and a larger distance look the same. "
+            f"Try: photographs of the whole board from directions {_APART}."
+        )
     slopes, displaced = [], []
     errors: dict[str, dict[int, float]] = {}
     for (name, markers), corners, turn, shift in zip(

@@ -40,6 +40,20 @@ def test_what_would_make_it_better_is_told(pictures):
     assert "degrees" in advice
 
 
+def test_photographs_from_straight_ahead_tell_no_focal_length():
+    size, scale = 60, 1000.0
+    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    images = {}
+    for name, (left, top) in {"a": (500, 450), "b": (540, 430), "c": (520, 470)}.items():
+        images[name] = np.full((900, 1200, 3), 255, np.uint8)
+        for n, (x, y) in BOARD.marker_centers.items():
+            u, v = int(left + scale * x - size / 2), int(top - scale * y - size / 2)
+            marker = cv2.aruco.generateImageMarker(words, n, size)
+            images[name][v : v + size, u : u + size] = marker[..., None]
+    with pytest.raises(VisionError, match="all face the board alike"):
+        calibrate_camera(images, BOARD)
+
+
 def test_how_well_the_matrix_is_known_is_as_opencv_has_it(pictures, monkeypatch):
     """Of markers in their places, and photographs from different sides, OpenCV's are right."""
     monkeypatch.setattr(calibration, "_PLACED", 0.0)
