@@ -173,7 +173,7 @@ def _located(
     return fit, {
         "shape": (height, width),
         "reprojection_error": fit.rms,
-        "markers": np.array(list(fit.found.values())),
+        "markers": np.array([fit.found[n] for n in sorted(fit.found)]),
         "numbers": tuple(sorted(fit.found)),
         "messages": (*copies, *(f"marker {n} {why[n]}; {used}" for n in lost)),
     }

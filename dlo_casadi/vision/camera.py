@@ -67,9 +67,9 @@ class Photograph:
     reprojection_error: float = 0.0
     """Root mean square [px] over the corners of the markers; 0 for two reference points."""
     markers: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 2)))
-    """Corners (n, 4, 2) [px] of the markers that were used."""
+    """Corners (n, 4, 2) [px] of the markers that were used, by their numbers."""
     numbers: tuple[int, ...] = ()
-    """Their numbers."""
+    """These numbers, the smallest one first."""
     messages: tuple[str, ...] = ()
     """Which markers were not used, and why."""
 

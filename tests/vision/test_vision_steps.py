@@ -104,7 +104,10 @@ def board_picture(centers, size_px=60):
 
 def test_markers_are_told_apart():
     board = Board("DICT_4X4_50", 60 / SCALE, 0.0, CENTERS)
-    assert locate_board(board_picture(CENTERS), board).numbers == (0, 1, 2, 3)
+    view = locate_board(board_picture(CENTERS), board)
+    assert view.numbers == (0, 1, 2, 3)
+    places = view.to_board(view.markers.mean(axis=1))
+    assert places == pytest.approx(np.array([CENTERS[n] for n in view.numbers]), abs=2e-3)
     seen = locate_board(board_picture({n: CENTERS[n] for n in (0, 1, 3)}), board)
     assert seen.numbers == (0, 1, 3)
     assert seen.messages == ("marker 2 is not found; 3 of 4 are used",)
