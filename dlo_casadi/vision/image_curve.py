@@ -47,8 +47,8 @@ class ImageCurve:
     distance: float
     """Depth [m] at which the picture was searched: between the fixtures."""
     correlation: float
-    """Length [px] along the line over which neighbours share their errors, the integral of the
-    correlation: pixels are averaged along the cable by a Gaussian."""
+    """Length [px] along the line, to either side, over which neighbours share their errors: the
+    integral of the correlation from 0 on. Pixels are averaged along the cable by a Gaussian."""
     confidence: float
     """Share of the line inside the picture that was measured soundly, 0..1."""
     messages: tuple[str, ...]

@@ -140,8 +140,8 @@ def fit_curve_to_images(
     curve, n, m = first, len(first.coefficients), len(curves)
     grid = np.linspace(0.0, 1.0, _GRID)
     params = list(params or [places_along(seen, curve.position(grid)) for seen in curves])
-    # Pixels a distance h apart whose errors are correlated over the length c (the integral of the
-    # correlation, on both sides) are worth h / (2 c) independent ones.
+    # Pixels a distance h apart whose errors are correlated over the length c to either side (the
+    # integral of the correlation from 0 on) are each worth h / (2 c) independent ones.
     shared = [max(2 * seen.correlation / max(seen.spacing, 1e-6), 1.0) for seen in curves]
     motions = np.zeros((m, 6))
     rigid = [np.linalg.inv(seen.viewpoint.covariance) for seen in curves]
