@@ -420,6 +420,27 @@ def test_clamps_in_space_that_give_way(clips, effects, more):
                 assert found == pytest.approx(change, abs=1e-7), (side, axis, name)
 
 
+def test_turns_of_the_end_are_those_beyond_the_last_saddle():
+    """Four rolled saddles twist the cable by 1.7 turns, which the end's turns do not count."""
+    model = replace(loom(0), clips=("clamped",) * 4, n=20)
+    saddles = tuple(
+        HeldClip(
+            "clamped", (0.1998 * k, 0, 0), 0.2 * k, orientation=turned(k * np.radians(150), 0, 0)
+        )
+        for k in range(1, 5)
+    )
+    pose = replace(
+        POSE,
+        end=(0.999, 0.0, 0.0),
+        start_orientation=turned(0, 0, 0),
+        end_orientation=saddles[-1].orientation,
+        clips=saddles,
+        turns=1.0,
+    )
+    solver, p, rest = compiled(model)
+    assert_agree(solver.solve(pose), solve_equilibrium(model, p, rest, pose))
+
+
 @pytest.mark.parametrize(("element", "position"), [("quadratic", 0.02), ("arc", 0.7)])
 def test_a_tether_in_a_plane(element, position):
     model, pose = flat(effects=(Tether(),), element=element)
