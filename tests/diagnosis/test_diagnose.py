@@ -8,12 +8,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hidden_sets import simulated
 
 from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis import from_pose_to_pose
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
-from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.crossval import (
+    CrossValidation,
+    _as_far_by_chance,
+    _predicted,
+    cross_validate,
+)
 from dlo_casadi.diagnosis.diagnose import Search, diagnose
 from dlo_casadi.diagnosis.from_pose_to_pose import at_random_instead
 from dlo_casadi.diagnosis.screening import Screen
@@ -26,6 +32,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.parallel import generator_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -205,6 +212,32 @@ def test_the_place_of_a_mass_of_zero_stops_nothing(fit):
     here, there = cross_validate(fit), cross_validate(same)
     assert here.squares == pytest.approx(there.squares, rel=1e-3)  # two stops of the same descent
     assert Screen(same, candidates(model, setup_of(model, n_poses=6))).run(screening_degrees(same))
+
+
+@pytest.mark.parametrize(("factor", "by_chance"), [(1e-8, False), (1e4, True)])
+def test_chance_moves_a_pose_as_far_as_its_unknowns_are_uncertain(fit, factor, by_chance):
+    theta = fit.point.theta
+    size = fit.problem.unknowns.size
+    covariance = factor * fit.covariance[:size, :size]
+    seen = _predicted(fit, {0: theta})[0]
+    assert _as_far_by_chance(fit, 0, seen, theta, covariance) is by_chance
+
+
+def test_a_fold_that_does_not_count_neither_hides_nor_adds_an_error():
+    counts = np.full(5, 100.0)
+    told = CrossValidation(np.array([1e-4, np.nan, 1e-4, 1e-4, 1e-4]), counts, 1e-3)
+    assert told.complete
+    assert told.error == pytest.approx(1e-3)
+    assert told.error_of_most == pytest.approx(1e-3)
+    assert CrossValidation(np.full(5, np.nan), counts, 1e-3).error == np.inf
+    assert CrossValidation(np.full(5, np.nan), counts, 1e-3).error_of_most == np.inf
+
+
+@pytest.mark.long
+def test_a_clean_cable_with_a_pose_at_a_fold_is_complete():
+    """Without one of its poses a complete model predicts it 43 mm off."""
+    found = simulated(generator_of(2063, 450), 3, 0)
+    assert found.session.fit().verdict == "complete"
 
 
 def test_structure_is_seen_before_and_not_after(fit, found):
