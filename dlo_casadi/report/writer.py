@@ -59,7 +59,8 @@ class ResultsFolder(FolderDraft):
     def of_another(self) -> str | None:
         """Path of another configuration whose results the folder holds; else None."""
         earlier, own = _report(self.path).get("config_path"), self.config and self.config.path
-        return earlier if earlier and own and earlier != str(own) else None
+        other = earlier and own and os.path.realpath(earlier) != os.path.realpath(own)
+        return earlier if other else None
 
     def __enter__(self) -> Self:
         taken = [name for name in OWNED if os.path.lexists(self.path / name)]

@@ -70,6 +70,8 @@ def test_results_of_another_configuration_are_known(earlier, outcome):
     (earlier / "report.json").write_text(report_text(outcome))
 
     assert ResultsFolder(earlier, config).of_another is None
+    roundabout = config.noted(path=config.path.parent / "inner" / ".." / config.path.name)
+    assert ResultsFolder(earlier, roundabout).of_another is None
     assert ResultsFolder(earlier, other).of_another == str(config.path)
     assert ResultsFolder(earlier / "empty", other).of_another is None
 
