@@ -353,13 +353,19 @@ def test_a_straight_cable_can_be_checked_from_the_command_line(tmp_path, capsys)
         (["--end", "0.5", "0", "--samples", "-1"], "samples: a whole number, 0 or more, found -1"),
     ],
 )
-def test_an_export_without_its_session_tells_what_is_missing(tmp_path, capsys, words, said):
+def test_an_export_without_its_session_tells_what_is_missing(
+    tmp_path, monkeypatch, capsys, words, said
+):
     """Wrong numbers are told first, except that the start needs an end."""
+    monkeypatch.chdir(tmp_path.parent)
     (tmp_path / "parameters.yaml").write_text(
         dump_yaml(dlo.known_cable(ROPE, **PINNED).metadata.document)
     )
     assert main(["export", str(tmp_path), "--to", "mujoco", *words]) == 2
-    assert re.search(said, capsys.readouterr().err)
+    told = capsys.readouterr().err
+    assert re.search(said, told)
+    folders = re.findall(r"[^ ,]+", told.partition("is not in")[2].partition(".\n")[0])
+    assert len(set(folders)) == len(folders)
 
 
 @pytest.mark.parametrize("words", [["--start-heading", "0"], []])

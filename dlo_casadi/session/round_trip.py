@@ -88,7 +88,7 @@ def session_of(cable: FittedCable, given: Path | None) -> Config:
         fitted = cable.metadata.document.get("config_hash")
         if given or hashlib.sha256(path.read_bytes()).hexdigest() == fitted:
             return load_config(path)
-    looked = ", ".join(str(path.resolve()) for path in dict.fromkeys(found or places))
+    looked = ", ".join(dict.fromkeys(str(path.resolve()) for path in found or places))
     missing = f"is no longer as it was fitted: {looked}" if found else f"is not in {looked}"
     raise ConfigError(
         f"the session {name} that {cable.name!r} was fitted to {missing}.\n"
