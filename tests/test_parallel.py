@@ -27,7 +27,7 @@ from tasks import (
 from dlo_casadi.equilibrium.by_ipopt import run_ipopt
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.runtime import parallel
-from dlo_casadi.runtime.executors import InProcess, interrupts_held
+from dlo_casadi.runtime.executors import INTERRUPTS, InProcess, interrupts_held
 from dlo_casadi.runtime.parallel import (
     LostTaskError,
     Tally,
@@ -155,6 +155,18 @@ def test_an_interrupt_waits_for_the_start_of_processes():
         stop.set()
         thread.join()
     assert done == ["started"]
+
+
+def test_interrupts_of_a_program_around_python_are_left_to_it(monkeypatch):
+    """Python knows no handler that such a program has set, and cannot set it again."""
+    before = [signal.getsignal(number) for number in INTERRUPTS]
+    monkeypatch.setattr(signal, "getsignal", lambda _: None)
+    real = signal.signal
+    monkeypatch.setattr(signal, "signal", lambda number, handler: real(number, handler) and None)
+    with interrupts_held():
+        pass
+    monkeypatch.undo()
+    assert [signal.getsignal(number) for number in INTERRUPTS] == before
 
 
 @contextmanager

@@ -289,6 +289,7 @@ def interrupts_held() -> Iterator[None]:
     before = {
         number: signal.signal(number, lambda number, _: received.append(number))
         for number in INTERRUPTS
+        if signal.getsignal(number) is not None  # one that is not of Python cannot be set again
     }
     try:
         yield
