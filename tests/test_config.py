@@ -65,6 +65,12 @@ def load(folder: Path, *changes: tuple[str, str], text: str = GOOD) -> Config:
     return load_config(path)
 
 
+def test_the_text_of_a_file_is_that_which_was_read(tmp_path):
+    path = load(tmp_path).path
+    path.write_text(GOOD, encoding="utf-16")
+    assert load_config(path).text == GOOD
+
+
 def load_images(folder: Path, *parts: str) -> Config:
     measurement = "{" + ", ".join(["kind: images", *parts]) + "}"
     return load(folder, ("{kind: centerlines, std: 3e-4}", measurement), (".csv", ".jpg"))

@@ -1,6 +1,7 @@
 """Convert YAML text <-> plain data. No other module imports yaml."""
 
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,13 @@ def read_yaml(path: str | Path) -> Any:
     Raises ConfigError if the file cannot be read, is empty, or is not YAML.
     """
     return Document.read(Path(path)).data
+
+
+def yaml_text(path: Path) -> str:
+    """Text of a YAML file, in the encoding that `read_yaml` takes it in; raises OSError."""
+    with path.open("rb") as file:
+        wide = file.read(2) in (BOM_UTF16_LE, BOM_UTF16_BE)
+    return path.read_text(encoding="utf-16" if wide else "utf-8-sig", errors="replace")
 
 
 def dump_yaml(data: object) -> str:

@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from dlo_casadi.config.document import dump_yaml
+from dlo_casadi.config.document import dump_yaml, yaml_text
 from dlo_casadi.config.options import (
     Centerlines,
     DeclaredTolerances,
@@ -441,7 +441,7 @@ class Config(ConfigSection):
         """
         if self.path is None:
             return dump_yaml(self.model_dump(exclude_unset=True))
-        return self.path.read_text(encoding="utf-8-sig", errors="replace")
+        return yaml_text(self.path)
 
     @property
     def measured_poses(self) -> tuple[Pose, ...]:
