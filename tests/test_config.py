@@ -389,6 +389,11 @@ def test_a_tolerance_lies_within_the_bounds_of_what_takes_it_up(tmp_path, key, v
         load(tmp_path, ("  poses:", tolerances + "  poses:"))
 
 
+def test_a_tolerance_of_the_roll_is_in_radians(tmp_path):
+    with pytest.raises(ConfigError, match=r"line 11: .*tolerances\.roll: 180 rad: 0 to 9 rad is"):
+        load(tmp_path, ("  poses:", "  tolerances: {roll: 180}\n  poses:"))
+
+
 @pytest.mark.parametrize(
     ("effect", "parameter", "message"),
     [

@@ -110,6 +110,8 @@ class DiagnosisOptions(ConfigSection):
 _LARGEST = 3.0
 # A full turn within a tenth of a millimetre.
 _TWIST = Range(0.0, 1.0e5, "1/m")
+# The bound of `end_roll`: of a larger tolerance the bound would decide instead.
+_ROLL = Range(0.0, 9.0, "rad")
 
 
 class Limits(ConfigSection):
@@ -317,7 +319,7 @@ class DeclaredTolerances(ConfigSection):
     """Of the heading of a clamp or saddle in a plane [rad]."""
     rotation: Positive = _STANDARD.rotation
     """Of a clamp's orientation in space, about each of its axes, of a saddle's across [rad]."""
-    roll: Positive = _STANDARD.roll
+    roll: Annotated[Positive, within(_ROLL)] = _STANDARD.roll
     """Of the roll of a cable in its end clamp, about itself [rad]."""
     clip: Positive = _STANDARD.clip
     """Of a coordinate of a clip between the ends [m]."""
