@@ -186,7 +186,9 @@ def test_spikes_are_no_motion(take):
         ({"start_offset": (10.0, 0.0, 0.0)}, "--start-offset 10 0 0: .* 1 m at most"),
         ({"at": (0.1, 0.1)}, "--at 0.1 0.1: .* each larger"),
         ({"at": (0.1, 5.5), "known": {"length": 0.6}}, "--at 0.1 5.5: .* --length 0.6"),
+        ({"at": (0.1, np.inf)}, "--at 0.1 inf: "),
         ({"end": "start"}, "--end start: .* another body"),
+        ({"end": "free", "end_offset": (0.0, 0.0, 0.1)}, "--end-offset 0 0 0.1: .* --end free"),
     ],
 )
 def test_impossible_options_are_refused_by_name(wishes, said):
@@ -206,6 +208,17 @@ def test_impossible_options_are_refused_by_name(wishes, said):
 def test_impossible_views_are_refused_by_name(view, said):
     with pytest.raises(DloError, match=said):
         CloudView(**view)
+
+
+def test_options_of_what_a_recording_does_not_have_are_refused(take, tmp_path):
+    files, _ = write_motive(take, tmp_path)
+    with pytest.raises(MeasurementError, match=r"--color and --box tell of clouds, .* has none"):
+        read_recording(files, view=CloudView(color=(230, 110, 20), box=(0,) * 6))
+    recording = recording_of(replace(take, bodies={}))
+    with pytest.raises(
+        MeasurementError, match=r"--start-offset .* has none\.\n  Try: --start O,X,Y"
+    ):
+        make_session("loom", recording, Wishes(start_offset=(0.0, 0.0, 0.1)))
 
 
 def test_a_contradiction_that_only_the_recording_shows_cites_no_file(take, tmp_path, capsys):

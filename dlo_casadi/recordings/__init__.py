@@ -47,7 +47,8 @@ def read_recording(
     Raises
     ------
     MeasurementError
-        If one of them cannot be read. An exception that no reader expects is its `__cause__`.
+        If one of them cannot be read, or if the view is asked of a recording without clouds. An
+        exception that no reader expects is its `__cause__`.
     """
     names = [path.absolute().name for path in paths]
     found = []
@@ -69,7 +70,11 @@ def read_recording(
                 f"{str(error).rstrip('.')}.\n  Try: {again}.",
                 pose=label,
             ) from error
-    return together(found)
+    recording = together(found)
+    asked = " and ".join(f"--{key}" for key in ("camera", "color", "box") if getattr(view, key))
+    if asked and not recording.clouds:
+        raise MeasurementError(f"{asked} tell of clouds, but this recording has none.")
+    return recording
 
 
 def _reader(path: Path) -> Callable[..., Recording] | None:

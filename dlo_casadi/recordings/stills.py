@@ -343,6 +343,9 @@ def find_gripper(
         return Gripper(o + frames @ np.array(offset or np.zeros(3)), frames)
     bodies = recording.of("body")
     if not bodies and name == side:
+        if len(offset):
+            why = f"--{side}-offset is in the axes of a body, and this recording has none"
+            raise MeasurementError(f"{why}.\n  Try: --{side} O,X,Y of three markers on it.")
         return None
     if name not in bodies:
         raise MeasurementError(

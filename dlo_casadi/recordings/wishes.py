@@ -49,13 +49,16 @@ class Wishes:
             require(
                 near, f"{side}_offset", offset, f"three numbers in metres, {_OFFSET:g} m at most"
             )
+            held = getattr(self, side) != FREE or not len(offset)
+            require(held, f"{side}_offset", offset, f"left out with --{side} {FREE}")
         if len(self.at):
             longest = self.known.get("length", np.inf)
             ordered = all(np.diff(self.at) > 0.0) and self.at[0] >= 0.0
             wanted = "arc lengths in metres, each larger than the one before"
             if "length" in self.known:
                 wanted += f", from 0 to --length {longest:g}"
-            require(bool(ordered and self.at[-1] <= longest), "at", self.at, wanted)
+            fine = bool(ordered and self.at[-1] <= longest and np.isfinite(self.at[-1]))
+            require(fine, "at", self.at, wanted)
         require(self.start != self.end, "end", self.end, "another body than that at the start")
 
     @property
