@@ -570,6 +570,19 @@ def test_reach_allows_for_the_tolerances(tmp_path):
     assert load(tmp_path, ("[0.5, 0.1]", "[0.8017, 0]")).skipped
 
 
+def test_reach_of_clips_allows_for_their_tolerances(tmp_path):
+    """By default 3 hypot(0.5, 0.2, 0.2, 0.5) mm = 2.3 mm."""
+
+    def held(place, tolerances=""):
+        clip = f"clips: [{{kind: pinned, at: 0.4, place: [{place}, 0]}}], role:"
+        return load(tmp_path, ("role:", clip), ("  poses:", f"{tolerances}  poses:"))
+
+    assert not held(0.4022).skipped
+    assert not held(0.414, "  tolerances: {slip: 5.0e-3}\n").skipped
+    with pytest.raises(ConfigError, match=r"clip_1 are 0\.4024 m apart, with 0\.4 m of cable"):
+        held(0.4024)
+
+
 def test_no_pose_within_reach(tmp_path):
     with pytest.raises(ConfigError, match="no pose to fit is left") as caught:
         load(tmp_path, ("[0.5, 0.1]", "[508, 101]"), ("[0.4, 0.1]", "[0, 0.9]"))

@@ -269,8 +269,12 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
 def _unreachable(
     poses: Iterable[Pose], cable: Cable, tolerances: DeclaredTolerances
 ) -> dict[str, str]:
-    """Find poses whose ends are farther apart than the cable's length plus three tolerances."""
+    """Find poses whose fixtures are farther apart than their cable is long, plus three tolerances.
+
+    Between clips, these include how well the places of clips are known, and their arc lengths.
+    """
     slack = 3.0 * math.hypot(tolerances.length, tolerances.end)
+    at_clips = math.hypot(slack, 3.0 * tolerances.clip, 3.0 * tolerances.slip)
     reasons: dict[str, str] = {}
     for pose in poses:
         end = pose.end or pose.start
@@ -282,7 +286,7 @@ def _unreachable(
                 f"end ({', '.join(f'{x:g}' for x in end)}) m is {distance:.4g} m from the start; "
                 f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?{hint}"
             )
-        elif wrong := too_short(pose, cable.length, slack):
+        elif wrong := too_short(pose, cable.length, at_clips):
             reasons[pose.name] = wrong
     return reasons
 
