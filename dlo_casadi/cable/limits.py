@@ -169,7 +169,7 @@ class LimitCheck(LimitUse, Exceedance):
 Asked = ConfigSection | Mapping[str, Any] | None
 # Largest tolerance of a place or of the length, in lengths of the cable.
 _LOOSE = 0.1
-_TRY = "{'bend_radius': 0.05, 'force': 8.0}, of the commands --limits bend_radius=0.05 force=8"
+_TRY = "limits={'bend_radius': 0.05, 'force': 8.0}; of a command --limits bend_radius=0.05 force=8"
 
 
 def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Limits:
