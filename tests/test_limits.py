@@ -269,6 +269,12 @@ def test_what_cannot_be_checked_says_what_to_try(fitted, capsys, words, said):
     assert said in capsys.readouterr().err
 
 
+def test_limits_that_no_pose_is_checked_against_are_no_success(fitted, tmp_path, capsys):
+    (tmp_path / "list.csv").write_text("name,end_x_m,end_y_m\nfar,9,0\n")
+    assert main(["limits", str(fitted), str(tmp_path / "list.csv"), "--limits", "force=9"]) == 2
+    assert "no limit is checked, no pose has a shape: far: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -235,6 +235,9 @@ def limits(chosen: argparse.Namespace) -> None:
             continue
         named = replace(shape, pose=replace(shape.pose, name=name))
         checks += _checked(named, chosen)
+    if not checks:
+        name, problem = next(iter(lost.items()))
+        raise EquilibriumError(f"no limit is checked, no pose has a shape: {name}: {problem}")
     page = Page(chosen)
     page.data({"limits": [check.as_dict() for check in checks], "without_shape": lost})
     page.print(limits_table(cable.name, checks))
