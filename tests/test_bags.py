@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings import CloudView, Wishes, make_session, read_recording
 from dlo_casadi.recordings.bags import _markers
-from dlo_casadi.recordings.stills import align_clocks, find_stills
+from dlo_casadi.recordings.stills import align_clocks, find_gripper, find_stills
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
 typesys = pytest.importorskip("rosbags.typesys")
@@ -243,6 +243,8 @@ def test_a_frame_that_changes_its_parent_is_left_out_with_a_remark(tmp_path):
     recording = read_recording(written(tmp_path, *held, *moved, *cable()))
     assert set(recording.of("body")) == {"table", "hand"}
     assert "frames plug of TF have several parents: left out" in recording.assumptions
+    with pytest.raises(MeasurementError, match="found: table, hand; frames plug of TF have sever"):
+        find_gripper("plug", (), "start", [], recording)
 
 
 def test_a_frame_without_a_name_is_told_as_such(tmp_path):

@@ -348,10 +348,11 @@ def find_gripper(
             raise MeasurementError(f"{why}.\n  Try: --{side} O,X,Y of three markers on it.")
         return None
     if name not in bodies:
+        why = "".join(f"; {remark}" for remark in recording.assumptions if name in remark)
         raise MeasurementError(
             f"no body is called {name!r}, which holds the {side} of the cable; found: "
-            f"{', '.join(bodies) or 'none'}.\n  Try: --{side} NAME of one of them, or --{side} "
-            "O,X,Y of three markers on it: its place, along its x axis, on the side of y."
+            f"{', '.join(bodies) or 'none'}{why}.\n  Try: --{side} NAME of one of them, or "
+            f"--{side} O,X,Y of three markers on it: its place, along its x axis, on the side of y."
         )
     values = _means(stills, "body", name, recording)
     frames = Rotation.from_quat(values[:, 3:]).as_matrix()
