@@ -823,6 +823,9 @@ def test_a_mass_that_is_not_declared_takes_a_reading(tmp_path):
     assert any("cable.mass is not declared" in text for text in config.warnings)
     with pytest.raises(ConfigError, match=r"5: cable.diameter: 0.5 m: a solid .* 3.5e\+02 kg"):
         read_at(tmp_path, "end_force: [1, -2]", unknown, ("1.28e-2", "0.5"))
+    with pytest.raises(ConfigError, match=r": cable.length: 800000 m") as caught:
+        read_at(tmp_path, "end_force: [1, -2]", unknown, ("length: 0.8", "length: 8.0e+5"))
+    assert "kg" not in str(caught.value)
     with pytest.raises(ConfigError, match=r"or end_force of a fit pose\n.*bb.csv does not"):
         read_at(tmp_path, "end_force: [1, -2]", unknown, ("b.csv", "bb.csv"))
     with pytest.raises(ConfigError, match="without gravity nothing depends on it"):

@@ -109,7 +109,8 @@ class Cable(ConfigSection):
         problems = implausible_sizes(self.length, self.prior_mass, self.diameter)
         if self.mass is None and ("mass",) in [place for place, _ in problems]:
             text = f"{self.diameter:g} m: a solid cable has {self.prior_mass:.2g} kg: in metres?"
-            problems = [ConfigProblem(("diameter",), text)]
+            sizes = [problem for problem in problems if problem.place != ("mass",)]
+            problems = sizes or [ConfigProblem(("diameter",), text)]
         if declared is not None and (wrong := STIFFNESS.complaint(declared)):
             problems.append(ConfigProblem(("bending_stiffness",), wrong))
         if (young is None) == (declared is None):
@@ -434,10 +435,7 @@ class Config(ConfigSection):
     def text(self) -> str:
         """The session as a configuration file, as far as it was declared.
 
-        Raises
-        ------
-        OSError
-            If its file cannot be read any more.
+        Raises OSError if its file cannot be read any more.
         """
         if self.path is None:
             return dump_yaml(self.model_dump(exclude_unset=True))
