@@ -24,6 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import stdtr
 
 from dlo_casadi.arrays import FloatArray, root_of
@@ -341,19 +342,21 @@ def _stretches(fit: Fit) -> CrossValidation:
     j = problem.used[0]
     item = problem.measured[j]
     points = np.argsort(fit.point.projections[0], kind="stable")  # a stretch of all photographs
-    joint = np.concatenate([lin.by_theta[0], lin.by_deviation[0]], axis=1)
     size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
     prior = np.zeros((size + n_dev, size + n_dev))
     prior[:size, :size] = problem.precision
     prior[size:, size:] = np.diag(1 / problem.deviation_std**2)
     pull = np.concatenate([fit.point.theta - problem.mean, fit.own_deviations[0]])
-    noise = np.linalg.inv(problem.whitening[0])
+    root = np.linalg.inv(problem.whitening[0])
+    noise = root @ root.T
     errors: list[tuple[FloatArray, FloatArray] | None] = []
     densities = []
     for left_out in np.array_split(points, min(STRETCHES, len(points))):
         kept = np.ones(item.n_residuals, dtype=bool)
         kept[item.on_points] = ~np.isin(item.point_of, left_out)
-        a, e = joint[kept], lin.residuals[0][kept]
+        # Correlated noise: the fit's weights would mix left-out points into those beside them.
+        white = _whitening(noise[np.ix_(kept, kept)])
+        a, e = white @ lin.raw_directions[0][kept], white @ lin.raw[0][kept]
         hessian = a.T @ a + prior
         hessian += 1e-9 * np.diag(np.diag(hessian)) + NO_INFORMATION * np.eye(len(hessian))
         step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
@@ -365,8 +368,14 @@ def _stretches(fit: Fit) -> CrossValidation:
         off: FloatArray = lin.raw[0] + lin.raw_directions[0] @ step
         if seen is not None:
             off = item.residual(seen, item.located(seen, fit.point.projections[0]))
-        rows, ways = noise[~kept], lin.raw_directions[0][~kept] @ root_of(np.linalg.inv(hessian))
-        white = np.linalg.inv(np.linalg.cholesky(rows @ rows.T))
+        ways = lin.raw_directions[0][~kept] @ root_of(np.linalg.inv(hessian))
+        white = _whitening(noise[np.ix_(~kept, ~kept)])
         told = _log_density(white @ off[~kept], white @ ways)
         densities.append(told + float(np.linalg.slogdet(white)[1]))
     return replace(_validation(errors), densities=np.array(densities))
+
+
+def _whitening(covariance: FloatArray) -> FloatArray:
+    """Matrix W (K, K) with W covariance W^T = 1."""
+    factor = np.linalg.cholesky(covariance)
+    return np.asarray(solve_triangular(factor, np.eye(len(factor)), lower=True))

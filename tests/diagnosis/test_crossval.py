@@ -12,8 +12,10 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel
 
 CABLE = CableData(length=0.5, mass=0.02, diameter=0.006, bending_stiffness=0.002)
 NOISE = 3e-4
@@ -84,6 +86,28 @@ def test_a_left_out_pose_is_that_of_a_fit_without_it(k):
     apart = np.sqrt(2 * crossval.REFIT_TOLERANCE) * known.std("bending_stiffness")
     np.testing.assert_allclose(again, known.p, atol=apart)
     assert cross_validate(fit).squares[k] == pytest.approx(expected, rel=1e-2)
+
+
+def test_points_of_a_left_out_stretch_do_not_move_what_predicts_it(monkeypatch):
+    """Nor through the points beside it, whose noise is correlated with theirs."""
+    model = CableModel(CABLE, 12, n_rest=0)
+    (pose,) = measured(model)[-1:]
+    fit = fit_model(model, [pose], Tolerances(), NOISE, refined=False)
+    fit = fit.reweighed(NoiseModel(NOISE, 0.9, 0.05, source="declared"))
+    moved = pose.points + np.where(np.arange(40)[:, None] // 8 == 2, 1e-3, 0.0)
+    others = replace(fit.problem, history=(MeasuredPose.of_points(pose.pose, moved),))
+    thetas, predicted = [], crossval._predicted
+
+    def kept(fit, own):
+        thetas.append(own[0])
+        return predicted(fit, own)
+
+    monkeypatch.setattr(crossval, "_predicted", kept)
+    for one in (fit, Fit(others, fit.point)):
+        cross_validate(one)
+    before, after = np.split(np.array(thetas), 2)
+    assert after[2] == pytest.approx(before[2], rel=1e-9)
+    assert np.abs(after - before).max() > 1e-2
 
 
 def test_a_state_before_a_left_out_pose_moves_with_the_unknowns():
