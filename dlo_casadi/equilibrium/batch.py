@@ -200,10 +200,10 @@ class BatchEquilibrium:
             stale[active] |= (size > NEAR) | bool(self.model.surfaces)
             way = self.node.difference(shapes.x[active], now.x[active])
             lost = ~(np.abs(way).max(axis=(1, 2)) <= reach)
-            converged[active[done & ~lost]] = True
-            last[active] = size
             if coupled and lost.any():
                 break
+            converged[active[done & ~lost]] = True
+            last[active] = size
             active = active[~(done | lost)]
             if not len(active):
                 break

@@ -150,6 +150,19 @@ def test_a_pose_that_is_lost_leaves_the_others_alone():
         np.testing.assert_allclose(solved.x[j], alone[j].x, atol=1e-8)  # IPOPT's tol
 
 
+def test_no_pose_of_a_state_converges_if_one_is_lost_in_the_last_step():
+    """The first has moved nothing and the second too far when both have converged."""
+    model = CableModel(CABLE, 8, effects=(RestCurvatureDrift(),))
+    p, rest, poses = np.array([0.06, 0.3]), np.full(8, 0.8), poses_at(2)
+    found = [shape.equilibrium for shape in predict_poses(model, p, rest, poses)]
+    x = np.array([eq.x for eq in found]) + np.array([0.0, 0.02])[:, None, None]
+    lam = np.array([eq.multipliers for eq in found])
+    guess = Shapes(x, lam, np.zeros((2, len(deviation_names(Heading)))))
+    step = {"tolerance": 1.0, "reach": 0.01}
+    _, converged = BatchEquilibrium(model, poses).solve(guess, p, rest, **step)
+    assert not converged.any()
+
+
 def test_a_drift_is_carried_in_order():
     """Each pose finds rest + rate (curvature - rest) of the one before."""
     model = CableModel(CABLE, 8, effects=(RestCurvatureDrift(),))
