@@ -36,6 +36,15 @@ def rope():
     return dlo.known_cable(ROPE, **PINNED, model={"n": 20})
 
 
+def test_a_known_cable_held_straight_up_falls_to_either_side():
+    """Nothing is uncertain, yet by symmetry neither side is the lower one."""
+    cable = dlo.known_cable(ROPE, **FREE, model={"n": 20})
+    shape = cable.solve(start_heading=np.pi / 2)
+    mirrored = shape.other_side.points * (-1, 1)
+    np.testing.assert_allclose(mirrored, shape.points, atol=1e-8)
+    assert cable.solve(start_heading=np.pi / 2 + 1e-6).other_side is None
+
+
 def test_a_limp_cable_hangs_in_a_catenary():
     """L = 2a sinh(s/2a), sag = a (cosh(s/2a) - 1), H = w a  [Irvine, Cable Structures, 1981]."""
     length, span, mass = 1.0, 0.6, 0.05

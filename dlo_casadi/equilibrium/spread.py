@@ -23,6 +23,8 @@ from dlo_casadi.thresholds import EITHER
 # Share of new repeats inside the band, and its half width in standard deviations.
 COVERED = 0.9
 EDGE = -float(ndtri((1 - COVERED) / 2))
+# Angle [rad] from where two sides are equally low that rounding of their energies alone may make.
+_ROUNDING = 1e-9
 # Step of finite differences of energies, as a share of a standard deviation.
 _SHARE = 1e-3
 
@@ -250,7 +252,7 @@ class Tipping:
     @property
     def either(self) -> bool:
         """Whether it is uncertain which side is the lower one."""
-        return self.angle < EITHER * self.std
+        return self.angle < max(EITHER * self.std, _ROUNDING)
 
 
 def tipping_of(
