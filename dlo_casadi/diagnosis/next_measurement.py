@@ -184,14 +184,17 @@ class NextPose:
 def separating_pose(fit: Fit, added: Sequence[AddedEffect]) -> NextPose | None:
     """Pose that separates one of a fit's added effects from its closest rival.
 
-    Both rivals are fits on the mesh of the search.
+    A rival fitted before another effect was found does not count: the poses would differ by that
+    effect, too.
     """
+    own = {effect.label for effect in fit.model.effects}
     for item in added:
-        if item.rivals:
-            rival = item.rivals[0]
-            found = next_pose(fit, rival.fit)
-            names = (item.candidate.name, rival.candidate.name)
-            return None if found is None else replace(found, separates=names)
+        for rival in item.rivals:
+            apart = own ^ {effect.label for effect in rival.fit.model.effects}
+            if apart <= {item.candidate.effect.label, rival.candidate.effect.label}:
+                found = next_pose(fit, rival.fit)
+                names = (item.candidate.name, rival.candidate.name)
+                return None if found is None else replace(found, separates=names)
     return None
 
 
