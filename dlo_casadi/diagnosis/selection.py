@@ -324,7 +324,7 @@ def choose(
     validation: CrossValidation,
     doubt: float | None,
 ) -> tuple[list[Confirmed], dict[str, str]]:
-    """The best refit by `support` and its rivals; by name, why other candidates are in none.
+    """The best refit by `support` and its rivals; by name, why candidates are not in `added_by`.
 
     Both gains have to be positive. Rivals fall short of the best by less than EVIDENCE_APART. Of a
     candidate in several refits the likeliest one's reason counts.
@@ -333,19 +333,18 @@ def choose(
     order = {item.name: support(item, base, validation) for item in refits}
     better = [item for item in refits if not why[item.name]]
     better.sort(key=lambda item: -order[item.name])
-    chosen = []
-    for item in better:
-        behind = order[better[0].name] - order[item.name]
-        if behind < EVIDENCE_APART:
-            chosen.append(item)
-        else:
-            why[item.name] = f"log likelihood {behind:.3g} behind {better[0].name}"
+    behind = {item.name: order[better[0].name] - order[item.name] for item in better}
+    chosen = [item for item in better if behind[item.name] < EVIDENCE_APART]
+    for item in better[1:]:
+        why[item.name] = f"log likelihood {behind[item.name]:.3g} behind {better[0].name}"
     reasons = {
         x.candidate.name: why[item.name]
         for item in sorted(refits, key=lambda item: order[item.name])
         for x in item.each
     }
-    kept = {x.candidate.name for item in chosen for x in item.each}
+    beside = [_names(own.beside) for item in chosen[:1] for own in item.beside_others()]
+    turned = (x for item in chosen for x in item.beside_others())
+    kept = {x.candidate.name for x in turned if _names(x.beside) in beside}
     return chosen, {name: reason for name, reason in reasons.items() if name not in kept}
 
 

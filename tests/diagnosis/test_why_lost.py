@@ -65,16 +65,19 @@ def test_each_reason_has_its_number():
 
 
 def test_both_candidates_of_a_pair_have_its_reason():
-    """Unless another pair with one of them is chosen."""
+    """Unless it is in the best pair, or a rival of one of that pair's candidates."""
 
     def pair(first, second, *gains):
         return replace(refit(second, *gains), beside=(refit(first, *gains).screened,))
 
     tried = [pair("one", "two", 50.0, 50.0), pair("one", "other", 30.0, 30.0)]
     tried += [pair("other", "last", 20.0, 20.0), refit("last", -1.0, -1.0)]
-    chosen, why = choose(tried, BASE, DECLARED, None)
-    assert chosen == tried[:1]
+    rivals = [pair("one", "rival", 49.0, 49.0), pair("apart", "both", 48.0, 48.0)]
+    chosen, why = choose([*rivals, *tried], BASE, DECLARED, None)
+    assert chosen == [tried[0], *rivals]
     assert why == {
+        "apart": "log likelihood 2 behind one and two",
+        "both": "log likelihood 2 behind one and two",
         "other": "log likelihood 20 behind one and two",
         "last": "log likelihood 30 behind one and two",
     }
