@@ -298,6 +298,8 @@ def test_what_needs_a_fit_says_so(rope, tmp_path):
     wire = dlo.known_cable(WIRE, **IN_SPACE)
     with pytest.raises(dlo.DloError, match="element: one of quadratic, arc belongs here"):
         wire.with_mesh(element="link")
+    with pytest.raises(dlo.DloError, match="arc, link belongs here, found array"):
+        rope.with_mesh(element=np.array(["arc", "link"]))
     with pytest.raises(dlo.DloError, match="'rope' is known exactly: all samples would be the sam"):
         rope.export("mujoco", tmp_path / "rope.xml", end=(0.5, 0.1), samples=2)
     with pytest.raises(dlo.DloError, match="'bending_stiffness' was not fitted; fitted are none"):

@@ -409,6 +409,7 @@ def test_the_command_takes_what_the_function_takes(loom, capsys):
             "end: two numbers [x, y] belong here, in space three [x, y, z], found 'ab'",
         ),
         ("pinned", {"end": (0.3, 0), "branch": "left"}, "branch must be 'ccw', 'cw' or None"),
+        ("pinned", {"end": (0.3, 0), "branch": np.array(["ccw", "cw"])}, "None, found array"),
         (
             "overhang",
             {"start_heading": float("nan")},

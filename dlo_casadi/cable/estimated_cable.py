@@ -76,7 +76,7 @@ class EstimatedCable(CasadiCable):
         if n is not None and (not isinstance(n, int | np.integer) or int(n) not in MESH):
             raise DloError(f"n: a whole number, {MESH}, found {n!r}")
         known = ELEMENTS_IN_SPACE if self.model.in_space else ELEMENTS
-        if element not in (None, *known):
+        if not (element is None or (isinstance(element, str) and element in known)):
             raise DloError(f"element: one of {', '.join(known)} belongs here, found {element!r}")
         if self.model.has_state:
             raise DloError(

@@ -139,7 +139,7 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     own, other = AXES[model.node.dimension], AXES[5 - model.node.dimension]
     kind, gravity = own.direction, f"{own.gravity} of gravity"
     given = {key: value for key, value in asked.items() if value is not None}
-    if branch not in (None, *get_args(Branch)):
+    if not (branch is None or (isinstance(branch, str) and branch in get_args(Branch))):
         raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
     if branch not in (None, *model.node.branches):
         raise DloError(f"{name} is in space: a branch has no meaning")
