@@ -15,6 +15,7 @@ import dlo_casadi as dlo
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml
 from dlo_casadi.effects import ClipSlip
+from dlo_casadi.export.rod import Rod
 
 ROPE = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, name="rope")
 WIRE = dlo.Cable(
@@ -79,6 +80,8 @@ def test_frames_at_a_saddle_that_slipped_are_those_of_one_declared_there():
     )
     assert own.points == pytest.approx(other.points, abs=1e-9)
     assert own.frames == pytest.approx(other.frames, abs=1e-7)
+    exported, known = (Rod.of(one.held, 60).frames for one in (own, other))
+    assert (exported.inv() * known).magnitude().max() < 1e-7
 
 
 def test_two_masses_pull_like_two_forces_of_their_weights(tmp_path):

@@ -257,16 +257,21 @@ class Shape:
     @cached_property
     def frames(self) -> FloatArray:
         """Material frames (101, d, d) at `s`, see `CableCurve.frames`."""
-        cable, eq = self.cable, self.equilibrium
+        return self.curve.frames(self.s, self._places, self.equilibrium.x)
+
+    @property
+    def _places(self) -> FloatArray:
+        """Arc lengths (n_nodes,) [m] of the model's nodes; those of saddles are moved to these."""
+        cable = self.cable
         given = Inputs.of(cable.p, cable.rest, self.pose.vector[None])
-        clipped = assembly_of(cable.model).clipped(eq.shapes, given)
-        return self.curve.frames(self.s, clipped.places[0], eq.x)
+        return assembly_of(cable.model).clipped(self.equilibrium.shapes, given).places[0]
 
     @property
     def held(self) -> SolvedCable:
         """The state from which an export is made."""
         model, p = self.cable.model.without_kind(MeasurementEffect, self.cable.p)
-        return SolvedCable(model, p, self.cable.rest, self.pose, self.curve, self.equilibrium.x)
+        shape = self.curve, self.equilibrium.x, self._places
+        return SolvedCable(model, p, self.cable.rest, self.pose, *shape)
 
     @property
     def start_force(self) -> FloatArray:

@@ -29,7 +29,6 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.export.common import printable
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import node_places
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.node import Node
 from dlo_casadi.rod.section import Cell
@@ -73,6 +72,8 @@ class SolvedCable:
         The true curve, by declared arc length.
     x : (n_nodes, coordinates)
         States of the model's nodes.
+    places : (n_nodes,) [m]
+        Arc lengths of the model's nodes; nodes of saddles are moved to these.
     """
 
     model: CableModel
@@ -81,13 +82,16 @@ class SolvedCable:
     pose: HeldPose
     curve: NodeCurve
     x: FloatArray
+    places: FloatArray
 
     @classmethod
     def of(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> Self:
         """The cable in its predicted shape."""
         eq = solve_equilibrium(model, p, rest, pose)
-        rows = assembly_of(model).curve(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
-        return cls(model, p, rest, pose, NodeCurve.of(model.cable.length, rows), eq.x)
+        given, assembly = Inputs.of(p, rest, pose.vector[None]), assembly_of(model)
+        curve = NodeCurve.of(model.cable.length, assembly.curve(eq.shapes, given)[0])
+        places = assembly.clipped(eq.shapes, given).places[0]
+        return cls(model, p, rest, pose, curve, eq.x, places)
 
 
 @dataclass(frozen=True)
@@ -371,8 +375,7 @@ def _segments(
     start, end = fixtures
     model, length = cable.model, cable.model.cable.length
     middles = np.clip((s[:-1] + s[1:]) / 2, 0.0, length)
-    places = node_places(model.chain, cable.pose.clips)
-    frames = model.node.rotations(model.node.interpolated(middles, places, cable.x))
+    frames = model.node.rotations(model.node.interpolated(middles, cable.places, cable.x))
     ways = np.diff(_spatial(cable.curve.at(np.clip(s, 0.0, length))), axis=0)
     first, last = start.cable_place, end.cable_place
     held = [k for k, side in ((0, start), (-1, end)) if side.kind == "clamped"]
