@@ -63,21 +63,24 @@ def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",
     DloError
         If there is no compiler, or it fails.
     """
-    named = os.environ.get("CC")
-    compiler = next((c for c in (named, "cc", "gcc", "clang") if c and shutil.which(c)), None)
+    named = os.environ.get("CC", "").strip()
+    # A path, or a name with options: gcc -m64.
+    words = [named] if shutil.which(named) else named.split()
+    names = words[:1] or ["cc", "gcc", "clang"]
+    compiler = next((name for name in names if shutil.which(name)), None)
     if compiler is None:
+        looked = f"CC is {named!r}" if named else f"looked for {', '.join(names)}"
         raise DloError(
-            "no C compiler found (looked for $CC, cc, gcc, clang).\n"
+            f"no C compiler found ({looked}).\n"
             "  Try: apt-get install gcc, or set CC; dlo generate-solver needs none."
         )
     if isinstance(flags, str):
         raise DloError(f"flags is a sequence of words, found {flags!r}\n  Try: {flags.split()}")
     solver.write(folder)
     library = folder / f"{solver.prefix}_solver.so"
-    command = [compiler, "-std=c99", *flags, "-fPIC", "-shared", f"{solver.prefix}_solver.c"]
-    run = subprocess.run(
-        [*command, "-o", library.name, "-lm"], cwd=folder, capture_output=True, text=True
-    )
+    command = [compiler, *words[1:], "-std=c99", *flags, "-fPIC", "-shared"]
+    command += [f"{solver.prefix}_solver.c", "-o", library.name, "-lm"]
+    run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if run.returncode:
         raise DloError(f"{compiler} could not compile the solver:\n{run.stderr[:2000]}")
     return library

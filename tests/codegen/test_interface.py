@@ -416,8 +416,18 @@ def test_links_nothing_but_libm(tmp_path):
 
 
 def test_no_compiler_is_an_error_that_says_so(monkeypatch):
+    monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(DloError, match="no C compiler"):
+    with pytest.raises(DloError, match=r"no C compiler found .looked for cc, gcc, clang"):
+        CompiledSolver(*cable())
+
+
+def test_the_compiler_that_CC_names_is_used_with_its_options(monkeypatch):
+    monkeypatch.setenv("CC", "cc -O0 --no-such-option")
+    with pytest.raises(DloError, match=r"cc could not compile the solver:\n.*no-such-option"):
+        CompiledSolver(*cable())
+    monkeypatch.setenv("CC", "no-such-compiler -O0")
+    with pytest.raises(DloError, match=r"no C compiler found .CC is 'no-such-compiler -O0'"):
         CompiledSolver(*cable())
 
 
