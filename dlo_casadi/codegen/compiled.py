@@ -33,7 +33,7 @@ from dlo_casadi.codegen.shapes import (
 from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.rod.obstacles import Obstacle
+from dlo_casadi.rod.obstacles import Obstacle, Plane
 
 # Poses, or rows of numbers in the layout of dlo_pose in the C header.
 Poses = Sequence[AnyPose] | FloatArray
@@ -388,6 +388,8 @@ class CompiledSolver:
                     f"places of an obstacle must have {counted(d, 'number')}, found {obstacle!r}\n"
                     "  Try: as many as the cable's gravity has"
                 )
+            if isinstance(obstacle, Plane) and not np.any(obstacle.normal):
+                raise DloError(f"the normal of a plane must not be zero, found {obstacle!r}")
         return np.array(list(map(row_of, obstacles)), self._records.obstacle)
 
     def _along(self, slope: Slope | None) -> Any:

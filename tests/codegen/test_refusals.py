@@ -19,6 +19,7 @@ pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compile
 
 CABLE = CableData(0.8, 0.2, 0.01, 0.05)
 TABLE = Plane((0.0, -0.6), (0.0, 1.0))
+FLAT = Plane((0.0, -0.6), (0.0, 0.0))
 CLIP = HeldClip("pinned", (0.25, -0.1), 0.4)
 POSE = HeldPose((0.0, 0.0), (0.5, 0.1), clips=(CLIP,))
 
@@ -83,6 +84,7 @@ def test_a_failed_shape_is_no_start(solver, failed):
         (lambda s, x: s.path(POSE), r"a list of poses .*\n  Try: \[pose\]"),
         (lambda s, x: s.solve(POSE, obstacles=TABLE), r"obstacles is a list, .*Plane"),
         (lambda s, x: s.clearance(x, TABLE), r"obstacles is a list, .*Plane"),
+        (lambda s, x: s.solve(POSE, obstacles=[FLAT]), "a plane must not be zero, found Plane"),
         (lambda s, x: s.limits(x, {"force": "3"}), "positive and finite, found force '3'"),
         (lambda s, x: s.limits(x, {"force": np.inf}), "positive and finite, found force inf"),
     ],
