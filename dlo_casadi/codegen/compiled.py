@@ -195,7 +195,7 @@ class CompiledSolver:
         DloError
             If pose or shape do not fit this cable, or `steps` is not a whole number.
         """
-        if not isinstance(steps, int | np.integer):
+        if not isinstance(steps, int | np.integer) or abs(steps) >= 2**31:
             raise DloError(f"steps: a whole number of Newton steps belongs here, found {steps!r}")
         table, _ = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.shape)

@@ -85,6 +85,10 @@ def test_a_failed_shape_is_no_start(solver, failed):
         (lambda s, x: s.solve(POSE, obstacles=TABLE), r"obstacles is a list, .*Plane"),
         (lambda s, x: s.clearance(x, TABLE), r"obstacles is a list, .*Plane"),
         (lambda s, x: s.solve(POSE, obstacles=[FLAT]), "a plane must not be zero, found Plane"),
+        (
+            lambda s, x: s.step(x, POSE, steps=2**32 + 4),
+            "steps: a whole number .* found 4294967300",
+        ),
         (lambda s, x: s.limits(x, {"force": "3"}), "positive and finite, found force '3'"),
         (lambda s, x: s.limits(x, {"force": np.inf}), "positive and finite, found force inf"),
     ],
