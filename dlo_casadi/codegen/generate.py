@@ -257,7 +257,8 @@ def generate(
     among = Obstacles.of(model, p, obstacles)
     bare, p = replace(model, obstacles=()).without_kind(ContactEffect, p)
     case = case_of(bare, p, rest, inline, among.most)
-    elements = sorted(int(tether[0] * bare.n) for tether in case.tethers)
+    # One at the end is in the last element.
+    elements = [min(int(tether[0] * bare.n), bare.n - 1) for tether in case.tethers]
     if len({*elements}) < len(elements):
         raise DloError(
             f"two tethers are in one of the {counted(bare.n, 'element')}: no solver can be made\n"

@@ -355,8 +355,10 @@ def test_two_tethers_in_one_element_are_refused():
     tethers = (Tether(), Tether(label="tether_2"))
     model = loom(0, tethers)
     values = TETHER | {name.replace("tether.", "tether_2."): x for name, x in TETHER.items()}
-    with pytest.raises(DloError, match=r"two tethers are in one of the .* elements"):
-        compiled(model, values)
+    at_end = values | {"tether.position": 0.999, "tether_2.position": 1.0}
+    for own in (values, at_end):
+        with pytest.raises(DloError, match=r"two tethers are in one of the .* elements"):
+            compiled(model, own)
 
 
 def test_a_saddle_that_is_turned():
