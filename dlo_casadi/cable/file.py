@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -41,12 +42,13 @@ from dlo_casadi.config.values import (
     stacked,
     within,
 )
-from dlo_casadi.effects import EFFECTS, NUISANCES, RANDOM, CableData, Effect, known_effect
+from dlo_casadi.effects import EFFECTS, NUISANCES, CableData, Effect, known_effect
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import ConfigError, DloError, counted
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, CableModel
-from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter
+from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, sources_in
+from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame
 
 FILE = "parameters.yaml"
@@ -179,17 +181,12 @@ class _Own(OpenSection):
     source: str = REST_CURVATURE
     std: NonNegative = 0.0
 
-    @property
-    def complaint(self) -> str:
-        known = (REST_CURVATURE, *RANDOM)
-        return "" if self.source in known else f"source is one of {', '.join(known)}"
-
 
 class _Scatter(OpenSection):
     fixtures: dict[str, NonNegative | None] | None = None
     rest_curvature_std: NonNegative = PoseScatter().std
     rest_curvature_smoothness: NonNegative = PoseScatter().smoothness
-    from_pose_to_pose: Annotated[_Own, checked(lambda found: found.complaint)] = _Own()
+    from_pose_to_pose: _Own = _Own()
     hanging: NonNegative = 0.0
 
 
@@ -348,6 +345,16 @@ def _unlike(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:
     for name in set(file.covariance.names) - {*model.names, *coefficients}:
         text = f"covariance.names: nothing is called {show(name)}"
         yield ConfigProblem(("covariance", "names"), text)
+    scatter, known = file.scatter or _Scatter(), (REST_CURVATURE, *sources_in(model))
+    if scatter.from_pose_to_pose.source not in known:
+        text = f"scatter.from_pose_to_pose.source: this cable has {', '.join(known)}"
+        yield ConfigProblem(("scatter", "from_pose_to_pose", "source"), text)
+    # A fit's clips and random effects are no part of this model.
+    others = re.compile(r"clip_\d|\w+_from_pose_to_pose\.")
+    for name in {*(scatter.fixtures or {})} - {*deviation_names(model.node)}:
+        if not others.match(name):
+            text = f"scatter.fixtures: nothing is called {show(name)}"
+            yield ConfigProblem(("scatter", "fixtures", name), text)
 
 
 def _other_rest(file: ParametersFile, model: CableModel) -> Iterator[ConfigProblem]:

@@ -263,6 +263,14 @@ def damaged(file, tmp_path, change):
             lambda d: d["scatter"].update(rest_curvature_std=-5.0),
             "scatter.rest_curvature_std: must not be smaller than 0, found -5",
         ),
+        (
+            lambda d: d["scatter"]["from_pose_to_pose"].update(source="clamp_rotation"),
+            "scatter.from_pose_to_pose.source: this cable has rest_curvature, pin_moment",
+        ),
+        (
+            lambda d: d["scatter"]["fixtures"].update(end_q=1e-3),
+            "scatter.fixtures: nothing is called 'end_q'",
+        ),
         (lambda d: d["parameters"]["end_offset.dx"].update(value=None), "found nothing"),
         (
             lambda d: d["parameters"]["bending_stiffness"].update(value="soft"),
