@@ -6,6 +6,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from solvers import QUICK, STRICT, moved
 
 from dlo_casadi.codegen import generate
@@ -271,3 +272,27 @@ def test_a_step_on_a_round_obstacle_starts_with_its_normals():
     assert stepped.status == "ok"
     solved = solver.solve(near, warm=shape, obstacles=disc)
     assert stepped.points == pytest.approx(solved.points, abs=1e-8)
+
+
+def test_a_step_in_space_goes_on_until_a_contact_that_presses_hard_is_closed():
+    ahead = tuple(Rotation.from_euler("ZYX", (0.2, -0.3, 0.1)).as_quat())
+    saddle = HeldClip("clamped", (0.3, 0.05, 0.1), 0.36, orientation=ahead)
+    turned = [tuple(Rotation.from_euler("ZY", own).as_quat()) for own in ((0, -0.2), (0.1, 0.3))]
+    ends = {"start_orientation": turned[0], "end_orientation": turned[1]}
+    pose = HeldPose((0.0, 0.0, 0.0), (0.7, 0.1, 0.2), clips=(saddle,), **ends)
+    held = {"start": "clamped", "end": "clamped", "clips": ("clamped",), "n_rest": 0}
+    cable = CableData(1.0, 0.2, 0.01, 0.02, torsional_stiffness=0.015)
+    model = CableModel(cable, 12, gravity=(0.0, 0.0, -9.81), **held)
+    curved = np.full(model.chain.n_rests, 0.3)
+    solver = CompiledSolver(model, model.nominal, curved, flags=QUICK, obstacles=1)
+    free = solver.solve(pose, obstacles=[])
+    before, after = free.points[4:6]
+    along = (after - before) / np.linalg.norm(after - before)
+    side = np.cross(along, (0.0, 0.0, 1.0)) / np.linalg.norm(along[:2])
+    center = (before + after) / 2 + 0.04 * np.cross(side, along) + 0.005 * side
+    bar = [rod.Capsule(tuple(center - 0.2 * side), tuple(center + 0.2 * side), 0.038)]
+    shape = solver.solve(pose, warm=free, obstacles=bar)
+    assert shape.contact_forces.max() > 10.0
+    for way in (0.0, 1e-6):
+        near = replace(pose, end=(0.7 + way, 0.1, 0.2))
+        assert solver.step(shape, near, obstacles=bar).status == "ok"
