@@ -234,7 +234,7 @@ class CasadiCable:
         return PoseUnknowns(found.x.T, found.multipliers)
 
     def _check_branch(self, branch: Branch | None) -> None:
-        if branch not in (None, *self.model.node.branches):
+        if not (branch is None or (isinstance(branch, str) and branch in self.model.node.branches)):
             raise DloError(f"branch must be 'ccw', 'cw' (in a plane) or None, found {branch!r}")
 
     def _check_search(self, search: ca.Function, *, with_others: bool) -> None:
