@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.errors import VisionError
+from dlo_casadi.errors import VisionError, counted
 from dlo_casadi.vision.board import (
     CORNERS_THAT_SHARE,
     LEAST_MARKERS,
@@ -164,9 +164,9 @@ def _solve(
     _, fitted, (rms, matrix, lens, turns, shifts) = min(trials, key=lambda trial: trial[0])
     if not matrix[:2, :2].max() < _LONGEST * max(size):
         raise VisionError(
-            f"the focal length cannot be found from these {len(seen)} photographs: all face the "
-            "board alike, where a longer focal length and a larger distance look the same. "
-            f"Try: photographs of the whole board from directions {_APART}."
+            f"the focal length cannot be found from these {counted(len(seen), 'photograph')}: all "
+            "face the board alike, where a longer focal length and a larger distance look the same."
+            f" Try: photographs of the whole board from directions {_APART}."
         )
     slopes, displaced = [], []
     errors: dict[str, dict[int, float]] = {}
