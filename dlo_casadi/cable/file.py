@@ -405,7 +405,8 @@ def metadata_of(
     scatter = file.scatter or _Scatter()
     fixtures = {name: std or 0.0 for name, std in (scatter.fixtures or {}).items()}
     own, smoothness = scatter.from_pose_to_pose, scatter.rest_curvature_smoothness
-    pose_scatter = PoseScatter(own.std or scatter.rest_curvature_std, smoothness, source=own.source)
+    bends = scatter.rest_curvature_std if own.source == REST_CURVATURE else 0.0
+    pose_scatter = PoseScatter(own.std or bends, smoothness, source=own.source)
     if pose_scatter.of_moments:  # written in N m
         stiffness = file.parameters[BENDING_STIFFNESS].value
         pose_scatter = replace(pose_scatter, std=own.std / stiffness)

@@ -96,14 +96,14 @@ class CrossValidation:
         A pose at the edge of stability has no equilibrium nearby, whatever the model.
         """
         known = np.isfinite(self.squares)
-        if 2 * known.sum() <= len(known):
+        if 2 * known.sum() <= (~np.isnan(self.squares)).sum():
             return float("inf")
         return float(np.sqrt(self.squares[known].sum() / self.counts[known].sum()))
 
     @property
     def rmse(self) -> float:
         """Root mean square distance over all points [m]; infinite as `error` is."""
-        return self.of_points if self.complete else float("inf")
+        return self.of_points if np.isfinite(self.error) else float("inf")
 
     @property
     def log_density(self) -> float:

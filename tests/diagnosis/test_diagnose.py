@@ -229,8 +229,10 @@ def test_a_fold_that_does_not_count_neither_hides_nor_adds_an_error():
     assert told.complete
     assert told.error == pytest.approx(1e-3)
     assert told.error_of_most == pytest.approx(1e-3)
-    assert CrossValidation(np.full(5, np.nan), counts, 1e-3).error == np.inf
-    assert CrossValidation(np.full(5, np.nan), counts, 1e-3).error_of_most == np.inf
+    few = CrossValidation(np.array([1e-4, 1e-4, np.nan, np.nan, np.nan]), counts, 1e-3)
+    assert few.error_of_most == pytest.approx(1e-3)
+    none = CrossValidation(np.full(5, np.nan), counts, 0.0)
+    assert none.error == none.error_of_most == none.rmse == np.inf
 
 
 @pytest.mark.long
