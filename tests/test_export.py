@@ -18,6 +18,7 @@ from dlo_casadi.model.cable_model import CableModel
 SPACE = CableData(0.6, 0.03, 0.004, 0.015, "loom <&>", torsional_stiffness=0.011)
 PLANE = CableData(0.8, 0.2, 0.012, 0.3, "rope")
 MASS, PLACE, RATIO = 0.02, 0.25, 3.0
+ON_TABLE = HeldPose((0.0, 0.0), (0.5, 0.1))
 
 
 def in_space(*effects, **values):
@@ -212,6 +213,20 @@ def test_what_is_not_carried_is_named_with_its_size():
     s = np.linspace(0, 0.6, 101)
     moved = np.linalg.norm(held.curve.at(s) - without.curve.at(s), axis=1).max() / 0.6
     assert float(share[1]) == pytest.approx(100 * moved, rel=0.05)  # two digits
+
+
+def test_a_table_that_a_fit_has_found_is_not_carried_either():
+    model = CableModel(PLANE, 20, start="pinned", end="pinned", n_rest=0)
+    free = SolvedCable.of(model, model.nominal, np.zeros(20), ON_TABLE)
+    on_table = model.with_effect(EFFECTS["contact_plane"]())
+    p = np.append(model.nominal, -0.15)
+    held = SolvedCable.of(on_table, p, np.zeros(20), ON_TABLE)
+    found = losses(held, TARGETS["mujoco"], Rod.of(held, 10))
+    s = np.linspace(0, 0.8, 101)
+    moved = np.linalg.norm(held.curve.at(s) - free.curve.at(s), axis=1).max() / 0.8
+    share = re.search(r"moves by up to ([\d.]+) %", found["obstacles"])
+    assert float(share[1]) == pytest.approx(100 * moved, rel=0.05)
+    assert moved > 0.02
 
 
 def test_samples_scatter_as_the_covariance_says():

@@ -383,6 +383,28 @@ def test_a_known_cable_has_tolerances_of_its_clips_and_obstacles(
         known.solve(end).check(limits, tolerances=tolerances)
 
 
+def test_a_twist_is_that_of_a_mesh_that_resolves_it_with_and_without_a_bend():
+    cable = dlo.known_cable(
+        dlo.Cable(
+            length=0.8,
+            mass=0.05,
+            diameter=0.005,
+            bending_stiffness=1e-3,
+            torsional_stiffness=8e-4,
+        ),
+        gravity=(0, 0, -9.81),
+        boundary=("clamped", "clamped"),
+        rest_curvature=[[2.0], [5.0]],
+        model={"n": 10},
+    )
+    ends = {"start_orientation": (0, 0, 0, 1), "end_orientation": (0.5, 0.5, 0.5, 0.5)}
+    shape = cable.solve(end=(0.5, 0.1, 0.0), **ends)
+    (alone,), (_, both) = (
+        shape.check({"twist": 8.5} | more) for more in ({}, {"bend_radius": 1e-3})
+    )
+    assert alone.value == both.value > 8.5
+
+
 def test_a_known_cable_has_a_tolerance_of_its_length(fitted):
     held = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
     zero = {"name": "length_error", "parameters": {"length_difference": 0.0}}

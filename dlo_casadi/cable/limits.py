@@ -270,7 +270,8 @@ class Resolved:
     ) -> Self:
         """Solve on the meshes that the limits need."""
         meshes = [(cable.model, found)]
-        if limits.bend_radius is not None and not cable.model.has_state:
+        curved = limits.bend_radius is not None or limits.twist is not None
+        if curved and not cable.model.has_state:
             meshes = resolved(cable.model, cable.p, coefficients, pose, found)
         return cls(cable, coefficients, pose, meshes)
 
@@ -319,7 +320,7 @@ def limit_checks(
 ) -> tuple[LimitCheck, ...]:
     """Check one predicted shape, one limit after the other.
 
-    A bend is measured on a mesh that resolves it, see `resolved`. Draws are solved there, too: how
+    Bend and twist are measured on a mesh that resolves the bend. Draws are solved there, too: how
     places compete for the sharpest bend depends on the mesh. `coefficients` (n_coefficients,)
     [1/m]: of the rest curvature. `limits`: meaningful for this cable, see `Limits.problems`.
     """

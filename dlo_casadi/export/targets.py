@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, root_of
+from dlo_casadi.effects import ContactEffect
 from dlo_casadi.errors import DloError, EquilibriumError, OutputError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
 from dlo_casadi.export.common import Relaxed, printable
@@ -282,7 +283,7 @@ def _cost(cable: SolvedCable, rod: Rod, feature: Feature) -> str:
         known["bending_stiffness"] = float(rod.mean_bending.mean())
         known["torsional_stiffness"] = float(rod.torsion.mean())
     if feature == "obstacles":
-        model = replace(model, obstacles=())
+        model, _ = replace(model, obstacles=()).without_kind(ContactEffect, cable.p)
     if feature == "rest shape":
         rest = np.zeros_like(rest)
     for label in labels:
