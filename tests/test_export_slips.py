@@ -62,5 +62,8 @@ def test_a_name_of_two_lines_breaks_no_file(target, tmp_path):
     known = ROPE | {"name": "rope\nb = 1 / 0\x07"}
     rope = dlo.known_cable(known, gravity=(0, -9.81), boundary={"start": "pinned", "end": "pinned"})
     (path,) = rope.export(target, tmp_path / "rope", end=(0.5, 0.1), segments=6)
+    text = path.read_text()
     read = ElementTree.fromstring if target == "mujoco" else ast.parse
-    read(path.read_text())
+    read(text)  # raises unless it is well formed
+    assert "rope b = 1 / 0" in text
+    assert "\nb = " not in text
