@@ -1,0 +1,155 @@
+"""Grippers that hold the cable in the poses of a recording, with x along the cable."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.arrays import FloatArray, length_of, unit
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.recordings.recording import Kind, Recording
+from dlo_casadi.recordings.stills import Still
+
+_INSIDE = 0.05  # share of a line's length, beyond the noise and the hidden ends of lines in clouds
+_IN_LINE = 0.05  # smallest sine of the angle at the first of three markers on a gripper
+_STRAY = 0.5  # smallest cosine at which a gripper's axis may be the cable's
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """A fixture in all poses: positions (P, 3) [m], and frames (P, 3, 3) with x along the cable."""
+
+    places: FloatArray
+    frames: FloatArray
+
+    def turned(self, axes: FloatArray) -> "Gripper":
+        """Return the gripper with other axes, given as columns in its own frame."""
+        return Gripper(self.places, self.frames @ axes)
+
+
+def find_gripper(
+    name: str, offset: Sequence[float], side: str, stills: Sequence[Still], recording: Recording
+) -> Gripper | None:
+    """The body, or the three markers, holding an end; None if the recording has no body."""
+    if name.count(",") == 2:
+        o, x, y = (_means(stills, "marker", part.strip(), recording) for part in name.split(","))
+        first = unit(x - o)
+        across = np.cross(first, unit(y - o))
+        sines = np.linalg.norm(across, axis=1)
+        if sines.min() < _IN_LINE:
+            raise MeasurementError(
+                f"markers {name} at the {side} are in one line in pose {sines.argmin() + 1}: they "
+                "do not tell how the gripper is turned about it.\n  Try: a third marker beside it."
+            )
+        third = unit(across)
+        frames = np.stack([first, np.cross(third, first), third], axis=2)
+        return Gripper(o + frames @ np.array(offset or np.zeros(3)), frames)
+    bodies = recording.of("body")
+    if not bodies and name == side:
+        if len(offset):
+            why = f"--{side}-offset is in the axes of a body, and this recording has none"
+            raise MeasurementError(f"{why}.\n  Try: --{side} O,X,Y of three markers on it.")
+        return None
+    if name not in bodies:
+        why = "".join(f"; {remark}" for remark in recording.assumptions if name in remark)
+        raise MeasurementError(
+            f"no body is called {name!r}, which holds the {side} of the cable; found: "
+            f"{', '.join(bodies) or 'none'}{why}.\n  Try: --{side} NAME of one of them, or "
+            f"--{side} O,X,Y of three markers on it: its place, along its x axis, on the side of y."
+        )
+    values = _means(stills, "body", name, recording)
+    frames = Rotation.from_quat(values[:, 3:]).as_matrix()
+    return Gripper(values[:, :3] + frames @ np.array(offset or np.zeros(3)), frames)
+
+
+def _means(stills: Sequence[Still], kind: Kind, name: str, recording: Recording) -> FloatArray:
+    """Means (P, k) of a stream in all poses."""
+    if not any((kind, name) in still.values for still in stills):
+        known = ", ".join(recording.of(kind)) or "none"
+        raise MeasurementError(
+            f"no {kind} {name!r} was seen in any pose; found: {known}.\n  Try: --start or --end "
+            "with one of these names."
+        )
+    for k, still in enumerate(stills, start=1):
+        if (kind, name) not in still.values:
+            raise MeasurementError(
+                f"{kind} {name} is not seen in pose {k} ({still.span}).\n"
+                "  Try: fill its gaps, or cut the recording there."
+            )
+    return np.array([still.values[kind, name] for still in stills])
+
+
+def along_cable(
+    start: Gripper | None, end: Gripper | None, lines: Sequence[FloatArray], remarks: list[str]
+) -> tuple[Gripper | None, Gripper | None]:
+    """Grippers with x along the cable from start to end, and the least roll between them.
+
+    Of a body's six axes, x is the one closest to the cable's direction, see `_ways`. Of the four
+    ways to roll the end about it, the one with the smallest twist of the cable over all poses is
+    chosen. The remaining roll is a nuisance of the fit, `end_roll`.
+    """
+    if start is not None:
+        start = _aimed(start, _ways(start, lines), "start", remarks)
+    if end is not None:
+        back = _ways(end, [line[::-1] for line in lines])
+        end = _aimed(end, -back, "end", remarks)
+    if start is not None and end is not None:
+        rolls = [Rotation.from_rotvec([k * np.pi / 2, 0, 0]).as_matrix() for k in range(4)]
+        twists = [_twist(start, lines, end.turned(roll)) for roll in rolls]
+        end = end.turned(rolls[int(np.argmin(np.abs(twists)))])
+        remarks.append(
+            "roll of the grippers: of four ways the one with the least twist of the cable; a fit "
+            "finds what is left as end_roll"
+        )
+    return start, end
+
+
+def _ways(gripper: Gripper, lines: Sequence[FloatArray]) -> FloatArray:
+    """Vectors (P, 3) [m] from a gripper to the first point of each line that is well inside it.
+
+    That is a twentieth of its length away: the first points of a line in a cloud are at the place
+    of the gripper, where the direction to them is noise.
+    """
+    found = []
+    for place, line in zip(gripper.places, lines, strict=True):
+        inside = np.linalg.norm(line - place, axis=1) >= _INSIDE * length_of(line)
+        found.append(line[int(np.argmax(inside))] - place)
+    return np.array(found)
+
+
+def _aimed(gripper: Gripper, ways: FloatArray, side: str, remarks: list[str]) -> Gripper:
+    """The gripper with x along the axis that is closest to the directions `ways` (P, 3)."""
+    ways = unit(ways)
+    cosines = np.mean(np.einsum("pij,pi->pj", gripper.frames, ways), axis=0)
+    k = int(np.argmax(np.abs(cosines)))
+    sign = float(np.sign(cosines[k]))
+    angle = np.degrees(np.arccos(min(1.0, abs(cosines[k]))))
+    if abs(cosines[k]) < _STRAY:
+        raise MeasurementError(
+            f"no axis of the body at the {side} is directed along the cable: the nearest is "
+            f"{'-' if sign < 0 else ''}{'xyz'[k]}, {angle:.0f} degrees off the direction of the "
+            "cable there.\n  Try: a body whose x axis is the cable's direction in the clamp; --up; "
+            "cable and grippers in one frame."
+        )
+    remarks.append(
+        f"{side} gripper: its {'-' if sign < 0 else ''}{'xyz'[k]} axis is taken along the cable "
+        f"({angle:.0f} degrees off the cable's direction there)"
+    )
+    axes = np.zeros((3, 3))
+    axes[k, 0], axes[(k + 1) % 3, 1], axes[(k + 2) % 3, 2] = sign, sign, 1.0
+    return gripper.turned(axes)
+
+
+def _twist(start: Gripper, lines: Sequence[FloatArray], end: Gripper) -> float:
+    """Mean angle [rad] from the start frame, moved along the cable without twist, to the end's."""
+    total = 0j
+    for k, (first, last) in enumerate(zip(start.frames, end.frames, strict=True)):
+        steps = np.diff(np.vstack([start.places[k], lines[k], end.places[k]]), axis=0)
+        ways = [first[:, 0], *unit(steps), last[:, 0]]
+        side = first[:, 1]
+        for a, b in pairwise(ways):
+            side = side - (side @ b) / (1.0 + a @ b) * (a + b)
+        total += complex(side @ last[:, 1], side @ last[:, 2])
+    return float(-np.angle(total))
