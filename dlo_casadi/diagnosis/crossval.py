@@ -41,9 +41,9 @@ from dlo_casadi.thresholds import EVIDENCE_APART
 STRETCHES = 5
 # Steps of a fit without a pose, and the decrease of the objective at which it ends.
 REFIT_STEPS, REFIT_TOLERANCE = 3, 0.1
-# Draws of the unknowns that show how far chance moves a pose. At a fold one of them as far as the
-# measured pose is enough: a complete model predicted one pose of a clean cable 43 mm off, expected
-# 6 mm to first order, and 7 of 20 draws were farther.
+# Draws of the unknowns that show how far chance moves a left-out pose: it is at a fold if one of
+# them moves it as far as it was predicted off. Evidence: a complete model predicted one pose of a
+# clean cable 43 mm off, 3 mm were expected on average, and 7 of 20 draws moved it farther.
 DRAWS = 20
 
 

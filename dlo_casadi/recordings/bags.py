@@ -180,7 +180,7 @@ def _add(
 ) -> None:
     """Add a TransformStamped to TF; of a static one only the last pose is valid.
 
-    `torn` gets the name of a frame that has another parent than before: its poses do not mix.
+    A frame that has another parent than before is added to `torn`: its poses cannot be compared.
     """
     pose = _pose(link.transform.translation, link.transform.rotation)
     frame, parent = link.child_frame_id.strip("/"), _frame(link)
