@@ -55,10 +55,9 @@ class CrossValidation:
     ----------
     squares : (folds,) [m^2]
         Sum of squared errors of each fold: distances of its points, and wrench measurements
-        converted by `NoiseModel.units`; infinite if it could not be predicted, NaN if it is not
-        counted.
+        converted by `NoiseModel.units`; infinite if it could not be predicted.
     counts : (folds,)
-        Number of points and of wrench components of each fold.
+        Number of points and of wrench components of each fold; zero if it is not counted.
     of_points : float [m]
         Root mean square distance over all points of the folds that could be predicted and count.
     expected : float [m]
@@ -84,10 +83,8 @@ class CrossValidation:
     @property
     def error(self) -> float:
         """Root mean square error of everything [m]; infinite if a fold could not be predicted."""
-        counted = ~np.isnan(self.squares)
-        if not counted.any():
-            return float("inf")
-        return float(np.sqrt(self.squares[counted].sum() / self.counts[counted].sum()))
+        counts = self.counts.sum()
+        return float(np.sqrt(self.squares.sum() / counts)) if counts else float("inf")
 
     @property
     def error_of_most(self) -> float:
@@ -95,8 +92,8 @@ class CrossValidation:
 
         A pose at the edge of stability has no equilibrium nearby, whatever the model.
         """
-        known = np.isfinite(self.squares)
-        if 2 * known.sum() <= (~np.isnan(self.squares)).sum():
+        counted, known = self.counts > 0, np.isfinite(self.squares)
+        if 2 * (counted & known).sum() <= counted.sum():
             return float("inf")
         return float(np.sqrt(self.squares[known].sum() / self.counts[known].sum()))
 
@@ -112,7 +109,7 @@ class CrossValidation:
 
     def loses_most_of(self, other: CrossValidation) -> bool:
         """Whether most folds that the other validation predicts are not predicted."""
-        known = np.isfinite(other.squares)
+        known = np.isfinite(other.squares) & (other.counts > 0)
         return bool(2 * np.isinf(self.squares[known]).sum() > known.sum())
 
     def chance_of_gain(self, other: CrossValidation) -> float:
@@ -176,13 +173,12 @@ def cross_validate(fit: Fit) -> CrossValidation:
     ]
     items = [problem.measured[j] for j in problem.used]
     errors = [
-        None
-        if seen is None or k in at_folds
-        else (item.distances(seen.curve), item.misread(seen, fit.noise))
-        for k, (item, seen) in enumerate(zip(items, predicted.values(), strict=True))
+        None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
+        for item, seen in zip(items, predicted.values(), strict=True)
     ]
+    for k in at_folds:
+        errors[k] = np.zeros(0), np.zeros(0)
     found, expected = _validation(errors), fit.expected_with(covariances)
-    found.squares[at_folds] = np.nan
     return replace(found, expected=expected, densities=np.array(densities))
 
 
@@ -269,12 +265,11 @@ def _log_density(white: FloatArray, ways: FloatArray) -> float:
 
 def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> CrossValidation:
     """Validation from each fold's errors [m] of points and wrenches; None if not predicted."""
-    known = [fold for fold in errors if fold is not None]
     both = [np.zeros(1) if fold is None else np.concatenate(fold) for fold in errors]
     squares = np.array([float((fold**2).sum()) for fold in both])
     squares[[fold is None for fold in errors]] = np.inf
-    points = np.concatenate([fold[0] for fold in known]) if known else np.zeros(1)
-    rmse = float(np.sqrt((points**2).mean()))
+    points = np.concatenate([np.zeros(0), *(fold[0] for fold in errors if fold is not None)])
+    rmse = float(np.sqrt((points**2).sum() / max(len(points), 1)))
     return CrossValidation(squares, np.array([float(len(fold)) for fold in both]), rmse)
 
 
