@@ -4,7 +4,9 @@ import copy
 import inspect
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -436,6 +438,19 @@ def test_a_fit_from_arrays_is_that_of_the_file(tmp_path):
     assert (
         dlo.load(tmp_path).params["bending_stiffness"] == result.cable.params["bending_stiffness"]
     )
+
+    # Photographs whose names differ in what joins them have a file each, beside other poses' own.
+    first, second, *_ = result.poses
+    pixels = {"pose_01-a": np.array([[1.0, 0.0]]), "pose_01_a": np.array([[2.0, 0.0]])}
+    views = [SimpleNamespace(name=n, seen=SimpleNamespace(pixels=p)) for n, p in pixels.items()]
+    poses = (replace(first, views=views), replace(second, name="pose_01_a"))
+    write_numbers(tmp_path, replace(result, poses=poses))
+    files = {
+        file.stem: np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)[0, 0]
+        for file in (tmp_path / "centerlines").glob("pose_01*")
+    }
+    expected = {"pose_01": tables[0][0, 0], "pose_01_a": tables[1][0, 0]}
+    assert files == expected | {"pose_01_a_1": 1.0, "pose_01_a_2": 2.0}
 
 
 def test_a_photograph_named_as_its_pose_is_named_once(tmp_path):

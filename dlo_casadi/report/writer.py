@@ -118,12 +118,17 @@ def write_numbers(folder: Path, outcome: Outcome) -> None:
     write_file(folder / "parameters.yaml", parameters_text(outcome))
     lines = folder / "centerlines"
     make_folder(lines)
+    taken = {pose.name for pose in outcome.poses}
     for pose in outcome.poses:
         if len(pose.points):
             write_points(lines / f"{pose.name}.csv", pose.points, pose.s)
         for k, view in enumerate(pose.views, 1):
             which = view.name.removeprefix(pose.name).lstrip("-_. ") or str(k)
-            write_table(lines / f"{pose.name}_{which}.csv", ["u_px", "v_px"], view.seen.pixels)
+            name = f"{pose.name}_{which}"
+            while name in taken:  # p-a.png and p_a.png, or a pose called p_a
+                name += f"_{k}"
+            taken.add(name)
+            write_table(lines / f"{name}.csv", ["u_px", "v_px"], view.seen.pixels)
 
 
 def draw(folder: Path, outcome: Outcome, executor: Executor) -> None:

@@ -54,7 +54,17 @@ def test_where_a_step_leads_too_far_the_other_poses_are_fitted_again(effects, mo
     monkeypatch.setattr(crossval, "_predicted", astray)
     monkeypatch.setattr(crossval, "_fitted_without", lambda *_: None)
     monkeypatch.setattr(crossval, "_as_far_by_chance", lambda *_: False)
-    assert cross_validate(fit).squares.sum() > 20 * expected.sum()
+    found = cross_validate(fit)
+    assert found.squares.sum() > 20 * expected.sum()
+    assert (found.counts > 0).all()
+
+    monkeypatch.setattr(crossval, "_predicted", astray)
+    monkeypatch.setattr(crossval, "_as_far_by_chance", lambda *_: True)
+    found = cross_validate(fit)  # of what is left only the taut cable is predicted
+    assert not found.counts[1:].any()
+    assert found.complete
+    assert found.error == pytest.approx(np.sqrt(found.squares[0] / found.counts[0]))
+    assert found.of_points == pytest.approx(found.error)
 
 
 def test_a_fit_that_does_not_explain_its_points_is_not_repeated_without_each_pose(monkeypatch):
