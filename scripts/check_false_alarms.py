@@ -47,7 +47,7 @@ import dlo_casadi as dlo
 from dlo_casadi.config import declared_setup, load_config
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.diagnose import diagnose
-from dlo_casadi.effects import RANDOM
+from dlo_casadi.effects import random_effects
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import tipping
 from dlo_casadi.estimation.constrained import profile_intervals
@@ -150,7 +150,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
-    kind, dimension = RANDOM.get(args.random), 3 if args.space else 2
+    kind, dimension = random_effects().get(args.random), 3 if args.space else 2
     if kind is not None and dimension not in kind.dimensions:
         where = "in space" if args.space else "in a plane"
         parser.error(f"--random {args.random} is not of cables {where}")

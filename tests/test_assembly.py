@@ -8,7 +8,6 @@ import pytest
 from perturbed import any_rest, any_shapes, central, directions
 
 from dlo_casadi.effects import (
-    RANDOM,
     AxialStretch,
     BendingSoftening,
     CableData,
@@ -25,6 +24,7 @@ from dlo_casadi.effects import (
     SideLoad,
     StiffSection,
     UnknownPull,
+    random_effects,
 )
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -50,7 +50,7 @@ MOST = (
 )
 HOLDERS = {"pinned": (EndSpring(), EndOffset()), "clamped": (ClampAngle(),), "free": ()}
 OWN_LENGTH = LengthError(label="length of a pose")
-RANDOM_OF = {"pinned": (RANDOM["pin_moment"](label="moment of a pose"), OWN_LENGTH)}
+RANDOM_OF = {"pinned": (random_effects()["pin_moment"](label="moment of a pose"), OWN_LENGTH)}
 
 
 def posed(

@@ -24,6 +24,7 @@ from dlo_casadi.effects import (
     PointForce,
     PointLoad,
     Setup,
+    SideLoad,
 )
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Params, PointForceAt, SpringAt
@@ -263,6 +264,26 @@ def test_a_compliance_of_ones_own_stretches_the_cable():
         for one in (Rubber(), AxialStretch())
     )
     assert own.points == pytest.approx(known.points, abs=1e-12)
+
+
+def test_an_effect_of_ones_own_may_differ_at_random_from_pose_to_pose(monkeypatch):
+    class Draught(SideLoad):
+        name = "draught"
+        at_random = "a draught of its own"
+
+    monkeypatch.setitem(EFFECTS, "draught", Draught)
+    model = CableModel(CableData(0.8, 0.06, 0.006, 0.02), 40, effects=(Draught(),), n_rest=0)
+    rng, s, std, listed = np.random.default_rng(3), np.linspace(0.02, 0.98, 25) * 0.8, 0.05, []
+    for end in ENDS:
+        p, held = np.array([0.03, rng.normal(scale=std)]), HeldPose((0.0, 0.0), end)
+        (shape,) = predict_poses(model, p, np.zeros(model.chain.n_rests), [held])
+        points = shape.curve.at(s) + rng.normal(scale=NOISE, size=(25, 2))
+        listed.append(dlo.Pose((0.0, 0.0), end, points=points))
+    cable = dlo.Cable(length=0.8, mass=0.06, diameter=0.006, bending_stiffness=0.02)
+    session = dlo.Session(cable, listed, gravity=(0.0, -9.81), boundary=("pinned", "pinned"))
+    scatter = session.fit(diagnosis=False).fit.problem.priors.pose_scatter
+    assert scatter.words == "a draught of its own"
+    assert 0.5 < scatter.std / std < 2.0
 
 
 def test_the_registry_accepts_the_effects_of_the_package():

@@ -79,12 +79,14 @@ UNKNOWN_MASS: type[Effect] = MassError
 # Effect whose parameter moves a clip along the cable, for derivatives by the clip's arc length.
 ALONG_CABLE = ClipSlip
 
-# Effects that may differ at random from pose to pose.
-_KINDS: list[type[Effect]] = [PinMoment, *EFFECTS.values()]
-RANDOM = {kind.name: kind for kind in _KINDS if kind.at_random}
-
 # Effects of every measurement, estimated together with the others, never declared or diagnosed.
 NUISANCES: dict[str, type[Effect]] = {kind.name: kind for kind in (EdgeBias, SensorBias)}
+
+
+def random_effects() -> dict[str, type[Effect]]:
+    """Effects that may differ at random from pose to pose, registered ones of users among them."""
+    kinds: list[type[Effect]] = [PinMoment, *EFFECTS.values()]
+    return {kind.name: kind for kind in kinds if kind.at_random}
 
 
 def known_effect(name: str) -> type[Effect] | None:

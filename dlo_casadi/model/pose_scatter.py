@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects import RANDOM, Effect, Setup
+from dlo_casadi.effects import Effect, Setup, random_effects
 from dlo_casadi.model.cable_model import CableModel
 
 # Number of cosines of a random rest curvature, and its trial correlation lengths as shares of L.
@@ -28,7 +28,7 @@ class PoseScatter:
     dof : float
         Degrees of freedom of the chi-square distribution of the estimated variance.
     source : str
-        `rest_curvature`, or the name of one of the RANDOM effects, whose parameters differ.
+        `rest_curvature`, or the name of one of `random_effects`, whose parameters differ.
     rivals : tuple of PoseScatter
         Other random quantities that the data cannot distinguish from it.
     shown : bool
@@ -57,13 +57,14 @@ class PoseScatter:
     @property
     def words(self) -> str:
         """What each pose has of its own, in words."""
-        known = RANDOM.get(self.source)
+        known = random_effects().get(self.source)
         return known.at_random if known else "a rest curvature of its own"
 
     @property
     def of_moments(self) -> bool:
         """Whether it is of moments, which `std` gives per bending stiffness [1/m]."""
-        return self.source in RANDOM and RANDOM[self.source].per_stiffness
+        kind = random_effects().get(self.source)
+        return kind is not None and kind.per_stiffness
 
     @property
     def bends(self) -> bool:
@@ -112,13 +113,13 @@ class PoseScatter:
 
 def sources_in(model: CableModel) -> list[str]:
     """Names of the effects that may differ from pose to pose, besides the rest curvature."""
-    return [name for name in RANDOM if effect_of(name, model) is not None]
+    return [name for name in random_effects() if effect_of(name, model) is not None]
 
 
 def effect_of(source: str, model: CableModel) -> Effect | None:
-    """The RANDOM effect of that name, with options for a model; None if it does not apply."""
+    """The random effect of that name, with options for a model; None if it does not apply."""
     setup = Setup(model.cable, model.start, model.end, model.gravity)
-    kind = RANDOM.get(source)
+    kind = random_effects().get(source)
     if kind is None or not kind.applies(setup):
         return None
     return replace(kind.made_for(setup), label=_label(source))
