@@ -355,23 +355,23 @@ class Search:
     def _judged_again(self, fit: Fit, smaller: Fit, effect: AddedEffect) -> tuple[Fit, AddedEffect]:
         """The likeliest candidate beside effects that were added later, and its rivals.
 
-        Sequential replacement (Miller 1990): an effect may be the best one alone, and another one
-        beside what was still missing then. Alone, a force explained a tilt and a drift better than
-        either. `smaller` lacks the effect; if it misfits, scores are useless and only known rivals
-        are judged.
+        Sequential replacement (Miller 1990): an effect may be the best one alone, and another one,
+        or that of another clip, beside what was still missing then. Alone, a force explained a tilt
+        and a drift better than either. `smaller` lacks the effect; if it misfits, scores are
+        useless and only known rivals are judged.
         """
-        before, name = cross_validate(smaller), effect.name
+        before, name, label = cross_validate(smaller), effect.name, effect.candidate.effect.label
         rivals_only = {name, *(rival.name for rival in effect.rival_candidates)}
         screened = self._screened(smaller, rivals_only if misfits(smaller) else None)
         p_values = p_values_of(screened)
-        own = [item for item in screened if item.candidate.name == name]
+        own = [item for item in screened if item.candidate.effect.label == label]
         known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}
         tried = self._leading(smaller, screened, p_values, known, fit)
         chosen, _ = choose(tried, smaller, before, self.doubt)
         others = tuple(item for item in chosen if item.name != name)
         if len(others) < len(chosen):
             effect = replace(effect, rivals=others)
-        if not chosen or chosen[0].name == name:
+        if not chosen or (chosen[0].name == name and own):
             return fit, effect
         winner = chosen[0]
         better, p_value = with_new_noise(winner, smaller, p_values, self._starts_at_shapes(smaller))
@@ -380,7 +380,7 @@ class Search:
                 after = cross_validate(better)
                 (other,) = added_by(winner, chosen[1:], p_value, before, after)
                 return better, other
-        rivals = {item.name: item for item in (*effect.rivals, winner)}
+        rivals = {item.name: item for item in (*effect.rivals, winner) if item.name != name}
         return fit, replace(effect, rivals=tuple(rivals.values()))
 
     def _leading(

@@ -8,16 +8,22 @@ import pytest
 
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
+from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen, sidak
+from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.diagnosis.unknown_force import _Search
-from dlo_casadi.effects import CableData, LengthError, LumpedMass, UnknownPull
+from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.thresholds import SIGNIFICANCE
 
 NOISE = 3e-4
 PLAIN = CableModel(CableData(0.5, 0.03, 0.006, 0.01), 12, n_rest=5)
@@ -160,3 +166,28 @@ def test_a_refit_beside_another_effect_has_the_weights_of_its_base(base, monkeyp
     assert found.gain == pytest.approx(
         2 * (base.point.objective - larger.point.objective), rel=1e-6
     )
+
+
+def test_the_offset_of_another_clip_replaces_a_first_one():
+    """As the diagnosis may choose it for want of what it finds later."""
+    held = (HeldClip("pinned", (0.25, 0.02), 0.3), HeldClip("pinned", (0.5, 0.0), 0.6))
+    model = CableModel(CableData(0.9, 0.06, 0.006, 0.02), 18, n_rest=0, clips=("pinned", "pinned"))
+    moved, rng, measured = model.with_effect(ClipOffset(clip=1)), np.random.default_rng(0), []
+    s, values = np.linspace(0.02, 0.88, 40), {"clip_offset_2.dx": 4e-3, "clip_offset_2.dy": -6e-3}
+    p = np.array([values.get(name, x) for name, x in zip(moved.names, moved.nominal, strict=True)])
+    for end in ((0.75, 0.1), (0.7, -0.15), (0.8, 0.0)):
+        pose = HeldPose((0.0, 0.0), end, clips=held)
+        (seen,) = predict_poses(moved, p, np.zeros(18), [pose])
+        points = seen.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2))
+        measured.append(MeasuredPose.of_points(pose, points, s=s))
+    base = fit_model(model, measured, Tolerances(), NOISE)
+    first, _ = (c for c in candidates(model, setup_of(model)) if c.name == "clip_offset")
+    wrong = refits.confirm(base, *Screen(base, [first]).run(np.inf))
+    effect = AddedEffect(first, 1e-9, cross_validate(base), wrong.validation, ())
+    among = [name for name in EFFECTS if name != "clip_offset"]
+    search = Search(base, None, among, SIGNIFICANCE, 4, lambda *_: None, InProcess())
+    better, judged = search._judged_again(wrong.fit, base, effect)
+    assert judged.candidate.effect == ClipOffset(clip=1)
+    assert not judged.rivals
+    assert better.value("clip_offset_2.dy") == pytest.approx(-6e-3, abs=3e-4)
+    assert search._judged_again(better, base, judged) == (better, judged)
