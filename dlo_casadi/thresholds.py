@@ -51,6 +51,9 @@ EVIDENCE_APART = 5.0
 # must promise; one step gains half a score. It promised 0.45 to 2.9 in four sessions with hidden
 # effects, 0.02 to 0.34 in nineteen in which something differed at random, 0.45 in another one.
 LEAST_PROMISED = 0.4
+# The same for the gain of a first effect and the score of a second one: 0.97 in a session with two
+# hidden effects, 0 to 0.55 in sixteen in which something differed at random.
+LEAST_PROMISED_BY_TWO = 0.6
 
 # Difference of -2 log likelihood below which two random effects cannot be told apart: a likelihood
 # ratio of 20. Moments of both pins and smooth rest curvatures differed by 2 to 9 in three sessions.

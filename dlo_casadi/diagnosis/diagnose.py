@@ -56,7 +56,7 @@ from dlo_casadi.thresholds import (
     EVIDENCE_APART,
     LARGER_OF_TWO,
     LEAST_PROMISED,
-    LEFT,
+    LEAST_PROMISED_BY_TWO,
     REFITTED,
     SIGNIFICANCE,
     WORTH,
@@ -179,7 +179,8 @@ class Search:
         if found.unexplained:
             found, force = self._or_causes(found)
         if found.unexplained and found.added:
-            found = self.without_wrong_causes(found)
+            if not found.leaves_little(self.validation):
+                found = self._ended(fit, [], found.ranked)
             if found.added or not fit.errors_known:
                 force = estimate_unknown_force(found.fit, self.executor)
         tried = {row.name for row in found.ranked}
@@ -228,9 +229,20 @@ class Search:
         return self._or_causes(found)[0] if lost else found
 
     def _may_gain(self, scattering: Fit) -> bool:
-        """Whether a score promises a fair share of what the scatter gains over this fit."""
-        least = LEAST_PROMISED * (scattering.log_evidence - self.declared.log_evidence)
-        return not self.declared.converged or any(item.score / 2 > least for item in self.first)
+        """Whether scores promise a fair share of what the scatter gains over this fit.
+
+        Those of a first effect or, beside that which gains most, of a second one.
+        """
+        gained = scattering.log_evidence - self.declared.log_evidence
+        best = max((item.score for item in self.first), default=0.0)
+        if not self.declared.converged or best / 2 > LEAST_PROMISED * gained:
+            return True
+        refitted = self._tried(self.declared, None, 0).refits
+        one = max(refitted, key=lambda item: item.gain, default=None)
+        if one is None:
+            return False
+        second = max((item.score for item in self._screened(one.fit)), default=0.0)
+        return (one.gain + second) / 2 > LEAST_PROMISED_BY_TWO * gained
 
     def _forwards(self) -> Found:
         """Result of `run`, or of the same among simpler effects if that is better."""
@@ -434,17 +446,3 @@ class Search:
         if self.finest is None:
             return fit
         return fine_enough(fit, fit.model.n, SETTLED_MODES, finest or self.finest)[0]
-
-    def without_wrong_causes(self, found: Found) -> Found:
-        """Withdraw effects that do not explain nearly all of what the declared model lacks.
-
-        If something is still missing, a wrong effect may stand for part of it. Effects are kept
-        only if the mean square error of left-out data, beyond noise and fixtures, falls below LEFT
-        times its value without them: what is missing beside them is then small compared with what
-        they explain.
-        """
-        # If the declared model did not predict every pose, no effect counts as an explanation.
-        known = self.validation.error if self.validation.complete else 0.0
-        floor = found.fit.expected_error**2
-        after, before = (max(x**2 - floor, 0.0) for x in (found.validation.error, known))
-        return found if after <= LEFT * before else self._ended(self.declared, [], found.ranked)

@@ -19,7 +19,7 @@ from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of, settle
-from dlo_casadi.thresholds import EVIDENCE_APART, UNSEEN
+from dlo_casadi.thresholds import EVIDENCE_APART, LEFT, UNSEEN
 
 Verdict = Literal["complete", "effect_found", "unexplained"]
 
@@ -195,6 +195,20 @@ class Found:
             if x.name not in known
         )
         return replace(other, ranked=(*other.ranked, *rest))
+
+    def leaves_little(self, validation: CrossValidation) -> bool:
+        """Whether its effects explain nearly all of what the declared model lacks.
+
+        If something is still missing, a wrong effect may stand for part of it. The mean square
+        error of left-out data, beyond noise and fixtures, has to fall below LEFT times its value
+        without the effects, that of `validation`: what is missing beside them is then small
+        compared with what they explain.
+        """
+        # If the declared model did not predict every pose, no effect counts as an explanation.
+        known = validation.error if validation.complete else 0.0
+        floor = self.fit.expected_error**2
+        after, before = (max(x**2 - floor, 0.0) for x in (self.validation.error, known))
+        return after <= LEFT * before
 
     def _sets(self, candidates: int) -> float:
         """Log of the number of sets of this many effects, all taken as equally likely."""

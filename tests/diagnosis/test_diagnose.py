@@ -224,14 +224,20 @@ def test_chance_moves_a_pose_as_far_as_its_unknowns_are_uncertain(fit, factor, b
 
 
 def test_a_fold_that_does_not_count_neither_hides_nor_adds_an_error():
-    counts = np.full(5, 100.0)
-    told = CrossValidation(np.array([1e-4, np.nan, 1e-4, 1e-4, 1e-4]), counts, 1e-3)
+    counted = np.array([True, False, True, True, True])
+    told = CrossValidation(1e-4 * counted, 100.0 * counted, 1e-3)
     assert told.complete
     assert told.error == pytest.approx(1e-3)
     assert told.error_of_most == pytest.approx(1e-3)
-    few = CrossValidation(np.array([1e-4, 1e-4, np.nan, np.nan, np.nan]), counts, 1e-3)
+    lost = replace(told, squares=np.array([1e-4, 0.0, 1e-4, 1e-4, np.inf]))
+    assert lost.error_of_most == pytest.approx(1e-3)
+    assert not told.loses_most_of(lost)
+    most = replace(told, squares=np.array([np.inf, 0.0, np.inf, 1e-4, np.inf]))
+    assert most.error_of_most == np.inf
+    assert most.loses_most_of(lost)
+    few = CrossValidation(np.array([1e-4, 1e-4, 0, 0, 0]), np.array([100.0, 100, 0, 0, 0]), 1e-3)
     assert few.error_of_most == pytest.approx(1e-3)
-    none = CrossValidation(np.full(5, np.nan), counts, 0.0)
+    none = CrossValidation(np.zeros(5), np.zeros(5), 0.0)
     assert none.error == none.error_of_most == none.rmse == np.inf
 
 

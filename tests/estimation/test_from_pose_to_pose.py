@@ -274,8 +274,23 @@ def test_a_scatter_may_be_of_the_rest_shape_if_a_rival_is(near):
         assert bends_at_random(both) is expected
 
 
-@pytest.mark.parametrize(("score", "worth"), [(70.0, False), (90.0, True)])
-def test_effects_without_a_scatter_are_sought_where_a_score_promises_as_much(score, worth):
+@pytest.mark.parametrize(
+    ("score", "gains", "second", "worth"),
+    [
+        (90.0, [], 0.0, True),
+        (70.0, [], 0.0, False),
+        (70.0, [60.0, 70.0], 40.0, False),
+        (70.0, [60.0, 70.0], 60.0, True),
+    ],
+)
+def test_effects_without_a_scatter_are_sought_where_scores_promise_as_much(
+    score, gains, second, worth, monkeypatch
+):
+    """One effect of 0.4 times what the scatter gains, or two of 0.6 times."""
+    refitted = [SimpleNamespace(gain=gain, fit=gain) for gain in gains]
+    screened = {gain: [SimpleNamespace(score=x) for x in (second, 1.0)] for gain in gains[1:]}
+    monkeypatch.setattr(Search, "_tried", lambda *_: SimpleNamespace(refits=refitted))
+    monkeypatch.setattr(Search, "_screened", lambda _, fit: screened[fit])
     repeating = SimpleNamespace(log_evidence=0.0, converged=True)
     search = Search(repeating, None, (), SIGNIFICANCE, 4, lambda *_: None, InProcess())
     vars(search)["first"] = [SimpleNamespace(score=score)]
