@@ -52,7 +52,7 @@ EVIDENCE_APART = 5.0
 # effects, 0.02 to 0.34 in nineteen in which something differed at random, 0.45 in another one.
 LEAST_PROMISED = 0.4
 # The same for the gain of a first effect and the score of a second one: 0.97 in a session with two
-# hidden effects, 0 to 0.55 in sixteen in which something differed at random.
+# hidden effects, 0 to 0.51 in sixteen in which something differed at random.
 LEAST_PROMISED_BY_TWO = 0.6
 
 # Difference of -2 log likelihood below which two random effects cannot be told apart: a likelihood
