@@ -229,25 +229,27 @@ class Search:
         return self._or_causes(found)[0] if lost else found
 
     def _may_gain(self, scattering: Fit) -> bool:
-        """Whether scores promise a fair share of what the scatter gains over this fit.
-
-        Those of a first effect or, beside that which gains most, of a second one.
-        """
-        gained = scattering.log_evidence - self.declared.log_evidence
-        best = max((item.score for item in self.first), default=0.0)
-        if not self.declared.converged or best / 2 > LEAST_PROMISED * gained:
+        """Whether one or two scores promise a fair share of what the scatter gains."""
+        gained = 2 * (scattering.log_evidence - self.declared.log_evidence)
+        least, by_two = LEAST_PROMISED * gained, LEAST_PROMISED_BY_TWO * gained
+        if not self.declared.converged or any(item.score > least for item in self.first):
             return True
-        refitted = self._tried(self.declared, None, 0).refits
-        one = max(refitted, key=lambda item: item.gain, default=None)
-        if one is None:
-            return False
-        second = max((item.score for item in self._screened(one.fit)), default=0.0)
-        return (one.gain + second) / 2 > LEAST_PROMISED_BY_TWO * gained
+        refitted = sorted(self._tried(self.declared, None, 0).refits, key=lambda item: -item.gain)
+        return any(x.gain + y.score > by_two for x in refitted[:1] for y in self._screened(x.fit))
 
     def _forwards(self) -> Found:
-        """Result of `run`, or of the same among simpler effects if that is better."""
+        """Result of `run`, or of the same among simpler effects if that is better.
+
+        The first estimate of slow noise is rough, and a large one hides an effect. If nothing is
+        found, and the noise of a complete model is smaller, the search begins anew with that.
+        """
         found = self.run()
-        return found.or_better(self.of_simpler_effects(found))
+        found = found.or_better(self.of_simpler_effects(found))
+        if found.added or found.fit.noise.std >= self.declared.noise.std:
+            return found
+        settled = replace(self, declared=found.fit)
+        shown = min(p_values_of(settled.first).values(), default=1.0) <= self.significance
+        return again if shown and (again := settled.run()).added else found
 
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise or left-out data are predicted no better.
