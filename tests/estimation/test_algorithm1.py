@@ -15,6 +15,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.paper import algorithm1
 from dlo_casadi.paper.algorithm1 import (
     Algorithm1Status,
     InnerProblem,
@@ -248,11 +249,28 @@ def test_loop_converges_in_several_calm_iterations():
 
 
 @pytest.mark.parametrize(
+    ("step", "status", "iterations"),
+    [(1e-3, Algorithm1Status.ITERATION_LIMIT, 5), (0.0, Algorithm1Status.CONVERGED, 3)],
+)
+def test_loop_goes_on_while_rest_angles_change(step, status, iterations, monkeypatch):
+    """Though k_theta stays as it is; three calm iterations end it."""
+
+    def found(angles, slopes, k_theta, theta_0):
+        return k_theta, theta_0 + step
+
+    monkeypatch.setattr(algorithm1, "best_parameters", found)
+    result = run_algorithm1(CABLE, measured(0.3, ENDS[:1]), GRAVITY, n=4, max_iterations=5)
+    assert result.status is status
+    assert result.iterations == iterations
+
+
+@pytest.mark.parametrize(
     ("history", "away"),
     [
         ([1.0, 2e3], True),
         ([1.0, 0.4e-3], True),
         (list(1.2 ** np.arange(14)), True),  # twenty percent more in every iteration
+        (list(1.2 ** -np.arange(14.0)), True),  # or less
         (list(4 - 3 * 0.3 ** np.arange(14)), False),  # rises to 4 and stays there
         ([1.0, 3.0, 2.0, 9.0], False),
     ],
