@@ -40,8 +40,11 @@ def test_the_law_is_read_off_a_hanging_strip(torsion, gravity, level, softness, 
     k = found.curvature
     exact = EI * k / (1 + k * softness)
     bent = k > 0.3 * k.max()
-    # Noise of 20 micrometres leaves some 5 % in the second derivative.
-    np.testing.assert_allclose(found.moment[bent], exact[bent], rtol=0.15)
+    ratio = found.moment[bent] / exact[bent]
+    # Noise of 20 micrometres leaves some 5 % in the second derivative, less in its mean. Without
+    # the weight of the part beyond the last marker 1 to 4 % of the moment would be missing.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.07)
+    assert ratio.mean() == pytest.approx(1.0, abs=0.012)
     np.testing.assert_allclose(law_of(model, p, k), exact, rtol=5e-3, atol=1e-7)
 
 
