@@ -10,6 +10,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, RestCurvatureDrift
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import displacements, spread_across
+from dlo_casadi.estimation import repeats
 from dlo_casadi.estimation.prediction import (
     measured_branches,
     predict_poses,
@@ -76,6 +77,25 @@ def test_repeats_tell_size_and_correlation():
     assert again.std == pytest.approx(found.std, rel=0.01)
     turned = replace(moved[0], pose=replace(moved[0].pose, start_heading=0.002))
     assert different_poses([turned, *moved], MODEL) == 2
+
+
+def test_of_pairs_the_mean_takes_half_of_the_degrees_of_freedom(monkeypatch):
+    """Five poses, each taken twice: either is sqrt(2) times the noise off the other."""
+    truth, pose = NoiseModel(3e-3), HeldPose((0.0, 0.0), (LENGTH, 0.0))
+    measured = [
+        replace(item, pose=replace(pose, end=(LENGTH, 0.01 * (k // 2))))
+        for k, item in enumerate(lines(truth, 10, pose))
+    ]
+    assert different_poses(measured, MODEL) == 5
+    # 300 degrees of freedom: three times 4 %.
+    assert repeatability(measured, MODEL) == pytest.approx(np.sqrt(2) * truth.std, rel=0.12)
+    found = with_repeats(DECLARED, measured, MODEL)
+    assert found.std == pytest.approx(truth.std, rel=0.12)
+    assert repeat_std(measured, MODEL, truth.std) < truth.std / 2
+    # Of the 600 distances from the means 300 are independent.
+    all_of_them = NoiseModel(truth.std, slow_dof=600.0)
+    monkeypatch.setattr(repeats, "estimate_noise", lambda *_: all_of_them)
+    assert with_repeats(DECLARED, measured, MODEL).slow_dof == pytest.approx(300.0)
 
 
 def test_poses_that_hold_a_cable_in_different_ways_are_no_repeats():
