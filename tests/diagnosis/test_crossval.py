@@ -99,6 +99,15 @@ def test_a_left_out_pose_is_that_of_a_fit_without_it(k):
     assert cross_validate(fit).squares[k] == pytest.approx(expected, rel=1e-2)
 
 
+def test_density_of_residuals_is_that_of_their_covariance():
+    rng = np.random.default_rng(0)
+    white, ways = rng.normal(size=9), rng.normal(size=(9, 4))
+    covariance = np.eye(9) + ways @ ways.T
+    energy = white @ np.linalg.solve(covariance, white)
+    expected = -(energy + np.linalg.slogdet(covariance)[1]) / 2
+    assert crossval._log_density(white, ways) == pytest.approx(expected, rel=1e-9)
+
+
 def test_points_of_a_left_out_stretch_do_not_move_what_predicts_it(monkeypatch):
     """Nor through the points beside it, whose noise is correlated with theirs."""
     model = CableModel(CABLE, 12, n_rest=0)

@@ -9,7 +9,7 @@ from dlo_casadi.diagnosis import selection
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
-from dlo_casadi.diagnosis.screening import survival
+from dlo_casadi.diagnosis.screening import sidak, survival
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.effects import CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -117,6 +117,14 @@ def test_an_effect_that_stands_for_the_error_of_the_mesh_is_dropped_on_a_finer_o
 
         assert len(left) == kept
         assert (smaller.model.n == 20) == kept
+
+
+def test_significance_of_two_parameters_and_of_the_best_of_many_tests():
+    """exp(-T / 2), with a noise of k degrees of freedom (1 + T / k)^(-k / 2); 1 - (1 - p)^n."""
+    assert survival(7.0, 2, np.inf) == pytest.approx(np.exp(-3.5))
+    assert survival(7.0, 2, 10.0) == pytest.approx(1.7**-5)
+    assert sidak(0.2, 3) == pytest.approx(1 - 0.8**3)
+    assert sidak(1e-15, 14) == pytest.approx(1.4e-14)
 
 
 @pytest.mark.parametrize("noise_degrees", [np.inf, 1000.0])
