@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.stats import spearmanr
+from scipy.special import ndtri
+from scipy.stats import chi2, spearmanr
 
 from dlo_casadi.diagnosis.structure import _rank_score, structure_of
 from dlo_casadi.effects import CableData
@@ -58,3 +59,46 @@ def test_ties_share_their_rank():
 def test_the_distance_of_the_ends_is_that_in_space(structure):
     """Level, all ends are equally far apart; the energy of the waves grows with the distance."""
     assert structure.span_z == pytest.approx(np.sqrt(len(HEIGHTS) - 1))
+    # In the order of the poses the ranks are 3, 1, 5, 2, 4: Spearman's correlation is 0.3.
+    assert structure.order_z == pytest.approx(0.3 * np.sqrt(len(HEIGHTS) - 1))
+
+
+def test_a_lens_is_seen_as_least_squares_with_its_terms_see_it():
+    """Chi-square falls by the score if ten terms of first and second degree are fitted, too."""
+    cable = CableData(0.8, 0.05, 0.008, 0.02)
+    model, rng = CableModel(cable, 8, n_rest=0), np.random.default_rng(0)
+    poses = [HeldPose((0.0, 0.0), end) for end in ((0.6, 0.0), (0.4, -0.3), (0.5, 0.2))]
+    s, measured = np.linspace(0.02, 0.98, 30) * cable.length, []
+    shapes = predict_poses(model, model.nominal, np.zeros(8), poses)
+    for pose, shape in zip(poses, shapes, strict=True):
+        x, y = shape.curve.at(s).T
+        lens = 7 * STD * np.column_stack([x * y, y**2]) / cable.length**2
+        points = shape.curve.at(s) + lens + rng.normal(scale=STD, size=(len(s), 2))
+        measured.append(MeasuredPose.of_points(pose, points))
+    fit = fit_model(model, measured, Tolerances(), STD)
+    # Rows of each pose: its points, then the scatter of its own ends; at last what is known of EI.
+    problem, lin, std = fit.problem, fit.linearization, fit.problem.deviation_std
+    fields, others, target = [], [], []
+    for k, (item, seen) in enumerate(zip(measured, problem.observed(fit.point), strict=True)):
+        x, y = item.points.T
+        terms = np.column_stack([x, y, x**2, x * y, y**2])
+        normals = seen.curve.normals(fit.point.projections[k])[:, 0]
+        moved = problem.whitening[k] @ np.hstack([normals[:, [i]] * terms for i in (0, 1)])
+        fields += [moved, np.zeros((len(std), 10))]
+        own = np.zeros((len(s) + len(std), 3, len(std)))
+        own[:, k] = np.vstack([lin.by_deviation[k], np.diag(1 / std)])
+        by_theta = np.pad(lin.by_theta[k], ((0, len(std)), (0, 0)))
+        others.append(np.hstack([by_theta, own.reshape((len(own), -1))]))
+        target += [lin.residuals[k], fit.own_deviations[k] / std]
+    prior = np.sqrt(problem.precision[0, 0])
+    fields = np.vstack([*fields, np.zeros((1, 10))])
+    others = np.vstack([*others, prior * np.eye(1, others[0].shape[1])])
+    target = np.concatenate([*target, prior * (fit.point.theta - problem.mean)])
+    without, beside = (
+        np.linalg.lstsq(columns, target, rcond=None)[1][0]
+        for columns in (others, np.hstack([others, fields]))
+    )
+    expected = -ndtri(chi2.sf(without - beside, 10))
+    found = structure_of(fit, np.inf).position_z
+    assert 3 < found < 6
+    assert found == pytest.approx(expected, rel=1e-3)
