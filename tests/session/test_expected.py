@@ -64,6 +64,7 @@ def test_expected_distances_are_those_of_drawn_hangings(model, marked):
     fit = fit_model(model, repeats(model, model.nominal, poses, true, marked, rng), TOLERANCES, STD)
     stage = fit_stage("batch", fit, fit.problem.history, {})
     expected = np.array([stage.shapes[pose.name].expected for pose in poses])
+    assert fit.expected_error == pytest.approx(np.sqrt(np.mean(expected**2)), rel=0.01)
     scatter = np.array([uncertainty_of(fit).scatter[f"end_{axis}"] for axis in "xyz"[:d]])
     predicted = predict_poses(model, fit.p, fit.rest, poses)
     curves, near = zip(*((x.curve, x.equilibrium.x) for x in predicted), strict=True)
