@@ -14,6 +14,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import ConfigError, MeasurementError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.variances import reading_noise_of
 from dlo_casadi.model.assembly import Inputs, Tangents, assembly_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.clips import HeldClip
@@ -217,6 +218,13 @@ def test_noise_and_bias_of_readings_are_estimated():
     # A size from 24 numbers is known to 1/sqrt(48), from 12 to 1/sqrt(24): three of these.
     assert fit.noise.readings.force == pytest.approx(0.02, rel=0.43)
     assert fit.noise.readings.moment == pytest.approx(0.002, rel=0.61)
+    # A first guess counts as one component, what the unknowns explain as none.
+    kinds = np.concatenate([item.kinds for item in measured])
+    raw, taken = np.concatenate(fit.linearization.raw), np.concatenate(fit.leverages)
+    guess, own = 0.01 * fit.model.force_scale, kinds == "force"
+    assert taken[own].sum() > 1
+    known = (np.sum(raw[own] ** 2) + guess**2) / (np.sum(1 - taken[own]) + 1)
+    assert reading_noise_of(fit).force == pytest.approx(np.sqrt(known), rel=1e-9)
     for axis in "xy":
         name = f"sensor_bias.end_force_{axis}"
         assert fit.value(name) == pytest.approx(0.03, abs=3 * fit.std(name))
@@ -264,7 +272,12 @@ def test_a_sensor_at_a_clip_makes_stiffness_absolute_where_the_mass_is_unknown(t
     bias = result.params["sensor_bias.clip_1_force_x"]
     assert (bias.value, bias.unit) == (pytest.approx(0.03, abs=3 * bias.std), "N")
     # Both components together; three readings give the size of noise to 1/sqrt(12) at best.
-    assert result.stages[-1].readings_fit.force == pytest.approx(0.01 * np.sqrt(2), rel=0.6)
+    stage = result.stages[-1]
+    assert stage.readings_fit.force == pytest.approx(0.01 * np.sqrt(2), rel=0.6)
+    read = [x.readings["clip_1_force"] for x in stage.shapes.values() if x.readings]
+    off = [np.linalg.norm(known - predicted) for known, predicted in read]
+    assert len(off) == 3
+    assert stage.readings_fit.force == pytest.approx(np.sqrt(np.mean(np.square(off))))
     result.write(tmp_path)
     assert dlo.load(tmp_path).model.effects == result.cable.model.effects
 
