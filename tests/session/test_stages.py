@@ -19,6 +19,7 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting
 from dlo_casadi.session.fitting import nearest_to_poses, not_worse
 from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.pose_shape import PoseShape
 from dlo_casadi.session.remarks import branch_warnings, doubts_of, worse_than_simpler
 from dlo_casadi.session.stages import fit_stage, initial_stage, pose_shape
 
@@ -93,6 +94,21 @@ def test_residuals_are_distances():
     (shape, *_) = initial_stage(MODEL, measured("ccw", "ccw", "ccw")).shapes.values()
 
     assert np.sqrt((shape.residual**2).mean()) == pytest.approx(shape.rmse, rel=1e-6)
+
+
+def test_points_inside_of_a_band_of_ninety_per_cent():
+    """In a plane within 1.645 standard deviations; in space the circle of radius sqrt(2 ln 10)."""
+    none, length = np.zeros(0), 2.0
+    shape = PoseShape(none, None, none, none, none, 0.0, True, none)
+    # The band is 3 mm wide at the start and 7 at the end, the noise 4 mm: at 0.5 m 4 sqrt(2) mm.
+    s, spread = np.array([0.5, 0.5, 0.5]), np.array([3e-3, 7e-3])
+    off = 4e-3 * np.sqrt(2) * np.array([-1.64, 1.65, 0.0])
+    flat = replace(shape, s=s, residual=off, spread=spread)
+    assert flat.inside_band(length, 4e-3).tolist() == [True, False, True]
+    way, edge = np.array([[0.6, 0.8], [-0.8, 0.6], [1.0, 0.0]]), np.sqrt(2 * np.log(10))
+    away = 4e-3 * np.sqrt(2) * edge * np.array([[0.99], [1.01], [0.99]]) * way
+    spatial = replace(shape, s=s, residual=away, spread=np.stack([spread, spread], axis=1))
+    assert spatial.inside_band(length, 4e-3).tolist() == [True, False, True]
 
 
 def test_a_held_out_pose_without_a_prediction_is_named():
