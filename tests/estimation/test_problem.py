@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from dlo_casadi.effects import (
     AxialStretch,
@@ -342,17 +343,6 @@ def test_gradient_of_the_objective():
         assert (values[0] - values[1]) / 2e-5 == pytest.approx(gradient[k], abs=tolerance), name
 
 
-def test_unknown_ends_take_information_away():
-    """Eliminating the deviations lowers the Hessian of the unknowns, never raises it."""
-    problem, point = rich("arc")
-    lin = problem.linearize(point)
-    normal = problem.normal_equations(point, lin)
-    full = problem.precision + sum(a.T @ a for a in lin.by_theta)
-    lost = np.linalg.eigvalsh(full - normal.hessian)
-    assert lost.max() > 0
-    assert lost.min() > -1e-9 * lost.max()  # rounding
-
-
 # ---- round trips -------------------------------------------------------------------------------
 
 
@@ -391,14 +381,22 @@ def test_round_trip_with_noise_within_three_sigma(element, markers):
     assert fit.std("bending_stiffness") < (0.17 if markers else 0.05) * p[0]
 
 
-def test_standard_deviations_match_the_scatter_of_the_normal_equations():
-    """Covariance times Hessian is one, bounds included; correlations are correlations."""
+def test_what_residuals_determine_is_that_of_all_unknowns_at_once():
+    """Covariances and leverages from one matrix, from which no deviation is eliminated."""
     fit, *_ = round_trip("arc")
-    bounds = np.diag(1 / fit.problem.unknowns.widest**2)
-    product = fit.covariance @ (fit.normal.hessian + bounds)
-    np.testing.assert_allclose(product, np.eye(len(product)), atol=1e-6)
-    std = np.sqrt(np.diag(fit.covariance))
-    assert np.abs(fit.covariance / np.outer(std, std)).max() < 1 + 1e-9
+    problem, lin = fit.problem, fit.linearization
+    rows = np.hstack([np.concatenate(lin.by_theta), block_diag(*lin.by_deviation)])
+    of_theta = problem.precision + np.diag(1 / problem.unknowns.widest**2)
+    ends = [np.diag(1 / problem.deviation_std**2)] * len(problem.used)
+    whole = np.linalg.inv(rows.T @ rows + block_diag(of_theta, *ends))
+    n, std = len(of_theta), np.sqrt(np.diag(whole)[: len(of_theta)])
+    apart = (fit.covariance - whole[:n, :n]) / np.outer(std, std)
+    np.testing.assert_allclose(apart, 0, atol=1e-6)
+    own = block_diag(*fit.normal.own_covariances(fit.covariance))
+    np.testing.assert_allclose(np.diag(own), np.diag(whole)[n:], rtol=1e-6)
+    leverages = ((rows @ whole) * rows).sum(axis=1)
+    np.testing.assert_allclose(np.concatenate(fit.leverages), leverages, rtol=1e-6)
+    assert fit.determined_unknowns == pytest.approx(leverages.sum(), rel=1e-6)
 
 
 def test_noise_free_round_trip_is_exact():
