@@ -106,7 +106,14 @@ def test_axes_of_the_sensor(read, sign):
 
 @pytest.mark.parametrize(
     ("unit", "of_force", "of_moment"),
-    [("grams-force", 101.97, 1.0), ("kilograms-force", 0.10197, 1.0), ("N mm", 1.0, 1e3)],
+    [
+        ("grams-force", 101.97, 1.0),
+        ("kilograms-force", 0.10197, 1.0),
+        ("millinewtons", 1e3, 1.0),
+        ("N mm", 1.0, 1e3),
+        ("N cm", 1.0, 1e2),
+        ("kgf cm", 1.0, 10.197),
+    ],
 )
 def test_other_units(read, unit, of_force, of_moment):
     force, moment, _ = read
