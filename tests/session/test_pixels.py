@@ -68,9 +68,10 @@ def test_a_curve_is_where_it_is_seen():
     np.testing.assert_allclose(pixels.nearest(curve()), S, atol=1e-4)
 
 
-def test_derivatives_are_those_of_the_residual():
+@pytest.mark.parametrize(("bend", "off"), [(2.0, 1e-3), (2.02, 0.05)])
+def test_derivatives_are_those_of_the_residual(bend, off):
     """To first order; the middle of the outline follows the axis to a part in 1e-4."""
-    pixels, now = sensor(0.4, curve()), curve(2.02)
+    pixels, now = sensor(0.4, curve()), curve(bend)
     table = now.numbers
     places = pixels.located(Observed(now, np.zeros(0)), S)
     step = np.random.default_rng(0).normal(size=(*table.shape, 1))
@@ -86,7 +87,23 @@ def test_derivatives_are_those_of_the_residual():
     )
     found = (ahead - behind) / 2e-6
     # beside it the tangent turns the normal, which a residual of some millimetres feels
-    np.testing.assert_allclose(change[:, 0], found, atol=0.05 * np.abs(found).max())
+    np.testing.assert_allclose(change[:, 0], found, atol=off * np.abs(found).max())
+
+
+def test_displaced_points_change_the_residual_as_their_images_do():
+    pixels, shown, way = (
+        sensor(0.4, curve()),
+        curve(),
+        np.random.default_rng(0).normal(size=(40, 3)),
+    )
+
+    def residual(step):
+        seen = project_outline(viewpoint(0.4), shown.at(S) + step * way, shown.at(S, 1), DIAMETER)
+        return replace(pixels, pixels=seen[0]).residual(Observed(shown, np.zeros(0)), S)
+
+    found = (residual(1e-6) - residual(-1e-6)) / 2e-6
+    change = pixels.components(shown, S, way[..., None])[:, 0]
+    np.testing.assert_allclose(change, found, atol=1e-3 * np.abs(found).max())
 
 
 def test_errors_of_the_cameras_place_are_part_of_the_covariance():
@@ -126,6 +143,27 @@ def test_pixels_near_the_ends_and_beside_each_other_are_left_out():
     np.testing.assert_allclose(np.diff(u), 8.0)
     np.testing.assert_allclose(found.weight, 1.0)
     assert found.correlation_length == pytest.approx(np.sqrt(2) * 4.0 * 1.2 / 1000)
+
+
+def test_errors_of_the_cameras_pose_move_all_pixels_as_it_does():
+    """Rows of pixels along u are compared in v; the covariance is J C J^T, J by differences."""
+    count, root = 301, 1e-3 * np.random.default_rng(0).normal(size=(6, 6))
+    camera = replace(viewpoint(0.3), covariance=root @ root.T)
+    pixels = np.column_stack([np.arange(count) + 400.0, np.full(count, 500.0)])
+    places = np.linspace([0.2, -0.1, 0.1], [0.6, 0.2, 0.0], count)
+    curve = ImageCurve(
+        camera, pixels, np.full(count, 0.05), np.ones(count, bool), 6.0, 0.1, DIAMETER, 1.2,
+        4.0 * np.sqrt(np.pi), 1.0, (), np.zeros(3), 1.0,
+    )  # fmt: skip
+    found = pixels_of(ViewInput("a", Path("a.jpg"), curve, places), 1e-4)
+    ahead, behind = (
+        np.array([camera.moved(way).to_pixels(found.points)[:, 1] for way in step * np.eye(6)])
+        for step in (1e-6, -1e-6)
+    )
+    slopes = found.size * (ahead - behind).T / 2e-6
+    expected = slopes @ camera.covariance @ slopes.T
+    shared = found.by_camera @ found.by_camera.T
+    np.testing.assert_allclose(shared, expected, rtol=0, atol=1e-6 * expected.max())
 
 
 @pytest.mark.parametrize("line", [True, False])
