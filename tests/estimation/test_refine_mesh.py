@@ -47,6 +47,23 @@ def test_a_fit_that_gets_stuck_on_a_finer_mesh_starts_again(monkeypatch):
     assert finer.chi2_per_dof < 1.2 * fit.chi2_per_dof
 
 
+def test_the_error_of_a_mesh_is_the_distance_from_a_much_finer_one():
+    """Of links, whose error falls with the square of their length; nothing holds the other end."""
+    model = CableModel(CableData(0.5, 0.03, 0.006, 0.01), 10, "link", end="free", n_rest=3)
+    pose, rest = HeldPose((0.0, 0.0)), model.rest_basis @ np.array([4.0, 5.0, 2.0])
+    (shape,) = predict_poses(model, model.nominal, rest, [pose])
+    seen = [MeasuredPose.of_points(pose, shape.curve.at(np.linspace(0.01, 0.49, 40)))]
+    fit = fitting.fit_model(model, seen, Tolerances(), NOISE, refined=False)
+    fine = model.with_mesh(160)
+    (true,) = predict_poses(fine, fit.p, fine.rest_basis @ fit.coefficients, [pose])
+    places = np.linspace(0.0, 0.5, 101)
+    gap = true.curve.at(places) - fit.problem.observed(fit.point)[0].curve.at(places)
+    apart = np.sqrt((gap**2).sum(axis=1).mean())
+    assert apart > 1e-4
+    # Between nodes, chords of both meshes differ otherwise than nodes do.
+    assert fitting.mesh_error(fit) == pytest.approx(apart, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("lost", "found"), [(None, (36, True)), ("mesh", (20, True)), ("noise", (10, True))]
 )
