@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Uncertainty, displacements, gap_std_of_repeats
 from dlo_casadi.estimation.batch import solve_batch
-from dlo_casadi.estimation.constrained import profile_interval
+from dlo_casadi.estimation.constrained import EnergyGap, profile_interval
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import CableModel
@@ -408,6 +408,36 @@ def test_gap_of_two_equilibria_moves_with_each_repeat_as_energies_solved_anew():
         uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
         found = gap_std_of_repeats(model, model.nominal, rest, pose, pair, uncertainty)
         assert found == pytest.approx(np.linalg.norm(moved), rel=1e-4)
+
+
+@pytest.mark.parametrize("bend", [0.0, 4.0])
+def test_gap_of_two_equilibria_is_as_uncertain_as_energies_solved_anew(bend):
+    """Along EI and coefficients; a gap in units of EI keeps its sign if EI alone is not known."""
+    model, pose = CableModel(PLANE, 12, n_rest=2), MODELS["pins"][1]
+    size, p, rest = 3, model.nominal, np.full(model.chain.n_rests, bend)
+    by_p, by_rest = np.zeros((1, size)), np.zeros((model.chain.n_rests, size))
+    by_p[0, 0], by_rest[:, 1:] = p[0], model.rest_basis
+    pair = [
+        solve_equilibrium(model, p, rest, replace(pose, branch=branch)) for branch in ("cw", "ccw")
+    ]
+    whole, without = [], []
+    for way in 1e-4 * np.eye(size):
+        gaps, stiff = [], []
+        for there in (way, -way):
+            given = p + by_p @ there, rest + by_rest @ there
+            one, other = (solve_equilibrium(model, *given, pose, x_init=x.x).energy for x in pair)
+            gaps.append(one - other)
+            stiff.append((one - other) / given[0][0] * p[0])
+        whole.append((gaps[0] - gaps[1]) / 2e-4)
+        without.append((stiff[0] - stiff[1]) / 2e-4)
+    covariance = np.diag([1.0, 0.1, 0.1]) ** 2
+    found = EnergyGap.between(model, pose, tuple(pair), (p, rest), (by_p, by_rest), covariance)
+    assert found.value == pytest.approx(pair[0].energy - pair[1].energy)
+    scale = np.abs(whole).max()
+    np.testing.assert_allclose(found.slope, without, rtol=0, atol=1e-4 * scale)
+    stds = [np.sqrt(np.array(x) @ covariance @ x) for x in (whole, without)]
+    assert (stds[0] < stds[1]) == (bend == 0.0)
+    assert found.std == pytest.approx(min(stds), rel=1e-3)
 
 
 def test_density_of_a_pose_with_turned_clamps_is_that_of_its_own_turns(near):
