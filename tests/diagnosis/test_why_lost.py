@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dlo_casadi.diagnosis import selection
 from dlo_casadi.diagnosis.crossval import CrossValidation
 from dlo_casadi.diagnosis.refits import Confirmed
-from dlo_casadi.diagnosis.selection import choose, support
+from dlo_casadi.diagnosis.selection import Found, Ranked, choose, support
 
 COUNTS = np.full(6, 40.0)
 BASE = SimpleNamespace(log_evidence=100.0)
@@ -104,3 +105,51 @@ def test_hangings_that_are_no_better_by_more_than_chance():
     chosen, why = choose([one], BASE, DECLARED, 0.005)
     assert chosen == []
     assert why["rival"].startswith("may predict left-out poses better by chance: p = 0.1")
+
+
+def result(evidence, *added, unexplained=False):
+    """Of a search among ten candidates."""
+    model, noise = SimpleNamespace(n=10), SimpleNamespace(source="declared")
+    fit = SimpleNamespace(log_evidence=evidence, model=model, noise=noise)
+    effects = tuple(
+        SimpleNamespace(candidate=SimpleNamespace(name=name), rival_candidates=[]) for name in added
+    )
+    ranked = tuple(Ranked(f"c{k}", 1.0, 1.0, None) for k in range(10))
+    return Found(fit, effects, ranked, None, None, unexplained)
+
+
+@pytest.mark.parametrize(
+    ("more", "margin", "better"), [(1.4, 0.0, False), (1.6, 0.0, True), (1.6, 0.2, False)]
+)
+def test_two_effects_have_to_be_likelier_by_the_number_of_pairs(more, margin, better):
+    """Of ten candidates there are 45 pairs: log 45/10 = 1.50."""
+    one, two = result(100.0, "c0"), result(100.0 + more, "c1", "c2")
+    assert (one.or_better(two, margin) is one) is not better
+    assert (two.or_better(one, -margin) is two) is better
+    assert one.or_better(None) is one
+
+
+def test_a_search_that_explains_the_data_is_better_than_one_that_does_not():
+    lost, found = result(200.0, "c0", unexplained=True), result(100.0, "c1")
+    assert found.or_better(lost) is found
+    assert lost.or_better(found).fit is found.fit
+
+
+@pytest.mark.parametrize(
+    ("error", "p_noise", "source", "added", "unexplained"),
+    [
+        (1.9e-3, 0.1, "declared", True, False),
+        (2.1e-3, 0.1, "declared", True, True),  # more than twice as far off as expected
+        (2.1e-3, 0.1, "declared", False, False),  # of two poses neither foretells the other
+        (1.9e-3, 1e-3, "declared", True, True),
+        (1.9e-3, 0.1, "misfit", True, True),
+    ],
+)
+def test_what_explains_the_data(error, p_noise, source, added, unexplained, monkeypatch):
+    told = CrossValidation(np.full(2, error**2), np.ones(2), error, expected=1e-3)
+    monkeypatch.setattr(selection, "cross_validate", lambda _: told)
+    monkeypatch.setattr(selection, "structure_of", lambda *_: SimpleNamespace(p_noise=p_noise))
+    monkeypatch.setattr(selection, "noise_degrees", lambda _: np.inf)
+    fit = SimpleNamespace(expected_error=5e-4, noise=SimpleNamespace(source=source))
+    effects = ["one"] * added
+    assert Found.of(fit, effects, (), poses=2, significance=0.005).unexplained is unexplained
