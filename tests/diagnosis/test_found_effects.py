@@ -9,14 +9,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis import crossval, refits
+from dlo_casadi.diagnosis import crossval, refits, unknown_force
 from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.refits import confirm, loads_from_best
 from dlo_casadi.diagnosis.screening import Screened
-from dlo_casadi.diagnosis.unknown_force import UnknownForce, start_from
+from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force, start_from
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
@@ -127,6 +127,25 @@ def test_the_forces_of_a_pull_tell_a_tethers_stiffness_and_anchor():
     # A weight has no force across gravity: what comes closest along it.
     mass = start_from(*given, listed["lumped_mass"])["lumped_mass.mass"]
     assert mass == pytest.approx(max(0.0, -pull.force_per_pose[:, 1].mean() / 9.81))
+
+
+def test_a_force_is_found_without_its_cause(monkeypatch):
+    """Where it pulls, and how hard in each pose."""
+    monkeypatch.setattr(unknown_force, "PLACES", (0.2, 0.4, 0.6))
+    cable, force, position = replace(CABLE, straight=True), (0.5, 0.8), 0.3
+    true = CableModel(cable, 10, effects=(EFFECTS["point_force"](),))
+    poses = [HeldPose((0.0, 0.0), end, name=f"{end}") for end in ENDS[:3]]
+    p, rest = np.array([0.1, *force, position]), np.zeros(true.chain.n_rests)
+    rng, s = np.random.default_rng(0), np.linspace(0.02, 0.98, 30) * cable.length
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE / 10, size=(30, 2)))
+        for pose, shape in zip(poses, predict_poses(true, p, rest, poses), strict=True)
+    ]
+    base = fit_model(CableModel(cable, 10), measured, Tolerances(), NOISE / 10)
+    found = estimate_unknown_force(base, InProcess())
+    assert found.interval[0] < position < found.interval[1] < found.interval[0] + 0.02
+    assert found.force_per_pose == pytest.approx(np.tile(force, (3, 1)), abs=0.05)
+    assert found.poses == tuple(pose.name for pose in poses)
 
 
 def test_a_load_starts_from_the_place_and_forces_of_a_likelier_one(monkeypatch):
