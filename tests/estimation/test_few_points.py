@@ -16,6 +16,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import threshold
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.variances import _white_noise
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -160,10 +161,17 @@ def test_noise_of_few_points_beside_readings():
     truth = CableModel(CABLE, 16, n_rest=5)
     rest = np.array([0.5, 1.0, 1.5, 0.8, 0.4])
     measured = measured_from(truth, np.array([EI]), rest, 8, STD, 5)
-    alone = fit_model(truth, measured, Tolerances()).noise.std
     heard = [
         x.with_readings({"end_force": [0.0, 0.0]}) if k < 2 else x for k, x in enumerate(measured)
     ]
     fit = fit_model(truth, heard, Tolerances())
     assert fit.noise.source == "estimated"
-    assert alone / 2 < fit.noise.std < 2 * alone
+    assert STD / 2 < fit.noise.std < 2 * STD
+    # Degrees of freedom of the 40 distances alone.
+    points = np.concatenate([item.on_points for item in heard])
+    raw, taken = np.concatenate(fit.linearization.raw), np.concatenate(fit.leverages)
+    assert points.sum() == 40
+    degrees = 40 - taken[points].sum()
+    white = _white_noise(fit)
+    assert white.slow_dof == pytest.approx(degrees, rel=1e-3)
+    assert white.std == pytest.approx(np.sqrt((raw[points] ** 2).sum() / degrees), rel=1e-3)
