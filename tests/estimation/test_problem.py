@@ -35,6 +35,7 @@ from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.variances import scatter_of
 from dlo_casadi.model.assembly import Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.ends import deviation_names
@@ -397,6 +398,20 @@ def test_what_residuals_determine_is_that_of_all_unknowns_at_once():
     leverages = ((rows @ whole) * rows).sum(axis=1)
     np.testing.assert_allclose(np.concatenate(fit.leverages), leverages, rtol=1e-6)
     assert fit.determined_unknowns == pytest.approx(leverages.sum(), rel=1e-6)
+
+
+def test_scatter_of_the_ends_is_that_of_those_that_are_known():
+    """Sum of squares over their number; as far as they are not known, the tolerance counts."""
+    fit, *_ = round_trip("arc")
+    problem, limit = fit.problem, Tolerances().end
+    known = problem.deviation_std
+    variances = np.array([np.diag(x) for x in fit.normal.own_covariances(fit.covariance)])
+    determined = (1 - variances / known**2).sum()
+    share, square = 1 - determined / 16, (fit.own_deviations**2).sum()
+    assert 0.1 < share < 0.9
+    found = np.sqrt((square + share * limit**2) / (determined + share))
+    assert 0.05 * limit < found < limit
+    np.testing.assert_allclose(scatter_of(fit)[:2], found, rtol=1e-3)
 
 
 def test_noise_free_round_trip_is_exact():
