@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
@@ -79,6 +80,25 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
     smaller = refit_without(larger, taper, base)
     assert kept(smaller) == FIXED
     assert "lumped_mass.mass" not in smaller.problem.unknowns.names
+
+
+def test_a_score_is_the_gain_of_least_squares_with_the_candidate(base):
+    """To first order: what residuals and priors leave without it, less what they leave with it."""
+    screen = Screen(base, [taper_of(base.model)])
+    (found,) = screen.run(np.inf)
+    problem, point, lin = screen._linearized
+    std, columns = problem.deviation_std, problem.equilibria.used_deviations
+    sizes, vectors = np.linalg.eigh(problem.precision)
+    root = np.sqrt(np.maximum(sizes, 0.0))[:, None] * vectors.T
+    jacobian = np.hstack([np.concatenate(lin.by_theta), block_diag(*lin.by_deviation)])
+    rows = np.vstack([jacobian, block_diag(root, *[np.diag(1 / std)] * 3)])
+    own = point.shapes.deviation[:, columns] / std
+    target = np.concatenate([*lin.residuals, root @ (point.theta - problem.mean), *own])
+    k = problem.unknowns.names.index("stiffness_gradient.slope")
+    without, beside = (
+        np.linalg.lstsq(some, target, rcond=None)[1][0] for some in (np.delete(rows, k, 1), rows)
+    )
+    assert found.score == pytest.approx(without - beside, rel=1e-3)
 
 
 def test_the_one_step_estimate_of_a_nuisance_is_the_minimum_without_its_prior():
