@@ -16,7 +16,8 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import threshold
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.variances import _white_noise
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.variances import _white_noise, contradicted
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
@@ -72,6 +73,19 @@ def test_a_declared_noise_that_the_points_contradict(points, source):
         assert fit.noise.std == pytest.approx(STD, rel=0.3)
         assert "measurement.std declares, 0.1 mm" in said[0]
         assert fitted(points, std=STD).noise.source == "declared"
+
+
+def test_errors_that_are_smooth_along_the_cable_contradict_no_declared_noise():
+    """As a missing effect leaves them: waves of three times the noise, four along the cable."""
+    fit, rng, waved = fitted(24, std=STD), np.random.default_rng(0), []
+    seen = fit.problem.observed(fit.point)
+    for item, s, one in zip(fit.problem.history, fit.point.projections, seen, strict=True):
+        wave = 3 * STD * np.sin(8 * np.pi * s / CABLE.length + rng.uniform(0, 2 * np.pi))
+        points = item.points + wave[:, None] * one.curve.normals(s)[:, 0]
+        waved.append(MeasuredPose.of_points(item.pose, points))
+    problem = replace(fit.problem, history=tuple(waved))
+    assert not contradicted(Fit(problem, problem.evaluate(fit.point)))
+    assert contradicted(fit.reweighed(replace(fit.noise, std=STD / 3)))
 
 
 def test_how_well_the_variance_of_a_parameter_is_known():
