@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,14 +10,17 @@ import pytest
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import (
     measured_branches,
     predict_poses,
 )
 from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting
+from dlo_casadi.session import stages as stages_module
 from dlo_casadi.session.fitting import nearest_to_poses, not_worse
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.pose_shape import PoseShape
@@ -149,6 +153,20 @@ def test_a_pose_predicted_on_another_equilibrium_is_in_doubt(held_out):
 
     poses = measured("cw", "ccw", "ccw", held_out=held_out, told=True)
     assert judged(poses, fit_model(MODEL, poses, Tolerances(), NOISE))[1] == ()
+
+
+@pytest.mark.parametrize(("scatter", "undecided"), [(0.48, False), (0.51, True)])
+def test_scatter_alone_may_leave_an_equilibrium_undecided(scatter, undecided, monkeypatch):
+    """A gap of 1 J is decided from two standard deviations on: 2 sqrt(0.1^2 + 0.49^2)."""
+    gap = SimpleNamespace(value=1.0, std=0.1)
+    monkeypatch.setattr(stages_module.EnergyGap, "between", lambda *_: gap)
+    monkeypatch.setattr(stages_module, "gap_std_of_repeats", lambda *_: scatter)
+    uncertainty = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter(0.3))
+    own = SimpleNamespace(model=MODEL, p=MODEL.nominal, uncertainty=uncertainty)
+    known = SimpleNamespace(equilibrium=None, rest=None)
+    other = SimpleNamespace(prediction=known)
+    item = SimpleNamespace(pose=None)
+    assert stages_module._Model._undecided(own, item, known, other) is undecided
 
 
 @pytest.mark.parametrize(("nearer", "doubted"), [(0.5, True), (2.0, False)])
