@@ -33,6 +33,15 @@ def test_the_last_stage_says_that_it_does_not_explain(outcome, unexplained):
     assert judged(outcome, None).stages[-1].explains is None
 
 
+@pytest.mark.parametrize("verdict", ["complete", "effect_found"])
+def test_a_doubt_takes_the_verdict_and_the_intervals(outcome, verdict, monkeypatch):
+    monkeypatch.setattr(run.remarks, "doubts_of", lambda *_: ("not converged",))
+    found = judged(outcome, verdict)
+    assert (found.verdict, found.doubts) == ("unexplained", ("not converged",))
+    assert found.stages[-1].parameters["bending_stiffness"].interval_95 is None
+    assert judged(outcome, None).verdict is None
+
+
 def test_tables_and_page_have_no_interval(unexplained):
     for name, value, interval, remark in fitted_rows(unexplained):
         assert (interval, remark) == ("", NO_FIT), name
