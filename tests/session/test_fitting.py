@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,10 +12,19 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import explains
+from dlo_casadi.estimation.point import Point
 from dlo_casadi.estimation.prediction import predict_poses
+from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import run_session
-from dlo_casadi.session.fitting import declared_model, fit_declared
+from dlo_casadi.session.fitting import (
+    Minimum,
+    carried_coefficients,
+    confirmed,
+    declared_model,
+    fit_declared,
+)
 from dlo_casadi.session.measure import measured_poses, read_session
 from dlo_casadi.session.outliers import outliers_of
 
@@ -35,6 +45,50 @@ def test_a_declared_mesh_is_kept_and_its_error_told():
     (warning,) = [text for text in outcome.warnings if "mesh" in text]
     assert f"{1e3 * outcome.mesh_error:.3g} mm" in warning
     assert "the mesh of 6 elements" in warning
+
+
+@pytest.mark.parametrize(
+    ("ends", "places", "coefficients"),
+    [
+        (("pinned", "pinned"), (0.1, 0.3, 0.5, 0.6), 4),
+        (("pinned", "pinned"), (0.1, 0.105, 0.5, 0.6), 3),  # two of them at one place
+        (("clamped", "pinned"), (0.1, 0.3, 0.5, 0.6), 3),
+        (("clamped", "clamped"), (0.1, 0.3, 0.5, 0.6), 2),
+        (("clamped", "clamped"), (0.3, 0.5), 2),
+        (("pinned", "pinned"), (0.3,), 1),
+        (("clamped", "clamped"), None, 13),  # a line
+    ],
+)
+def test_markers_tell_as_many_coefficients_of_the_rest_curvature_as_places(
+    ends, places, coefficients
+):
+    """Less the directions of the clamps, but two at least; a pose that is held out tells none."""
+    model = CableModel(CableData(0.8, 0.05, 0.008, 0.02), start=ends[0], end=ends[1])
+    s = None if places is None else np.array(places)
+    points = np.zeros((5 if s is None else len(s), 2))
+    pose = HeldPose((0.0, 0.0), (0.5, 0.0))
+    held_out = MeasuredPose.of_points(pose, np.zeros((1, 2)), s=np.array([0.7]), held_out=True)
+    measured = [MeasuredPose.of_points(pose, points, s=s), held_out]
+    assert carried_coefficients(model, measured) == coefficients
+
+
+def test_a_fit_that_ipopt_confirms_has_converged_and_one_where_it_fails_has_not():
+    """A minimum lower by more than 1e-4 counts; one higher by a millionth is the same."""
+    problem = SimpleNamespace(n_residuals=1, used=[0], equilibria=SimpleNamespace(m=1))
+    problem.unknowns = SimpleNamespace(model=None)
+    fit = Fit(problem, Point(None, SimpleNamespace(x=None), [], 10.0, 1.0, []))
+
+    def found(objective):
+        return Minimum(replace(fit.point, objective=objective))
+
+    assert confirmed(fit, found(10.0 + 1e-6)).converged
+    assert confirmed(fit, found(10.0 + 1e-6)).point is fit.point
+    assert not confirmed(fit, found(10.1)).converged
+    better = found(9.9)
+    assert confirmed(fit, better).point is better.point
+    assert confirmed(fit, better).converged
+    assert not confirmed(replace(fit, converged=True), Minimum()).converged
+    assert confirmed(fit, Minimum(searched=False)) is fit
 
 
 EI, PER_LINE, SHARE, MESH = 0.026, 80, 0.03, 12
