@@ -16,6 +16,7 @@ from dlo_casadi.estimation.unknowns import REST_TURNS_STD
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.session.stages import rest_curvature_of
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,7 @@ def test_bands_of_a_rest_curvature_that_shapes_hardly_tell_are_wide(fit):
         variance = np.diag(scaled @ covariance[first:, first:] @ scaled.T)
         off.append(float((np.abs(basis @ fit.coefficients - true) / np.sqrt(variance)).max()))
     assert off[1] < 3 < off[0]
+    np.testing.assert_allclose(rest_curvature_of(fit).std[::2], np.sqrt(variance), rtol=1e-9)
 
 
 def test_the_covariance_is_that_of_refits_at_many_roughnesses(fit):
