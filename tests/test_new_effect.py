@@ -130,7 +130,9 @@ def test_the_diagnosis_finds_it(result):
     assert row.name == "balloon"
     for name, true in (("lift", LIFT), ("position", PLACE)):
         assert abs(row.parameters[name].value - true) < 3 * row.parameters[name].std
-    assert row.parameters["compliance"].value == 1 / row.parameters["lift"].value
+    lift, compliance = row.parameters["lift"], row.parameters["compliance"]
+    assert compliance.value == 1 / lift.value
+    assert compliance.std == pytest.approx(lift.std / lift.value**2)
 
 
 def test_the_results_tell_of_it(result, tmp_path):
