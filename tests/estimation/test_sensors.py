@@ -1,9 +1,11 @@
 """Sensors against curves that are known: a helix in space, a circle in the plane."""
 
 import numpy as np
+import pytest
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.sensing.sensors import Centerline, Markers
@@ -118,3 +120,12 @@ def test_sensors_of_a_pose_follow_one_another():
     np.testing.assert_allclose(item.whitening(noise, places), white)
     assert [(x.start, x.stop) for _, x, _ in item.slices] == [(0, 3), (3, 6)]
     assert [(x.start, x.stop) for _, _, x in item.slices] == [(0, 6), (6, 15)]
+
+
+def test_distance_that_noise_alone_gives():
+    """In space sqrt(2) times the noise for a line, sqrt(3) for markers; RMS over the points."""
+    pose, points = HeldPose((0.0, 0.0, 0.0)), np.zeros((2, 3))
+    line = MeasuredPose.of_points(pose, points, weight=np.array([1.0, 3.0]))
+    marked = MeasuredPose.of_points(pose, points, s=np.array([0.1, 0.2]))
+    assert noise_distance([line], 2e-3) == pytest.approx(2e-3 * np.sqrt(2 * 5))
+    assert noise_distance([marked], 2e-3) == pytest.approx(2e-3 * np.sqrt(3))
