@@ -5,15 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
-from scipy.special import expit
+from scipy.special import expit, logit
 
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.sensing.noise import NoiseModel, correlation, smooth_modes
+from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, correlation, smooth_modes
 from dlo_casadi.sensing.noise_estimate import (
     NoiseSample,
     Profile,
+    _correlated,
     estimate_noise,
     restricted_deviance,
 )
@@ -187,6 +188,18 @@ def test_whitening_makes_the_covariance_one(noise):
     np.testing.assert_allclose(product, np.eye(60), atol=1e-8)
 
 
+def test_doubted_noise_is_white_and_leaves_readings_their_weight():
+    noise = NoiseModel(3e-4, share=0.6, length=0.03, readings=ReadingNoise(0.01, 0.02, True))
+    found = noise.doubted(9e-4)
+    assert (found.std, found.share) == (9e-4, 0.0)
+    assert found.readings.force == pytest.approx(0.03)
+    assert found.readings.moment == pytest.approx(0.06)
+    kinds = np.array(["point", "force", "moment"])
+    np.testing.assert_allclose(found.units(kinds), [1.0, 0.03, 0.015])
+    np.testing.assert_allclose(noise.units(kinds), [1.0, 0.03, 0.015])
+    assert noise.doubted(3e-4) is noise
+
+
 @pytest.mark.parametrize("kernel", ["exponential", "matern", "gaussian"])
 def test_correlation_falls_from_one(kernel):
     values = correlation(kernel, np.linspace(0.0, 6.0, 50))
@@ -321,6 +334,28 @@ def test_slow_errors_beside_smooth_ones_are_seen_in_dense_points():
         errors.append(log_slow_variance(found.covariance(s, np.ones(160)), s) - true)
     # What is told, 2 / slow_dof, is a standard deviation of 0.16 to 0.2: two of them.
     assert np.abs(errors).max() < 0.35
+
+
+def test_how_well_slow_modes_are_known_is_that_of_their_likelihood():
+    """Of one kernel, by sums over a grid of shares and lengths, uniform in the share."""
+    samples = simulated(NoiseModel(3e-4, 0.5, 0.03, "gaussian"), 12, 60)
+    found = _correlated(samples, LENGTH, "gaussian")
+    shares = expit(logit(found.noise.share) + np.linspace(-0.8, 0.8, 7))
+    lengths = found.noise.length * np.exp(np.linspace(-0.4, 0.4, 7))
+    logs, slow = [], []
+    for share in shares:
+        for length in lengths:
+            unit = NoiseModel(1.0, float(share), float(length), "gaussian")
+            there = restricted_deviance(unit, samples)
+            noise = replace(unit, std=there.std)
+            covariance = noise.covariance(samples[0].places, samples[0].weight)
+            # On a grid of logits a density of the share is weighed by its derivative.
+            logs.append(np.log(share * (1 - share)) - there.value / 2)
+            slow.append(log_slow_variance(covariance, samples[0].places))
+    weights = np.exp(np.array(logs) - max(logs))
+    variance = np.cov(slow, aweights=weights, ddof=0)
+    size = 2 / (12 * (60 - 4))  # of the noise itself, with 4 of 60 directions projected out
+    assert found.log_slow_variance == pytest.approx(variance + size, rel=0.1)
 
 
 def test_how_well_slow_modes_are_known_is_known():
