@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 from dlo_casadi.config import load_config
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.stiffness import fit_stiffness
+from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model, simpler_fits, straight
 from dlo_casadi.session.measure import measured_poses, read_inputs
+from dlo_casadi.session.stages import stiffness_stage
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
 
@@ -66,6 +68,19 @@ def test_the_std_of_the_stiffness_alone_is_that_of_every_coordinate_of_a_marker(
     slope = np.linalg.norm(places(1e-3) - places(-1e-3)) / 2e-3
     # 360 squares tell the noise to a twentieth.
     assert fit_stiffness(model, marked).log_std == pytest.approx(noise / slope, rel=0.15)
+
+
+@pytest.mark.parametrize(("log_std", "known"), [(0.58, True), (0.6, False)])
+def test_the_interval_of_the_stiffness_alone_spans_a_factor_of_ten_at_most(session, log_std, known):
+    """exp(2 x 1.96 x 0.5874) is ten."""
+    _, model, measured = session
+    found = StiffnessFit(0.02, log_std, 1e-3)
+    stage = stiffness_stage(straight(model).with_mesh(10), measured[:1], found)
+    estimate = stage.parameters["bending_stiffness"]
+    assert (estimate.value, estimate.std) == (0.02, pytest.approx(0.02 * log_std))
+    assert estimate.identifiable is known
+    ends = 0.02 * np.exp(np.array([-1, 1]) * ndtri(0.975) * log_std)
+    assert estimate.interval_95 == (pytest.approx(ends, rel=1e-6) if known else (None, None))
 
 
 def test_markers_do_not(session):
