@@ -1,18 +1,21 @@
 """Cables that do not repeat: the restricted likelihood by two routes, and what it finds."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from scipy.stats import chi2
 
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.scatter_likelihood import (
     ScatterLikelihood,
     ScatterSample,
+    Variances,
     estimate_pose_scatter,
 )
-from dlo_casadi.model.pose_scatter import MODES, PoseScatter, modes_of
+from dlo_casadi.model.pose_scatter import MODES, REST_CURVATURE, PoseScatter, modes_of
 from dlo_casadi.sensing.noise_estimate import Deviance
 
 M, ROWS = 9, 6
@@ -138,6 +141,20 @@ def test_what_poses_that_are_alike_have_in_common_is_not_random():
         found = estimate_pose_scatter(ScatterLikelihood(samples, distances))
         assert found.p_systematic < 1e-6
         assert found.scatter.std < 0.1
+
+
+def test_significance_of_a_systematic_part_is_that_of_the_better_of_two_ranges():
+    """A size that is bounded by zero has half of chi-square's probability, in each of them."""
+
+    def best(smoothness, range_, std=True, **_):
+        return Variances(1.0, 0.2 * std, 0.1, 100.0 - 4.0 * (range_ is not None), 10.0)
+
+    deviance = SimpleNamespace(value=100.0)
+    likelihood = SimpleNamespace(
+        source=REST_CURVATURE, m=M, apart=1.0, best=best, deviance=lambda *_: deviance
+    )
+    found = estimate_pose_scatter(likelihood)
+    assert found.p_systematic == pytest.approx(2 * chi2.sf(4.0, 1) / 2)
 
 
 def test_modes_have_the_std_along_the_cable():
