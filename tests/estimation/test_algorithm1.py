@@ -244,8 +244,6 @@ def test_loop_converges_in_several_calm_iterations():
     assert result.status is Algorithm1Status.CONVERGED
     # Three successive changes within the tolerance of 1e-4.
     assert np.abs(np.diff(np.log(result.history[-4:]))).max() <= 1e-4
-    again = run_algorithm1(cable, poses, GRAVITY)
-    assert again.k_theta == result.k_theta
 
 
 @pytest.mark.parametrize(
@@ -259,7 +257,10 @@ def test_loop_goes_on_while_rest_angles_change(step, status, iterations, monkeyp
         return k_theta, theta_0 + step
 
     monkeypatch.setattr(algorithm1, "best_parameters", found)
-    result = run_algorithm1(CABLE, measured(0.3, ENDS[:1]), GRAVITY, n=4, max_iterations=5)
+    x = np.linspace(0.02, 0.58, 40)
+    points = np.column_stack([x, -0.25 * np.sin(np.pi * x / 0.6)])
+    poses = [MeasuredPose.of_points(HeldPose((0.0, 0.0), (0.6, 0.0)), points)]
+    result = run_algorithm1(CABLE, poses, GRAVITY, n=4, max_iterations=5)
     assert result.status is status
     assert result.iterations == iterations
 
