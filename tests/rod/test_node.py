@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.rod.chain import ELEMENTS
-from dlo_casadi.rod.node import NODES, Heading, Node
+from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
+from dlo_casadi.rod.node import NODES, Frame, Heading, Node
 
 # Some node of each kind; all others are reached from there.
-SOME: dict[type[Node], list[float]] = {Heading: [0.3]}
+SOME: dict[type[Node], list[float]] = {Heading: [0.3], Frame: [0.1, -0.5, 0.7, 0.5]}
 EVERY = pytest.mark.parametrize("kind", SOME, ids=lambda kind: kind.__name__)
 ROUNDING = 1e-14  # a few operations on numbers of order one
 
@@ -22,7 +22,8 @@ def nodes(kind: type[Node], *shape: int) -> np.ndarray:
 
 
 def test_every_kind_of_node_is_known_here():
-    assert {element.node for element in ELEMENTS.values()} <= set(SOME)
+    every = (*ELEMENTS.values(), *ELEMENTS_IN_SPACE.values())
+    assert {element.node for element in every} == set(NODES.values()) == set(SOME)
 
 
 @EVERY
@@ -38,7 +39,8 @@ def test_moved_and_difference_are_inverse(kind):
 def test_expressions_move_as_arrays_do(kind):
     x = nodes(kind, 5)
     way = np.random.default_rng(2).uniform(-1.5, 1.5, size=(5, kind.increment))
-    moved = [np.array(kind.moved(ca.DM(a), ca.DM(d))).ravel() for a, d in zip(x, way, strict=True)]
+    moved = [kind.moved(ca.SX(a), ca.SX(d)) for a, d in zip(x, way, strict=True)]
+    moved = [np.array(ca.evalf(one)).ravel() for one in moved]
     np.testing.assert_allclose(moved, kind.moved(x, way), atol=ROUNDING)
 
 
@@ -64,8 +66,8 @@ def test_interpolation_hits_what_is_known_and_the_middle_in_between(kind):
     known, x = np.array([0.1, 0.4, 0.5]), nodes(kind, 2, 3)
     np.testing.assert_allclose(kind.interpolated(known, known, x), x, atol=ROUNDING)
     middle = kind.interpolated(np.array([0.25, 0.45]), known, x)
-    half = kind.difference(x[:, :-1], x[:, 1:]) / 2
-    np.testing.assert_allclose(kind.difference(x[:, :-1], middle), half, atol=ROUNDING)
+    halves = kind.difference(x[:, :-1], middle), kind.difference(middle, x[:, 1:])
+    np.testing.assert_allclose(*halves, atol=ROUNDING)
     beyond = kind.interpolated(np.array([0.0, 0.9]), known, x)
     np.testing.assert_allclose(beyond, x[:, [0, -1]], atol=ROUNDING)
 
