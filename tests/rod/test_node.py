@@ -132,3 +132,33 @@ def test_bends_are_the_length_of_the_curvatures(kind):
     curvatures = np.random.default_rng(4).uniform(-2.0, 2.0, size=(len(kind.curvatures), 6))
     bend = np.abs(np.array(ca.DM(kind.bend(ca.DM(curvatures))))).ravel()
     np.testing.assert_allclose(bend, np.linalg.norm(curvatures, axis=0), atol=1e-12)
+
+
+@BOTH
+def test_a_shape_is_the_same_up_to_what_cannot_be_seen(kind):
+    """Full turns of all headings; in space signs of quaternions, and a roll of the whole cable."""
+    x, tolerance = some(kind), 0.05
+    step = np.zeros((len(x), kind.increment))
+    step[2, -1] = 1.1 * tolerance
+    assert kind.same(x, x, tolerance)
+    assert not kind.same(x, kind.moved(x, step), tolerance)
+    assert kind.same(x, kind.moved(x, 0.8 * step), tolerance)
+    if kind is Heading:
+        assert kind.same(x, x - 4 * np.pi, tolerance)
+        assert not kind.same(x, x - np.pi, tolerance)
+    else:
+        roll, bend = np.tile([0.7, 0.0, 0.0], (len(x), 1)), np.tile([0.0, 0.0, 0.7], (len(x), 1))
+        assert kind.same(x, -kind.moved(x, roll), tolerance)
+        assert not kind.same(x, kind.moved(x, bend), tolerance)
+
+
+@BOTH
+def test_the_turning_of_a_shape_is_its_bend_or_its_twist(kind):
+    """In a plane headings differ by it; in space it is about the cable's axis."""
+    steps = np.random.default_rng(5).uniform(-0.4, 0.4, size=(6, kind.increment))
+    x = [np.array(kind.identity)]
+    for step in steps:
+        x.append(kind.moved(x[-1], step))
+    both = np.array([x, x[::-1]])
+    total = steps[:, 0].sum()
+    np.testing.assert_allclose(kind.turning(both), [total, -total], atol=10 * ROUNDING)
