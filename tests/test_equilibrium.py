@@ -20,6 +20,7 @@ from dlo_casadi.effects import (
     LengthError,
     LumpedMass,
     PointForce,
+    StiffnessGradient,
 )
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -167,6 +168,27 @@ def test_end_moment_gives_constant_curvature():
     np.testing.assert_allclose(bent.curvature, kappa, rtol=1e-9)
     moment = stiffness * kappa
     assert abs(bent.moments[0]) == pytest.approx(moment, rel=1e-9)
+
+
+@pytest.mark.parametrize(("element", "pieces"), [("arc", 1), ("quadratic", 2)])
+def test_an_end_moment_bends_a_taper_by_the_sum_of_its_compliances(element, pieces):
+    """phi(L) = M int ds / EI(s), by the midpoint rule: once in each element, or in its halves.
+
+    The integral itself is L / (2 a EI) log((1 + a) / (1 - a)), of second order in the mesh.
+    """
+    length, stiffness, spring, heading, slope, n = 0.8, 0.05, 0.2, 1.5, 0.6, 6
+    s = (np.arange(pieces * n) + 0.5) * length / (pieces * n)
+    compliance = (length / stiffness / (1 + slope * (2 * s / length - 1))).mean()
+    exact = length / (2 * slope * stiffness) * np.log((1 + slope) / (1 - slope))
+    assert compliance == pytest.approx(exact, rel=0.03 / pieces**2)
+    effects = (StiffnessGradient(), EndSpring())
+    cable = CableData(length, 0.1, 0.01, stiffness)
+    model = CableModel(cable, n, element, "clamped", "free", WEIGHTLESS, effects=effects)
+    p = np.array([stiffness, slope, spring, heading])
+    bent = solve_equilibrium(model, p, np.zeros(n), HeldPose((0.0, 0.0), start_heading=0.0))
+    turn = compliance * spring * heading / (1 + compliance * spring)
+    assert bent.turn == pytest.approx(turn, rel=1e-9)
+    assert bent.moments[0] == pytest.approx(spring * (heading - turn), rel=1e-9)
 
 
 # ---- bench poses against a fine mesh -----------------------------------------------------------
