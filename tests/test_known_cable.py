@@ -141,6 +141,16 @@ def test_in_space_a_rest_curvature_is_about_the_axes_y_and_z():
     for axes, end in (((0, 2.0), (*arc, 0)), ((2.0, 0), (arc[0], 0, -arc[1]))):
         cable = dlo.known_cable(WIRE, **weightless, rest_curvature=axes, model={"n": 20})
         assert cable.solve(**FORWARD).points[-1] == pytest.approx(end, abs=1e-5)
+    # Growing with the arc length it is a clothoid: to the fourth order of the mesh.
+    size, growing = np.sqrt(np.pi / 5.0), 5.0 * np.linspace(0.0, 0.8, 9)
+    aside, ahead = size * np.array(fresnel(0.8 / size))
+    still = np.zeros(9)
+    for axes, end in (
+        ((still, growing), (ahead, aside, 0)),
+        ((growing, still), (ahead, 0, -aside)),
+    ):
+        cable = dlo.known_cable(WIRE, **weightless, rest_curvature=axes, model={"n": 20})
+        assert cable.solve(**FORWARD).points[-1] == pytest.approx(end, abs=1e-6)
 
 
 def test_it_is_what_a_fit_returns(rope, fewer_starts, tmp_path):
