@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import (
     EFFECTS,
+    RANDOM,
     BendingSoftening,
     CableData,
     ClampAngle,
@@ -25,6 +26,7 @@ from dlo_casadi.effects import (
     PlasticSet,
     PointForce,
     SectionLaw,
+    Setup,
     SideLoad,
     StandoffError,
     StiffnessGradient,
@@ -174,6 +176,31 @@ def test_declaration(name):
         assert q.lower <= q.nominal <= q.upper
         assert q.nominal + q.scale <= q.upper or q.nominal - q.scale >= q.lower
     assert len({q.name for q in declared}) == len(declared)
+
+
+def test_trial_values_are_about_what_the_shapes_show():
+    setup = Setup(CABLE, directions=(0.3, -0.7), largest_bend=5.0, level=0.2, resting=-0.3)
+    trials = {name: kind.made_for(setup).scans(setup) for name, kind in EFFECTS.items()}
+    for name, mean in (("start_spring", 0.3), ("end_spring", -0.7)):
+        headings = [scan["heading"] for scan in trials[name]]
+        assert mean in headings
+        assert np.mean(headings) == pytest.approx(mean)
+    yields = [scan["yield_curvature"] for scan in trials["plastic_set"]]
+    assert 0.0 < min(yields) < 1.0 < 3.0 < max(yields) < 5.0
+    # From the level of the first start to where shapes rest: the cable's axis lies a radius higher.
+    (table,) = trials["contact_plane"]
+    assert table["height"] == pytest.approx(-0.3 - 0.2 - CABLE.diameter / 2)
+    (above,) = EFFECTS["contact_plane"](level=-0.4).scans(setup)
+    assert above["height"] == 0.0
+    stretches = [(scan["start"], scan["end"]) for scan in trials["stiff_section"]]
+    assert all(0.0 <= start < end <= CABLE.length for start, end in stretches)
+    for name in ("lumped_mass", "point_force", "tether", "stiff_section"):
+        places = [EFFECTS[name]().place(scan) for scan in trials[name]]
+        assert min(places) < 0.2 * CABLE.length < 0.8 * CABLE.length < max(places)
+    # The middle of a section, unless the cable ends within it.
+    for start, end in stretches:
+        place = EFFECTS["stiff_section"]().place({"start": start, "end": end})
+        assert place == pytest.approx((start + end) / 2)
 
 
 @pytest.mark.parametrize("headings", ["straight", "random"])
@@ -491,6 +518,20 @@ def test_a_clamp_that_gives_way_is_one_turned_by_the_moment_on_it(element):
         for step in (d, -d)
     )
     assert (back - ahead) / (2 * d) == pytest.approx(found.moments[0], rel=1e-6)
+
+
+def test_moments_of_pins_turn_the_ends_counter_clockwise():
+    """V = -EI (start phi(0) + end phi(L)) with the numbers of the pose."""
+    model = CableModel(CABLE, 5, "arc", random=(RANDOM["pin_moment"](),))
+    shapes, given = posed(model, model.nominal)
+    own = np.zeros((1, len(model.deviation_names)))
+    names = ["pin_moment.start", "pin_moment.end"]
+    own[0, [model.deviation_names.index(name) for name in names]] = [0.7, -0.4]
+    energies = [
+        assembly_of(model).energy(replace(shapes, deviation=x), given)[0] for x in (own, 0 * own)
+    ]
+    work = CABLE.bending_stiffness * shapes.x[0, [0, -1], 0] @ [0.7, -0.4]
+    assert energies[0] - energies[1] == pytest.approx(-work, abs=1e-13)
 
 
 def test_clamp_angles_of_one_end_only():
