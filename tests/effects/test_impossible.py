@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dlo_casadi as dlo
-from dlo_casadi.effects import EFFECTS, CableData, Setup, SideLoad
+from dlo_casadi.effects import EFFECTS, RANDOM, CableData, Setup, SideLoad
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.cable_model import CableModel
@@ -59,6 +59,29 @@ def test_effects_that_are_only_invisible_may_be_declared(name):
     setup = Setup(CABLE, "pinned", "pinned")
     assert not EFFECTS[name].applies(setup)
     assert EFFECTS[name]().refusal(setup, {}) == ""
+
+
+SPACE = replace(CABLE, torsional_stiffness=0.2)
+ROUND = {"gravity": (0.0, 0.0, -9.81), "curved": False}
+
+
+@pytest.mark.parametrize(
+    ("name", "hidden", "shown"),
+    [
+        ("tether", {"n_poses": 1}, {"n_poses": 2}),
+        ("rest_curvature_drift", {"n_poses": 1}, {"n_poses": 2}),
+        ("plastic_set", {"n_poses": 2, "curved": False}, {"n_poses": 2, "curved": True}),
+        ("mass_error", {"readings": ()}, {"readings": ("end_force",)}),
+        ("bending_anisotropy", ROUND, ROUND | {"curved": True}),
+        ("bending_anisotropy", ROUND, ROUND | {"start": "clamped"}),
+        ("pin_moment", {"start": "clamped", "end": "free"}, {"start": "clamped"}),
+    ],
+)
+def test_effects_apply_where_measurements_show_them(name, hidden, shown):
+    kind = (EFFECTS | RANDOM)[name]
+    for changed, applies in ((hidden, False), (shown, True)):
+        cable = SPACE if len(changed.get("gravity", ())) == 3 else CABLE
+        assert kind.applies(Setup(cable, **changed)) is applies
 
 
 def test_a_table_needs_gravity():
