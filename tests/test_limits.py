@@ -123,6 +123,32 @@ def test_a_sharp_bend_beside_a_clamp_is_resolved():
     assert (item.verdict, item.std, item.decided_by) == ("pass", 0.0, "nothing is uncertain")
 
 
+def test_a_force_is_as_likely_beside_a_bend_that_a_finer_mesh_resolves():
+    """Its value is that on the fit's mesh, from which the finer one differs by many deviations."""
+    model = CableModel(CableData(0.5, 0.05, 0.006, 1e-2), 8, "arc", n_rest=0)
+    known = Uncertainty((), np.zeros((0, 0)), {"end_x": 1e-5, "end_y": 1e-5}, PoseScatter())
+    pose = HeldPose((0.0, 0.0), (0.32, 0.05))
+    shape = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+    size = np.linalg.norm([shape.start_force, shape.end_force], axis=1).max()
+    std = check(model, pose, known, force=2 * size)["force"].std
+    limit = size + std
+    alone = check(model, pose, known, force=limit)["force"]
+    beside = check(model, pose, known, force=limit, bend_radius=0.01)["force"]
+    assert (alone.value, beside.value) == pytest.approx((size, size), rel=1e-12)
+    assert beside.std == pytest.approx(std, rel=0.05)
+    for item in (alone, beside):
+        assert item.probability == pytest.approx(norm.sf(1.0), abs=0.02)
+        assert item.verdict == "risk"
+
+
+def test_a_chance_is_told_as_far_as_it_is_known():
+    model = CableModel(CableData(0.5, 0.1, 0.01, 5.0), 4, start="clamped", end="free", n_rest=0)
+    known = Uncertainty(("bending_stiffness",), np.array([[0.25]]), {}, PoseScatter())
+    item = check(model, HeldPose((0.0, 0.0), start_heading=0.0), known, force=1.0)["force"]
+    for chance, said in ((4e-4, "< 0.1 %"), (0.051, "5.1 %"), (0.5, "50 %"), (0.9996, "> 99.9 %")):
+        assert replace(item, probability=chance).chance == said
+
+
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 def test_probability_is_the_share_of_shapes_that_the_compiled_solver_finds():
     """2,000 ends, 3 mm off in both directions: three standard errors are 3 %, first order 2 %."""
