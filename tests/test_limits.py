@@ -107,6 +107,35 @@ def test_a_stiff_cantilever_bends_as_its_stiffness_lets_it():
         assert item.verdict == ("fail" if sigma < 0 else "risk")
 
 
+def test_repeats_that_snap_to_the_other_side_violate_any_limit():
+    """A soft cable leans back over its clamp; turned on, it falls to the other side at a fold."""
+    length, weight = 0.8, 1.0
+    data = CableData(length, weight * length / 9.81, 0.01, weight * length**3 / 15)
+    model = CableModel(data, 8, "arc", start="clamped", end="free", n_rest=0)
+    rest, upright, step = np.zeros(model.chain.n_rests), np.pi / 2, 0.2
+
+    def at(heading: float, near: np.ndarray):
+        x = near + (heading - near[0]) * (1 - model.chain.places[:, None] / length)
+        pose = HeldPose((0.0, 0.0), start_heading=heading)
+        return pose, solve_equilibrium(model, model.nominal, rest, pose, x_init=x)
+
+    fold, (_, eq) = upright, at(upright, np.linspace(upright, -upright, 9)[:, None])
+    while step > 1e-3:
+        further = at(fold + step, eq.x)[1]
+        if further.stable and further.turn < 0:
+            fold, eq = fold + step, further
+        else:
+            step /= 2
+    assert fold > upright + 0.1
+    pose, found = at(fold - 0.05, eq.x)
+    known = Uncertainty((), np.zeros((0, 0)), {"start_heading": 0.05}, PoseScatter())
+    cable, none = CasadiCable(model, model.nominal, rest), np.zeros(model.n_coefficients)
+    (item,) = limit_checks(cable, none, pose, found, known, Limits(force=100 * weight))
+    # Three standard errors of 2,000 draws, and the step of the search.
+    assert item.probability == pytest.approx(norm.sf(1.0), abs=0.03)
+    assert (item.lost / item.draws, item.verdict) == (item.probability, "risk")
+
+
 def test_a_sharp_bend_beside_a_clamp_is_resolved():
     """On 20 elements the radius is 24 % too large, that of the segments beside a clamp, too."""
     cable = CableData(0.5, 0.015, 0.003, 2e-5)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from dlo_casadi.arrays import BoolArray, FloatArray
-from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.batch import REACH, BatchEquilibrium
 from dlo_casadi.equilibrium.equilibrium import Equilibrium, curvatures_along, places_along
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -297,15 +297,18 @@ class Varied:
         self, z: FloatArray, names: tuple[str, ...]
     ) -> tuple[dict[str, FloatArray], BoolArray]:
         """Sizes (m, K) of repeats z (m, q), newly solved, and which repeats (m,) are lost."""
-        near, given = self._near(z), self._given(z)
+        guesses, given = self._near(z), self._given(z)
         parts: dict[str, list[FloatArray]] = {name: [] for name in names}
         lost = []
         for begin in range(0, len(z), CHUNK):
             some = slice(begin, begin + CHUNK)
-            own, start = given.subset(some), near.subset(some)
+            own, start = given.subset(some), guesses.subset(some)
             batch = BatchEquilibrium(self._larger, [self.pose] * len(start.x))
             shapes, converged = batch.solve_or_descend(start, own.p, own.rest, tolerance=_TOLERANCE)
-            lost.append(~(converged & batch.stable(shapes, own.p, own.rest)))
+            # A descent may end far away, where the cable snaps to.
+            way = np.abs(self.model.node.difference(start.x, shapes.x)).max(axis=(1, 2))
+            near = converged & (way <= REACH)
+            lost.append(~(near & batch.stable(shapes, own.p, own.rest)))
             for name in names:
                 parts[name].append(sizes_of(self._larger, shapes, own, name))
         return {name: np.concatenate(x) for name, x in parts.items()}, np.concatenate(lost)
