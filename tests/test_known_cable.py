@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.special import fresnel
+from scipy.stats import norm
 
 import dlo_casadi as dlo
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml
 from dlo_casadi.effects import ClipSlip
+from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.export.rod import Rod
+from dlo_casadi.model.pose_scatter import PoseScatter
 
 ROPE = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01, name="rope")
 WIRE = dlo.Cable(
@@ -213,6 +216,24 @@ def test_only_the_fixtures_are_uncertain_where_they_are_told(rope):
     slopes = [np.diff(np.linalg.norm(two, axis=1))[0] / 2e-4 for two in (moved, lifted)]
     assert check.std == pytest.approx(2e-3 * np.hypot(*slopes), rel=1e-3)
     assert check.decided_by == "2 mm at the end (100 %)"
+
+
+def test_the_band_holds_nine_tenths_of_repeats(rope):
+    """At both ends, where it is the fixtures' and the repeats' own standard deviation."""
+    fixtures = {"end_x": 2e-3, "end_y": 2e-3}
+    known = Uncertainty((), np.zeros((0, 0)), fixtures, PoseScatter(), repeat_std=1e-3)
+    cable = replace(rope, metadata=replace(rope.metadata, uncertainty=known))
+    stds = np.array([1e-3, np.hypot(1e-3, 2e-3)])
+    band = cable.solve(end=(0.5, 0.1)).band
+    np.testing.assert_allclose(band[[0, -1]], norm.ppf(0.95) * stds, rtol=1e-6)
+
+
+def test_headings_in_degrees_are_doubted():
+    cable = dlo.known_cable(ROPE, gravity=(0, -9.81), boundary=("clamped", "pinned"))
+    with pytest.raises(dlo.EquilibriumError, match=r"degrees\? 90 degrees are 1\.571 rad"):
+        cable.solve(end=(0.9, 0.0), start_heading=90)
+    with pytest.raises(dlo.EquilibriumError, match=r"metres, nearer to the start\.$"):
+        cable.solve(end=(0.9, 0.0), start_heading=1.5)
 
 
 UNWEIGHED = dlo.Cable(length=0.8, mass=None, diameter=0.005, bending_stiffness=0.01)
