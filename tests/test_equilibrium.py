@@ -22,13 +22,14 @@ from dlo_casadi.effects import (
     PointForce,
     StiffnessGradient,
 )
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.guesses import guesses
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import continued, solve_equilibria, solve_equilibrium
+from dlo_casadi.equilibrium.solve import coarse_rest, continued, solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 
 DATA = Path(__file__).parent / "data"
@@ -479,6 +480,28 @@ def test_a_joint_at_its_bound_is_reported():
     assert np.all(np.abs(folded.bound_multipliers) > 0.1)
     relaxed = solve(model, 0.1, HeldPose((0.0, 0.0), start_heading=0.0), rest=1.0)
     np.testing.assert_allclose(relaxed.bound_multipliers, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("bend", "stable"), [(0.49 * np.pi, True), (0.51 * np.pi, False)])
+def test_among_many_poses_no_joint_is_bent_beyond_its_bound(bend, stable):
+    """At rest in that shape: a minimum of the energy, of which only the bound may think less."""
+    model = CableModel(HEAVY, 5, "link", "clamped", "free", WEIGHTLESS)
+    pose = HeldPose((0.0, 0.0), start_heading=0.0)
+    x = bend * np.arange(model.chain.n_nodes)[:, None]
+    rest = bend / np.diff(model.chain.cells, axis=1).ravel()
+    shapes = Shapes.declared(x[None], np.zeros((1, model.n_border)))
+    batch = BatchEquilibrium(model, [pose])
+    assert np.abs(batch.imbalance(shapes, model.nominal, rest).rows).max() < 1e-14
+    assert batch.stable(shapes, model.nominal, rest).tolist() == [stable]
+
+
+def test_rest_strains_of_a_coarse_mesh_are_means_over_its_cells():
+    model = CableModel(HEAVY, 24)
+    coarse = model.with_mesh(10)
+    rest = np.random.default_rng(0).normal(size=24)
+    found, turned = coarse_rest(model, coarse, rest), np.append(0.0, np.cumsum(rest) / 24)
+    edges = np.interp(np.linspace(0, 1, 11), np.linspace(0, 1, 25), turned)
+    np.testing.assert_allclose(found, 10 * np.diff(edges), atol=1e-13)
 
 
 @pytest.mark.parametrize(
