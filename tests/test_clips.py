@@ -13,6 +13,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, ClipAngle, ClipOffset, ClipSlip, RestCurvatureDrift
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
+from dlo_casadi.equilibrium.equilibrium import curvatures_along
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -21,9 +22,10 @@ from dlo_casadi.equilibrium.spread import tolerances_of
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import HeldClip, clamped_nodes
+from dlo_casadi.model.clips import Clipped, HeldClip, clamped_nodes
 from dlo_casadi.model.whole_pose import potential
-from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.chain import Chain
+from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.rod.obstacles import Plane
 
 LENGTH, EI = 1.0, 0.02  # m, N m^2
@@ -128,6 +130,14 @@ def test_a_rod_clamped_in_three_places_is_two_rods():
     (load,) = whole.clips
     assert load.force == pytest.approx(first.end_force + last.start_force, rel=1e-9)
     moment = np.ravel(first.moments)[1] + np.ravel(last.moments)[0]
+    # The curvature at both ends and on both sides of the clip is that at the ends of the two rods.
+    clipped = Clipped.none(Chain(0.5, 10), 1)
+    bends = [curvatures_along(one.curvature[None, None], clipped)[0, -2:] for one in (first, last)]
+    held, at = np.array([clip.vector(Heading)])[None], np.array([[0.5]])
+    between = Clipped.of(Chain(LENGTH, 20), ("clamped",), held, at, np.zeros((1, 1)), whole.x[None])
+    found = curvatures_along(whole.curvature[None, None], between)[0, -4:]
+    np.testing.assert_allclose(found, np.concatenate(bends), rtol=1e-6)
+    assert len(set(np.round(found, 3))) == 4
     assert np.shape(load.moment) == ()
     assert load.moment == pytest.approx(moment, rel=1e-9)
 
@@ -336,6 +346,22 @@ def test_a_clearance_beside_a_saddle_between_even_places():
         given = Inputs.of(model.nominal, np.zeros((1, model.chain.n_rests)), pose.vector[None])
         heights.append(sizes_of(model, eq.shapes, given, "clearance")[0])
     np.testing.assert_allclose(heights[0], heights[1][::4], atol=2.5e-4)
+
+
+def test_places_and_directions_at_even_arc_lengths_are_exact_for_cubics():
+    """From those at nodes that saddles have moved either way, and not at all."""
+    chain, rng = Chain(LENGTH, 10), np.random.default_rng(0)
+    held, at = np.zeros((1, 3, 4)), np.array([[0.17, 0.5, 0.74]])
+    held[..., -1] = at
+    clipped = Clipped.of(chain, ("clamped",) * 3, held, at, np.zeros((3, 1)), np.zeros((1, 11, 1)))
+    assert clipped.places[0, [2, 5, 7]].tolist() == at[0].tolist()
+    curve = [np.polynomial.Polynomial(cubic) for cubic in rng.normal(size=(2, 4))]
+
+    def rows(s):
+        return np.stack([*(one(s) for one in curve), *(one.deriv()(s) for one in curve)], axis=1)
+
+    found = clipped.evenly(rows(clipped.places[0])[None, ..., None])[0, ..., 0]
+    np.testing.assert_allclose(found, rows(chain.places), atol=1e-13)
 
 
 def test_a_pose_with_other_clips_than_the_model():
