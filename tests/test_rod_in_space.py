@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import EFFECTS, CableData, SectionLaw
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.curve import across
 from dlo_casadi.equilibrium.minima import descend
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -378,6 +379,43 @@ def test_a_straight_cable_between_ball_joints_is_stable_though_it_may_spin(eleme
     assert found.energy == pytest.approx(alike.energy, rel=close)
     flat = np.stack([found.points[:, :2] @ pose.end[:2] / level, found.points[:, 2]], axis=1)
     np.testing.assert_allclose(flat, alike.points, atol=close * LENGTH)
+
+
+@pytest.mark.parametrize(
+    ("held", "spins"),
+    [
+        ({}, True),
+        ({"start": "clamped", "end": "free"}, False),
+        ({"end": "clamped"}, False),
+        ({"clips": ("pinned", "eyelet")}, True),
+        ({"clips": ("swivel",)}, True),
+        ({"clips": ("eyelet", "clamped")}, False),
+        ({"effects": (EFFECTS["bending_softening"](),)}, True),
+        ({"effects": (EFFECTS["bending_anisotropy"](),)}, False),
+    ],
+)
+def test_what_keeps_a_cable_from_turning_about_itself(held, spins):
+    cable = CableData(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
+    assert CableModel(cable, 12, gravity=DOWN, **held).may_spin is spins
+    planar = replace(cable, torsional_stiffness=None)
+    assert not CableModel(planar, 12).may_spin
+
+
+def test_normals_are_carried_along_a_curve_without_twist():
+    """By the smallest rotation from one tangent to the next; also where the first axis changes."""
+    s = np.linspace(0.0, 6.0, 400)
+    tangents = np.stack(
+        [np.cos(s), np.sin(s) * np.cos(0.7 * s), np.sin(s) * np.sin(0.7 * s)], axis=1
+    )
+    normals = across(tangents)
+    frames = np.concatenate([tangents[:, None], normals], axis=1)
+    np.testing.assert_allclose(
+        frames @ np.swapaxes(frames, 1, 2), np.eye(3)[None] + 0 * frames, atol=1e-12
+    )
+    axes = np.cross(tangents[:-1], tangents[1:])
+    angles = np.arccos((tangents[:-1] * tangents[1:]).sum(axis=1))
+    turns = Rotation.from_rotvec(axes * (angles / np.linalg.norm(axes, axis=1))[:, None])
+    np.testing.assert_allclose(turns.apply(normals[:-1, 0]), normals[1:, 0], atol=1e-9)
 
 
 def test_a_cable_bent_against_its_rest_shape_is_no_minimum():
