@@ -103,6 +103,7 @@ def test_a_stiff_cantilever_bends_as_its_stiffness_lets_it():
         assert item.value == pytest.approx(1 / straight, rel=4e-3)
         assert item.std == pytest.approx(share / straight, rel=6e-3)
         assert item.probability == pytest.approx(norm.sf(sigma), abs=0.015)
+        assert 0 < item.error < np.sqrt(item.probability * (1 - item.probability) / item.draws)
         assert item.at == 0.0
         assert item.shares["parameters"] == pytest.approx(1.0)
         assert item.verdict == ("fail" if sigma < 0 else "risk")
