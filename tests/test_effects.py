@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.effects import (
     EFFECTS,
+    NUISANCES,
     RANDOM,
     BendingSoftening,
     CableData,
@@ -532,6 +533,13 @@ def test_moments_of_pins_turn_the_ends_counter_clockwise():
     ]
     work = CABLE.bending_stiffness * shapes.x[0, [0, -1], 0] @ [0.7, -0.4]
     assert energies[0] - energies[1] == pytest.approx(-work, abs=1e-13)
+
+
+def test_biases_of_sensors_are_known_within_the_tolerances_of_forces_and_moments():
+    tolerances = {"force_bias": 0.02, "moment_bias": 0.003}
+    setup = Setup(CABLE, readings=("end_force", "end_moment"), tolerances=tolerances)
+    prior = NUISANCES["sensor_bias"].made_for(setup).prior(setup)
+    assert prior == {"end_force_x": 0.02, "end_force_y": 0.02, "end_moment": 0.003}
 
 
 def test_clamp_angles_of_one_end_only():
