@@ -7,9 +7,10 @@ import pytest
 
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.limits import Resolved
-from dlo_casadi.cable.placing import ROOM, placed
+from dlo_casadi.cable.placing import ROOM, _Search, placed
 from dlo_casadi.config import Limits
 from dlo_casadi.effects import CableData
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError
@@ -88,6 +89,41 @@ def test_the_least_force_may_use_more_of_the_bend_radius():
     free = placed(known, KNOWN, 1, poses, corners, None, "force")
     assert (free.uses, free.binding, free.margin) == ((), None, 1.0)
     assert free.force <= least.force + 1e-3
+
+
+@pytest.mark.parametrize("aim", ["margin", "force"])
+def test_the_first_order_model_is_the_derivative_of_solved_shapes(aim):
+    """Of the room of spans, exactly; of sizes along a direction of all places and arc lengths."""
+    held = tuple(HeldPose((0.0, 0.0), pose["end"]) for pose in POSES)
+    between, box = cable().with_clips(["pinned"] * 2), np.array([[0.0, -0.3], [0.6, 0.1]]) / 0.8
+    search = _Search(between, KNOWN.coefficients, held, box, Limits(**LIMITS), aim)
+    z, way = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 6))
+    z = np.array([0.3, 0.2, -0.1, 0.6, 0.42, -0.05]) + 0.02 * z
+    spare, by_z = search.spare(z)
+    chord = np.hypot(*(z[4:] - z[1:3]))
+    assert spare[1] == pytest.approx(ROOM * (z[3] - z[0]) - chord, abs=1e-14)
+    step = 1e-5 * way
+    changed = search.spare(z + step)[0] - search.spare(z - step)[0]
+    assert by_z @ way == pytest.approx(changed / 2e-5, abs=1e-8)
+    scales = np.array([[1.0, 2.0], [1.5, 0.5]])
+    here, ahead, back = (search.solved_at(x, scales) for x in (z, z + step, z - step))
+    for exact, more, less in zip(
+        search.slopes(here, scales),
+        (ahead.aims, ahead.others),
+        (back.aims, back.others),
+        strict=True,
+    ):
+        # Slopes are taken over 1 mm to either side: a hundredth of a few.
+        assert exact @ way == pytest.approx((more - less) / 2e-5, rel=0.02, abs=1e-3)
+    least = search.cable.model.force_scale
+    for row, sizes, scale in zip((0, 1), here.sizes, scales, strict=True):
+        shares = here.aims if aim == "margin" else here.others
+        own = np.split(shares, 2)[row]
+        expected = [0.04 * scale[0] * sizes["curvature"], scale[1] * sizes["force"] / 6.0]
+        np.testing.assert_allclose(own, np.concatenate(expected), rtol=1e-12)
+    if aim == "force":
+        forces = np.concatenate([sizes["force"] for sizes in here.sizes])
+        np.testing.assert_allclose(here.aims * least, forces, rtol=1e-12)
 
 
 def test_no_place_near_a_clip_in_space_is_better():
