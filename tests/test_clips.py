@@ -364,6 +364,32 @@ def test_places_and_directions_at_even_arc_lengths_are_exact_for_cubics():
     np.testing.assert_allclose(found, rows(chain.places), atol=1e-13)
 
 
+def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():
+    """kappa_0 = a + b s + c s^2: mean, slope and bend times the width, of the moved cells."""
+    chain, (a, b, c) = Chain(LENGTH, 10), (1.0, -4.0, 9.0)
+    held, at = np.zeros((1, 2, 4)), np.array([[0.17, 0.74]])
+    held[..., -1] = at
+    clipped = Clipped.of(chain, ("clamped",) * 2, held, at, np.zeros((2, 1)), np.zeros((1, 11, 1)))
+
+    def inside(cells):
+        middle, width = cells.mean(axis=1), np.diff(cells, axis=1)[:, 0]
+        mean = a + b * middle + c * (middle**2 + width**2 / 12)
+        return np.stack([mean, (b + 2 * c * middle) * width, c * width**2], axis=1)
+
+    even = chain.rest_inside(inside(chain.cells)[:, :1])
+    found = clipped.rest(even[None])[0, ..., 0]
+    np.testing.assert_allclose(found, inside(clipped.cells[0]), atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("at", "ordered"),
+    [((0.3, 0.6), True), ((0.6, 0.3), False), ((0.0, 0.5), False), ((0.5, 1.0), False)],
+)
+def test_clips_are_in_order_within_the_cable(at, ordered):
+    none = np.zeros((1, 2, 4)), np.array([at]), np.zeros((2, 1)), np.zeros((1, 11, 1))
+    assert Clipped.of(Chain(LENGTH, 10), ("eyelet",) * 2, *none).in_order.tolist() == [ordered]
+
+
 def test_a_pose_with_other_clips_than_the_model():
     model, pose, _ = solved([HeldClip("pinned", (0.4, 0.15), 0.47)])
     with pytest.raises(EquilibriumError, match="the pose has the clips none, the model pinned"):
