@@ -97,6 +97,16 @@ def test_a_heavy_beam_laid_on_a_table_lifts_off_where_beam_theory_says():
     assert contact.force + found.start_force == pytest.approx([0.0, -WEIGHT], abs=1e-9)
 
 
+def test_a_cable_touches_down_and_lifts_off_alike():
+    """Between pins at one height; both contact points lie between nodes."""
+    soft = replace(CABLE, bending_stiffness=1e-3)
+    _, found = solved(soft, HeldPose((0.0, 0.0), (0.88, 0.0)), TABLE, n=36)
+    (contact,) = found.contacts
+    assert contact.end - contact.start > 0.2 * LENGTH
+    assert contact.start + contact.end == pytest.approx(LENGTH, abs=1e-6)
+    assert abs(36 * contact.start / LENGTH % 1 - 0.5) < 0.45
+
+
 def test_tension_over_a_cylinder_follows_from_the_height():
     """T + M^2 / (2 EI) - w y is the same everywhere, without friction on the cylinder, too."""
     radius, pose = 0.1, HeldPose((-0.2, -0.25), (0.22, -0.15))
