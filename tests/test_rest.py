@@ -4,6 +4,8 @@ import itertools
 
 import numpy as np
 
+from dlo_casadi.equilibrium.curve import chord_places
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.rod.chain import Chain, RestCurvature
 
 LENGTH = 0.8  # m
@@ -32,6 +34,17 @@ def test_equal_coefficients_are_a_constant_curvature():
     np.testing.assert_allclose(rest.basis(np.array([0.0, 0.3, LENGTH])).sum(axis=1), 1.0)
     # A parabola through the coefficients has constant second differences.
     np.testing.assert_allclose(rest.roughness @ np.arange(6.0) ** 2, 2.0)
+
+
+def test_few_points_of_a_half_circle_are_as_far_along_it_as_their_chords():
+    """Chords of a fifth are 2 % shorter than the cable: held at both ends, they are scaled."""
+    s, radius = np.linspace(0.0, LENGTH, 6), LENGTH / np.pi
+    places = radius * np.stack([1 - np.cos(s / radius), np.sin(s / radius)], axis=1)
+    pose = HeldPose((0.0, 0.0), tuple(places[-1]))
+    np.testing.assert_allclose(chord_places(places[1:-1], pose, LENGTH), s[1:-1], rtol=2e-3)
+    free = chord_places(places[1:-1], HeldPose((0.0, 0.0)), LENGTH)
+    chord = 2 * radius * np.sin(np.pi / 10)
+    np.testing.assert_allclose(free, chord * np.arange(1, 5), rtol=2e-3)
 
 
 def test_a_straight_cable_has_no_coefficients():
