@@ -46,6 +46,8 @@ def test_a_known_cable_held_straight_up_falls_to_either_side():
     shape = cable.solve(start_heading=np.pi / 2)
     mirrored = shape.other_side.points * (-1, 1)
     np.testing.assert_allclose(mirrored, shape.points, atol=1e-8)
+    for side in (shape, shape.other_side):
+        assert side.pose.branch == ("ccw" if side.equilibrium.turn > 0 else "cw")
     assert cable.solve(start_heading=np.pi / 2 + 1e-6).other_side is None
 
 
@@ -218,6 +220,33 @@ def test_only_the_fixtures_are_uncertain_where_they_are_told(rope):
     slopes = [np.diff(np.linalg.norm(two, axis=1))[0] / 2e-4 for two in (moved, lifted)]
     assert check.std == pytest.approx(2e-3 * np.hypot(*slopes), rel=1e-3)
     assert check.decided_by == "2 mm at the end (100 %)"
+
+
+def test_text_and_data_of_a_shape_name_what_each_fixture_takes():
+    """Of two clamps and a saddle: no two of them take the same."""
+    clamps = {"gravity": (0, -9.81), "boundary": ("clamped", "clamped")}
+    cable = dlo.known_cable(ROPE, **clamps, model={"n": 16})
+    saddle = dlo.Clip(kind="clamped", at=0.3, place=(0.25, -0.05), heading=-0.3, name="saddle")
+    held = {"start_heading": 0.2, "end_heading": 0.4, "clips": [saddle]}
+    shape = cable.solve(end=(0.5, 0.02), **held)
+    rows, data = dict(shape.rows()), shape.as_dict()
+    loads = {"its start": shape.start_force, "its end": shape.end_force}
+    loads["saddle"] = shape.clips["saddle"].force
+    for name, force in loads.items():
+        told = re.findall(r"-?\d[\d.]*(?:e-?\d+)?", rows[f"force of the cable on {name}"])
+        assert np.array(told[:2], float) == pytest.approx(force, rel=1e-3, abs=1e-12)
+    on_all = sum(loads.values())
+    assert on_all == pytest.approx([0.0, -9.81 * ROPE.mass], abs=1e-6)
+    moments = {"its start": shape.start_moment, "its end": shape.end_moment}
+    moments["saddle"] = shape.clips["saddle"].moment
+    for name, moment in moments.items():
+        told = rows[f"moment of the cable on {name}"].removesuffix(" N m")
+        assert float(told) == pytest.approx(float(moment), rel=1e-3)
+    assert len({*map(float, moments.values())}) == 3
+    for side in ("start", "end"):
+        assert data[f"force_on_{side}"] == loads[f"its {side}"].tolist()
+        assert data[f"moment_on_{side}"] == float(moments[f"its {side}"])
+    assert data["clips"][0]["force"] == loads["saddle"].tolist()
 
 
 def test_the_band_holds_nine_tenths_of_repeats(rope):
