@@ -36,6 +36,7 @@ from dlo_casadi.effects import (
     UnknownPull,
     Viewpoint,
 )
+from dlo_casadi.effects.effect import Fitted
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
@@ -540,6 +541,39 @@ def test_biases_of_sensors_are_known_within_the_tolerances_of_forces_and_moments
     setup = Setup(CABLE, readings=("end_force", "end_moment"), tolerances=tolerances)
     prior = NUISANCES["sensor_bias"].made_for(setup).prior(setup)
     assert prior == {"end_force_x": 0.02, "end_force_y": 0.02, "end_moment": 0.003}
+
+
+@pytest.mark.parametrize(
+    ("force", "std", "weight"),
+    [
+        ((0.0, -0.3), 0.01, True),
+        ((0.0, 0.3), 0.01, False),  # it lifts the cable
+        ((0.015, -0.3), 0.01, True),  # along gravity within two standard deviations
+        ((0.025, -0.3), 0.01, False),
+        ((0.025, -0.3), 0.02, True),
+    ],
+)
+def test_a_force_may_be_a_weight_if_it_is_along_gravity(force, std, weight):
+    values = {"fx": force[0], "fy": force[1], "position": 0.4}
+    stds = {"fx": std, "fy": 5.0, "position": 0.0}
+    assert LumpedMass().may_be(Fitted(PointForce(), Setup(CABLE), values, stds)) is weight
+    strap = values | {"stiffness": 1.0, "anchor_x": 0.0, "anchor_y": -1.0}
+    assert not LumpedMass().may_be(Fitted(Tether(), Setup(CABLE), strap, stds))
+
+
+@pytest.mark.parametrize(
+    ("share", "beside"), [(0.09, "start"), (0.11, ""), (0.89, ""), (0.91, "end")]
+)
+def test_what_acts_beside_a_fixture_may_be_the_fixture(share, beside):
+    values = {"fx": 0.1, "fy": 0.2, "position": share * CABLE.length}
+    found = Fitted(PointForce(), Setup(CABLE), values, values)
+    for side in ("start", "end"):
+        assert found.near(side) is (side == beside)
+        assert EFFECTS[f"{side}_spring"]().may_be(found) is (side == beside)
+        only = ClampAngle(start=side == "start", end=side == "end")
+        assert only.may_be(found) is (side == beside)
+    everywhere = Fitted(SideLoad(), Setup(CABLE), {"force_per_length": 0.1}, {})
+    assert not everywhere.near("start")
 
 
 def test_clamp_angles_of_one_end_only():
