@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
 
 from dlo_casadi.config import load_config
-from dlo_casadi.effects import CableData, ClipAngle, ClipOffset, ClipSlip, RestCurvatureDrift
+from dlo_casadi.effects import (
+    CableData,
+    ClipAngle,
+    ClipOffset,
+    ClipSlip,
+    LengthError,
+    RestCurvatureDrift,
+)
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import curvatures_along
@@ -518,6 +525,9 @@ def test_an_offset_brings_a_clip_within_reach():
         solve_equilibrium(model, model.nominal, rest, pose)
     eq = solve_equilibrium(model, model.nominal - np.array([0.0, 0.0, 0.02]), rest, pose)
     assert eq.stable
+    # And so does a longer cable: 0.51 m of it.
+    longer = replace(model, effects=(LengthError(),))
+    assert solve_equilibrium(longer, longer.nominal + np.array([0.0, 0.02]), rest, pose).stable
 
 
 def test_a_way_through_eyelets_that_is_too_long_is_told_as_such():
