@@ -603,6 +603,19 @@ def test_over_the_start_fixture_a_standoff_error_is_a_scale():
     np.testing.assert_allclose(number(seen), number(scaled), rtol=1e-14)
 
 
+def test_a_scaled_line_is_scaled_between_its_nodes_too():
+    """Its derivatives by the arc length as well as its places, from the start fixture."""
+    bare = CableModel(CABLE, 5)
+    model = bare.with_effect(ImageScale())
+    seen, true = (
+        assembly_of(m).curve(*posed(m, p))[0]
+        for m, p in ((model, np.append(bare.nominal, 1.1)), (bare, bare.nominal))
+    )
+    start = true[0, :2]
+    np.testing.assert_allclose(seen[:, :2], start + 1.1 * (true[:, :2] - start), atol=1e-14)
+    np.testing.assert_allclose(seen[:, 2:], 1.1 * true[:, 2:], atol=1e-14)
+
+
 @pytest.mark.parametrize("element", ["arc", "quadratic"])
 def test_the_line_that_a_map_by_direction_shows_converges(element):
     """Between nodes its slopes count, which turn as the cable does."""
