@@ -25,7 +25,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.guesses import guesses
+from dlo_casadi.equilibrium.guesses import arc_half_angle, guesses
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import coarse_rest, continued, solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
@@ -344,6 +344,14 @@ def test_straight_strut_about_the_euler_load(share, stable):
     np.testing.assert_allclose(straight.phi, 0.0, atol=1e-8)
     assert straight.end_force[0] == pytest.approx(share * euler, rel=1e-6)
     assert straight.stable is stable
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.1, 0.5, 0.9, 0.99, 0.9999])
+def test_the_arc_of_a_first_guess_has_the_length_of_the_cable(ratio):
+    """sin(a) / a = chord / length; a chord longer than the cable has no arc."""
+    exact = brentq(lambda a: np.sinc(a / np.pi) - ratio, 1e-9, 3.2)
+    assert arc_half_angle(0.8 * ratio, 0.8) == pytest.approx(exact, abs=3e-4)
+    assert arc_half_angle(0.81, 0.8) == 0.0
 
 
 @ALL
