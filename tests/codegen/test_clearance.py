@@ -55,6 +55,8 @@ def test_distance_is_that_of_many_points_and_its_gradient_central_differences(sp
         u = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
         away = np.linalg.norm(points - a - u[:, None] * (b - a), axis=1) - obstacle.radius
     assert gap.distance == pytest.approx(away.min() - 0.002, abs=1e-8)
+    assert gap.place == pytest.approx(away.argmin() / 20000, abs=1e-4)
+    assert gap.point == pytest.approx(points[away.argmin()], abs=1e-4)
     assert np.linalg.norm(gap.normal) == pytest.approx(1.0)
     step = 1e-5
     for column in range(12):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 from test_holds import (
     CLIPS,
     EYELET,
@@ -93,8 +94,10 @@ def test_values_and_places_are_those_of_python(case):
     assert usages[first].margin == min(item.margin for item in usages.values())
 
 
-def test_a_clearance_is_that_of_dlo_clearance():
-    model, pose = flat()
+@pytest.mark.parametrize("case", ["plane", "plane, saddle and eyelet"])
+def test_a_clearance_is_that_of_dlo_clearance(case):
+    """Its place, too, of nodes that a saddle moves along the cable."""
+    model, pose = CASES[case]()
     solver, *_ = compiled(model)
     shape = solver.solve(pose)
     slope, obstacles = solver.sensitivity(shape, pose), ball_beside(shape)
@@ -102,6 +105,11 @@ def test_a_clearance_is_that_of_dlo_clearance():
     own = solver.limits(shape, {"clearance": 0.02}, obstacles, slope)["clearance"]
     assert (own.value, own.which) == (gap.distance, gap.obstacle)
     assert own.at == gap.place * model.cable.length
+    s = model.cable.length * (shape.places if pose.clips else np.linspace(0.0, 1.0, model.n + 1))
+    tangents = np.column_stack([np.cos(shape.x), np.sin(shape.x)])
+    there = CubicHermiteSpline(s, shape.points, tangents)(own.at)
+    surface = obstacles[gap.obstacle].near(there[None]).distance[0]
+    assert surface - model.cable.diameter / 2 == pytest.approx(gap.distance, abs=1e-9)
     assert own.margin == pytest.approx(gap.distance / 0.02 - 1)
     assert np.array_equal(own.gradient, gap.gradient)
     without = solver.limits(shape, {"clearance": 0.02}, obstacles)
