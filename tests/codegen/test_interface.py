@@ -161,6 +161,22 @@ def test_a_failure_leaves_no_stale_number_in_a_batch(links):
     assert shapes[0].tobytes() == shapes[3].tobytes()
 
 
+def test_batches_and_paths_return_the_first_status_that_is_not_ok(links):
+    """As the header promises to callers in C, and C++ throws it."""
+    good = at((0.5, 0.1))
+    for poses, status in (
+        ([good, good], "ok"),
+        ([good, at((2.0, 0.0)), at((np.nan, 0.0)), good], "unreachable"),
+        ([at((np.nan, 0.0)), at((2.0, 0.0))], "not_finite"),
+    ):
+        table, branch = shapes.pose_table(links.model, poses)
+        out = np.zeros(len(table), shapes.records_of(links.model).shape)
+        told, jump = np.zeros(len(table), np.intc), np.zeros(1, np.uintp)
+        given = (table, len(table), branch)
+        assert STATUSES[links._call("dlo_batch", *given, out, told)] == status
+        assert STATUSES[links._call("dlo_path", *given, None, out, told, jump)] == status
+
+
 def test_both_ends_at_one_place_is_a_loop(links):
     for branch in ("ccw", "cw"):
         loop = links.solve(at((0.0, 0.0), branch=branch))
