@@ -230,19 +230,39 @@ def test_a_table_that_a_fit_has_found_is_not_carried_either():
 
 
 def test_samples_scatter_as_the_covariance_says():
+    """EI and GJ, which move together, and a coefficient of the rest curvature."""
     held = CASES["space"]()
     names = ["bending_stiffness", "torsional_stiffness", "rest_curvature[1]"]
     std = np.array([0.1 * 0.015, 0.5 * 0.011, 0.2])
-    coefficients = np.linalg.lstsq(held.model.rest_basis, held.rest)[0]
-    drawn = samples_of(held, coefficients, names, np.diag(std**2), 40, 3)
+    together = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    covariance = std * together * std[:, None]
+    basis = held.model.rest_basis
+    coefficients = np.linalg.lstsq(basis, held.rest)[0]
+    drawn = samples_of(held, coefficients, names, covariance, 30, 3)
 
     p = np.array([item.p for item in drawn])
     assert (p[:, :2] > 0).all()
-    assert np.log(p[:, 0] / 0.015).std() == pytest.approx(0.1, rel=0.3)  # 40 of them: 11 %
+    assert np.log(p[:, 0] / 0.015).std() == pytest.approx(0.1, rel=0.3)  # 30 of them: 13 %
     assert np.log(p[:, 1] / 0.011).std() == pytest.approx(0.5, rel=0.3)
-    again = samples_of(held, coefficients, names, np.diag(std**2), 2, 3)
+    assert np.corrcoef(np.log(p[:, :2]).T)[0, 1] == pytest.approx(0.9, abs=0.1)
+    off = np.array([np.linalg.lstsq(basis, item.rest)[0] - coefficients for item in drawn])
+    assert off[:, 1].std() == pytest.approx(0.2, rel=0.3)
+    assert np.delete(off, 1, axis=1) == pytest.approx(0.0, abs=1e-9)
+    again = samples_of(held, coefficients, names, covariance, 2, 3)
     assert (again[1].rest == drawn[1].rest).all()
     assert (again[1].curve.nodes == drawn[1].curve.nodes).all()
+    (other,) = samples_of(held, coefficients, names, covariance, 1, 4)
+    assert other.p[0] not in p[:, 0]
+
+
+def test_samples_stay_within_the_bounds_of_physics():
+    """Of a mass 50 mm before the end, known to 0.2 m, a third would be beyond the cable."""
+    held = in_space("lumped_mass", lumped_mass__mass=MASS, lumped_mass__position=0.55)
+    coefficients = np.linalg.lstsq(held.model.rest_basis, held.rest)[0]
+    drawn = samples_of(held, coefficients, ["lumped_mass.position"], np.array([[0.04]]), 8, 0)
+    places = [item.p[held.model.names.index("lumped_mass.position")] for item in drawn]
+    assert 0.0 <= min(places) < max(places) - 0.1
+    assert max(places) <= 0.6
 
 
 def test_only_exports_are_replaced(tmp_path):
