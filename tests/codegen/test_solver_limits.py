@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
+from solvers import moved
 from test_holds import (
     CLIPS,
     EYELET,
@@ -18,6 +19,7 @@ from test_holds import (
     flat,
     loom,
     moves_of,
+    turned,
 )
 
 from dlo_casadi.codegen import QUANTITIES, Capsule, Plane
@@ -133,15 +135,28 @@ def test_gradients_are_differences(case):
     shape, step = solver.solve(pose), 1e-5
     obstacles = ball_beside(shape)
     usages = solver.limits(shape, LIMITS, obstacles, solver.sensitivity(shape, pose))
-    for column, moved, _ in moves_of(model, pose):
+    for column, move, _ in moves_of(model, pose):
         ahead, back = (
-            solver.limits(solver.solve(moved(h), warm=shape), LIMITS, obstacles)
+            solver.limits(solver.solve(move(h), warm=shape), LIMITS, obstacles)
             for h in (step, -step)
         )
         for name in QUANTITIES:
             change = (ahead[name].value - back[name].value) / (2 * step)
             own = usages[name].gradient[column]
             assert own == pytest.approx(change, rel=1e-6, abs=2e-6), (column, name)
+
+
+def test_a_twist_backwards_counts_by_its_size():
+    model, pose = CASES["space, swivel and eyelet"]()
+    pose = replace(pose, end_orientation=turned(-1.5, -0.2, 0.1))
+    solver, *_ = compiled(model)
+    shape, step = solver.solve(pose), 1e-5
+    own = solver.limits(shape, {}, slope=solver.sensitivity(shape, pose))["twist"]
+    assert own.value == -shape.max_twist > 0.0
+    for column in (9, 10, 11):  # turns of the end
+        ahead, back = (solver.solve(moved(pose, column, h), warm=shape) for h in (step, -step))
+        change = (back.max_twist - ahead.max_twist) / (2 * step)
+        assert own.gradient[column] == pytest.approx(change, rel=1e-6, abs=2e-6), column
 
 
 def test_limits_that_cannot_be_checked():
