@@ -15,6 +15,7 @@ from dlo_casadi.export.mujoco import principal
 from dlo_casadi.export.rod import Rod, SolvedCable
 from dlo_casadi.export.targets import TARGETS, losses, samples_of, target_of, write_rods
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import HeldClip
 
 SPACE = CableData(0.6, 0.03, 0.004, 0.015, "loom <&>", torsional_stiffness=0.011)
 PLANE = CableData(0.8, 0.2, 0.012, 0.3, "rope")
@@ -84,6 +85,36 @@ def test_what_effects_are_to_a_rod():
     assert np.abs(axes.as_matrix()[:, 2, 1] / axes.as_matrix()[:, 1, 1]) == pytest.approx(
         np.tan(0.4)
     )
+
+
+def test_what_scales_a_rod():
+    """A longer cable, a heavier one, one that stretches, one that is stiffer in a part."""
+    plain = Rod.of(CASES["space"](), 20)
+    assert plain.h * 19 == pytest.approx(0.6)  # half a link is in each clamp
+    assert plain.axial == np.inf
+    longer = Rod.of(in_space("length_error", length_error__length_difference=0.005), 20)
+    assert longer.h * 19 == pytest.approx(0.605)
+    heavier = Rod.of(in_space("mass_error", mass_error__factor=1.2), 20)
+    assert heavier.masses == pytest.approx(1.2 * plain.masses)
+    assert Rod.of(in_space("axial_stretch", axial_stretch__compliance=2e-3), 20).axial == 500.0
+    values = {"stiff_section__start": 0.2, "stiff_section__end": 0.4, "stiff_section__factor": 3.0}
+    part = Rod.of(in_space("stiff_section", **values), 20)
+    inner, s = part.h / 2, part.s[1:-1]
+    for joints, factor in (
+        ((s > 0.2 + inner) & (s < 0.4 - inner), 3.0),
+        ((s < 0.2 - inner) | (s > 0.4 + inner), 1.0),
+    ):
+        assert joints.sum() > 3
+        assert part.mean_bending[joints] == pytest.approx(factor * 0.015, rel=0.04)  # soft edges
+        assert part.torsion[joints] == pytest.approx(factor * 0.011, rel=0.04)
+
+
+@pytest.mark.parametrize("case", ["space", "overhang"])
+def test_the_default_mesh_turns_by_a_tenth_of_a_radian_at_most(case):
+    rod = Rod.of(CASES[case]())
+    most = rod.turns.magnitude().max()
+    assert most < 0.1 * 1.02  # the curvature is sampled
+    assert most > 0.09 or len(rod.masses) == 40
 
 
 @pytest.mark.parametrize("place", [0.0, PLACE, 0.8])
@@ -229,6 +260,25 @@ def test_a_table_that_a_fit_has_found_is_not_carried_either():
     s = np.linspace(0, 0.8, 101)
     moved = np.linalg.norm(held.curve.at(s) - free.curve.at(s), axis=1).max() / 0.8
     share = re.search(r"moves by up to ([\d.]+) %", found["obstacles"])
+    assert float(share[1]) == pytest.approx(100 * moved, rel=0.05)
+    assert moved > 0.02
+
+
+def test_clips_are_not_carried_either():
+    """By how much the shape without the clip is another one."""
+    model = CableModel(PLANE, 20, start="pinned", end="pinned", n_rest=0)
+    free = SolvedCable.of(model, model.nominal, np.zeros(20), ON_TABLE)
+    clip = HeldClip("pinned", (0.3, -0.15), 0.4)
+    held = SolvedCable.of(
+        replace(model, clips=("pinned",)),
+        model.nominal,
+        np.zeros(20),
+        replace(ON_TABLE, clips=(clip,)),
+    )
+    found = losses(held, TARGETS["mujoco"], Rod.of(held, 10))
+    s = np.linspace(0, 0.8, 101)
+    moved = np.linalg.norm(held.curve.at(s) - free.curve.at(s), axis=1).max() / 0.8
+    share = re.search(r"moves by up to ([\d.]+) %", found["clips"])
     assert float(share[1]) == pytest.approx(100 * moved, rel=0.05)
     assert moved > 0.02
 
