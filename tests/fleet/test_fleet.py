@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import astuple
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -18,7 +20,7 @@ import pyarrow.parquet as pq
 from tiny_sessions import QUICK, without_times, write_fleet
 
 from dlo_casadi.cli import fit, main
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.fleet.rows import (
     COLUMNS,
     empty_row,
@@ -28,7 +30,7 @@ from dlo_casadi.fleet.rows import (
     robust_z,
     row_of,
 )
-from dlo_casadi.fleet.run import digest_of, find_sessions, fit_fleet
+from dlo_casadi.fleet.run import Options, digest_of, find_sessions, fit_fleet
 from dlo_casadi.io.files import only_run
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import open_executor
@@ -205,6 +207,50 @@ def test_each_photograph_of_a_pose_decides_the_results(tmp_path):
         (tmp_path / name).write_text("changed")
         digests.add(digest_of(session, ()))
     assert len(digests) == 4
+
+
+def test_options_decide_the_results(tmp_path):
+    (tmp_path / "session.yaml").write_text("experiment: {poses: []}\n")
+    every = [astuple(Options(*item)) for item in product((True, False), repeat=2)]
+    assert len({digest_of(tmp_path / "session.yaml", options) for options in every}) == 4
+
+
+def test_failed_sessions_are_taken_over_unless_they_are_to_be_tried_again(tmp_path):
+    (tmp_path / "broken.yaml").write_text("cable: {lenght: 1.0}\nexperiment: {}\n")
+    sessions, told = find_sessions(tmp_path)[1], []
+    for retry in (False, False, True):
+        fit_fleet(
+            sessions,
+            tmp_path / "out",
+            InProcess(),
+            QUICK,
+            retry_failed=retry,
+            begin=lambda taken_over, left: told.append((taken_over, left)),
+        )
+    assert told == [(0, 1), (1, 0), (0, 1)]
+
+
+def test_a_session_whose_results_cannot_be_written_is_lost_and_tried_again(tmp_path, monkeypatch):
+    (tmp_path / "broken.yaml").write_text("cable: {lenght: 1.0}\nexperiment: {}\n")
+    sessions, told = find_sessions(tmp_path)[1], []
+
+    def full(*_):
+        raise OutputError("no space", tmp_path)
+
+    for status in ("lost", "failed"):
+        with monkeypatch.context() as patched:
+            if status == "lost":
+                patched.setattr("dlo_casadi.fleet.run._fitted", full)
+            (row,) = fit_fleet(
+                sessions,
+                tmp_path / "out",
+                InProcess(),
+                QUICK,
+                begin=lambda taken_over, left: told.append((taken_over, left)),
+            )
+        assert row["status"] == status
+        assert rows_of(tmp_path / "out")[0]["message"] == row["message"]
+    assert told == [(0, 1), (0, 1)]
 
 
 def test_results_and_hidden_folders_are_no_sessions(tmp_path):
