@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -189,7 +190,8 @@ def test_both_ends_at_one_place_is_a_loop(links):
 def test_almost_taut(links):
     for ratio in (0.99, 0.999, 0.99999):
         shape = links.solve(at((ratio * CABLE.length, 0.0)))
-        assert shape.end_error < 1e-9
+        assert 0.0 < shape.end_error < 1e-9
+        assert 0.0 < shape.imbalance < 1e-6
 
 
 def test_branches_bow_either_way(straight):
@@ -305,6 +307,22 @@ def test_sensitivity_of_a_shape_of_another_pose_is_refused(links):
     shape = links.solve(at((0.5, 0.1)))
     with pytest.raises(EquilibriumError, match="bad_argument"):
         links.sensitivity(shape, at((0.5, 0.11)))
+
+
+def test_an_equilibrium_that_is_no_minimum_has_no_derivatives():
+    """An S of a weightless cable between pins: two bows, the second one turned half round."""
+
+    def weightless(length, n):
+        model = CableModel(replace(CABLE, length=length), n=n, element="link", gravity=(0.0, 0.0))
+        return model, model.nominal, np.zeros(model.chain.n_rests)
+
+    half = solve_equilibrium(*weightless(CABLE.length / 2, 5), at((0.25, 0.0), branch="ccw"))
+    whole, pose = compiled(*weightless(CABLE.length, 10)), at((0.5, 0.0))
+    bow = whole.solve(pose)
+    assert whole.sensitivity(bow, pose).end_force.any()
+    x = np.concatenate([half.x, half.x[::-1]])
+    with pytest.raises(EquilibriumError, match="unstable"):
+        whole.sensitivity(replace(bow, x=x, end_force=half.end_force), pose)
 
 
 def test_minus_the_end_force_is_the_slope_of_the_energy(links):

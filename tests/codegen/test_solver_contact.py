@@ -178,6 +178,19 @@ def test_derivatives_through_contacts(own, what, where):
             )
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_contact_that_is_about_to_begin_is_told(d):
+    """A table a nanometre below the lowest node: there derivatives have two sides."""
+    solver = at_nodes(d)
+    pose = pose_of(solver.model)
+    free = solver.solve(pose, obstacles=())
+    lowest = free.points[:, -1].min() - solver.model.cable.diameter / 2
+    for gap, count in ((1e-9, 1), (1e-4, 0)):
+        table = [replace(TABLE[d], point=(*[0.0] * (d - 1), lowest - gap))]
+        slope = solver.sensitivity(solver.solve(pose, obstacles=table), pose, obstacles=table)
+        assert slope.degenerate == count
+
+
 def test_a_path_touches_down_and_lifts_off(own):
     model, solver = own
     drops = np.concatenate([np.linspace(0.2, 0.04, 20), np.linspace(0.04, 0.2, 20)])
@@ -197,6 +210,8 @@ def test_refusals(own):
     model, solver = own
     d = model.node.dimension
     low = replace(pose_of(model), start=(*[0.0] * (d - 1), -0.1899))
+    assert solver.solve(low, throw=False).status == "no_room"
+    low = replace(pose_of(model), end=(0.85, *[0.1] * (d - 2), -0.1899))
     assert solver.solve(low, throw=False).status == "no_room"
     flat = rod.Plane((0.0,) * d, (0.0,) * d)
     with pytest.raises(DloError, match="the normal of a plane must not be zero"):
@@ -263,6 +278,12 @@ def test_a_saddle_keeps_its_direction_where_the_cable_touches_beside_it():
     assert free.places[4] == 0.36
     assert shape.x[4] == pytest.approx(0.3, abs=1e-12)
     assert shape.energy > free.energy
+
+
+def test_a_clip_inside_of_an_obstacle_has_no_room():
+    solver, pose, *_ = beside_a_saddle()
+    around = [rod.Capsule(pose.clips[0].place, pose.clips[0].place, 0.02)]
+    assert solver.solve(pose, obstacles=around, throw=False).status == "no_room"
 
 
 def test_a_step_on_a_round_obstacle_starts_with_its_normals():
