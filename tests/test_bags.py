@@ -82,6 +82,30 @@ def test_markers_and_bodies_go_to_the_root_of_tf(tmp_path):
     assert {stream.frame for stream in recording.streams} == {"world"}
 
 
+def test_a_frame_that_moves_is_interpolated_between_its_transforms(tmp_path):
+    """It turns evenly and is sent half as often as the markers of a lens on it."""
+    turn, lens = Rotation.from_rotvec(np.outer(T, [0.0, 0.0, 0.3])), np.array([0.02, 0.01, 0.0])
+    at = np.column_stack([0.1 * T, 0.0 * T, 0.0 * T])
+    sent = [("/tf_static", tf(0.0, "camera", "lens", [*lens, *STILL[3:]]))]
+    sent += [
+        ("/tf", tf(T[k], "world", "camera", [*at[k], *turn[k].as_quat()]))
+        for k in range(0, len(T), 2)
+    ]
+    sent += [("/a", markers(t, "lens", POINTS)) for t in T]
+    found = read_recording(written(tmp_path, *sent)).of("marker").values()
+    for stream, point in zip(found, POINTS, strict=True):
+        assert stream.values[:-1] == pytest.approx((turn.apply(point + lens) + at)[:-1], abs=1e-9)
+
+
+def test_clouds_go_to_the_root_of_tf_and_their_camera_is_there(tmp_path):
+    mount = ("/tf_static", tf(0.0, "world", "camera", MOUNT))
+    files = written(tmp_path, mount, ("/depth", cloud()))
+    (found,) = read_recording(files, view=CloudView(units="mm")).clouds
+    turn, points = Rotation.from_quat(MOUNT[3:]), np.arange(12.0).reshape(4, 3)
+    assert found.points == pytest.approx(turn.apply(1e-3 * points) + MOUNT[:3])
+    assert found.camera == pytest.approx(MOUNT[:3])
+
+
 def test_markers_of_two_topics_are_not_mixed(tmp_path):
     other = [("/b", markers(t, "world", 2.0 + POINTS)) for t in T]
     found = read_recording(written(tmp_path, *cable(), *other)).of("marker")
@@ -231,8 +255,9 @@ def test_a_cloud_without_the_cable_costs_no_other(tmp_path):
     """Something hid it between two poses; that no cloud of a bag shows it is told."""
     seen, hidden = cloud(), replace(cloud(), data=np.zeros_like(cloud().data))
     bag = written(tmp_path, ("/depth", seen), ("/depth", hidden))
-    (found,) = read_recording(bag, view=CloudView(box=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))).clouds
-    assert len(found.points) == 2
+    for box in ((0.0, 1.0, 2.0, 3.0, 4.0, 5.0), (3.0, 1.0, 5.0, 0.0, 4.0, 2.0)):  # any corners
+        (found,) = read_recording(bag, view=CloudView(box=box)).clouds
+        assert len(found.points) == 2
     with pytest.raises(MeasurementError, match=r"none of its 8 points is finite, inside --box"):
         read_recording(bag, view=CloudView(box=(7.0, 7.0, 7.0, 7.5, 7.5, 7.5)))
 

@@ -232,6 +232,13 @@ def test_units_scale_the_camera_of_a_file_and_not_the_one_given_in_metres(tmp_pa
     assert read_recording([tmp_path / "a.pcd"], view=given).clouds[0].camera.tolist() == [1, 2, 3]
 
 
+def test_colours_of_an_array_choose_its_points(tmp_path):
+    grey = [90.0, 90.0, 90.0]
+    np.save(tmp_path / "a.npy", np.hstack([THREE, [RED, grey, RED]]))
+    (found,) = read_recording([tmp_path / "a.npy"], view=CloudView(color=RED)).clouds
+    assert found.points == pytest.approx(THREE[[0, 2]])
+
+
 PLY = ["ply", "format ascii 1.0", "element vertex 1", *(f"property float {a}" for a in "xyz")]
 
 

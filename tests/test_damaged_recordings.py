@@ -22,7 +22,7 @@ from dlo_casadi.recordings import (
     read_recording,
 )
 from dlo_casadi.recordings.lost import without_held
-from dlo_casadi.recordings.stills import align_clocks, find_stills
+from dlo_casadi.recordings.stills import Offset, Still, align_clocks, find_stills
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
 
@@ -348,6 +348,47 @@ def test_units_of_angle(unit, size, tmp_path):
     file.write_text(text.replace(unit, "gon"))
     with pytest.raises(MeasurementError, match=r"unit of angle is 'gon'.\n  Try: "):
         read_recording([file])
+
+
+def test_quaternions_of_a_vicon_body_at_the_origin(tmp_path):
+    """A body that never leaves the origin is there; markers would count as not seen."""
+    axes = "Frame,Sub Frame,RX,RY,RZ,RW,TX,TY,TZ"
+    frames = [f"{k},0,0,0,0.6,0.8,0,0,0" for k in (1, 2)]
+    text = ["Objects", "100", ",,hand" + "," * 6, axes, ",,,,,,mm,mm,mm", *frames]
+    (tmp_path / "hand.csv").write_text("\n".join(text))
+    (hand,) = read_recording([tmp_path / "hand.csv"]).streams
+    assert hand.values == pytest.approx(np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.6, 0.8], (2, 1)))
+
+
+@pytest.mark.parametrize("holder", ["body", "markers"])
+def test_an_offset_of_a_gripper_is_in_its_own_axes(holder, take):
+    """A body, or three markers at its origin and along its x and y axes."""
+    place, q = np.split(take.bodies["start"], [3], axis=1)
+    axes = 0.05 * np.swapaxes(Rotation.from_quat(q).as_matrix(), 1, 2)
+    trio = {"o": place, "x": place + axes[:, 0], "y": place + axes[:, 1]}
+    recording = recording_of(replace(take, markers=take.markers | trio))
+    offset, name = (0.01, 0.02, -0.03), {"body": "start", "markers": "o,x,y"}[holder]
+    places = []
+    for own in ((), offset):
+        session = make_session("loom", recording, Wishes(start=name, cable="m", start_offset=own))
+        places.append(
+            [np.array(pose["start"].strip("[]").split(","), float) for pose in session.poses]
+        )
+    own = Rotation.from_quat(q[len(q) // 2])  # the gripper at the start does not move
+    for before, after in zip(*places, strict=True):
+        assert own.inv().apply(after - before) == pytest.approx(offset, abs=1e-4)
+
+
+def test_what_is_told_of_clocks_and_of_poses():
+    ahead = Offset("robot", "cameras", 0.08, 0.931, 0.5)
+    assert ahead.told.startswith("robot is 80 ms ahead of cameras and was moved there")
+    assert "correlate by 0.93" in ahead.told
+    assert "it would move the fastest pose by 40 mm" in ahead.told
+    behind = replace(ahead, seconds=-0.001)
+    assert behind.told.startswith("robot is 1 ms behind cameras")
+    assert "it does not matter at these speeds" in behind.told
+    still = Still(1.0, 2.5, {}, 2.4e-4, 1.3e-3)
+    assert still.told == "still from 1.00 to 2.50 s: scatter 0.24 mm, drift 1.30 mm"
 
 
 def test_few_markers_whose_bends_look_like_another_pull_are_no_mistake(tmp_path, capsys):

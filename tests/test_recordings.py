@@ -248,6 +248,15 @@ def test_a_blank_line_above_a_motive_file_does_not_hide_its_units(take, tmp_path
         assert stream.values == pytest.approx(before[name].values)
 
 
+def test_a_motive_file_in_the_space_of_a_body_is_refused(take, tmp_path):
+    (cable, _), _ = WRITERS["motive"](take, tmp_path)
+    text = cable.read_text()
+    assert "Coordinate Space,Global" in text
+    cable.write_text(text.replace("Coordinate Space,Global", "Coordinate Space,Local"))
+    with pytest.raises(MeasurementError, match="is in the space 'Local'"):
+        read_recording([cable])
+
+
 VICON = "Segments\n100\n,,hand,,\nFrame,Sub Frame,TX,TY,TZ\n,,mm,mm,mm\n1,0,1,2,3\n\n"
 
 
@@ -278,7 +287,7 @@ def recorded(take, sensors=(), bodies=("start", "end")):
     streams = [Stream(name, "marker", take.t, x, **clock) for name, x in take.markers.items()]
     streams += [Stream(name, "body", take.t, x, **clock) for name, x in values.items()]
     for name, frame, force in sensors:
-        wrench = np.tile([force, 0.0, 0.0, 0.0, 0.0, 0.0], (len(take.t), 1))
+        wrench = np.tile([force, 0.0, 0.0, 0.0, 0.1 * force, 0.0], (len(take.t), 1))
         streams.append(Stream(name, "wrench", take.t, wrench, **clock, frame=frame))
     return Recording(tuple(streams))
 
@@ -287,11 +296,19 @@ def test_forces_go_to_the_fixture_of_their_whole_name(take):
     """By the frame, else by a part of the topic; "hand" is not a part of "hand2"."""
     sensors = (("ft", "hand2", 2.0), ("hand/wrench", "", 1.0))
     wishes = Wishes(start="hand", end="hand2")
-    session = make_session("loom", recorded(take, sensors, ("hand", "hand2")), wishes)
+    session, turned = make_session("loom", recorded(take, sensors, ("hand", "hand2")), wishes), []
     for pose in session.poses:
         assert pose["start_force"] == "[1.000000, 0.000000, 0.000000]"
-        force = [float(x) for x in pose["end_force"].strip("[]").split(",")]
+        assert pose["start_moment"] == "[0.000000, 0.100000, 0.000000]"
+        force, moment = (
+            np.array([float(x) for x in pose[f"end_{kind}"].strip("[]").split(",")])
+            for kind in ("force", "moment")
+        )
         assert np.linalg.norm(force) == pytest.approx(2.0, abs=1e-5)
+        assert np.linalg.norm(moment) == pytest.approx(0.2, abs=1e-5)
+        turned.append(abs(force[1]))
+        assert force @ moment == pytest.approx(0.0, abs=1e-5)
+    assert max(turned) > 1e-3
     assert any("means of ft, in axes of hand2;" in text for text in session.remarks)
     assert any("means of hand/wrench, in axes of the world;" in text for text in session.remarks)
 
