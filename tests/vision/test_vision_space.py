@@ -91,7 +91,8 @@ def test_a_camera_stands_where_it_stood(pictures, where):
     )
     shift = found.translation - turn @ translation
     error = np.concatenate([angles, shift])
-    assert error @ np.linalg.solve(found.covariance, error) < 6 * 3.0**2
+    # Of six numbers: 22 in one case of a thousand, 0.2 in one of six thousand.
+    assert 0.2 < error @ np.linalg.solve(found.covariance, error) < 22.0
 
 
 def test_slopes_of_a_projection_are_its_differences(pictures):
@@ -169,7 +170,7 @@ def test_the_line_in_space(pictures, name, places):
     away = cKDTree(curve).query(found.line.points)[0]
     assert rms(away) < 0.5e-3
     assert np.mean(cKDTree(found.line.points).query(curve)[0] < 2.5e-3) > 0.95
-    assert rms(away / found.line.std) < 2.0
+    assert 0.7 < rms(away / found.line.std) < 2.0
     assert set(found.curves) == set(places)
 
 
