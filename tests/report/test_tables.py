@@ -11,6 +11,7 @@ from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextReading
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.report.documents import check_dict
 from dlo_casadi.report.tables import (
     footnotes,
     nuisance_rows,
@@ -160,3 +161,16 @@ def test_scores_of_noise_are_not_told(outcome):
         "The declared model's residual changes its sign along the cable more often than noise "
         "(z = +9.0)."
     )
+
+
+def test_a_check_tells_lengths_and_the_larger_distance_from_a_fixture(outcome):
+    declared = {pose.name: pose for pose in outcome.config.experiment.poses}
+    rows = check_dict(outcome.config, outcome.poses, [])["poses"]
+    for row, pose in zip(rows, outcome.poses, strict=True):
+        held = declared[pose.name]
+        length = np.linalg.norm(np.diff(pose.points, axis=0), axis=1).sum()
+        assert row["length"] == pytest.approx(length)
+        assert row["length_over_declared"] == pytest.approx(length / 0.55)
+        away = np.linalg.norm(pose.points[[0, -1]] - [held.start, held.end], axis=1)
+        assert row["largest_distance_from_fixture"] == pytest.approx(away.max())
+        assert np.ptp(away) > 1e-6
