@@ -145,9 +145,11 @@ def test_c_compiles_and_runs(bench, tmp_path, monkeypatch):
     assert violated.startswith("a limit is violated at s = ")
 
 
-@pytest.mark.parametrize("page", TEXTS)
+@pytest.mark.parametrize("page", [page for page, text in TEXTS.items() if "![" in text])
 def test_pictures_have_a_description_and_are_small(page):
-    for alt, target in re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", TEXTS[page]):
+    shown = re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", TEXTS[page])
+    assert shown
+    for alt, target in shown:
         assert len(alt) > 30, f"{target}: describe it for those who cannot see it"
         assert (ROOT / page).parent.joinpath(target).stat().st_size <= 200_000
 
