@@ -331,7 +331,9 @@ def _log_slow(noise: NoiseModel, samples: list[NoiseSample], cable_length: float
     modes = smooth_modes(sample.places, cable_length, count, free_end=False)
     at = (sample.places, sample.weight, sample.correlation_length, sample.count)
     seen = noise.whitening(*at) @ modes
-    return -float(np.linalg.slogdet(seen.T @ seen)[1]) / count
+    known = np.linalg.eigvalsh(seen.T @ seen)
+    # In a fit that has run away all points may be at a fixture.
+    return -float(np.log(np.maximum(known, 1e-300)).sum()) / count
 
 
 def _slow_dof(found: list[_Estimate]) -> float:

@@ -234,6 +234,15 @@ def test_restricted_likelihood_of_white_noise_is_unbiased():
     assert std == pytest.approx(3e-4, rel=0.04)
 
 
+def test_points_at_a_fixture_tell_nothing_of_slow_modes():
+    """The projections of a fit that has run away: sines vanish there."""
+    samples = simulated(NoiseModel(3e-4), poses=3, points=20)
+    samples[1] = replace(samples[1], places=np.zeros(20))  # the middle pose
+    found = estimate_noise(samples, LENGTH)
+    assert 0 < found.slow_dof < 60
+    assert np.isfinite(found.std)
+
+
 def test_white_noise_is_recovered():
     found = estimate_noise(simulated(NoiseModel(3e-4)), LENGTH)
     # 14 * 76 degrees of freedom: 2.2 % is one standard deviation. A share that is not there may
