@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import dlo_casadi as dlo
-from dlo_casadi.effects import EFFECTS, RANDOM, CableData, Setup, SideLoad
+from dlo_casadi.effects import EFFECTS, CableData, Setup, SideLoad, random_effects
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.cable_model import CableModel
@@ -78,7 +78,7 @@ ROUND = {"gravity": (0.0, 0.0, -9.81), "curved": False}
     ],
 )
 def test_effects_apply_where_measurements_show_them(name, hidden, shown):
-    kind = (EFFECTS | RANDOM)[name]
+    kind = (EFFECTS | random_effects())[name]
     for changed, applies in ((hidden, False), (shown, True)):
         cable = SPACE if len(changed.get("gravity", ())) == 3 else CABLE
         assert kind.applies(Setup(cable, **changed)) is applies
