@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import (
     EFFECTS,
     NUISANCES,
-    RANDOM,
     BendingSoftening,
     CableData,
     ClampAngle,
@@ -35,6 +34,7 @@ from dlo_casadi.effects import (
     Tether,
     UnknownPull,
     Viewpoint,
+    random_effects,
 )
 from dlo_casadi.effects.effect import Fitted
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -524,7 +524,7 @@ def test_a_clamp_that_gives_way_is_one_turned_by_the_moment_on_it(element):
 
 def test_moments_of_pins_turn_the_ends_counter_clockwise():
     """V = -EI (start phi(0) + end phi(L)) with the numbers of the pose."""
-    model = CableModel(CABLE, 5, "arc", random=(RANDOM["pin_moment"](),))
+    model = CableModel(CABLE, 5, "arc", random=(random_effects()["pin_moment"](),))
     shapes, given = posed(model, model.nominal)
     own = np.zeros((1, len(model.deviation_names)))
     names = ["pin_moment.start", "pin_moment.end"]
