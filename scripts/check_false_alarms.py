@@ -1,6 +1,7 @@
 """False alarms of the diagnosis on simulated sessions, and what it names of hidden effects.
 
-    python scripts/check_false_alarms.py [--sets 300] [--seed 0] [--jobs N] [--output FILE]
+    python scripts/check_false_alarms.py [--sets 300] [--first 0] [--seed 0] [--jobs N]
+                                         [--output FILE]
                                          [--scatter | [--space]
                                          [--hidden | --random SOURCE | --table]]
 
@@ -139,6 +140,7 @@ def main() -> None:
     """Simulate, diagnose, count."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=300)
+    parser.add_argument("--first", type=int, default=0, help="number of the first set")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path)
     kinds = parser.add_mutually_exclusive_group()
@@ -161,11 +163,11 @@ def main() -> None:
             count_random(args, executor)
             return
         work = partial(run_one, seed=args.seed, scatter=args.scatter)
-        for done in map_as_completed(executor, work, range(args.sets)):
-            row = rows[done.index] = done.value
+        for done in map_as_completed(executor, work, range(args.first, args.first + args.sets)):
+            row = rows[done.item] = done.value
             seconds.append([row["fit_seconds"], row["diagnosis_seconds"]])
             if not row["right"]:
-                print(f"  set {done.index}: {row}", flush=True)
+                print(f"  set {done.item}: {row}", flush=True)
             if len(rows) % 20 == 0 or len(rows) == args.sets:
                 alarms = sum(bool(row["added"]) and not row["right"] for row in rows.values())
                 unexplained = sum(row["verdict"] == "unexplained" for row in rows.values())
@@ -189,10 +191,10 @@ def count_random(args: argparse.Namespace, executor: Executor) -> None:
     options = {"space": args.space, "hide": args.hidden, "random": args.random}
     options["table"] = args.table
     work = partial(run_random, seed=args.seed, **options)
-    for done in map_as_completed(executor, work, range(args.sets)):
-        row = rows[done.index] = done.value
+    for done in map_as_completed(executor, work, range(args.first, args.first + args.sets)):
+        row = rows[done.item] = done.value
         if row["missed"] or row["wrong"] or not all(row["inside"].values()) or row["worse"]:
-            print(f"  set {done.index}: {row}", flush=True)
+            print(f"  set {done.item}: {row}", flush=True)
         if len(rows) % 20 == 0 or len(rows) == args.sets:
             print(summary(list(rows.values())), flush=True)
             if args.output:
