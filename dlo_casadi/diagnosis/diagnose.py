@@ -184,10 +184,10 @@ class Search:
             if found.added or not fit.errors_known:
                 force = estimate_unknown_force(found.fit, self.executor)
         tried = {row.name for row in found.ranked}
-        added = [
+        added = (
             replace(x, equivalents=equivalents(found.fit, x.candidate, tried, x.rival_candidates))
             for x in found.added
-        ]
+        )
         return Diagnosis(
             before=fit,
             after=found.fit,
@@ -243,13 +243,14 @@ class Search:
         The first estimate of slow noise is rough, and a large one hides an effect. If nothing is
         found, and the noise of a complete model is smaller, the search begins anew with that.
         """
-        found = self.run()
-        found = found.or_better(self.of_simpler_effects(found))
-        if found.added or found.fit.noise.std >= self.declared.noise.std:
-            return found
+        found = (first := self.run()).or_better(self.of_simpler_effects(first))
         settled = replace(self, declared=found.fit)
-        shown = min(p_values_of(settled.first).values(), default=1.0) <= self.significance
-        return again if shown and (again := settled.run()).added else found
+        if not found.added and found.fit.noise.std < self.declared.noise.std:
+            with suppress(EstimationError):
+                best = min(p_values_of(settled.first).values(), default=1.0)
+                if best <= self.significance and (again := settled.run()).added:
+                    return again
+        return found
 
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise or left-out data are predicted no better.
@@ -439,8 +440,7 @@ class Search:
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         """The effects found, and whether they explain the data."""
-        if not added and not fit.noise.known:
-            fit = settle(fit)
+        fit = fit if added or fit.noise.known else settle(fit)
         return Found.of(fit, added, ranked, len(self.declared.problem.used), self.significance)
 
     def _fine(self, fit: Fit, finest: int | None = None) -> Fit:
