@@ -198,10 +198,10 @@ def show(row: dict, seconds: float) -> None:
         f"{row['session']:15s} {row['verdict']:12s} true {','.join(row['true']) or '-':24s} "
         f"found {','.join(row['found']) or '-'}  ties {row['ties']}"
     )
-    low, high = row["EI_interval_95"]
-    bounds = [f"{x:.4g}" if x is not None else "-" for x in (low, high)]
+    ends = row["EI_interval_95"] or ()  # none if the session is unexplained
+    bounds = ", ".join(f"{x:.4g}" if x is not None else "-" for x in ends)
     print(
-        f"    EI {row['EI']:.4g} [{bounds[0]}, {bounds[1]}] true {row['EI_true']:.4g}   noise "
+        f"    EI {row['EI']:.4g} [{bounds}] true {row['EI_true']:.4g}   noise "
         f"{row['noise_mm']:.3f} mm  held out {row['held_out_batch_mm'] or np.nan:.3f} -> "
         f"{row['held_out_mm'] or np.nan:.3f} mm = {row['held_out_over_noise']:.2f} noise, of which "
         f"fixtures {row['fixtures_mm'] or np.nan:.3f} mm   "
