@@ -93,7 +93,7 @@ def test_the_least_force_may_use_more_of_the_bend_radius():
 
 @pytest.mark.parametrize("aim", ["margin", "force"])
 def test_the_first_order_model_is_the_derivative_of_solved_shapes(aim):
-    """Of the room of spans, exactly; of sizes along a direction of all places and arc lengths."""
+    """Room of spans is compared exactly, sizes along a direction of all places and arc lengths."""
     held = tuple(HeldPose((0.0, 0.0), pose["end"]) for pose in POSES)
     between, box = cable().with_clips(["pinned"] * 2), np.array([[0.0, -0.3], [0.6, 0.1]]) / 0.8
     search = _Search(between, KNOWN.coefficients, held, box, Limits(**LIMITS), aim)

@@ -439,7 +439,7 @@ def test_a_fit_from_arrays_is_that_of_the_file(tmp_path):
         dlo.load(tmp_path).params["bending_stiffness"] == result.cable.params["bending_stiffness"]
     )
 
-    # Photographs whose names differ in what joins them have a file each, beside other poses' own.
+    # Photographs p-a and p_a have a file each, and no file of another pose is replaced.
     first, second, *_ = result.poses
     pixels = {"pose_01-a": np.array([[1.0, 0.0]]), "pose_01_a": np.array([[2.0, 0.0]])}
     views = [SimpleNamespace(name=n, seen=SimpleNamespace(pixels=p)) for n, p in pixels.items()]

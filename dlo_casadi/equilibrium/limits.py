@@ -305,7 +305,7 @@ class Varied:
             own, start = given.subset(some), guesses.subset(some)
             batch = BatchEquilibrium(self._larger, [self.pose] * len(start.x))
             shapes, converged = batch.solve_or_descend(start, own.p, own.rest, tolerance=_TOLERANCE)
-            # A descent may end far away, where the cable snaps to.
+            # A descent may end in a shape far away, to which the cable snaps.
             way = np.abs(self.model.node.difference(start.x, shapes.x)).max(axis=(1, 2))
             near = converged & (way <= REACH)
             lost.append(~(near & batch.stable(shapes, own.p, own.rest)))

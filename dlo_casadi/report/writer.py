@@ -125,7 +125,7 @@ def write_numbers(folder: Path, outcome: Outcome) -> None:
         for k, view in enumerate(pose.views, 1):
             which = view.name.removeprefix(pose.name).lstrip("-_. ") or str(k)
             name = f"{pose.name}_{which}"
-            while name in taken:  # p-a.png and p_a.png, or a pose called p_a
+            while name in taken:  # by p-a.png beside p_a.png, or by a pose called p_a
                 name += f"_{k}"
             taken.add(name)
             write_table(lines / f"{name}.csv", ["u_px", "v_px"], view.seen.pixels)

@@ -387,7 +387,7 @@ def test_the_search_begins_anew_where_a_complete_model_has_less_noise(
 
 @pytest.mark.long
 def test_a_taper_that_a_rough_estimate_of_the_noise_hides_is_found():
-    """Noise correlated along the lines is first taken for 1.6 times as large as it is.
+    """Noise that is correlated along the lines is first estimated 1.6 times too large.
 
     The model was called complete, with EI 27 % too low.
     """
