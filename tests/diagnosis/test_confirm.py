@@ -8,12 +8,13 @@ import pytest
 from scipy.linalg import block_diag
 
 from dlo_casadi.diagnosis import refits
+from dlo_casadi.diagnosis.backward import judged_again
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen, sidak
 from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.trials import Trials
 from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -205,9 +206,9 @@ def test_the_offset_of_another_clip_replaces_a_first_one():
     wrong = refits.confirm(base, *Screen(base, [first]).run(np.inf))
     effect = AddedEffect(first, 1e-9, cross_validate(base), wrong.validation, ())
     among = [name for name in EFFECTS if name != "clip_offset"]
-    search = Search(base, None, among, SIGNIFICANCE, 4, lambda *_: None, InProcess())
-    better, judged = search._judged_again(wrong.fit, base, effect)
+    trials = Trials(base, None, among, SIGNIFICANCE, InProcess())
+    better, judged = judged_again(trials, wrong.fit, base, effect)
     assert judged.candidate.effect == ClipOffset(clip=1)
     assert not judged.rivals
     assert better.value("clip_offset_2.dy") == pytest.approx(-6e-3, abs=3e-4)
-    assert search._judged_again(better, base, judged) == (better, judged)
+    assert judged_again(trials, better, base, judged) == (better, judged)

@@ -11,8 +11,8 @@ import pytest
 from hidden_sets import simulated
 
 from dlo_casadi.config import load_config
+from dlo_casadi.diagnosis import backward, from_pose_to_pose, refits, trials
 from dlo_casadi.diagnosis import diagnose as module
-from dlo_casadi.diagnosis import from_pose_to_pose
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.crossval import (
     CrossValidation,
@@ -25,6 +25,7 @@ from dlo_casadi.diagnosis.from_pose_to_pose import at_random_instead
 from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.selection import Found
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
+from dlo_casadi.diagnosis.trials import Trials
 from dlo_casadi.effects import EFFECTS, BendingSoftening, LumpedMass
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import refit
@@ -129,7 +130,7 @@ def test_no_force_is_asked_for_where_shapes_lead_to_an_explanation(
     monkeypatch.setattr(Search, "run", lambda *_: explained)
     monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
     lost = replace(cross_validate(fit), squares=np.full(12, np.inf))
-    monkeypatch.setattr(module, "cross_validate", lambda _: lost)
+    monkeypatch.setattr(trials, "cross_validate", lambda _: lost)
     assert diagnose(fit).verdict == "effect_found"
     assert bool(asked) != from_shapes
 
@@ -275,8 +276,8 @@ def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, mon
     searched = []
 
     def run(search):
-        searched.append(search.from_shapes)
-        return ended if search.from_shapes else replace(ended, fit=own)
+        searched.append(search.trials.from_shapes)
+        return ended if search.trials.from_shapes else replace(ended, fit=own)
 
     monkeypatch.setattr(module, "explains", lambda _: True)
     monkeypatch.setattr(Search, "run", run)
@@ -291,8 +292,8 @@ def test_shapes_near_which_nothing_is_found_do_not_end_the_search(found, fit, mo
     searched = []
 
     def run(search):
-        searched.append(search.from_shapes)
-        return replace(ended, added=()) if search.from_shapes else ended
+        searched.append(search.trials.from_shapes)
+        return replace(ended, added=()) if search.trials.from_shapes else ended
 
     monkeypatch.setattr(module, "explains", lambda _: False)
     monkeypatch.setattr(Search, "run", run)
@@ -308,18 +309,18 @@ def test_only_rivals_of_the_same_search_tell_which_refit_is_given_up(monkeypatch
     def confirm(current, screened, ceiling, beside):
         ceilings.append(ceiling)
 
-    monkeypatch.setattr(module.refits, "confirm", confirm)
-    monkeypatch.setattr(module.refits, "loads_from_best", lambda *_: [])
+    monkeypatch.setattr(refits, "confirm", confirm)
+    monkeypatch.setattr(refits, "loads_from_best", lambda *_: [])
 
     def scored(name):
         return SimpleNamespace(candidate=SimpleNamespace(name=name), score=100.0)
 
     screened = [scored("known"), scored("new")]
-    search = SimpleNamespace(executor=InProcess(), significance=0.01)
+    among = SimpleNamespace(executor=InProcess(), significance=0.01)
     fit = SimpleNamespace(point=SimpleNamespace(objective=300.0), scatters=False)
     confirmed, p_values = SimpleNamespace(fit=fit), {"known": 0.0, "new": 0.0}
-    Search._leading(search, fit, screened, p_values, {"known": confirmed})
-    Search._leading(search, fit, screened[1:], p_values, {"excluded": confirmed})
+    Trials.leading(among, fit, screened, p_values, {"known": confirmed})
+    Trials.leading(among, fit, screened[1:], p_values, {"excluded": confirmed})
     assert ceilings == [600.0, np.inf]
 
 
@@ -330,21 +331,22 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(misfit, rivals, 
     """Scores are useless there, and candidates were compared from the measured shapes."""
     asked = []
 
-    def judged_again(fit, smaller, effect):
+    def judged_again(_, fit, smaller, effect):
         asked.append(effect)
         return fit, effect
 
     fit, smaller = (SimpleNamespace(log_evidence=value) for value in (0.0, -1e5))
     first, last = (SimpleNamespace(candidate=None, rivals=rivals, after=k) for k in range(2))
-    monkeypatch.setattr(module.refits, "refit_without", lambda *_: smaller)
-    monkeypatch.setattr(module, "misfits", lambda _: misfit)
-    monkeypatch.setattr(module, "candidates_of", lambda *_: ())
-    monkeypatch.setattr(module, "p_of_removal", lambda *_: 0.0)
-    search = SimpleNamespace(
-        _fine=lambda found, _: found, from_shapes=True, declared=None, center=None, exclude=(),
-        significance=0.01, _judged_again=judged_again,
+    monkeypatch.setattr(refits, "refit_without", lambda *_: smaller)
+    monkeypatch.setattr(backward, "misfits", lambda _: misfit)
+    monkeypatch.setattr(backward, "candidates_of", lambda *_: ())
+    monkeypatch.setattr(backward, "p_of_removal", lambda *_: 0.0)
+    monkeypatch.setattr(backward, "judged_again", judged_again)
+    among = SimpleNamespace(
+        fine=lambda found, _: found, from_shapes=True, declared=None, center=None, exclude=(),
+        significance=0.01,
     )  # fmt: skip
-    _, left = Search._pruned(search, fit, [first, last])
+    _, left = backward.pruned(among, fit, [first, last])
     assert asked == [first] * again
     assert left == [first, last]
 
@@ -352,13 +354,13 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(misfit, rivals, 
 def test_only_effects_that_are_asked_for_are_screened(monkeypatch):
     """Where only rivals are judged again, no others are scored."""
     listed = [SimpleNamespace(name=name) for name in ("set", "drift", "table")]
-    monkeypatch.setattr(module, "candidates_of", lambda *_: listed)
-    monkeypatch.setattr(module, "screening_degrees", lambda _: np.inf)
-    monkeypatch.setattr(module.refits, "scored", lambda _, among, *__: [x.name for x in among])
-    search = SimpleNamespace(center=None, exclude=(), significance=0.01, executor=InProcess())
-    assert Search._screened(search, None) == ["set", "drift", "table"]
-    assert Search._screened(search, None, {"drift", "set"}) == ["set", "drift"]
-    assert Search._screened(search, None, set()) == []
+    monkeypatch.setattr(trials, "candidates_of", lambda *_: listed)
+    monkeypatch.setattr(trials, "screening_degrees", lambda _: np.inf)
+    monkeypatch.setattr(refits, "scored", lambda _, among, *__: [x.name for x in among])
+    among = SimpleNamespace(center=None, exclude=(), significance=0.01, executor=InProcess())
+    assert Trials.screened(among, None) == ["set", "drift", "table"]
+    assert Trials.screened(among, None, {"drift", "set"}) == ["set", "drift"]
+    assert Trials.screened(among, None, set()) == []
 
 
 @pytest.mark.parametrize(
@@ -380,8 +382,8 @@ def test_the_search_begins_anew_where_a_complete_model_has_less_noise(
     screened = SimpleNamespace(candidate=SimpleNamespace(name="one"), p_value=p_value)
     monkeypatch.setattr(Search, "run", lambda self: first if self.declared is declared else second)
     monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
-    monkeypatch.setattr(Search, "_screened", lambda *_: [screened])
-    search = Search(declared, None, (), 0.005, 4, lambda *_: None, InProcess())
+    monkeypatch.setattr(Trials, "screened", lambda *_: [screened])
+    search = Search(Trials(declared, None, (), 0.005, InProcess()), 4, lambda *_: None)
     assert search._forwards().name == expected
 
 

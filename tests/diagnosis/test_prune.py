@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis import selection
+from dlo_casadi.diagnosis.backward import pruned
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.screening import sidak, survival
 from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.trials import Trials
 from dlo_casadi.effects import CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
@@ -53,9 +54,9 @@ def found(coefficient: float):
 @pytest.mark.parametrize(("coefficient", "kept"), [(0.0065, False), (0.02, True)])
 def test_an_effect_stays_only_while_it_is_significant_among_all_candidates(coefficient, kept):
     fit, added = found(coefficient)
-    search = Search(fit, CENTER, (), SIGNIFICANCE, 2, lambda *_: None, InProcess())
+    trials = Trials(fit, CENTER, (), SIGNIFICANCE, InProcess())
 
-    smaller, left = search._pruned(fit, added)
+    smaller, left = pruned(trials, fit, added)
 
     names = ["image_distortion"] * kept + ["stiffness_gradient"]
     assert [item.candidate.name for item in left] == names
@@ -84,9 +85,9 @@ def test_a_nuisance_is_held_within_its_tolerance_again_where_it_is_needless(long
     told = cross_validate(fit)
     added = [AddedEffect(c, 1e-3, told, told, ()) for c in (length, taper)]
     declared = fit_model(held, measured, Tolerances(), NOISE)
-    search = Search(declared, CENTER, (), SIGNIFICANCE, 2, lambda *_: None, InProcess())
+    trials = Trials(declared, CENTER, (), SIGNIFICANCE, InProcess())
 
-    smaller, left = search._pruned(fit, added)
+    smaller, left = pruned(trials, fit, added)
 
     names = ["length_error"] * kept + ["stiffness_gradient"]
     assert [item.candidate.name for item in left] == names
@@ -111,9 +112,9 @@ def test_an_effect_that_stands_for_the_error_of_the_mesh_is_dropped_on_a_finer_o
     told = cross_validate(fit)
     added = [AddedEffect(section, 1e-3, told, told, ())]
     for finest, kept in ((None, True), (80, False)):
-        search = Search(fit, None, (), SIGNIFICANCE, 2, lambda *_: None, InProcess(), finest)
+        trials = Trials(fit, None, (), SIGNIFICANCE, InProcess(), finest)
 
-        smaller, left = search._pruned(fit, added)
+        smaller, left = pruned(trials, fit, added)
 
         assert len(left) == kept
         assert (smaller.model.n == 20) == kept

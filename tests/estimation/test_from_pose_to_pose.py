@@ -9,6 +9,7 @@ import pytest
 from hidden_sets import simulated
 
 from dlo_casadi.cable.file import metadata_of
+from dlo_casadi.diagnosis.backward import judged_again
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.from_data import from_data
@@ -20,6 +21,7 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
 )
 from dlo_casadi.diagnosis.refits import confirm
 from dlo_casadi.diagnosis.selection import AddedEffect
+from dlo_casadi.diagnosis.trials import Trials
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -289,11 +291,12 @@ def test_effects_without_a_scatter_are_sought_where_scores_promise_as_much(
     """One effect of 0.4 times what the scatter gains, or two of 0.6 times."""
     refitted = [SimpleNamespace(gain=gain, fit=gain) for gain in gains]
     screened = {gain: [SimpleNamespace(score=x) for x in (second, 1.0)] for gain in gains[1:]}
-    monkeypatch.setattr(Search, "_tried", lambda *_: SimpleNamespace(refits=refitted))
-    monkeypatch.setattr(Search, "_screened", lambda _, fit: screened[fit])
+    monkeypatch.setattr(Trials, "tried", lambda *_, pairs: SimpleNamespace(refits=refitted))
+    monkeypatch.setattr(Trials, "screened", lambda _, fit: screened[fit])
     repeating = SimpleNamespace(log_evidence=0.0, converged=True)
-    search = Search(repeating, None, (), SIGNIFICANCE, 4, lambda *_: None, InProcess())
-    vars(search)["first"] = [SimpleNamespace(score=score)]
+    trials = Trials(repeating, None, (), SIGNIFICANCE, InProcess())
+    vars(trials)["first"] = [SimpleNamespace(score=score)]
+    search = Search(trials, 4, lambda *_: None)
     assert search._may_gain(SimpleNamespace(log_evidence=100.0)) is worth
 
 
@@ -314,7 +317,7 @@ def searched(seed, index, count, random="", among=()):
     measured = measured_poses(found.session, read_inputs(found.session))
     fit, _ = fit_declared(found.session, declared_model(found.session), measured)
     exclude = [name for name in EFFECTS if among and name not in among]
-    return found, Search(fit, None, exclude, SIGNIFICANCE, 4, lambda *_: None, InProcess())
+    return found, Search(Trials(fit, None, exclude, SIGNIFICANCE, InProcess()), 4, lambda *_: None)
 
 
 def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
@@ -325,7 +328,7 @@ def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
     found = search.run()
     assert not found.added
     assert not found.unexplained
-    without = replace(search, declared=as_repeating(search.declared)).run()
+    without = search.beginning_with(declared=as_repeating(search.declared)).run()
     assert found.or_better(without, EVIDENCE_APART) is found
 
 
@@ -358,21 +361,21 @@ def test_the_first_effect_is_judged_again_beside_the_second():
     among = ("rest_curvature_drift", "point_force", "gravity_tilt")
     _, search = searched(2061, 13, 2, among=among)
     base = as_repeating(search.declared)
-    search = replace(search, declared=base)
-    listed = {x.candidate.name: x for x in search.first}
+    trials = replace(search.trials, declared=base)
+    listed = {x.candidate.name: x for x in trials.first}
     drift = confirm(base, listed["rest_curvature_drift"]).fit
-    beside = {x.candidate.name: x for x in search._screened(drift)}
+    beside = {x.candidate.name: x for x in trials.screened(drift)}
     fit = settle(confirm(drift, beside["point_force"]).fit)
     force = AddedEffect(
         listed["point_force"].candidate, 1e-9, cross_validate(base), cross_validate(fit), ()
     )
-    better, judged = search._judged_again(fit, drift, force)
+    better, judged = judged_again(trials, fit, drift, force)
     assert judged.name == "gravity_tilt"
     assert better.log_evidence > fit.log_evidence
     assert "point_force" not in {x.name for x in better.model.effects}
     # Where no candidate may be added, what was known of rivals stays.
-    alone = replace(search, exclude=[*search.exclude, *among])
-    assert alone._judged_again(better, drift, judged) == (better, judged)
+    alone = replace(trials, exclude=[*trials.exclude, *among])
+    assert judged_again(alone, better, drift, judged) == (better, judged)
 
 
 def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():
