@@ -63,6 +63,30 @@ def test_an_effect_stays_only_while_it_is_significant_among_all_candidates(coeff
     assert [effect.name for effect in smaller.model.effects] == names
 
 
+@pytest.mark.parametrize(("slope", "left"), [(0.0, []), (0.008, ["stiffness_gradient"])])
+def test_an_effect_of_fewer_parameters_takes_the_place_of_one_that_is_not_significant(slope, left):
+    """A taper gains 21: p = 5e-6 with its one parameter, 3e-5 with the two of a section."""
+    listed, rng = {c.name: c for c in candidates(PLAIN, setup_of(PLAIN))}, np.random.default_rng(0)
+    taper, section = listed["stiffness_gradient"], listed["stiff_section"]
+    model, s = taper.add_to(PLAIN), np.linspace(0.02, 0.98, 40) * PLAIN.cable.length
+    poses = [HeldPose((0.0, 0.0), end) for end in ENDS]
+    shapes = predict_poses(model, np.array([0.01, slope]), np.zeros(model.chain.n_cells), poses)
+    measured = [
+        MeasuredPose.of_points(pose, shape.curve.at(s) + rng.normal(scale=NOISE, size=(40, 2)))
+        for pose, shape in zip(poses, shapes, strict=True)
+    ]
+    declared = fit_model(PLAIN, measured, Tolerances(), NOISE)
+    fit = fit_model(section.add_to(PLAIN), measured, Tolerances(), NOISE)
+    told = cross_validate(fit)
+    others = [name for name in listed if name not in {"stiffness_gradient", "stiff_section"}]
+    trials = Trials(declared, None, others, 1e-5, InProcess(), from_shapes=True)
+
+    found, kept = pruned(trials, fit, [AddedEffect(section, 1e-9, told, told, ())])
+
+    assert [item.name for item in kept] == left
+    assert [effect.name for effect in found.model.effects] == left
+
+
 @pytest.mark.parametrize(("longer", "kept"), [(0.0, False), (0.02, True)])
 def test_a_nuisance_is_held_within_its_tolerance_again_where_it_is_needless(longer, kept):
     held = nuisances(PLAIN, Tolerances())
