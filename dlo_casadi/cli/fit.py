@@ -4,13 +4,13 @@ import argparse
 import multiprocessing
 import os
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 from dlo_casadi.cli import BAD_INPUT, OK
 from dlo_casadi.cli.options import CONFIG, SCHEDULER, Page, command, jobs, option
-from dlo_casadi.errors import counted
-from dlo_casadi.io.files import make_folder
+from dlo_casadi.errors import counted, well_formed
+from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.runtime.executors import ended_first
 from dlo_casadi.runtime.parallel import begin, open_executor
 
@@ -137,13 +137,20 @@ def fit_many(chosen: argparse.Namespace) -> int:
 
     base, sessions = find_sessions(chosen.where)
     output = chosen.output or Path("results") / f"fleet-{base.name}"
-    logs = output / "logs"
+    logs, source = output / "logs", output / "source.txt"
     make_folder(logs)
     counter = Counter(quiet=chosen.quiet, noun="session")
 
     def begin(taken_over: int, left: int) -> None:
         before = f", {taken_over} of them finished before" if taken_over else ""
         counter.message(f"{counted(len(sessions), 'session')}{before}; results in {output}")
+        own = earlier = well_formed(str(base))
+        with suppress(OSError):
+            earlier = source.read_text(encoding="utf-8", errors="replace")
+        if earlier != own:
+            said = f"{output} holds results of {earlier}, which this run replaces"
+            counter.message(f"warning: {said}. Try: --output DIR")
+        write_file(source, own)
 
     try:
         with counter, open_executor(chosen.jobs, chosen.scheduler, logs) as executor:

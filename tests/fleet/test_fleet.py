@@ -92,6 +92,17 @@ def test_a_session_without_results_is_told_by_the_exit_code(tmp_path, capsys):
         assert row["status"] == "failed"
 
 
+def test_results_of_another_folder_are_not_replaced_in_silence(tmp_path, capsys):
+    one, other = folders = [tmp_path / name / "cables" for name in "ab"]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "broken.yaml").write_text("cable: {lenght: 1.0}\nexperiment: {}\n")
+    for folder, warned in ((one, False), (one, False), (other, True), (other, False)):
+        main(["fit-many", str(folder), "--output", str(tmp_path / "out")])
+        said = f"out holds results of {one}, which this run replaces. Try: --output DIR"
+        assert (said in capsys.readouterr().err) is warned
+
+
 def test_a_bug_names_a_log_only_where_there_is_one(fleet, tmp_path, monkeypatch):
     monkeypatch.setattr("dlo_casadi.fleet.run.load_config", lambda _: 1 / 0)
     (row, *_) = fit_fleet(find_sessions(fleet)[1], tmp_path, InProcess(), QUICK)
