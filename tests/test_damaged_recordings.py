@@ -22,7 +22,7 @@ from dlo_casadi.recordings import (
     read_recording,
 )
 from dlo_casadi.recordings.lost import without_held
-from dlo_casadi.recordings.stills import Offset, Still, align_clocks, find_stills
+from dlo_casadi.recordings.stills import Offset, Still, _still, align_clocks, find_stills
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
 
@@ -158,6 +158,16 @@ def test_a_gripper_whose_last_pose_is_held_costs_no_other_pose(take):
     lost, bodies = in_pose(take, 2), {name: x.copy() for name, x in take.bodies.items()}
     bodies["end"][lost] = bodies["end"][np.flatnonzero(lost)[0] - 1]
     assert len(find_stills(recording_of(replace(take, bodies=bodies)), 0.5)) == 4
+
+
+def test_a_still_tells_how_far_a_marker_moves_from_its_first_half_to_its_second():
+    """One creeps at 2 mm a second for 4 s, another one at half of that."""
+    t = np.arange(400) / 100
+    creep = 2e-3 * t[:, None] * [0.6, 0.0, 0.8]
+    streams = [Stream(f"m{k}", "marker", t, creep / k) for k in (1, 2)]
+    still = _still(streams, 0.0, 4.0)
+    assert still.drift == pytest.approx(4e-3)
+    assert still.scatter == pytest.approx(2e-3 * 4 / 6 * np.sqrt((1 + 1 / 4) / 2), rel=1e-3)
 
 
 def test_spikes_are_no_motion(take):

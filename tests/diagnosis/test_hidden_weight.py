@@ -1,11 +1,13 @@
 """Weights that a cable with a free tip does not tell from its stiffness."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from dlo_casadi.diagnosis import next_measurement
-from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
+from dlo_casadi.diagnosis.candidates import _like_stiffness, candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
 from dlo_casadi.effects import EFFECTS, CableData, LumpedMass, RestCurvatureDrift
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -78,6 +80,19 @@ def test_the_largest_hidden_weight_is_within_95_percent_of_the_likelihood_ratio(
 
     least = chi2(0.0)
     assert chi2(weight.mass / 1.6) - least < 3.84 < chi2(1.6 * weight.mass) - least
+
+
+@pytest.mark.parametrize(
+    ("correlations", "alike"), [((0.92,), True), ((0.88,), False), ((0.7, 0.7), True)]
+)
+def test_a_load_is_like_the_stiffness_that_nearly_all_of_its_uncertainty_moves(correlations, alike):
+    """Five times less variance if it were known: 1 - r^2 = 0.19 of uncorrelated parameters."""
+    names = ("bending_stiffness", *(f"load.{k}" for k in range(len(correlations))))
+    covariance = np.eye(len(names))
+    covariance[0, 1:] = covariance[1:, 0] = correlations
+    unknowns = SimpleNamespace(names=names)
+    fit = SimpleNamespace(problem=SimpleNamespace(unknowns=unknowns), covariance=4.0 * covariance)
+    assert _like_stiffness(fit, names[1:]) is alike
 
 
 def test_a_weight_that_shows_is_not_hidden():

@@ -278,3 +278,11 @@ def test_a_whole_turn_of_twist_is_named_before_a_pose_is_to_be_taken_again():
     shape = pose_shape(predicted, item, found).measured_branch
     apart = other.equilibrium.energy - predicted.equilibrium.energy
     assert shape.above == pytest.approx(apart, rel=1e-6)
+
+
+@pytest.mark.parametrize(("value", "bound"), [(0.0, True), (1e-6, False), (1.0, True)])
+def test_a_parameter_is_at_its_bound_only_if_it_has_stopped_there(value, bound):
+    quantity = SimpleNamespace(lower=0.0, upper=1.0, scale=0.1)
+    model = SimpleNamespace(parameters=(quantity,), names=("one",))
+    fit = SimpleNamespace(model=model, value=lambda _: value)
+    assert stages_module._at_bound(fit, "one") is bound
