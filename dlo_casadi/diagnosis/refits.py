@@ -191,13 +191,15 @@ def confirm(
     """Refit with a candidate added; None if its equilibria cannot be followed.
 
     `ceiling`: see `descend`. The refit also starts from the fit `beside` it, which has another
-    effect in the candidate's place: without any, the base's other effects may have moved.
+    effect in the candidate's place, with the candidate's one-step estimate and without: lacking
+    any, the base's other effects may have moved, and its estimate may have the wrong sign.
     """
     found = screened.fit or refit_with(base, screened, ceiling)
     if beside is not None:
         same = beside.weighed_as(base)
         model = screened.candidate.add_to(base.model)
-        fits = (found, followed(same, model, screened.start, MOST_STEPS, ceiling))
+        starts = (screened.start, {})
+        fits = [found, *(followed(same, model, values, MOST_STEPS, ceiling) for values in starts)]
         found = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     return Confirmed.of(screened, base, found)
 

@@ -378,6 +378,17 @@ def test_the_first_effect_is_judged_again_beside_the_second():
     assert judged_again(alone, better, drift, judged) == (better, judged)
 
 
+@pytest.mark.long
+def test_a_taper_is_judged_again_from_its_nominal_value():
+    """Beside softening alone its slope seems to be -0.1: that had absorbed the true one of 0.35."""
+    truth, search = searched(2811, 37, 2)
+    assert truth.hidden == ("bending_softening", "stiffness_gradient")
+    found = search._searched()
+    assert {item.name for item in found.added} == set(truth.hidden)
+    interval = profile_interval(found.fit)
+    assert interval.low < truth.values["bending_stiffness"] < interval.high
+
+
 def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():
     session = drawn(generator_of(3301, 7), 2, 0, "rest_curvature").session
     measured = measured_poses(session, read_inputs(session))
