@@ -38,6 +38,8 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
     """
     before, fit = fit, trials.fine(fit, FINEST_MESH) if added else fit
     significant = added[-1:] if fit is before and not trials.from_shapes else []
+    last = [effect for effect in added if effect.after is added[-1].after]
+    compared = last if len(last) == 1 else []  # a pair was compared with some other pairs alone
     for effect in added:
         smaller = refits.refit_without(fit, effect.candidate, trials.declared)
         if smaller is None:
@@ -50,7 +52,7 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
             with suppress(EstimationError):  # else there is no fit without it
                 fit, instead = in_its_place(trials, settle(smaller), effect)
                 added = [x for item in added for x in (instead if item is effect else [item])]
-        elif effect.after is not added[-1].after and (effect.rivals or not misfits(smaller)):
+        elif effect not in compared and (effect.rivals or not misfits(smaller)):
             fit, chosen = judged_again(trials, fit, smaller, effect)
             added = [chosen if item is effect else item for item in added]
     return fit, added

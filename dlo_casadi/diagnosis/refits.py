@@ -198,7 +198,7 @@ def confirm(
     if beside is not None:
         same = beside.weighed_as(base)
         model = screened.candidate.add_to(base.model)
-        starts = (screened.start, {})
+        starts: tuple[Mapping[str, float], ...] = (screened.start, {})
         fits = [found, *(followed(same, model, values, MOST_STEPS, ceiling) for values in starts)]
         found = min((x for x in fits if x), key=lambda x: x.point.objective, default=None)
     return Confirmed.of(screened, base, found)

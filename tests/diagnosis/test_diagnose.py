@@ -325,10 +325,18 @@ def test_only_rivals_of_the_same_search_tell_which_refit_is_given_up(monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("misfit", "rivals", "again"), [(False, (), True), (True, (), False), (True, ("set",), True)]
+    ("misfit", "rivals", "steps", "again"),
+    [
+        (False, (), (0, 1), [0]),
+        (False, (), (0, 0), [0, 1]),
+        (True, (), (0, 1), []),
+        (True, ("set",), (0, 1), [0]),
+    ],
 )
-def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(misfit, rivals, again, monkeypatch):
-    """Scores are useless there, and candidates were compared from the measured shapes."""
+def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(
+    misfit, rivals, steps, again, monkeypatch
+):
+    """Scores are useless there. An effect found last was compared with all others, a pair not."""
     asked = []
 
     def judged_again(_, fit, smaller, effect):
@@ -336,7 +344,7 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(misfit, rivals, 
         return fit, effect
 
     fit, smaller = (SimpleNamespace(log_evidence=value) for value in (0.0, -1e5))
-    first, last = (SimpleNamespace(candidate=None, rivals=rivals, after=k) for k in range(2))
+    added = [SimpleNamespace(candidate=k, rivals=rivals, after=x) for k, x in enumerate(steps)]
     monkeypatch.setattr(refits, "refit_without", lambda *_: smaller)
     monkeypatch.setattr(backward, "misfits", lambda _: misfit)
     monkeypatch.setattr(backward, "candidates_of", lambda *_: ())
@@ -346,9 +354,9 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(misfit, rivals, 
         fine=lambda found, _: found, from_shapes=True, declared=None, center=None, exclude=(),
         significance=0.01,
     )  # fmt: skip
-    _, left = backward.pruned(among, fit, [first, last])
-    assert asked == [first] * again
-    assert left == [first, last]
+    _, left = backward.pruned(among, fit, added)
+    assert asked == [added[k] for k in again]
+    assert left == added
 
 
 def test_only_effects_that_are_asked_for_are_screened(monkeypatch):

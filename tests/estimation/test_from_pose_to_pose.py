@@ -389,6 +389,15 @@ def test_a_taper_is_judged_again_from_its_nominal_value():
     assert interval.low < truth.values["bending_stiffness"] < interval.high
 
 
+@pytest.mark.long
+def test_each_effect_of_a_pair_is_judged_again():
+    """The fit of a drift alone is lost in this misfit, so the pair has a plastic set instead."""
+    among = ("rest_curvature_drift", "plastic_set", "axial_stretch")
+    truth, search = searched(2811, 135, 2, among=among)
+    found = search._searched()
+    assert [item.name for item in found.added] == list(truth.hidden)
+
+
 def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():
     session = drawn(generator_of(3301, 7), 2, 0, "rest_curvature").session
     measured = measured_poses(session, read_inputs(session))
