@@ -398,6 +398,17 @@ def test_each_effect_of_a_pair_is_judged_again():
     assert [item.name for item in found.added] == list(truth.hidden)
 
 
+@pytest.mark.long
+def test_a_stretch_with_a_low_score_is_tried_before_pairs():
+    """Declared 4.6 times too limp, the cable seems to have a stiff section and to be shorter."""
+    among = ("axial_stretch", "stiff_section", "length_error", "bending_softening")
+    truth, search = searched(2811, 174, 1, among=among)
+    found = search._searched()
+    assert [item.name for item in found.added] == ["axial_stretch"]
+    name = "axial_stretch.compliance"
+    assert abs(found.fit.value(name) - truth.values[name]) < 2 * found.fit.std(name)
+
+
 def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():
     session = drawn(generator_of(3301, 7), 2, 0, "rest_curvature").session
     measured = measured_poses(session, read_inputs(session))
