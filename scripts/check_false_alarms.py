@@ -145,7 +145,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     kinds = parser.add_mutually_exclusive_group()
     kinds.add_argument("--scatter", action="store_true", help="of cables that do not repeat")
-    kinds.add_argument("--space", action="store_true", help="of cables in space")
+    kinds.add_argument("--plane", action="store_true", help="of random cables in the plane")
+    kinds.add_argument("--space", action="store_true", help="of random cables in space")
     parser.add_argument("--hidden", action="store_true", help="one or two effects hidden in each")
     parser.add_argument("--random", default="", choices=RANDOM_SIZES, help="of each pose's own")
     parser.add_argument("--table", action="store_true", help="on a table that is not declared")
@@ -159,7 +160,7 @@ def main() -> None:
     rows: dict[int, dict] = {}
     seconds = []
     with open_executor(args.jobs, args.scheduler) as executor:
-        if args.space or args.hidden or args.random or args.table:
+        if args.plane or args.space or args.hidden or args.random or args.table:
             count_random(args, executor)
             return
         work = partial(run_one, seed=args.seed, scatter=args.scatter)
