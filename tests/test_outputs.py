@@ -144,6 +144,7 @@ STATE = (
     "logs",
     "rows",
     "sessions",
+    "source.txt",
     f"{READABLE}.yaml",
 )
 

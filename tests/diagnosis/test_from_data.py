@@ -384,7 +384,7 @@ def named(name, *, gradual=True):
 def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, monkeypatch):
     def start(_, x):
         name = x.candidate.name
-        return SimpleNamespace(screened=x, names={name}, left=left[name])
+        return SimpleNamespace(screened=x, names={name}, left=left[name], reached=True)
 
     asked = []
     monkeypatch.setattr(RelaxedStart, "of", start)
@@ -402,6 +402,39 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
 
 
 @pytest.mark.parametrize(
+    ("reaching", "alone"),
+    [
+        (("force", "stretch"), ["force"]),
+        (("stretch",), ["force", "stretch"]),
+        ((), ["force"]),
+    ],
+)
+def test_unlikely_candidates_are_tried_if_no_likely_one_reaches_the_noise(
+    reaching, alone, monkeypatch
+):
+    """Those that reach it are fitted like likely ones, before pairs."""
+    told = []
+
+    def start(_, x):
+        name = x.candidate.name
+        return SimpleNamespace(screened=x, names={name}, left=1.0, reached=name in reaching)
+
+    def nearest(near, softness, singles, *_, **__):
+        told.extend(x.screened.candidate.name for x in singles)
+        return []
+
+    screened = [named("force"), named("stretch")]
+    monkeypatch.setattr(RelaxedStart, "of", start)
+    monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
+    monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: screened)
+    monkeypatch.setattr(fits_near_data, "likeliest", lambda _: screened[:1])
+    monkeypatch.setattr(fits_near_data, "nearest", nearest)
+    monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *_: [])
+    near_data(None, (None, 0.01), InProcess(), None, (), pairs=True)
+    assert told == alone
+
+
+@pytest.mark.parametrize(
     ("beside", "chi2", "lists"),
     [((), 2.9, 1), ((), 20.0, 2), (("other",), 3.0, 2), (("other",), 1.3, 2), (("other",), 1.0, 1)],
 )
@@ -412,7 +445,7 @@ def test_a_pair_ends_the_search_only_if_it_surely_explains_the_shapes(
     tether, asked = named("tether"), []
     fit = SimpleNamespace(noise=SimpleNamespace(source="declared"), chi2_per_dof=chi2)
     item = SimpleNamespace(fit=fit, beside=beside, each=(tether,), screened=tether)
-    begun = SimpleNamespace(screened=tether, names={"tether"}, left=1.0)
+    begun = SimpleNamespace(screened=tether, names={"tether"}, left=1.0, reached=True)
     monkeypatch.setattr(RelaxedStart, "of", lambda *_: begun)
     monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
     monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: [tether])
