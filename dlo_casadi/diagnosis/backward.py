@@ -39,7 +39,7 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
     before, fit = fit, trials.fine(fit, FINEST_MESH) if added else fit
     significant = added[-1:] if fit is before and not trials.from_shapes else []
     last = [effect for effect in added if effect.after is added[-1].after]
-    compared = last if len(last) == 1 else []  # a pair was compared with some other pairs alone
+    compared = last if len(last) == 1 else []  # a pair was compared with few other pairs
     for effect in added:
         smaller = refits.refit_without(fit, effect.candidate, trials.declared)
         if smaller is None:
@@ -61,7 +61,7 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
 def judged_again(
     trials: Trials, fit: Fit, smaller: Fit, effect: AddedEffect
 ) -> tuple[Fit, AddedEffect]:
-    """The likeliest candidate beside effects that were added later, and its rivals.
+    """The likeliest candidate beside effects that were added later or with it, and its rivals.
 
     Sequential replacement (Miller 1990): an effect may be the best one alone, and another one,
     or that of another clip, beside what was still missing then. Alone, a force explained a tilt
@@ -111,11 +111,12 @@ def _winner_added(
     least: float,
 ) -> tuple[Fit, AddedEffect] | None:
     """The best of the chosen refits, if it is significant and its log evidence above the least."""
-    for winner in chosen[:1]:
-        fit, p_value = with_new_noise(winner, base, p_values, trials.starts_at_shapes(base))
-        with suppress(EstimationError):
-            if fit.log_evidence > least and p_value <= trials.significance:
-                after = cross_validate(fit)
-                (effect,) = added_by(winner, chosen[1:], p_value, before, after)
-                return fit, effect
+    if not chosen:
+        return None
+    winner, *rivals = chosen
+    fit, p_value = with_new_noise(winner, base, p_values, trials.starts_at_shapes(base))
+    with suppress(EstimationError):
+        if fit.log_evidence > least and p_value <= trials.significance:
+            (effect,) = added_by(winner, rivals, p_value, before, cross_validate(fit))
+            return fit, effect
     return None
