@@ -212,6 +212,25 @@ def test_a_signal_interrupts_a_running_fit(config, tmp_path, number, begun):
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
 
 
+def test_an_interrupt_that_python_swallows_ends_the_run_without_a_traceback(
+    config, tmp_path, capsys, monkeypatch
+):
+    """Python prints and forgets what is raised in a finaliser or in a weak reference's callback."""
+
+    class Finalised:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def swallowed(_, progress, executor):
+        Finalised()
+        progress.step("read the poses", 0, 1)
+
+    monkeypatch.setattr("dlo_casadi.session.run_session", swallowed)
+
+    assert main(["fit", str(config), "--output", str(tmp_path / "out"), "--jobs", "1"]) == 130
+    assert capsys.readouterr().err.strip() == "interrupted; earlier results are as they were"
+
+
 def test_a_bug_is_told_apart_from_bad_input(config, tmp_path, capsys, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("oops")

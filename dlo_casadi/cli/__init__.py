@@ -9,7 +9,8 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from keyword import iskeyword
@@ -128,6 +129,21 @@ class _Signals:
         if self.received:
             raise KeyboardInterrupt
 
+    @contextmanager
+    def unprinted(self) -> Iterator[None]:
+        """Print no traceback of an interrupt that Python swallows, as in a weak reference."""
+        before = sys.unraisablehook
+
+        def told(error: "sys.UnraisableHookArgs") -> None:
+            if not issubclass(error.exc_type, KeyboardInterrupt):
+                before(error)
+
+        sys.unraisablehook = told
+        try:
+            yield
+        finally:
+            sys.unraisablehook = before
+
 
 signals = _Signals()
 
@@ -142,7 +158,8 @@ def guarded(work: Callable[[], int]) -> int:
             signal.signal(number, signals.interrupt)
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")  # same as stderr
-        code = work()
+        with signals.unprinted():
+            code = work()
         print(end="", flush=True)
         return code
     except KeyboardInterrupt:
