@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +23,7 @@ from dlo_casadi.estimation.fit import (
 )
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.variances import SETTLED_MODES
+from dlo_casadi.estimation.variances import SETTLED_MODES, SMOOTH_MODES
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess, one_thread, software
 from dlo_casadi.runtime.parallel import begin
@@ -52,29 +52,6 @@ class Progress(Protocol):
 TIMED = ("vision", "algorithm1", "batch", "diagnosis")
 
 
-class Clock:
-    """Wall-clock time [s] per part of a run; parts that run in parallel both count in full."""
-
-    def __init__(self) -> None:
-        self._begin = self._last = time.perf_counter()
-        self.parts = dict.fromkeys(TIMED, 0.0)
-
-    def lap(self, name: str) -> None:
-        """Add the time since the last lap to the named part."""
-        now = time.perf_counter()
-        self.add(name, now - self._last)
-        self._last = now
-
-    def add(self, name: str, seconds: float) -> None:
-        """Add the time [s] of a part that ran in parallel, if it is one of `TIMED`."""
-        if name in self.parts:
-            self.parts[name] += seconds
-
-    def total(self) -> dict[str, float]:
-        """All parts and the total [s]."""
-        return {**self.parts, "total": time.perf_counter() - self._begin}
-
-
 def run_session(
     config: Config, progress: Progress | None = None, executor: Executor | None = None
 ) -> Outcome:
@@ -94,102 +71,206 @@ def run_session(
     EstimationError
         If no model of the declared cable comes near the measured shapes.
     """
+    began = time.perf_counter()
     step = nobody if progress is None else progress.step
-    clock = Clock()
     executor = executor or InProcess()
     begin(executor, software)  # meanwhile another process starts and imports what fits need
     config, inputs = read_session(config, step)
     try:
         with one_thread():
-            return fit_session(config, inputs, clock, step, executor)
+            return _Run(config, step, executor, began).outcome(inputs)
     except DloError as error:
         error.poses = inputs  # for the page of a failure, which shows what was read
         raise
 
 
-def fit_session(
-    config: Config,
-    inputs: Sequence[PoseInput],
-    clock: Clock,
-    step: Step,
-    executor: Executor,
-) -> Outcome:
-    """Fit and report a session whose poses have been read; raises as `run_session` does."""
-    inputs, odd = without_implausible(config, inputs)
-    measured = measured_poses(config, inputs)
-    clock.lap("vision")
-    warnings = [*config.warnings, *remarks.reading_warnings(inputs, config.skipped), *odd]
-    center = _center(inputs)
-    pixels = [item.pixel for item in inputs if item.pixel is not None]
-    declared = fitting.declared_model(config, center, float(np.median(pixels)) if pixels else None)
+@dataclass(frozen=True)
+class _Run:
+    """One run: what its parts use.
 
-    step("fit the declared model", 0, 1)
-    n = config.model.n or fitting.first_mesh(declared.model)
-    if config.estimation.robust:
-        fit, _ = fitting.fit_declared(config, declared, measured)
-        outliers = outliers_of(fit, inputs)
-        inputs, measured = outliers.poses, measured_poses(config, outliers.poses)
-        warnings += remarks.left_out(outliers)
-    compared = begin(executor, fitting.simpler_fits, config.estimation, declared.model, measured, n)
-    fit, error = fitting.fit_declared(config, declared, measured)
-    meshed = fit  # whose mesh error is known
-    confirming = begin(executor, fitting.minimum_by_ipopt, fit)
-    step("fit the declared model", 1, 1)
+    `began`: the time at which it began. `seconds`: wall-clock time [s] per part of a run; parts
+    that run in parallel both count in full.
+    """
 
-    step("compare with simpler fits", 0, 1)
-    effects = declared_effects(config, declared_setup(config))
-    reported = _parameters_of({effect.label for _, effect in effects}, fit.model)
-    diagnosed = config.diagnosis.enabled
+    config: Config
+    step: Step
+    executor: Executor
+    began: float
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED, 0.0))
 
-    def staged(fit: Fit) -> Stage:
-        # Intervals follow the diagnosis: a model that does not explain the points gets none.
-        intervals = dict.fromkeys(profiled(fit)) if diagnosed else profile_intervals(fit)
-        return fit_stage("batch", fit, measured, intervals, reported)
+    def outcome(self, inputs: Sequence[PoseInput]) -> Outcome:
+        """Fit and report a session whose poses have been read; raises as `run_session` does."""
+        config, step, executor = self.config, self.step, self.executor
+        inputs, odd = without_implausible(config, inputs)
+        measured = measured_poses(config, inputs)
+        self.seconds["vision"] = time.perf_counter() - self.began
+        warnings = [*config.warnings, *remarks.reading_warnings(inputs, config.skipped), *odd]
+        center = _center(inputs)
+        pixels = [item.pixel for item in inputs if item.pixel is not None]
+        pixel = float(np.median(pixels)) if pixels else None
+        declared = fitting.declared_model(config, center, pixel)
 
-    simpler = compared()
-    clock.add("algorithm1", simpler.seconds)
-    own = staged(fit)
-    stages = simpler.stages(measured, fit.model.n)
-    best = _confirmed(fit, confirming, clock)
-    own = own if best.point is fit.point else staged(best)
-    fit = fitting.not_worse(best, [*stages, own])
-    if not diagnosed:
-        near = None
-        if fit.noise.source == "misfit" and enough_poses(fit):
-            near = with_loose_poses(fit, from_data(fit)[0]) or at_random(fit)
-        if near is not None:
-            kept = (near, mesh_error(near)) if config.model.n else None
-            meshed, error = kept or fine_enough(near, near.model.n)
-            fit = meshed
-        fit = as_measured(fit)
-    own = own if fit is best else staged(fit)
-    nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged, diagnosed=diagnosed)
-    stages = [*stages, own]
-    step("compare with simpler fits", 1, 1)
-    clock.lap("fit")
-    found: dict[str, Any] = {}
-    if diagnosed:
-        fit, error, found = close_the_loop(
-            config, fit, nearest, stages, measured, reported, center, clock, step, executor
+        step("fit the declared model", 0, 1)
+        n = config.model.n or fitting.first_mesh(declared.model)
+        if config.estimation.robust:
+            fit, _ = fitting.fit_declared(config, declared, measured)
+            outliers = outliers_of(fit, inputs)
+            inputs, measured = outliers.poses, measured_poses(config, outliers.poses)
+            warnings += remarks.left_out(outliers)
+        others = config.estimation, declared.model, measured, n
+        compared = begin(executor, fitting.simpler_fits, *others)
+        fit, error = fitting.fit_declared(config, declared, measured)
+        meshed = fit  # whose mesh error is known
+        confirming = begin(executor, fitting.minimum_by_ipopt, fit)
+        step("fit the declared model", 1, 1)
+
+        step("compare with simpler fits", 0, 1)
+        effects = declared_effects(config, declared_setup(config))
+        reported = _parameters_of({effect.label for _, effect in effects}, fit.model)
+        diagnosed = config.diagnosis.enabled
+
+        def staged(fit: Fit) -> Stage:
+            # Intervals follow the diagnosis: a model that does not explain the points gets none.
+            intervals = dict.fromkeys(profiled(fit)) if diagnosed else profile_intervals(fit)
+            return fit_stage("batch", fit, measured, intervals, reported)
+
+        simpler = compared()
+        self.seconds["algorithm1"] = simpler.seconds
+        own = staged(fit)
+        stages = simpler.stages(measured, fit.model.n)
+        best = self.confirmed(fit, confirming)
+        own = own if best.point is fit.point else staged(best)
+        fit = fitting.not_worse(best, [*stages, own])
+        if not diagnosed:
+            near = None
+            if fit.noise.source == "misfit" and enough_poses(fit):
+                near = with_loose_poses(fit, from_data(fit)[0]) or at_random(fit)
+            if near is not None:
+                fit, error = self.meshed(near)
+                meshed = fit
+            fit = as_measured(fit)
+        own = own if fit is best else staged(fit)
+        nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged, diagnosed=diagnosed)
+        stages = [*stages, own]
+        step("compare with simpler fits", 1, 1)
+        found: dict[str, Any] = {}
+        if diagnosed:
+            fit, error, found = self.close_the_loop(
+                fit, nearest, stages, measured, reported, center
+            )
+        else:
+            fit = nearest
+            error = error if fit is meshed else mesh_error(fit)
+        return judged(
+            Outcome(
+                config=config,
+                poses=tuple(inputs),
+                measurement=_summary(config, inputs, measured, fit),
+                stages=tuple(stages),
+                mesh_error=error,
+                timing={**self.seconds, "total": time.perf_counter() - self.began},
+                fit=fit,
+                warnings=tuple(warnings),
+                versions=software(),
+                limits=checked_limits(config.limits, fit, [item.pose for item in measured]),
+                **found,
+            )
         )
-    else:
-        fit = nearest
+
+    def close_the_loop(
+        self,
+        declared: Fit,
+        nearest: Fit,
+        stages: list[Stage],
+        measured: Sequence[MeasuredPose],
+        reported: Sequence[str],
+        center: tuple[float, float] | None,
+    ) -> tuple[Fit, float, dict[str, Any]]:
+        """Diagnose the declared model's residual and add missing effects.
+
+        Returns the last fit, the error [m] of its mesh, and the diagnosis in the fields of an
+        `Outcome`.
+
+        Parameters
+        ----------
+        declared : Fit
+            Of the declared model.
+        nearest : Fit
+            The declared fit, or a fit with the misfit as noise where that comes nearer to the
+            poses. It is reported unless effects are found, or nothing is missing.
+        stages : list of Stage
+            Its last stage, the declared one, gets its intervals; another follows if effects are
+            added.
+        reported : sequence of str
+            Parameters of the effects that the configuration declares.
+        """
+        began, options = time.perf_counter(), self.config.diagnosis
+        kept_mesh = self.config.model.n is not None
+        fine = declared.model.n > SEARCH_MESH and not kept_mesh
+        diagnosis = diagnose(
+            refine_mesh(declared, SEARCH_MESH) if fine else declared,
+            center=center,
+            exclude=options.exclude,
+            significance=options.significance,
+            max_effects=options.max_effects,
+            step=self.step,
+            executor=self.executor,
+            finest=None if kept_mesh else SEARCH_MESH,
+        )
+        unknown = diagnosis.unexplained and not diagnosis.added
+        fit = nearest if unknown and nearest is not declared else diagnosis.after
+        fit, error = self.meshed(fit, SETTLED_MODES)
+        meshed = fit  # whose mesh error is known
+        confirming = None
+        if diagnosis.added:
+            confirming = begin(self.executor, fitting.minimum_by_ipopt, fit)
+        next_pose = separating_pose(diagnosis.after, diagnosis.added)
+        if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
+            stages[-1] = _marked(stages[-1], explains=False)
+        elif diagnosis.added:
+            parameters = fitted_parameters(declared, profile_intervals(declared), reported)
+            stages[-1] = replace(stages[-1], parameters=parameters)
+        else:
+            # Nothing is missing: estimate the declared model's noise as that of a complete one.
+            fit = as_measured(fit)
+            stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
+        if confirming is not None:
+            labels = {item.candidate.effect.label for item in diagnosis.added}
+            names = [*reported, *_parameters_of(labels, fit.model)]
+            own = fit_stage("closed", fit, measured, profile_intervals(fit), names)
+            best = as_measured(self.confirmed(fit, confirming))
+            if best.point is not fit.point:
+                own = fit_stage("closed", best, measured, profile_intervals(best), names)
+            fit = best
+            stages.append(own)
         error = error if fit is meshed else mesh_error(fit)
-    return judged(
-        Outcome(
-            config=config,
-            poses=tuple(inputs),
-            measurement=_summary(config, inputs, measured, fit),
-            stages=tuple(stages),
-            mesh_error=error,
-            timing=clock.total(),
-            fit=fit,
-            warnings=tuple(warnings),
-            versions=software(),
-            limits=checked_limits(config.limits, fit, [item.pose for item in measured]),
-            **found,
-        )
-    )
+        diagnosis = replace(diagnosis, after=fit)
+        validated = diagnosis.validation_after
+        told = validated.complete and not diagnosis.added
+        self.seconds["diagnosis"] = time.perf_counter() - began
+        found = {
+            "verdict": diagnosis.verdict,
+            "effects": found_effects(diagnosis),
+            "candidates": diagnosis.ranked,
+            "unexplained": diagnosis.unknown_force,
+            "next_pose": next_pose,
+            "structure": (diagnosis.structure_before, diagnosis.structure_after),
+            "cross_validated": validated.rmse if told else None,
+            "hidden_weight": diagnosis.weight,
+        }
+        return fit, error, found
+
+    def meshed(self, fit: Fit, modes: int = SMOOTH_MODES) -> tuple[Fit, float]:
+        """The fit on a fine enough mesh, or on the declared one; the error of that mesh [m]."""
+        if self.config.model.n:
+            return fit, mesh_error(fit)
+        return fine_enough(fit, fit.model.n, modes)
+
+    def confirmed(self, fit: Fit, confirming: Callable[[], fitting.Minimum]) -> Fit:
+        """Compare a fit with the minimum that IPOPT has found in the meantime."""
+        found = confirming()
+        self.seconds["batch"] += found.seconds
+        return fitting.confirmed(fit, found)
 
 
 def judged(outcome: Outcome) -> Outcome:
@@ -221,104 +302,6 @@ def _marked(stage: Stage, explains: bool) -> Stage:
     if not explains:
         found = {name: replace(estimate, interval_95=None) for name, estimate in found.items()}
     return replace(stage, parameters=found, explains=explains)
-
-
-def close_the_loop(
-    config: Config,
-    declared: Fit,
-    nearest: Fit,
-    stages: list[Stage],
-    measured: Sequence[MeasuredPose],
-    reported: Sequence[str],
-    center: tuple[float, float] | None,
-    clock: Clock,
-    step: Step,
-    executor: Executor,
-) -> tuple[Fit, float, dict[str, Any]]:
-    """Diagnose the declared model's residual and add missing effects.
-
-    Parameters
-    ----------
-    declared : Fit
-        Of the declared model.
-    nearest : Fit
-        The declared fit, or a fit with the misfit as noise where that comes nearer to the poses.
-        It is reported unless effects are found, or nothing is missing.
-    stages : list of Stage
-        Its last stage, the declared one, gets its intervals; another follows if effects are added.
-    reported : sequence of str
-        Parameters of the effects that the configuration declares.
-
-    Returns
-    -------
-    fit : Fit
-    error : float [m]
-        Of its mesh.
-    found : dict
-        The diagnosis in the fields of an `Outcome`.
-    """
-    options, kept_mesh = config.diagnosis, config.model.n is not None
-    fine = declared.model.n > SEARCH_MESH and not kept_mesh
-    diagnosis = diagnose(
-        refine_mesh(declared, SEARCH_MESH) if fine else declared,
-        center=center,
-        exclude=options.exclude,
-        significance=options.significance,
-        max_effects=options.max_effects,
-        step=step,
-        executor=executor,
-        finest=None if kept_mesh else SEARCH_MESH,
-    )
-    unknown = diagnosis.unexplained and not diagnosis.added
-    fit = nearest if unknown and nearest is not declared else diagnosis.after
-    if kept_mesh:
-        error = mesh_error(fit)
-    else:
-        fit, error = fine_enough(fit, fit.model.n, SETTLED_MODES)
-    meshed = fit  # whose mesh error is known
-    confirming = begin(executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
-    next_pose = separating_pose(diagnosis.after, diagnosis.added)
-    if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
-        stages[-1] = _marked(stages[-1], explains=False)
-    elif diagnosis.added:
-        parameters = fitted_parameters(declared, profile_intervals(declared), reported)
-        stages[-1] = replace(stages[-1], parameters=parameters)
-    else:
-        # Nothing is missing: estimate the declared model's noise as that of a complete one.
-        fit = as_measured(fit)
-        stages[-1] = fit_stage("batch", fit, measured, profile_intervals(fit), reported)
-    if confirming is not None:
-        labels = {item.candidate.effect.label for item in diagnosis.added}
-        names = [*reported, *_parameters_of(labels, fit.model)]
-        own = fit_stage("closed", fit, measured, profile_intervals(fit), names)
-        best = as_measured(_confirmed(fit, confirming, clock))
-        if best.point is not fit.point:
-            own = fit_stage("closed", best, measured, profile_intervals(best), names)
-        fit = best
-        stages.append(own)
-    error = error if fit is meshed else mesh_error(fit)
-    diagnosis = replace(diagnosis, after=fit)
-    validated = diagnosis.validation_after
-    told = validated.complete and not diagnosis.added
-    clock.lap("diagnosis")
-    found = {
-        "verdict": diagnosis.verdict,
-        "effects": found_effects(diagnosis),
-        "candidates": diagnosis.ranked,
-        "unexplained": diagnosis.unknown_force,
-        "next_pose": next_pose,
-        "structure": (diagnosis.structure_before, diagnosis.structure_after),
-        "cross_validated": validated.rmse if told else None,
-        "hidden_weight": diagnosis.weight,
-    }
-    return fit, error, found
-
-
-def _confirmed(fit: Fit, confirming: Callable[[], fitting.Minimum], clock: Clock) -> Fit:
-    """Compare a fit with the minimum that IPOPT has found in the meantime."""
-    found = confirming()
-    clock.add("batch", found.seconds)
-    return fitting.confirmed(fit, found)
 
 
 def _center(inputs: Sequence[PoseInput]) -> tuple[float, float] | None:
