@@ -4,6 +4,7 @@ A measured line is straight between neighbouring points, so distances from it ar
 the sag between two points. Arc lengths are chords scaled to the cable, or those of markers.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config import Pose
 from dlo_casadi.model.clips import CLAMPS, HeldClip, tangents
+from dlo_casadi.rod.node import Node
 from dlo_casadi.session.hypotheses import ReadSession, Suspicion
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import CONTRADICTS, FITS, HEADING_OFF, NEARLY_ALL
@@ -18,11 +20,13 @@ from dlo_casadi.thresholds import CONTRADICTS, FITS, HEADING_OFF, NEARLY_ALL
 
 @dataclass(frozen=True)
 class _Passed:
-    """Point of a measured line that is nearest to the declared place of a clip.
+    """Point of a measured line, of the pose of that name, nearest to the declared place of a clip.
 
     `gap` [m]: its distance from the place; `at` [m]: its arc length; `ahead` (d,): tangent there.
     """
 
+    pose: str
+    clip: HeldClip
     gap: float
     at: float
     ahead: FloatArray
@@ -30,21 +34,21 @@ class _Passed:
 
 def wrong_clips(session: ReadSession) -> tuple[Suspicion, ...]:
     """Clips that are far from the measured lines, out of order, or not of the declared kind."""
-    declared, length = session.declared, session.config.cable.length
-    poses = [(declared[item.name], item) for item in session.read]
+    length = session.config.cable.length
+    poses = [(session.declared[item.name], item) for item in session.read]
+    passed = [
+        [_passed(pose, item, clip, length) for clip in pose.held.clips] for pose, item in poses
+    ]
     found: list[Suspicion] = []
-    for k, clip in enumerate(poses[0][0].held.clips if poses else ()):
-        held = [pose.held.clips[k] for pose, _ in poses]
-        own = [_passed(pose, item, held[j].place, length) for j, (pose, item) in enumerate(poses)]
-        found += _far_off(session, k, np.array([one.gap for one in own])) or [
-            *_of_other_kind(clip, held, own, length),
-            *_turned(poses, held, own),
+    for own in zip(*passed, strict=True):  # one clip in all poses
+        found += _far_off(own, length) or [
+            *_of_other_kind(own, length),
+            *_turned(own, poses[0][0].held.node),
         ]
-    return tuple(found) + (() if found else tuple(_out_of_order(poses, length)))
+    return tuple(found or _out_of_order(passed, length))
 
 
-def _passed(pose: Pose, item: PoseInput, place: tuple[float, ...], length: float) -> _Passed:
-    """The point of a measured line that is nearest to a place."""
+def _passed(pose: Pose, item: PoseInput, clip: HeldClip, length: float) -> _Passed:
     line = pose.held.joined(item.points)
     s = chord_lengths(line)
     chords = np.diff(s)
@@ -52,39 +56,38 @@ def _passed(pose: Pose, item: PoseInput, place: tuple[float, ...], length: float
         s = np.concatenate([[0.0], item.s, [] if pose.end is None else [length]])
     elif pose.end is not None:
         s = s * length / s[-1]
-    steps, toward = np.diff(line, axis=0), np.array(place) - line[:-1]
+    steps, toward = np.diff(line, axis=0), np.array(clip.place) - line[:-1]
     share = np.clip((toward * steps).sum(axis=1) / np.maximum(chords**2, 1e-300), 0.0, 1.0)
     gaps = np.linalg.norm(toward - share[:, None] * steps, axis=1)
     i = int(gaps.argmin())
     at = s[i] + share[i] * (s[i + 1] - s[i])
-    return _Passed(float(gaps[i]), float(at), steps[i] / max(chords[i], 1e-300))
+    ahead = steps[i] / max(chords[i], 1e-300)
+    return _Passed(pose.name, clip, float(gaps[i]), float(at), ahead)
 
 
-def _far_off(session: ReadSession, k: int, gaps: FloatArray) -> list[Suspicion]:
-    """Suspicion about one clip at distances `gaps` (m,) [m] from the lines; empty if it is near."""
-    length, poses = session.config.cable.length, [session.declared[x.name] for x in session.read]
-    clips = [pose.held.clips[k] for pose in poses]
+def _far_off(own: Sequence[_Passed], length: float) -> list[Suspicion]:
+    """Suspicion about one clip that is far from the lines; empty if it is near."""
+    gaps = np.array([one.gap for one in own])
     far = gaps > FITS * length
     if np.mean(far) < NEARLY_ALL:
         text = "{} is {:.3g} m from the measured line. Try: its place, in the frame of the points."
         return [
-            Suspicion.of_pose(pose.name, text.format(clip.name, gap))
-            for pose, clip, gap, off in zip(poses, clips, gaps, far, strict=True)
+            Suspicion.of_pose(one.pose, text.format(one.clip.name, one.gap))
+            for one, off in zip(own, far, strict=True)
             if off
         ]
     typical = float(np.median(gaps))
-    said = f"{clips[0].name} is {typical:.3g} m from the measured lines (median)"
+    said = f"{own[0].clip.name} is {typical:.3g} m from the measured lines (median)"
     text = f"{said}. Try: its places, in metres and in the frame of the points."
     return [Suspicion(text, typical > CONTRADICTS * length)]
 
 
-def _of_other_kind(
-    clip: HeldClip, held: list[HeldClip], own: list[_Passed], length: float
-) -> list[Suspicion]:
+def _of_other_kind(own: Sequence[_Passed], length: float) -> list[Suspicion]:
     """A clip that holds the cable at another arc length than declared, or lets it slide."""
+    clip = own[0].clip
     if clip.at is None:
         return []
-    slid = np.array([one.at - (h.at or 0.0) for one, h in zip(own, held, strict=True)])
+    slid = np.array([one.at - (one.clip.at or 0.0) for one in own])
     middle = float(np.median(slid))
     if np.ptp(slid) > FITS * length and np.mean(np.abs(slid - middle) < FITS * length / 4) < 0.5:
         text = (
@@ -102,39 +105,34 @@ def _of_other_kind(
     return []
 
 
-def _turned(
-    poses: list[tuple[Pose, PoseInput]], held: list[HeldClip], own: list[_Passed]
-) -> list[Suspicion]:
-    """Clamped clips that the line leaves in another direction than declared."""
-    clips = [clip for clip in held if clip.kind in CLAMPS]
-    if not clips:
+def _turned(own: Sequence[_Passed], node: type[Node]) -> list[Suspicion]:
+    """A clamped clip that the lines leave in another direction than declared."""
+    if own[0].clip.kind not in CLAMPS:
         return []
-    node = poses[0][0].held.node
-    frames = np.array([clip.frame for clip in clips])
+    frames = np.array([one.clip.frame for one in own])
     cosines = (tangents(node, frames) * np.array([one.ahead for one in own])).sum(axis=1)
     angles = np.arccos(np.clip(cosines, -1.0, 1.0))
     off = angles > HEADING_OFF
     if np.mean(off) >= NEARLY_ALL:
         text = (
-            f"{clips[0].name}: the lines pass it {np.median(angles):.2g} rad (median) from its "
+            f"{own[0].clip.name}: the lines pass it {np.median(angles):.2g} rad (median) from its "
             "direction. Try: kind: pinned if it turns; x of its frame forward along the cable."
         )
         return [Suspicion(text, False)]
     text = "{} is turned {:.2g} rad from the measured line. Try: its direction; pinned if it turns."
     return [
-        Suspicion.of_pose(pose.name, text.format(clip.name, angle))
-        for (pose, _), clip, angle, wrong in zip(poses, clips, angles, off, strict=True)
+        Suspicion.of_pose(one.pose, text.format(one.clip.name, angle))
+        for one, angle, wrong in zip(own, angles, off, strict=True)
         if wrong
     ]
 
 
-def _out_of_order(poses: list[tuple[Pose, PoseInput]], length: float) -> list[Suspicion]:
-    """Clips that the lines pass in another order."""
-    for pose, item in poses:
-        own = [_passed(pose, item, clip.place, length) for clip in pose.held.clips]
-        order = np.argsort([one.at for one in own])
-        if np.any(np.diff([one.at for one in own]) < -FITS * length):
-            names = ", ".join(pose.held.clips[k].name for k in order)
+def _out_of_order(passed: Sequence[Sequence[_Passed]], length: float) -> list[Suspicion]:
+    """Clips that the lines pass in another order, in the first pose where they do."""
+    for own in passed:
+        at = [one.at for one in own]
+        if np.any(np.diff(at) < -FITS * length):
+            names = ", ".join(own[k].clip.name for k in np.argsort(at))
             text = f"the line passes the clips in the order {names}. Try: clips in that order."
-            return [Suspicion.of_pose(pose.name, text)]
+            return [Suspicion.of_pose(own[0].pose, text)]
     return []
