@@ -13,11 +13,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, chord_lengths, un
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.session.measure import line_without_end
 from dlo_casadi.session.outcome import PoseInput
-from dlo_casadi.thresholds import (
-    FITS,
-    NEARLY_ALL,
-    OUT_OF_STEP,
-)
+from dlo_casadi.thresholds import FITS, NEARLY_ALL, OUT_OF_STEP
 
 T = TypeVar("T")
 
@@ -243,34 +239,35 @@ def lines_of(config: Config, read: Sequence[PoseInput]) -> Lines:
     A photograph is searched for a line between its declared ends, and wrong ends may hide the
     line. Where several poses do not fit, lines are searched for again without their ends.
     """
-    points = {item.name: item.points for item in read}
-    known = {item.name: item.s for item in read if item.s is not None}
-    lines = _lines(config, points, known)
+    found = {item.name: item for item in read}
+    lines = _lines(config, found)
     if config.experiment.boundary.end != "free":
         fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
         sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
         poses = [pose for pose in config.experiment.poses if pose.name not in sound]
         doubtful = [pose for pose in poses if pose.paths and pose.paths[0].is_file()]
         if len(doubtful) > 1:
-            again = {pose.name: line_without_end(config, pose) for pose in doubtful}
-            points |= {name: line for name, line in again.items() if line is not None}
-            lines = _lines(config, points, known)
+            for pose in doubtful:
+                if (line := line_without_end(config, pose)) is not None:
+                    found[pose.name] = PoseInput(pose.name, pose.role, line)
+            lines = _lines(config, found)
     return lines
 
 
-def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, FloatArray]) -> Lines:
-    """Ends and lengths of lines (K, d); some are markers at known arc lengths (K,)."""
+def _lines(config: Config, read: dict[str, PoseInput]) -> Lines:
+    """Ends and lengths of lines or markers, by the names of their poses."""
     length, d = config.cable.length, len(config.experiment.gravity)
     whole, spans, gaps, lengths = np.array([0.0, length]), [], [], []
-    poses = [pose for pose in config.experiment.poses if pose.name in points]
-    for pose in poses:
-        own, marked = points[pose.name], pose.name in known
-        span = known[pose.name][[0, -1]] if marked else whole
+    poses = [pose for pose in config.experiment.poses if pose.name in read]
+    items = [read[pose.name] for pose in poses]
+    for item in items:
+        own = item.points
+        span = whole if item.s is None else item.s[[0, -1]]
         # Sparse points leave some of the cable unseen at either end. A dense line reaches its
         # fixture unless something hides it.
         steps = np.linalg.norm(np.diff(own, axis=0), axis=1)
         apart = float(np.median(steps)) if len(steps) else length
-        far = apart > FITS * length and not marked
+        far = apart > FITS * length and item.s is None
         gaps.append(np.abs(span - whole) + (max(length - steps.sum(), 0.0) if far else 0.0))
         sparse = np.diff(own[spread(len(own), _SPARSE)], axis=0)
         lengths.append(np.linalg.norm(sparse, axis=1).sum())
@@ -279,11 +276,11 @@ def _lines(config: Config, points: dict[str, FloatArray], known: dict[str, Float
     return Lines(
         tuple(pose.name for pose in poses),
         np.array(ends).reshape(-1, 2, d),
-        np.array([points[pose.name][[0, -1]] for pose in poses]).reshape(-1, 2, d),
+        np.array([item.points[[0, -1]] for item in items]).reshape(-1, 2, d),
         np.array(lengths) / (np.array(spans) / length),
         length,
         np.array(gaps).reshape(-1, 2),
-        np.array([pose.name in known for pose in poses], dtype=bool),
+        np.array([item.s is not None for item in items], dtype=bool),
     )
 
 
@@ -303,21 +300,22 @@ def shown_pull(session: ReadSession) -> FloatArray | None:
     """
     boundary = session.config.experiment.boundary
     if boundary.start == boundary.end == "pinned":
-        poses = [session.declared[item.name] for item in session.read]
-        ends = [np.array([pose.start, pose.end]) for pose in poses]
-        pull = _off_the_chord([item.points for item in session.read], ends)
+        pull = _off_the_chord(session)
     else:
         pull = load_over_stiffness([(item.points, item.s) for item in session.read])
     return pull if np.all(np.isfinite(pull)) and pull.any() else None
 
 
-def _off_the_chord(lines: Sequence[FloatArray], chords: Sequence[FloatArray]) -> FloatArray:
-    """Mean offset of the points (K, d) of all lines from their chords (2, d)."""
+def _off_the_chord(session: ReadSession) -> FloatArray:
+    """Mean offset (d,) of the points of all lines from their chords."""
     across, away = np.zeros((2, 1, 1))
-    for points, (start, end) in zip(lines, chords, strict=True):
-        along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-300)
+    for item in session.read:
+        pose = session.declared[item.name]
+        start, end = np.array([pose.start, pose.end])
+        chord = end - start
+        along = chord / max(float(np.linalg.norm(chord)), 1e-300)
         own = np.eye(len(start)) - np.outer(along, along)
-        across, away = across + own, away + own @ (points - start).mean(axis=0)[:, None]
+        across, away = across + own, away + own @ (item.points - start).mean(axis=0)[:, None]
     return np.asarray(np.linalg.pinv(across, rcond=FITS) @ away)[:, 0]
 
 
