@@ -90,19 +90,17 @@ def counted_from_the_end(session: ReadSession) -> tuple[Suspicion, ...]:
     lines = session.lines
     if not lines.known.any():
         return ()
-    own = overall(lines.misfit(lines.measured, lines.declared)[lines.known])
     turned = replace(lines, measured=lines.measured[:, ::-1], gaps=lines.gaps[:, ::-1])
     said = (
         "the markers are {own:.3g} m RMS from the declared start and end, but {left:.3g} m once "
         "they are counted from the other end. Try: s_m from the start; or are start and end of "
         "the poses exchanged?"
     )
-    return _by_ends(
-        lines,
-        own,
-        [Hypothesis(said, turned)],
-        lambda one: overall(one.misfit(one.measured, one.declared)[one.known]),
-    )
+
+    def misfit(one: Lines) -> float:
+        return overall(one.misfit(one.measured, one.declared)[one.known])
+
+    return _by_ends(lines, misfit(lines), [Hypothesis(said, turned)], misfit)
 
 
 def _by_ends(
@@ -344,7 +342,11 @@ def shorter(session: ReadSession) -> tuple[Suspicion, ...]:
         pose = session.declared[item.name]
         start, end = np.array(pose.start), np.array(pose.end)
         ways = (np.vstack([start, points, end]) for points in (item.points, item.points[::-1]))
-        steps = min((np.diff(way, axis=0) for way in ways), key=_gaps)
+        # In the order in which the gaps to the fixtures are smaller.
+        steps = min(
+            (np.diff(way, axis=0) for way in ways),
+            key=lambda steps: float(np.linalg.norm(steps[[0, -1]], axis=1).sum()),
+        )
         chords = np.linalg.norm(steps, axis=1)
         steps = steps[chords > 0] / chords[chords > 0, None]
         chords = chords[chords > 0]
@@ -364,11 +366,6 @@ def shorter(session: ReadSession) -> tuple[Suspicion, ...]:
         "between the places where the ends are held."
     )
     return (Suspicion(text, False),)
-
-
-def _gaps(steps: FloatArray) -> float:
-    """Sum of the first and the last step [m]."""
-    return float(np.linalg.norm(steps[[0, -1]], axis=1).sum())
 
 
 # Alternatives: only the first that finds anything is reported; then independent questions.
