@@ -69,7 +69,7 @@ def pose_shape(
         eq.energy,
         eq.stable,
         np.stack([eq.start_force, eq.end_force]),
-        _branch_shape(other, item, prediction) if item.readable and other is not None else None,
+        None if other is None else _branch_shape(other, item, prediction),
         readings=item.readings_beside(prediction.seen),
         clips=tuple(clip_rows(item.pose.clips, eq.clips)),
         contacts=tuple(contact.row for contact in eq.contacts),
@@ -81,12 +81,9 @@ def _rmse(prediction: Prediction, item: MeasuredPose) -> float:
     return float(np.sqrt((item.distances(prediction.curve) ** 2).mean()))
 
 
-def _branch_shape(
-    found: MeasuredBranch, item: MeasuredPose, known: Prediction | None
-) -> BranchShape:
+def _branch_shape(found: MeasuredBranch, item: MeasuredPose, known: Prediction) -> BranchShape:
     """The equilibrium in which a pose was measured, beside the predicted one."""
-    own = found.prediction.equilibrium.energy
-    above = 0.0 if known is None else own - known.equilibrium.energy
+    above = found.prediction.equilibrium.energy - known.equilibrium.energy
     return BranchShape(_rmse(found.prediction, item), found.branch, found.turns, above)
 
 
@@ -113,7 +110,6 @@ class _Model:
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:
-        """Uncertainty of its predictions."""
         return uncertainty_of(self.fit) if self.fit else None
 
     @property
@@ -144,15 +140,16 @@ class _Model:
         others = measured_branches(self.model, self.p, self.rest, measured, predictions, self.nodes)
         shapes: dict[str, PoseShape] = {}
         for j, (item, known, other) in enumerate(zip(measured, predictions, others, strict=True)):
+            if known is None:
+                continue
             side = None
             if other is not None and other.other_side and not item.held_out:
                 # A fit has used the side on which the cable of each pose hangs.
                 side = _branch_shape(other, item, known)
                 known, other = other.prediction, None
                 predictions[j], others[j] = known, other
-            if known is not None:
-                shape = replace(pose_shape(known, item, other), measured_side=side)
-                shapes[item.pose.name] = self._with_uncertainty(item, known, other, shape)
+            shape = replace(pose_shape(known, item, other), measured_side=side)
+            shapes[item.pose.name] = self._with_uncertainty(item, known, other, shape)
         lost = [item for item in measured if item.pose.name not in shapes]
         if lost:
             names = ", ".join(item.pose.name for item in lost)
