@@ -6,7 +6,7 @@ model that lacks an effect is smooth along the line, so that none of its points 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -94,15 +94,11 @@ def outliers_of(fit: Fit, poses: Sequence[PoseInput]) -> Outliers:
     found, names, farthest = list(poses), [], 0.0
     for line, own in zip(lines, kept, strict=True):
         pose = poses[line.pose]
-        if line.points is not pose.means:
-            changed = {
-                name: value[own]
-                for name in ("points", "s", "pixels", "weight")
-                if (value := getattr(pose, name)) is not None
-            }
+        if line.points is pose.means:
+            means = replace(pose.means, **_taken(pose.means, own))
+            found[line.pose] = replace(found[line.pose], means=means)
         else:
-            changed = {"means": _taken(pose.means, own)}
-        found[line.pose] = replace(found[line.pose], **changed)
+            found[line.pose] = replace(found[line.pose], **_taken(pose, own))
         if pose.means is None or line.points is pose.means:
             before = np.cumsum(np.broadcast_to(line.points.count, len(own))) - line.points.count
             out = np.flatnonzero(~own)
@@ -170,6 +166,7 @@ def _beside(series: FloatArray, kept: BoolArray) -> tuple[FloatArray, FloatArray
     return series - middle, MAD * spread
 
 
-def _taken(points: MeasuredPoints, kept: BoolArray) -> MeasuredPoints:
-    count = np.broadcast_to(points.count, len(kept))[kept]
-    return MeasuredPoints(points.points[kept], None if points.s is None else points.s[kept], count)
+def _taken(item: PoseInput | MeasuredPoints, kept: BoolArray) -> dict[str, Any]:
+    """The points kept of a pose or of its means, and all that is given for each of them."""
+    given = {key: getattr(item, key, None) for key in ("points", "s", "pixels", "weight", "count")}
+    return {key: value[kept] for key, value in given.items() if value is not None}
