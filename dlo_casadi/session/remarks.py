@@ -68,37 +68,34 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
     Only the last stage counts: earlier models lacked something. The verdict reports held-out poses
     on the other side.
     """
+    stage = stages[-1]
+    if stage.name not in ("batch", "closed"):
+        return []
+    others = {
+        name: shape
+        for name, shape in stage.other_branch.items()
+        if not (side := stage.shapes[name].either_side) or side.other.chosen_by != shape.chosen_by
+    }
     lines = []
-    for stage in stages[-1:]:
-        if stage.name not in ("batch", "closed"):
-            continue
-        either = {name: shape.either_side for name, shape in stage.shapes.items()}
-        others = {
-            name: shape
-            for name, shape in stage.other_branch.items()
-            if not (side := either[name]) or side.other.chosen_by != shape.chosen_by
-        }
-        for group in _by_choice(others):
-            predicted = max(stage.shapes[name].rmse or 0.0 for name in group)
-            measured = max(shape.rmse for shape in group.values())
-            lines.append(
-                f"stage {stage.name}: {', '.join(group)}: measured in another equilibrium than "
-                f"predicted, {_energy(group)}: the predicted one is up to {1e3 * predicted:.3g} mm "
-                f"off, the measured one {1e3 * measured:.3g} mm; {_cure(group)}"
+    for group in _by_choice(others):
+        predicted = max(stage.shapes[name].rmse or 0.0 for name in group)
+        measured = max(shape.rmse for shape in group.values())
+        lines.append(
+            f"stage {stage.name}: {', '.join(group)}: measured in another equilibrium than "
+            f"predicted, {_energy(group)}: the predicted one is up to {1e3 * predicted:.3g} mm "
+            f"off, the measured one {1e3 * measured:.3g} mm; {_cure(group)}"
+        )
+        if undecided := [name for name in group if stage.shapes[name].undecided]:
+            lines[-1] += (
+                ". Fit, fixtures and scatter from pose to pose leave open which of the two is "
+                f"lower in {', '.join(undecided)}"
             )
-            if undecided := [name for name in group if stage.shapes[name].undecided]:
-                told = ", ".join(undecided)
-                lines[-1] += (
-                    ". Fit, fixtures and scatter from pose to pose leave open which of the two is "
-                    f"lower in {told}"
-                )
-        lines += [
-            f"stage {stage.name}: {', '.join(group)}: the cable hangs on another side than "
-            f"predicted, {_energy(group)}; fit poses are compared where they hang, and a "
-            f"prediction of the same ends needs `{next(iter(group.values())).chosen_by}`"
-            for group in _by_choice(stage.measured_side)
-        ]
-    return lines
+    return lines + [
+        f"stage {stage.name}: {', '.join(group)}: the cable hangs on another side than "
+        f"predicted, {_energy(group)}; fit poses are compared where they hang, and a "
+        f"prediction of the same ends needs `{next(iter(group.values())).chosen_by}`"
+        for group in _by_choice(stage.measured_side)
+    ]
 
 
 def _by_choice(found: Mapping[str, BranchShape]) -> list[dict[str, BranchShape]]:
@@ -146,23 +143,21 @@ def weight_warning(weight: HiddenWeight, expected: float) -> str:
 
 
 def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
-    """Simpler stages that come nearer to the fit poses than the last one, if that is a fit.
+    """Simpler stages that come nearer to the fit poses than the last one, a fit.
 
     Only by more than chance: the RMS of K points has a relative uncertainty of 1/sqrt(2 K).
     """
-    lines = []
-    for batch in stages[-1:]:
-        if batch.name not in ("batch", "closed") or batch.rmse_fit is None:
-            continue
-        count = sum(len(shape.s) for shape in batch.shapes.values())
-        least = batch.rmse_fit / (1 + 1 / np.sqrt(2 * max(count, 1)))
-        lines += [
-            f"stage {stage.name} comes nearer to the fit poses than stage {batch.name}: "
-            f"{1e3 * stage.rmse_fit:.4g} mm instead of {1e3 * batch.rmse_fit:.4g} mm RMS"
-            for stage in stages
-            if stage.name in SIMPLER and stage.rmse_fit is not None and stage.rmse_fit < least
-        ]
-    return lines
+    last = stages[-1]
+    if last.rmse_fit is None:
+        return []
+    count = sum(len(shape.s) for shape in last.shapes.values())
+    least = last.rmse_fit / (1 + 1 / np.sqrt(2 * max(count, 1)))
+    return [
+        f"stage {stage.name} comes nearer to the fit poses than stage {last.name}: "
+        f"{1e3 * stage.rmse_fit:.4g} mm instead of {1e3 * last.rmse_fit:.4g} mm RMS"
+        for stage in stages
+        if stage.name in SIMPLER and stage.rmse_fit is not None and stage.rmse_fit < least
+    ]
 
 
 def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> tuple[str, ...]:
