@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -379,32 +380,26 @@ def fitted_parameters(
 ) -> dict[str, Estimate]:
     """Estimates of a fit's parameters; see `fit_stage`."""
     model = fit.model
+
+    def estimate(name: str, unit: str, size: float = 1.0, **known: Any) -> Estimate:
+        value, std, fixed = fit.value(name), fit.std(name), name not in fit.problem.unknowns.names
+        bound = _at_bound(fit, name)
+        return Estimate(size * value, size * std, unit, at_bound=bound, fixed=fixed, **known)
+
     parameters: dict[str, Estimate] = {}
     for full, interval in intervals.items():
         key, unit, size = full, "N m^2", 1.0
         if full == MASS_FACTOR:
             key, unit, size = MASS, "kg", model.cable.mass
-        bounds = (interval.low, interval.high) if interval else ()
-        ends = [None if end is None else size * end for end in bounds]
-        parameters[key] = Estimate(
-            size * fit.value(full),
-            size * fit.std(full),
-            unit,
-            (ends[0], ends[1]) if ends else None,
-            interval.identifiable if interval else None,
-            at_bound=_at_bound(fit, full),
-            fixed=full not in fit.problem.unknowns.names,
-        )
+        known: dict[str, Any] = {}
+        if interval:
+            ends = (None if x is None else size * x for x in (interval.low, interval.high))
+            known = {"interval_95": tuple(ends), "identifiable": interval.identifiable}
+        parameters[key] = estimate(full, unit, size, **known)
     roll = [END_ROLL] if END_ROLL in model.names else []
-    for qualified in (*roll, *reported):
-        parameters[qualified] = Estimate(
-            fit.value(qualified),
-            fit.std(qualified),
-            model.parameters[model.names.index(qualified)].unit,
-            identifiable=fit.is_determined(qualified),
-            at_bound=_at_bound(fit, qualified),
-            fixed=qualified not in fit.problem.unknowns.names,
-        )
+    for name in (*roll, *reported):
+        unit = model.parameters[model.names.index(name)].unit
+        parameters[name] = estimate(name, unit, identifiable=fit.is_determined(name))
     return parameters
 
 
