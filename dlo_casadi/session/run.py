@@ -15,12 +15,7 @@ from dlo_casadi.diagnosis.from_pose_to_pose import at_random, enough_poses, with
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
-from dlo_casadi.estimation.fit import (
-    SEARCH_MESH,
-    fine_enough,
-    mesh_error,
-    refine_mesh,
-)
+from dlo_casadi.estimation.fit import SEARCH_MESH, fine_enough, mesh_error, refine_mesh
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, SMOOTH_MODES
@@ -30,13 +25,7 @@ from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.measure import Step, measured_poses, nobody, read_session
-from dlo_casadi.session.outcome import (
-    MeasurementSummary,
-    Outcome,
-    PoseInput,
-    Stage,
-    found_effects,
-)
+from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, Stage, found_effects
 from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_parameters
