@@ -337,7 +337,7 @@ def run_one(index: int, seed: int, scatter: bool) -> dict:
             found = simulate(config, generator)
         measured, stiffness = found
     begin = time.perf_counter()
-    fit, _ = fit_declared(config, declared_model(config), measured)
+    fit = fit_declared(config, declared_model(config), measured)
     fitted = time.perf_counter()
     diagnosis = diagnose(fit, finest=SEARCH_MESH)
     interval = profile_intervals(diagnosis.after)["bending_stiffness"]

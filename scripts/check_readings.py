@@ -137,7 +137,7 @@ def clean(generator) -> dict:
     """Nothing hidden: what the diagnosis adds, and whether EI's interval holds the truth."""
     config = measured_with(load_bench(), ("end_force",), 3)
     measured, stiffness = drawn(config, generator)
-    fit, _ = fit_declared(config, declared_model(config), measured)
+    fit = fit_declared(config, declared_model(config), measured)
     diagnosis = diagnose(fit)
     after, _ = fine_enough(diagnosis.after, diagnosis.after.model.n)
     interval = profile_intervals(after)["bending_stiffness"]
@@ -156,7 +156,7 @@ def mass(generator) -> dict:
     unknown = config.cable.model_copy(update={"mass": None})
     config = measured_with(config.model_copy(update={"cable": unknown}), ("end_force",), 3)
     measured, stiffness = drawn(config, generator, factor=1.1)
-    fit, _ = fit_declared(config, declared_model(config), measured)
+    fit = fit_declared(config, declared_model(config), measured)
     found = profile_intervals(fit)
     return {
         "EI": fit.value("bending_stiffness") / stiffness - 1,
@@ -194,7 +194,7 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
             model = model.with_effect(effect())
         declared = replace(declared, model=model, values=dict(START.get(name, {})))
         try:
-            fit, _ = fit_declared(as_held, declared, items, 20)
+            fit = fit_declared(as_held, declared, items, 20)
             gains[name] = 2 * fit.log_evidence
         except EstimationError:  # no shape of the model comes near the measured ones
             gains[name] = -1e9

@@ -27,7 +27,6 @@ from dlo_casadi.estimation.fit import (
     fine_enough,
     fit_model,
     fit_to_misfit,
-    mesh_error,
     refine_mesh,
 )
 from dlo_casadi.estimation.point import Point
@@ -159,10 +158,8 @@ def straight(model: CableModel) -> CableModel:
     return replace(model, cable=replace(model.cable, straight=True), effects=(), priors={})
 
 
-def fit_declared(
-    config: Config, declared: Declared, measured: Sequence[MeasuredPose]
-) -> tuple[Fit, float]:
-    """Fit the declared model on a mesh that is fine enough; return the fit, mesh error in [m].
+def fit_declared(config: Config, declared: Declared, measured: Sequence[MeasuredPose]) -> Fit:
+    """Fit the declared model on a mesh that is fine enough, or on the declared one.
 
     The mesh is refined first because a coarse mesh looks like a missing effect.
     """
@@ -180,10 +177,7 @@ def fit_declared(
         values=declared.start,
         readings=first_reading_noise(model, measurement.force_std, measurement.moment_std),
     )
-    if finest:
-        fit = refine_mesh(fit, finest)
-        return fit, mesh_error(fit)
-    return fine_enough(fit, first)
+    return refine_mesh(fit, finest) if finest else fine_enough(fit, first)[0]
 
 
 def first_mesh(model: CableModel) -> int:

@@ -102,14 +102,13 @@ class _Run:
         step("fit the declared model", 0, 1)
         n = config.model.n or fitting.first_mesh(declared.model)
         if config.estimation.robust:
-            fit, _ = fitting.fit_declared(config, declared, measured)
+            fit = fitting.fit_declared(config, declared, measured)
             outliers = outliers_of(fit, inputs)
             inputs, measured = outliers.poses, measured_poses(config, outliers.poses)
             warnings += remarks.left_out(outliers)
         others = config.estimation, declared.model, measured, n
         compared = begin(executor, fitting.simpler_fits, *others)
-        fit, error = fitting.fit_declared(config, declared, measured)
-        meshed = fit  # whose mesh error is known
+        fit = fitting.fit_declared(config, declared, measured)
         confirming = begin(executor, fitting.minimum_by_ipopt, fit)
         step("fit the declared model", 1, 1)
 
@@ -131,32 +130,25 @@ class _Run:
         own = own if best.point is fit.point else staged(best)
         fit = fitting.not_worse(best, [*stages, own])
         if not diagnosed:
-            near = None
             if fit.noise.source == "misfit" and enough_poses(fit):
                 near = with_loose_poses(fit, from_data(fit)[0]) or at_random(fit)
-            if near is not None:
-                fit, error = self.meshed(near)
-                meshed = fit
+                fit = fit if near is None else self.meshed(near)
             fit = as_measured(fit)
         own = own if fit is best else staged(fit)
         nearest, own = fitting.nearest_to_poses(fit, [*stages, own], staged, diagnosed=diagnosed)
         stages = [*stages, own]
         step("compare with simpler fits", 1, 1)
-        found: dict[str, Any] = {}
         if diagnosed:
-            fit, error, found = self.close_the_loop(
-                fit, nearest, stages, measured, reported, center
-            )
+            fit, found = self.close_the_loop(fit, nearest, stages, measured, reported, center)
         else:
-            fit = nearest
-            error = error if fit is meshed else mesh_error(fit)
+            fit, found = nearest, {}
         return judged(
             Outcome(
                 config=config,
                 poses=tuple(inputs),
                 measurement=_summary(config, inputs, measured, fit),
                 stages=tuple(stages),
-                mesh_error=error,
+                mesh_error=mesh_error(fit),
                 timing={**self.seconds, "total": time.perf_counter() - self.began},
                 fit=fit,
                 warnings=tuple(warnings),
@@ -174,24 +166,15 @@ class _Run:
         measured: Sequence[MeasuredPose],
         reported: Sequence[str],
         center: tuple[float, float] | None,
-    ) -> tuple[Fit, float, dict[str, Any]]:
+    ) -> tuple[Fit, dict[str, Any]]:
         """Diagnose the declared model's residual and add missing effects.
 
-        Returns the last fit, the error [m] of its mesh, and the diagnosis in the fields of an
-        `Outcome`.
+        Returns the last fit, and the diagnosis in the fields of an `Outcome`.
 
-        Parameters
-        ----------
-        declared : Fit
-            Of the declared model.
-        nearest : Fit
-            The declared fit, or a fit with the misfit as noise where that comes nearer to the
-            poses. It is reported unless effects are found, or nothing is missing.
-        stages : list of Stage
-            Its last stage, the declared one, gets its intervals; another follows if effects are
-            added.
-        reported : sequence of str
-            Parameters of the effects that the configuration declares.
+        `nearest`: the declared fit, or a fit with the misfit as noise where that comes nearer to
+        the poses; it is reported unless effects are found, or nothing is missing. The last of the
+        `stages`, the declared one, gets its intervals; another follows if effects are added.
+        `reported`: parameters of the effects that the configuration declares.
         """
         began, options = time.perf_counter(), self.config.diagnosis
         kept_mesh = self.config.model.n is not None
@@ -208,11 +191,10 @@ class _Run:
         )
         unknown = diagnosis.unexplained and not diagnosis.added
         fit = nearest if unknown and nearest is not declared else diagnosis.after
-        fit, error = self.meshed(fit, SETTLED_MODES)
-        meshed = fit  # whose mesh error is known
-        confirming = None
-        if diagnosis.added:
-            confirming = begin(self.executor, fitting.minimum_by_ipopt, fit)
+        fit = self.meshed(fit, SETTLED_MODES)
+        confirming = (
+            begin(self.executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
+        )
         next_pose = separating_pose(diagnosis.after, diagnosis.added)
         if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
             stages[-1] = _marked(stages[-1], explains=False)
@@ -232,7 +214,6 @@ class _Run:
                 own = fit_stage("closed", best, measured, profile_intervals(best), names)
             fit = best
             stages.append(own)
-        error = error if fit is meshed else mesh_error(fit)
         diagnosis = replace(diagnosis, after=fit)
         validated = diagnosis.validation_after
         told = validated.complete and not diagnosis.added
@@ -247,13 +228,11 @@ class _Run:
             "cross_validated": validated.rmse if told else None,
             "hidden_weight": diagnosis.weight,
         }
-        return fit, error, found
+        return fit, found
 
-    def meshed(self, fit: Fit, modes: int = SMOOTH_MODES) -> tuple[Fit, float]:
-        """The fit on a fine enough mesh, or on the declared one; the error of that mesh [m]."""
-        if self.config.model.n:
-            return fit, mesh_error(fit)
-        return fine_enough(fit, fit.model.n, modes)
+    def meshed(self, fit: Fit, modes: int = SMOOTH_MODES) -> Fit:
+        """The fit on a fine enough mesh, or as it is on the declared one."""
+        return fit if self.config.model.n else fine_enough(fit, fit.model.n, modes)[0]
 
     def confirmed(self, fit: Fit, confirming: Callable[[], fitting.Minimum]) -> Fit:
         """Compare a fit with the minimum that IPOPT has found in the meantime."""

@@ -132,7 +132,7 @@ def varied(request):
     """A session in the plane whose clamps turn, or lengths differ, with its declared fit."""
     found = drawn(generator_of(7, 1), 2, 0, request.param)
     measured = measured_poses(found.session, read_inputs(found.session))
-    return found, fit_declared(found.session, declared_model(found.session), measured)[0]
+    return found, fit_declared(found.session, declared_model(found.session), measured)
 
 
 def test_evidence_of_random_unknowns_is_that_of_their_covariance(varied):
@@ -178,7 +178,7 @@ def misfit():
     """A session in space whose clamps turn from pose to pose, and its declared fit: a misfit."""
     found = drawn(generator_of(3306, 6), 3, 0, "clamp_rotation")
     measured = measured_poses(found.session, read_inputs(found.session))
-    return found, fit_declared(found.session, declared_model(found.session), measured)[0]
+    return found, fit_declared(found.session, declared_model(found.session), measured)
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def rubbed():
     """A session in the plane with friction at its pins, a misfit, fitted from the shapes."""
     found = drawn(generator_of(3306, 20), 2, 0, "pin_moment")
     measured = measured_poses(found.session, read_inputs(found.session))
-    fit, _ = fit_declared(found.session, declared_model(found.session), measured)
+    fit = fit_declared(found.session, declared_model(found.session), measured)
     assert fit.noise.source == "misfit"
     return found, with_loose_poses(fit, from_data(fit)[0])
 
@@ -315,7 +315,7 @@ def searched(seed, index, count, random="", among=()):
     """A simulated session and the search in its declared fit, among these effects or all."""
     found = drawn(generator_of(seed, index), 2, count, random)
     measured = measured_poses(found.session, read_inputs(found.session))
-    fit, _ = fit_declared(found.session, declared_model(found.session), measured)
+    fit = fit_declared(found.session, declared_model(found.session), measured)
     exclude = [name for name in EFFECTS if among and name not in among]
     return found, Search(Trials(fit, None, exclude, SIGNIFICANCE, InProcess()), 4, lambda *_: None)
 
@@ -412,7 +412,7 @@ def test_a_stretch_with_a_low_score_is_tried_before_pairs():
 def test_pose_that_its_own_scatter_tips_over_says_nothing_of_the_model():
     session = drawn(generator_of(3301, 7), 2, 0, "rest_curvature").session
     measured = measured_poses(session, read_inputs(session))
-    fit, _ = fit_declared(session, declared_model(session), measured)
+    fit = fit_declared(session, declared_model(session), measured)
     shape = fit_stage("batch", fit, measured, {}, ()).shapes["pose_02"]
     assert shape.rmse > 0.1
     assert shape.measured_branch.rmse < 0.003

@@ -175,7 +175,7 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
         replace(item, held_out=k == left_out)
         for k, item in enumerate(measured_poses(config, read_inputs(config)))
     ]
-    fit, _ = fit_declared(config, declared_model(config, None, None), measured)
+    fit = fit_declared(config, declared_model(config, None, None), measured)
     assert 6e-4 < fit.p[0] < 2.4e-3  # a factor of two
     poses = [item.pose for item in measured]
     predictions = predict_poses(fit.model, fit.p, fit.rest, poses)

@@ -180,7 +180,7 @@ def test_the_residual_of_a_missing_effect_has_no_outliers():
     declared = declared_model(config)
     for every in (6, 16):
         poses = tuple(replace(item, points=item.points[::every], means=None) for item in inputs)
-        fit, _ = fit_declared(config, declared, measured_poses(config, poses))
+        fit = fit_declared(config, declared, measured_poses(config, poses))
         found = outliers_of(fit, poses)
         assert not explains(fit)
         assert found.lines == len(fit.problem.fitted)

@@ -47,7 +47,7 @@ def session(folder, count, marked, std):
 
 
 def fit_of(config, measured):
-    return fit_declared(config, declared_model(config), measured)[0]
+    return fit_declared(config, declared_model(config), measured)
 
 
 @pytest.mark.parametrize("marked", [False, pytest.param(True, marks=pytest.mark.long)])
