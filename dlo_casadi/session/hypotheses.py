@@ -66,8 +66,24 @@ class ReadSession:
 
     @cached_property
     def lines(self) -> "Lines":
-        """Measured lines beside their declared ends."""
-        return lines_of(self.config, self.read)
+        """Measured lines beside their declared ends.
+
+        A photograph is searched for a line between its declared ends, and wrong ends may hide the
+        line. Where several poses do not fit, lines are searched for again without their ends.
+        """
+        experiment, found = self.config.experiment, {item.name: item for item in self.read}
+        lines = _lines(self.config, found)
+        if experiment.boundary.end != "free":
+            fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
+            sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
+            poses = [pose for pose in experiment.poses if pose.name not in sound]
+            doubtful = [pose for pose in poses if pose.paths and pose.paths[0].is_file()]
+            if len(doubtful) > 1:
+                for pose in doubtful:
+                    if (line := line_without_end(self.config, pose)) is not None:
+                        found[pose.name] = PoseInput(pose.name, pose.role, line)
+                lines = _lines(self.config, found)
+        return lines
 
     def with_experiment(self, **values: object) -> Self:
         """Return the session with other values in its configuration's `experiment`."""
@@ -231,27 +247,6 @@ def overall(misfit: FloatArray) -> float:
     """Root mean square over the poses without the worst fifth: one or two poses may be wrong."""
     kept = np.sort(misfit)[: max(1, int(np.ceil(NEARLY_ALL * len(misfit))))]
     return float(np.sqrt(np.mean(kept**2)))
-
-
-def lines_of(config: Config, read: Sequence[PoseInput]) -> Lines:
-    """Measured lines beside their declared ends.
-
-    A photograph is searched for a line between its declared ends, and wrong ends may hide the
-    line. Where several poses do not fit, lines are searched for again without their ends.
-    """
-    found = {item.name: item for item in read}
-    lines = _lines(config, found)
-    if config.experiment.boundary.end != "free":
-        fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
-        sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
-        poses = [pose for pose in config.experiment.poses if pose.name not in sound]
-        doubtful = [pose for pose in poses if pose.paths and pose.paths[0].is_file()]
-        if len(doubtful) > 1:
-            for pose in doubtful:
-                if (line := line_without_end(config, pose)) is not None:
-                    found[pose.name] = PoseInput(pose.name, pose.role, line)
-            lines = _lines(config, found)
-    return lines
 
 
 def _lines(config: Config, read: dict[str, PoseInput]) -> Lines:
