@@ -77,7 +77,6 @@ def find_sessions(where: str | Path) -> tuple[Path, dict[str, Path]]:
 
 
 def _is_session(path: Path) -> bool:
-    """Whether a YAML file is meant as a configuration."""
     try:
         content = path.read_bytes()
     except OSError:

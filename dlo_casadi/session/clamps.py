@@ -110,7 +110,6 @@ class _Shown:
 
     @property
     def wrong(self) -> bool:
-        """Whether the line contradicts the declared value."""
         return self.off(self.value) > HEADING_OFF
 
     def __str__(self) -> str:

@@ -306,22 +306,20 @@ def repeated(session: ReadSession) -> tuple[Suspicion, ...]:
 
 def stretched(session: ReadSession) -> tuple[Suspicion, ...]:
     """Markers that are farther apart than the cable between them is long."""
-    texts, marked = {}, 0
-    for item in session.read:
-        if item.s is None:
-            continue
-        marked += 1
-        chords, along = np.linalg.norm(np.diff(item.points, axis=0), axis=1), np.diff(item.s)
+    marked = [(x.name, x.points, x.s) for x in session.read if x.s is not None]
+    texts = {}
+    for name, points, s in marked:
+        chords, along = np.linalg.norm(np.diff(points, axis=0), axis=1), np.diff(s)
         k = int((chords - along).argmax()) if len(along) else 0
         if len(along) and chords[k] - along[k] > STRETCHED * session.config.cable.length:
-            texts[item.name] = (
-                f"its markers at s_m {item.s[k]:g} and {item.s[k + 1]:g} are {chords[k]:.4g} m "
-                f"apart, the cable between them is {along[k]:.4g} m long"
+            texts[name] = (
+                f"its markers at s_m {s[k]:g} and {s[k + 1]:g} are {chords[k]:.4g} m apart, the "
+                f"cable between them is {along[k]:.4g} m long"
             )
     advice = ". Try: s_m in metres along the cable, each beside its own point."
-    if texts and 2 * len(texts) > marked:
+    if texts and 2 * len(texts) > len(marked):
         name = next(iter(texts))
-        told = f"{len(texts)} of {counted(marked, 'pose')}"
+        told = f"{len(texts)} of {counted(len(marked), 'pose')}"
         said = f"s_m contradicts the points of {told}. {name}: "
         return (Suspicion(said + texts[name] + advice, True),)
     return tuple(Suspicion.of_pose(name, text + advice) for name, text in texts.items())

@@ -117,7 +117,6 @@ def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
 
 
 def _reader(config: Config, pose: Pose) -> Callable[[Config, Pose], PoseInput]:
-    """Function that reads a pose."""
     if pose.points is not None:
         return _read_points
     if config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv":
