@@ -94,7 +94,9 @@ class _Run:
         measured = measured_poses(config, inputs)
         self.seconds["vision"] = time.perf_counter() - self.began
         warnings = [*config.warnings, *remarks.reading_warnings(inputs, config.skipped), *odd]
-        center = _center(inputs)
+        centers = [item.center for item in inputs if item.center is not None]
+        x, y = np.mean(centers or [(np.nan, np.nan)], axis=0).tolist()
+        center = (x, y) if centers else None
         pixels = [item.pixel for item in inputs if item.pixel is not None]
         pixel = float(np.median(pixels)) if pixels else None
         declared = fitting.declared_model(config, center, pixel)
@@ -270,12 +272,6 @@ def _marked(stage: Stage, explains: bool) -> Stage:
     if not explains:
         found = {name: replace(estimate, interval_95=None) for name, estimate in found.items()}
     return replace(stage, parameters=found, explains=explains)
-
-
-def _center(inputs: Sequence[PoseInput]) -> tuple[float, float] | None:
-    centers = [item.center for item in inputs if item.center is not None]
-    x, y = np.mean(centers or [(np.nan, np.nan)], axis=0).tolist()
-    return (x, y) if centers else None
 
 
 def _parameters_of(labels: set[str], model: CableModel) -> list[str]:
