@@ -179,7 +179,10 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
         )
         update = {"boundary": boundary, "poses": poses}
         as_held = config.model_copy(
-            update={"experiment": config.experiment.model_copy(update=update)}
+            update={
+                "experiment": config.experiment.model_copy(update=update),
+                "model": config.model.model_copy(update={"n": 20}),
+            }
         )
         if name == right:
             measured, _ = drawn(as_held, generator, hidden)
@@ -192,9 +195,12 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
             model = replace(model, priors=kept)
         else:
             model = model.with_effect(effect())
-        declared = replace(declared, model=model, values=dict(START.get(name, {})))
+        start = model.nominal.copy()
+        for full, value in START.get(name, {}).items():
+            start[model.names.index(full)] = value
+        declared = replace(declared, model=model, start=start, free=list(model.names))
         try:
-            fit = fit_declared(as_held, declared, items, 20)
+            fit = fit_declared(as_held, declared, items)
             gains[name] = 2 * fit.log_evidence
         except EstimationError:  # no shape of the model comes near the measured ones
             gains[name] = -1e9
