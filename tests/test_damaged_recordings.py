@@ -21,7 +21,6 @@ from dlo_casadi.recordings import (
     mocap,
     read_recording,
 )
-from dlo_casadi.recordings.lost import without_held
 from dlo_casadi.recordings.stills import Offset, Still, _still, align_clocks, find_stills
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
@@ -151,7 +150,7 @@ def test_without_noise_a_marker_may_be_constant(take):
     at = np.clip(take.t - 3.0, 0.0, 1.0)[:, None] * [0.0, 0.1, 0.0]
     exact = {f"m{k}": (k > 0) * at + [0.1 * k, 0.2, 0.3] for k in range(4)}
     recording = recording_of(replace(take, markers=exact))
-    assert without_held(recording).assumptions == ()
+    assert recording.without_held().assumptions == ()
 
 
 def test_a_gripper_whose_last_pose_is_held_costs_no_other_pose(take):

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, library
 from dlo_casadi.recordings.clouds import cloud_of
-from dlo_casadi.recordings.lost import without_zeros
 from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream, checked_times
 
 _NANO = 1e-9
@@ -98,16 +97,17 @@ def read_bag(path: Path, scale: float = 1.0) -> Recording:
         times = max((links[below][1] for below in _chain(name, links)[:-1]), key=len)
         rows["body", name, "tf", name] = [(t, _ORIGIN) for t, _ in times]
     sources = [_stream(kind, name, frame, items) for (kind, name, _, frame), items in rows.items()]
-    seen_markers, zeros = without_zeros([x for x in sources if x.kind == "marker"])
+    markers = Recording(tuple(x for x in sources if x.kind == "marker")).without_zeros()
     others = [x for x in sources if x.kind != "marker"]
-    streams = [_rooted(stream, links) for stream in (*seen_markers, *others)]
+    streams = [_rooted(stream, links) for stream in (*markers.streams, *others)]
     seen = tuple(_cloud(message, t, links, scale) for t, message in messages)
     roots = {x.frame for x in streams if x.kind != "wrench"} | {x.frame for x in seen}
     roots -= {x.name for x in streams if x.kind == "body"}
     told = tuple(
         replace(x, frame="") if x.kind == "wrench" and x.frame in roots else x for x in streams
     )
-    return Recording(told, seen, (*remarks, *zeros), up_by="as ROS has it (REP 103)")
+    remarks += markers.assumptions
+    return Recording(told, seen, tuple(remarks), up_by="as ROS has it (REP 103)")
 
 
 def _time(message: Any) -> float:

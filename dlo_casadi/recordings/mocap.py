@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError, counted, library
-from dlo_casadi.recordings.lost import without_zeros
 from dlo_casadi.recordings.recording import Kind, Recording, Stream, checked_times, factor
 
 # Sections of a Vicon file that hold positions; others (devices, model outputs) are skipped.
@@ -62,8 +61,8 @@ def read_mocap_csv(path: Path) -> Recording:
         raise MeasurementError(
             "holds no labelled marker and no rigid body.\n  Try: label them before the export."
         )
-    seen, zeros = without_zeros(streams)
-    return Recording(seen, (), (*remarks, *zeros), up=own, up_by=f"as {program} exports it")
+    said = f"as {program} exports it"
+    return Recording(tuple(streams), (), remarks, own, said).without_zeros()
 
 
 def _text(path: Path) -> tuple[str, tuple[str, ...]]:
@@ -244,10 +243,9 @@ def read_c3d(path: Path) -> Recording:
         raise MeasurementError(f"POINT:RATE is {rate:g} Hz.\n  {_WHOLE}")
     t = np.arange(places.shape[2]) / rate
     scale = factor("".join(point.get("UNITS", [])[:1]) or "mm")  # mm by the standard
-    streams = [Stream(labels[k], "marker", t, scale * places[:, k].T) for k in named]
+    streams = tuple(Stream(labels[k], "marker", t, scale * places[:, k].T) for k in named)
     screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
     own, said = screen.lstrip("+"), "as POINT:Y_SCREEN tells"
     if own not in ("x", "y", "z"):
         own, said = "z", f"in most C3D files; POINT:Y_SCREEN is {screen.upper() or 'absent'}"
-    seen, zeros = without_zeros(streams)
-    return Recording(seen, (), zeros, up=own, up_by=said)
+    return Recording(streams, up=own, up_by=said).without_zeros()

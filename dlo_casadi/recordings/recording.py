@@ -1,13 +1,14 @@
 """One form for everything that laboratories record: streams in SI units, z up, with own clocks."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import find_objects, label
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.errors import MeasurementError
 
 Kind = Literal["marker", "body", "wrench"]
@@ -22,6 +23,9 @@ LARGEST = 100.0  # m, distance from the origin beyond which coordinates cannot b
 # Longest time between two frames of a recording: a longer one is a wrong time, such as one that is
 # counted from 1970 beside others from the start of the recording (1.7e9 s).
 _PAUSE = 86400.0  # s
+_HELD = 0.4  # s, shortest stretch in which an exactly constant marker is a held one
+_CHANGES = 0.8  # share of the frames in which a marker with noise changes; one without moves less
+_EQUAL = 1e-9  # m, above the rounding of a change of axes, below the resolution of all files
 METRES = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "centimeters": 0.01}
 METRES |= {"mm": 1e-3, "millimeters": 1e-3, "millimetres": 1e-3}
 
@@ -118,6 +122,66 @@ class Recording:
             for cloud in self.clouds
         )
         return Recording(streams, clouds, (*self.assumptions, *assumed))
+
+    def without_zeros(self) -> "Recording":
+        """The recording, streams nan where their position is exactly (0, 0, 0).
+
+        Programs write zeros for what they do not see. Forces may be zero, and a body that is always
+        at the origin, such as a frame of TF, is there.
+        """
+
+        def zero(stream: Stream) -> BoolArray:
+            found: BoolArray = np.all(stream.values[:, :3] == 0.0, axis=1)
+            there = stream.kind == "wrench" or (stream.kind == "body" and found.all())
+            return np.zeros_like(found) if there else found
+
+        return self._without(zero, "at exactly (0, 0, 0)")
+
+    def without_held(self) -> "Recording":
+        """The recording, markers nan where their last position is held while most others change.
+
+        A recording without noise, in which others change only while they move, stays as it is.
+        """
+
+        def held(stream: Stream) -> BoolArray:
+            found = np.zeros(len(stream.t), bool)
+            if stream.kind == "marker" and stream.moves:
+                step = np.abs(np.diff(stream.values, axis=0)).max(axis=1)
+                for (run,) in find_objects(label(step < _EQUAL)[0]):
+                    begin, end = stream.t[run.start], stream.t[run.stop]
+                    if end - begin >= _HELD and self._most_change(stream, begin, end):
+                        found[run.start + 1 : run.stop + 1] = True
+            return found
+
+        return self._without(held, "exactly constant, unlike most markers,")
+
+    def _most_change(self, held: Stream, begin: float, end: float) -> bool:
+        """Whether most other markers on the same clock change all the time between times [s]."""
+        changes = []
+        for other in self.of("marker").values():
+            if other is held or other.clock != held.clock:
+                continue
+            inside = other.values[(other.t >= begin) & (other.t <= end)]
+            inside = inside[np.isfinite(inside).all(axis=1)]
+            if len(inside) > 1:
+                steps = np.abs(np.diff(inside, axis=0)).max(axis=1)
+                changes.append(bool(np.mean(steps > _EQUAL) > _CHANGES))
+        return 2 * sum(changes) > len(changes)
+
+    def _without(self, lost: Callable[[Stream], BoolArray], how: str) -> "Recording":
+        """Nan in the frames (n,) in which each stream is lost, with a remark on each."""
+        streams, remarks = [], []
+        for stream in self.streams:
+            frames = lost(stream)
+            values = np.where(frames[:, None], np.nan, stream.values)
+            streams.append(replace(stream, values=values))
+            if frames.any():
+                remarks.append(
+                    f"{stream.kind} {stream.name} is {how} in {frames.sum()} of {len(frames)} "
+                    "frames, which count as not seen"
+                )
+        assumptions = (*self.assumptions, *remarks)
+        return replace(self, streams=tuple(streams), assumptions=assumptions)
 
 
 def together(recordings: Sequence[Recording]) -> Recording:

@@ -16,7 +16,6 @@ from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.arc_lengths import arc_lengths
 from dlo_casadi.recordings.forces import readings_of
 from dlo_casadi.recordings.grippers import Gripper, along_cable, find_gripper
-from dlo_casadi.recordings.lost import without_held
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.stills import Still, align_clocks, find_stills
 from dlo_casadi.recordings.wishes import FREE, Wishes
@@ -91,7 +90,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     Called `name`. Raises MeasurementError if the recording lacks something that a session needs;
     the message says what to try.
     """
-    recording, offsets = align_clocks(without_held(recording))
+    recording, offsets = align_clocks(recording.without_held())
     stills = find_stills(recording, wishes.hold)
     start = find_gripper(wishes.start, wishes.start_offset, "start", stills, recording)
     end = None
