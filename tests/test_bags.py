@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings import CloudView, Wishes, make_session, read_recording
 from dlo_casadi.recordings.bags import _markers
-from dlo_casadi.recordings.grippers import find_gripper
+from dlo_casadi.recordings.fixtures import find_gripper
 from dlo_casadi.recordings.stills import align_clocks, find_stills
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")

@@ -16,7 +16,7 @@ from dlo_casadi.errors import MeasurementError, VisionError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.recordings import CloudView, Recording, Stream, Wishes, make_session, read_recording
 from dlo_casadi.recordings.clouds import cloud_of
-from dlo_casadi.recordings.grippers import Gripper, along_cable
+from dlo_casadi.recordings.fixtures import Gripper, along_cable
 from dlo_casadi.recordings.recording import Cloud
 from dlo_casadi.vision import KnownCable, line_in_cloud, of_color
 

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.recordings.grippers import Gripper
+from dlo_casadi.recordings.fixtures import Gripper
 
 # m, distance of a marker from a fixture below which their direction is not the cable's: a spline
 # through a marker 1 mm from a gripper's origin, in any direction, was 4 to 14 mm too long.

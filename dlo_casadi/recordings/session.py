@@ -14,8 +14,7 @@ from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.arc_lengths import arc_lengths
-from dlo_casadi.recordings.forces import readings_of
-from dlo_casadi.recordings.grippers import Gripper, along_cable, find_gripper
+from dlo_casadi.recordings.fixtures import Gripper, along_cable, find_gripper, readings_of
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.stills import Still, align_clocks, find_stills
 from dlo_casadi.recordings.wishes import FREE, Wishes
