@@ -95,7 +95,7 @@ def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
         raise MeasurementError(
             f"ends after {len(table)} of {counted(int(said), 'frame')}.\n  {_AGAIN}"
         )
-    t = _times(table[:, 1], lines)
+    t = checked_times(table[:, 1], lines)
     scale = factor(meta.get("Length Units", "m"))
     columns: dict[tuple[str, str], dict[str, int]] = {}
     for c in range(2, len(rows[head])):
@@ -132,7 +132,7 @@ def _vicon(rows: Rows) -> Iterator[Stream]:
                 f"line {k + 2}: the rate is {show(rate)} frames a second.\n  {_AGAIN}"
             )
         lines, table = _table(rows[k + 5 : stop], len(axes), k + 6)
-        t = _times(table[:, 0] / float(rate), lines)
+        t = checked_times(table[:, 0] / float(rate), lines)
         heads = [c for c in range(2, len(names)) if names[c].strip()]
         for c, following in zip(heads, [*heads[1:], len(axes)], strict=True):
             at = {axes[i].strip(): i for i in range(c, following)}
@@ -168,40 +168,30 @@ def _quaternions(turns: FloatArray, unit: str) -> FloatArray:
     """Quaternions (n, 4) from quaternions, or from rotation vectors (n, 3) in a unit of angle."""
     if turns.shape[1] == 4:
         return turns
-    if unit.strip().lower() not in _RADIANS:
-        raise MeasurementError(
-            f"the unit of angle is {unit!r}.\n  Try: an export in one of {', '.join(_RADIANS)}."
-        )
+    radians = factor(unit, "angle", _RADIANS)
     found = np.full((len(turns), 4), np.nan)
     seen = np.isfinite(turns).all(axis=1)
-    vectors = turns[seen] * _RADIANS[unit.strip().lower()]
-    found[seen] = Rotation.from_rotvec(vectors).as_quat()
+    found[seen] = Rotation.from_rotvec(turns[seen] * radians).as_quat()
     return found
 
 
-def _table(rows: Sequence[list[str]], width: int, first: int) -> tuple[list[int], FloatArray]:
-    """Line numbers, and numbers (n, width), of rows that are not blank; nan in empty cells."""
-    lines = [first + k for k, row in enumerate(rows) if any(cell.strip() for cell in row)]
-    table = np.full((len(lines), width), np.nan)
-    for k, line in enumerate(lines):
-        row = rows[line - first]
+def _table(rows: Sequence[list[str]], width: int, first: int) -> tuple[list[str], FloatArray]:
+    """Lines in the file, and numbers (n, width), of rows that are not blank; nan in empty cells."""
+    filled = [(f"line {k}", row) for k, row in enumerate(rows, first) if any(map(str.strip, row))]
+    if not filled:
+        raise MeasurementError(f"holds no frames.\n  {_AGAIN}")
+    table = np.full((len(filled), width), np.nan)
+    for numbers, (line, row) in zip(table, filled, strict=True):
         if len(row) < width:
             raise MeasurementError(
-                f"line {line} has {len(row)} of {counted(width, 'cell')}: the file is "
-                f"truncated.\n  {_AGAIN}"
+                f"{line} has {len(row)} of {counted(width, 'cell')}: the file is truncated.\n"
+                f"  {_AGAIN}"
             )
         try:
-            table[k] = [float(cell) if cell.strip() else np.nan for cell in row[:width]]
+            numbers[:] = [float(cell) if cell.strip() else np.nan for cell in row[:width]]
         except ValueError as error:
-            raise MeasurementError(f"line {line}: {error}.\n  {_AGAIN}") from None
-    if not lines:
-        raise MeasurementError(f"holds no frames.\n  {_AGAIN}")
-    return lines, table
-
-
-def _times(t: FloatArray, lines: Sequence[int]) -> FloatArray:
-    """The same times [s] of frames on these lines of a file, checked."""
-    return checked_times(t, [f"line {line}" for line in lines])
+            raise MeasurementError(f"{line}: {error}.\n  {_AGAIN}") from None
+    return [line for line, _ in filled], table
 
 
 _WHOLE = "Try: export the file again, whole."

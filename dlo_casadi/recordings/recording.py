@@ -1,6 +1,6 @@
 """One form for everything that laboratories record: streams in SI units, z up, with own clocks."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -211,13 +211,13 @@ def together(recordings: Sequence[Recording]) -> Recording:
     )
 
 
-def factor(unit: str) -> float:
-    """Convert a unit of length named in a file to metres."""
-    if unit.strip().lower() not in METRES:
+def factor(unit: str, of: str = "length", known: Mapping[str, float] = METRES) -> float:
+    """Convert a unit named in a file, by default one of length to metres."""
+    if unit.strip().lower() not in known:
         raise MeasurementError(
-            f"the unit of length is {unit!r}.\n  Try: an export in one of {', '.join(METRES)}."
+            f"the unit of {of} is {unit!r}.\n  Try: an export in one of {', '.join(known)}."
         )
-    return METRES[unit.strip().lower()]
+    return known[unit.strip().lower()]
 
 
 def checked_times(t: FloatArray, places: Sequence[str]) -> FloatArray:
