@@ -76,11 +76,10 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
     """Check a configuration from a file or from arguments; raises ConfigError as `load_config`."""
     config = source.checked(kind)
     if problems := [
-        *_contradictions(config.experiment),
+        *_contradictions(config.experiment, config.cable.length),
         *_weightless(config),
         *wrong_effects(config),
         *_impossible_values(config.experiment, config.cable.length),
-        *_wrong_clips(config.experiment, config.cable.length),
         *obstacle_problems(
             config.experiment.obstacles,
             config.experiment.gravity,
@@ -157,15 +156,18 @@ def _called(index: int, pose: Pose) -> str:
     return f"pose {index + 1} ({pose.shown_by})"
 
 
-def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
-    """Find poses that contradict the boundary, the kind of measurement, or each other."""
+def _contradictions(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
+    """Find poses that contradict boundary, measurement, the cable's length [m], or each other."""
     measurement, held, poses = experiment.measurement, experiment.boundary, experiment.poses
     if experiment.in_space and measurement.kind == "images" and measurement.board is None:
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
         yield ConfigProblem(("experiment", "measurement"), text)
     yield from undetermined(held.start, held.end, experiment.in_space)
+    if differ := clips_differ(poses):
+        yield ConfigProblem(("experiment", "poses"), differ)
     names = [pose.name for pose in poses]
     for i, pose in enumerate(poses):
+        at: Place = ("experiment", "poses", i)
         wrong = [*_file_problems(experiment, pose), *_end_problems(experiment, pose)]
         if (first := names.index(pose.name)) < i:
             text = "results are named after the file without its ending, give each its own"
@@ -173,22 +175,16 @@ def _contradictions(experiment: Experiment) -> Iterator[ConfigProblem]:
         if pose.branch == "previous" and i == 0:
             text = "branch: previous needs a pose before this one; use ccw or cw"
             wrong.append((text, "branch"))
+        if outside := [s for s in pose.at or () if not 0.0 <= s <= length]:
+            text = f"at {outside[0]:g} m is not between 0 and cable.length {length:g} m: arc"
+            wrong.append((f"{text} length from the start, in metres?", "at"))
         for message, key in wrong:
-            at: Place = ("experiment", "poses", i)
             yield ConfigProblem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
+        for message, k in clip_problems(pose, length, len(experiment.gravity)):
+            yield ConfigProblem((*at, "clips", k), f"{_called(i, pose)}: {message}")
     if not any(pose.role == "fit" for pose in poses):
         text = "no pose has role: fit, there is nothing to fit to"
         yield ConfigProblem(("experiment", "poses"), text)
-
-
-def _wrong_clips(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
-    """Find clips that are impossible on a cable of that length [m]."""
-    if wrong := clips_differ(experiment.poses):
-        yield ConfigProblem(("experiment", "poses"), wrong)
-    for i, pose in enumerate(experiment.poses):
-        for text, k in clip_problems(pose, length, len(experiment.gravity)):
-            at: Place = ("experiment", "poses", i, "clips", k)
-            yield ConfigProblem(at, f"{_called(i, pose)}: {text}")
 
 
 def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str | None]]:
@@ -351,18 +347,11 @@ def _oddities(config: Config) -> Iterator[str]:
 
 
 def _impossible_values(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
-    """Find noise, tolerances and arc lengths that are impossible for a cable of that length [m]."""
+    """Find noise and tolerances that are impossible for a cable of that length [m]."""
     std = experiment.measurement.std
     if std is not None and std not in (possible := Range(_FINEST_STD, length, "m")):
         text = f"std: {possible.complaint(std)}; without it, it is estimated from the data"
         yield ConfigProblem(("experiment", "measurement", "std"), text)
-    for i, pose in enumerate(experiment.poses):
-        if outside := [s for s in pose.at or () if not 0.0 <= s <= length]:
-            text = (
-                f"{_called(i, pose)}: at {outside[0]:g} m is not between 0 and cable.length "
-                f"{length:g} m: arc length from the start, in metres?"
-            )
-            yield ConfigProblem(("experiment", "poses", i, "at"), text)
     # A tolerance must fit within its bounds; otherwise the bounds decide instead.
     torsional_stiffness = 1.0 if experiment.in_space else None
     cable = CableData(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
