@@ -348,14 +348,6 @@ def _table(words: str, *columns: int) -> BeforeValidator:
     )
 
 
-def _moment(value: object) -> object:
-    if isinstance(value, list | tuple) and len(value) in (1, 3):
-        return value
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return (value,)
-    raise ValueError(f"one number belongs here, in space three [mx, my, mz], found {show(value)}")
-
-
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Heading = Annotated[Number, within(HEADING)]
 Positive = Annotated[Number, Field(gt=0.0)]
@@ -382,7 +374,8 @@ ArcLengths = Annotated[tuple[float, ...], _table("arc lengths [s, ...]")]
 Force = Annotated[Direction, within(FORCE)]
 Moment = Annotated[
     tuple[Number, ...],
-    BeforeValidator(_moment, json_schema_input_type=Number | Row),
+    _listed("one number belongs here, in space three [mx, my, mz]", Number | Row, 1, 3),
+    BeforeValidator(lambda value: [value] if type(value) in (int, float) else value),
     within(MOMENT),
 ]
 Quaternion = Annotated[
