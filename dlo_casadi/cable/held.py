@@ -165,7 +165,7 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
             )
     posed = Pose(**given)
     length, axes = model.cable.length, model.node.dimension
-    if wrong := [text for text, _ in clip_problems(posed, length, axes)]:
+    if wrong := [text for text, _ in clip_problems(posed.clips, length, axes)]:
         raise DloError(f"{name}: {'; '.join(wrong)}")
     pose = posed.held
     for key, at in (("start", pose.start), ("end", pose.end)):

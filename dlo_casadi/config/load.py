@@ -163,7 +163,7 @@ def _contradictions(experiment: Experiment, length: float) -> Iterator[ConfigPro
         text = "photographs of a cable in space need a board of markers; a reference is of a plane"
         yield ConfigProblem(("experiment", "measurement"), text)
     yield from undetermined(held.start, held.end, experiment.in_space)
-    if differ := clips_differ(poses):
+    if differ := clips_differ([pose.held for pose in poses]):
         yield ConfigProblem(("experiment", "poses"), differ)
     names = [pose.name for pose in poses]
     for i, pose in enumerate(poses):
@@ -180,7 +180,7 @@ def _contradictions(experiment: Experiment, length: float) -> Iterator[ConfigPro
             wrong.append((f"{text} length from the start, in metres?", "at"))
         for message, key in wrong:
             yield ConfigProblem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
-        for message, k in clip_problems(pose, length, len(experiment.gravity)):
+        for message, k in clip_problems(pose.clips, length, len(experiment.gravity)):
             yield ConfigProblem((*at, "clips", k), f"{_called(i, pose)}: {message}")
     if not any(pose.role == "fit" for pose in poses):
         text = "no pose has role: fit, there is nothing to fit to"
@@ -282,7 +282,7 @@ def _unreachable(
                 f"end ({', '.join(f'{x:g}' for x in end)}) m is {distance:.4g} m from the start; "
                 f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?{hint}"
             )
-        elif wrong := too_short(pose, cable.length, at_clips):
+        elif wrong := too_short(pose.held, cable.length, at_clips):
             reasons[pose.name] = wrong
     return reasons
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, Protocol, get_args
+from typing import Literal, get_args
 
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
 from dlo_casadi.config.values import (
@@ -16,6 +16,7 @@ from dlo_casadi.config.values import (
     Positive,
     Quaternion,
 )
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 from dlo_casadi.rod.obstacles import Obstacle as Surface
@@ -76,25 +77,14 @@ class Clip(ConfigSection):
         )
 
 
-class _Clipped(Protocol):
-    """A pose with clips."""
-
-    start: Place
-    end: Place | None
-    clips: tuple[Clip, ...]
-
-    @property
-    def held(self) -> Any: ...
-
-
-def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[str, int]]:
+def clip_problems(clips: Sequence[Clip], length: float, axes: int) -> Iterator[tuple[str, int]]:
     """Problems with the clips of a pose on a cable of that length [m], each with the clip's index.
 
     `axes`: 2 in a plane, 3 in space.
     """
     last, own, other = 0.0, AXES[axes], AXES[5 - axes]
-    names = [held.name for held in pose.held.clips]
-    for k, (clip, called) in enumerate(zip(pose.clips, names, strict=True)):
+    names = [clip.held(k).name for k, clip in enumerate(clips, start=1)]
+    for k, (clip, called) in enumerate(zip(clips, names, strict=True)):
         clamped = clip.kind == "clamped"
         if names.index(called) < k:
             yield f"two clips are called {called}", k
@@ -121,9 +111,9 @@ def clip_problems(pose: _Clipped, length: float, axes: int) -> Iterator[tuple[st
         last = clip.at if clip.at is not None else last
 
 
-def too_short(pose: _Clipped, length: float, slack: float) -> str:
+def too_short(pose: HeldPose, length: float, slack: float) -> str:
     """Why a pose is impossible: a span exceeds its cable by more than a slack [m]; empty if not."""
-    names = ["the start", *(clip.name for clip in pose.held.clips)]
+    names = ["the start", *(clip.name for clip in pose.clips)]
     places = [pose.start, *(clip.place for clip in pose.clips)]
     # A free end is at the last clip at best.
     names.append(names[-1] if pose.end is None else "the end")
@@ -145,9 +135,9 @@ def too_short(pose: _Clipped, length: float, slack: float) -> str:
     return ""
 
 
-def clips_differ(poses: Sequence[_Clipped]) -> str:
+def clips_differ(poses: Sequence[HeldPose]) -> str:
     """Why poses cannot share a session: kinds or numbers of clips differ; empty if they agree."""
-    kinds = [[clip.kind for clip in pose.held.clips] for pose in poses]
+    kinds = [[clip.kind for clip in pose.clips] for pose in poses]
     for i, own in enumerate(kinds):
         if own != kinds[0]:
             first, other = (", ".join(x) or "none" for x in (kinds[0], own))
