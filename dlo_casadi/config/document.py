@@ -189,10 +189,6 @@ class Document(Source):
                 break
         return line
 
-    def located(self, message: str, line: int | None = None) -> ConfigError:
-        """Add the file and the line to an error."""
-        return ConfigError(message, self.source, line)
-
 
 def _read_bytes(source: Path, largest: int) -> bytes:
     """Contents of a file, unless it is too large."""

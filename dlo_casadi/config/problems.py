@@ -98,6 +98,8 @@ class Source:
     """Data to check, and how to describe a place in them."""
 
     data: Any
+    source: Path | None
+    """The file, if they are of one."""
     folder: Path
     """Where the files are that it names."""
     hidden: tuple[str, ...] = ()
@@ -122,20 +124,16 @@ class Source:
         if len(lines) == 1:
             line, message = lines[0]
             said = ": ".join(filter(None, (heading, message)))
-            return self.located(said + remedy, line)
+            return ConfigError(said + remedy, self.source, line or None)
         listed = [f"  {f'line {line}: ' if line else ''}{said}" for line, said in lines[:most]]
         if len(lines) > most:
             listed.append(f"  ... and {len(lines) - most} more")
         heading = heading or f"{len(lines)} problems"
-        return self.located("\n".join([heading, *listed]) + remedy)
+        return ConfigError("\n".join([heading, *listed]) + remedy, self.source)
 
     def line(self, place: Place) -> int:
         """Line of a place in a file; 0 where there is none."""
         return 0
-
-    def located(self, message: str, line: int | None = None) -> ConfigError:
-        """Add the file and the line, where known, to an error."""
-        return ConfigError(message)
 
     def inside(self, key: str, section: str) -> str:
         """Say that a key belongs in a section; empty if there is no section."""
@@ -174,7 +172,7 @@ class Arguments(Source):
     top = "the arguments"
 
     def __init__(self, data: dict[str, Any], names: tuple[str, ...] = ()) -> None:
-        self.data, self.folder, self.names = data, Path(), names
+        self.data, self.source, self.folder, self.names = data, None, Path(), names
 
     def instead(self, section: str) -> str:
         """Advice to pass an object of the library, if there is one for the section."""
