@@ -6,10 +6,10 @@ together, each with its line.
 
 from dlo_casadi.config.document import dump_yaml, read_yaml
 from dlo_casadi.config.effects import declared_effects, declared_setup, wrong_effects
-from dlo_casadi.config.known import known_config
 from dlo_casadi.config.load import (
     any_photographs,
     checked_config,
+    known_config,
     load_as,
     load_config,
 )

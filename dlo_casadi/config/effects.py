@@ -75,6 +75,20 @@ def wrong_effects(config: Config, *, known: bool = False) -> list[ConfigProblem]
     return found
 
 
+def without_values(config: Config) -> Iterator[ConfigProblem]:
+    """Find effects whose declaration leaves values undetermined."""
+    setup = declared_setup(config)
+    for item, effect in declared_effects(config, setup):
+        needed = [q for q in effect.parameters(setup.cable) if q.name not in item.parameters]
+        if effect.kind == "state":
+            text = "changes the rest shape from pose to pose. Try: rest_curvature as it is now"
+            yield ConfigProblem((), f"model.effects: {item.name} {text}")
+        elif needed:
+            listed = ", ".join(f"{q.name} [{q.unit or '1'}]" for q in needed)
+            text = f"{item.name} needs {listed}: no fit tells it. Try: parameters={{name: value}}"
+            yield ConfigProblem((), f"model.effects: {text}")
+
+
 def wrong_limits(config: Config) -> list[ConfigProblem]:
     """Find limits that are meaningless for this cable."""
     given, ends = config.experiment, config.experiment.boundary

@@ -1,4 +1,4 @@
-"""Load a YAML file into a checked configuration; checks across several sections."""
+"""Make checked configurations of YAML files and of arguments; checks across several sections."""
 
 import difflib
 import math
@@ -6,12 +6,23 @@ import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.document import Document
-from dlo_casadi.config.effects import wrong_effects, wrong_limits
+from dlo_casadi.config.effects import without_values, wrong_effects, wrong_limits
 from dlo_casadi.config.options import DeclaredTolerances
-from dlo_casadi.config.problems import ConfigProblem, Place, Source, kind_of, show
+from dlo_casadi.config.problems import (
+    Arguments,
+    ConfigProblem,
+    Place,
+    Source,
+    did_you_mean,
+    kind_of,
+    show,
+)
 from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
 from dlo_casadi.config.supports import (
     clip_problems,
@@ -21,10 +32,10 @@ from dlo_casadi.config.supports import (
     undetermined,
     unused_directions,
 )
-from dlo_casadi.config.values import AXES, Range
+from dlo_casadi.config.values import AXES, REST_COEFFICIENTS, Range, plain
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData
 from dlo_casadi.errors import ConfigError, counted
-from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.chain import ELEMENTS, RestCurvature
 
 Kind = TypeVar("Kind", bound=Config)
 
@@ -115,6 +126,69 @@ def checked_config(source: Source, kind: type[Kind]) -> Kind:
         warnings=tuple(warnings),
         skipped=tuple(SkippedPose(pose.name, reasons[pose.name], pose.role) for pose in skipped),
     )
+
+
+def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config, FloatArray]:
+    """Make a configuration without poses, and rest coefficients [1/m], for `known_cable`.
+
+    Raises ConfigError if an argument is missing or impossible; the message lists every problem with
+    its argument.
+    """
+    given = plain(given)
+    rest = given.pop("rest_curvature", None)
+    held = {key: given.pop(key) for key in ("gravity", "boundary") if key in given}
+    nothing = {"measurement": {"kind": "centerlines"}, "poses": ()}
+    source = Arguments(given | {"experiment": nothing | held}, names)
+    if strange := sorted(given.keys() & Config.model_fields.keys() - {*names}):
+        hint = did_you_mean(strange[0], names)
+        raise source.error([ConfigProblem((), f"unknown key {strange[0]!r} in {source.top}{hint}")])
+    config = source.checked(Config)
+    ends, cable, in_space = config.experiment.boundary, config.cable, config.experiment.in_space
+    needed = (
+        ("mass", "the mass of its length [kg]; without gravity any"),
+        ("torsional_stiffness", "GJ [N m^2]; EI / 1.3 of a solid round rod"),
+    )[: 1 + in_space]
+    problems = [
+        *undetermined(ends.start, ends.end, in_space),
+        *(
+            ConfigProblem((), f"cable.{key} is not given, and no fit tells it. Try: {meant}")
+            for key, meant in needed
+            if getattr(cable, key) is None
+        ),
+        *(wrong_effects(config, known=True) or without_values(config)),
+        *wrong_limits(config),
+    ]
+    values = np.zeros((1 + in_space, 0)) if rest is None else _curvatures(rest, 1 + in_space)
+    text = ""
+    if values is None:
+        form = "(2,) or (2, K) numbers" if in_space else "one number or (K,)"
+        text = f"{form} [1/m], K <= {REST_COEFFICIENTS.most}, belong here, found {show(rest)}"
+    elif values.size and cable.rest_shape == "straight":
+        text = "the cable is declared straight. Try: one of rest_curvature and rest_shape"
+    elif (sharpest := np.linalg.norm(values, axis=0).max(initial=0.0)) * cable.diameter >= 2.0:
+        text = f"{sharpest:g} 1/m bends it more sharply than it is thick: units are SI"
+    problems += [ConfigProblem((), f"rest_curvature: {text}")] if text else []
+    if problems or values is None:
+        raise source.error(problems)
+    count = values.shape[1]
+    at = RestCurvature(cable.length, count).basis(np.linspace(0.0, cable.length, count))
+    config = config.changed(estimation={"rest_curvature_coefficients": count})
+    return config, np.linalg.solve(at, values.T).T.ravel()
+
+
+def _curvatures(given: Any, axes: int) -> FloatArray | None:
+    """A rest curvature as rows (axes, K) [1/m]; None if it is not one."""
+    try:
+        values = np.atleast_1d(np.array(given))
+    except ValueError:  # rows of different lengths
+        return None
+    if values.dtype.kind not in "iuf":  # a text, or true
+        return None
+    values = values.astype(float)
+    if values.ndim > axes or (axes == 2 and len(values) != 2) or not np.isfinite(values).all():
+        return None
+    rows = values.reshape(axes, -1)
+    return rows if 0 < rows.shape[1] <= REST_COEFFICIENTS.most else None
 
 
 _IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
