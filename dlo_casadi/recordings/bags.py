@@ -254,11 +254,6 @@ def _cloud(message: Any, t: float, links: Links, scale: float) -> Cloud:
     cloud = cloud_of(np.ndarray(shape, np.dtype(kind), bytes(message.data), 0, steps).ravel())
     frame = _frame(message)
     root, place, turn = _in_root(frame, links, np.array([t]))
-    return Cloud(
-        turn[0].apply(scale * cloud.points) + place,
-        cloud.colors,
-        place[0] if frame in links else None,
-        t,
-        "markers",
-        root,
-    )
+    camera = np.zeros(3) if frame in links else None
+    seen = Cloud(scale * cloud.points, cloud.colors, camera, t, "markers", root)
+    return seen.moved(turn[0], place[0])

@@ -88,6 +88,11 @@ class Cloud:
     frame: str = ""
     file: str = ""
 
+    def moved(self, turn: Rotation, place: FloatArray | float = 0.0) -> "Cloud":
+        """The cloud in other axes, in which its own have the rotation `turn` and the `place`."""
+        camera = None if self.camera is None else turn.apply(self.camera) + place
+        return replace(self, points=turn.apply(self.points) + place, camera=camera)
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -113,14 +118,7 @@ class Recording:
             stream if stream.kind == "wrench" and stream.frame else stream.moved(turn)
             for stream in self.streams
         )
-        clouds = tuple(
-            replace(
-                cloud,
-                points=turn.apply(cloud.points),
-                camera=None if cloud.camera is None else turn.apply(cloud.camera),
-            )
-            for cloud in self.clouds
-        )
+        clouds = tuple(cloud.moved(turn) for cloud in self.clouds)
         return Recording(streams, clouds, (*self.assumptions, *assumed))
 
     def without_zeros(self) -> "Recording":

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.options import DeclaredTolerances
+from dlo_casadi.config.sections import DENSITY
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.arc_lengths import arc_lengths
@@ -31,7 +32,6 @@ _FEW = 4  # markers through which a spline is often shorter than the cable
 # sight: two on opposite sides put the line of a cable of 7 mm 2.8 mm beside it.
 _ASIDE = 0.05
 _LENGTH = DeclaredTolerances().length  # m
-_DENSITY = 2200.0  # kg/m^3, assumed for a cable of unknown mass, for `Imported.stand_ins`
 
 Points = tuple[FloatArray, FloatArray | None]  # (K, 3) [m], and arc lengths (K,) [m] of markers
 
@@ -77,7 +77,7 @@ class Imported:
         """
         length = self.length
         diameter = float(self.cable.get("diameter", 0.01 * length))
-        mass = float(self.cable.get("mass", _DENSITY * np.pi / 4 * diameter**2 * length))
+        mass = float(self.cable.get("mass", DENSITY * np.pi / 4 * diameter**2 * length))
         found = {"length": length, "diameter": diameter, "mass": mass}
         found["bending_stiffness"] = _guess(mass, length)
         return {**{key: f"{value:.4g}" for key, value in found.items()}, **self.cable}
