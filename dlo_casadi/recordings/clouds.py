@@ -1,4 +1,4 @@
-"""Read files of point clouds: PLY, PCD and NPY."""
+"""Point clouds: their files (PLY, PCD and NPY), and the line of the cable in them."""
 
 import re
 from collections.abc import Sequence
@@ -10,11 +10,17 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
 from dlo_casadi import vision
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.recordings.fixtures import Gripper
 from dlo_casadi.recordings.recording import LARGEST, Cloud, Recording
-from dlo_casadi.recordings.wishes import require
+from dlo_casadi.recordings.stills import Still
+from dlo_casadi.recordings.wishes import Wishes, require
 
 _AGAIN = "Try: save it again, whole, as binary or text."
+# m, distance of two cameras beyond which their clouds are not moved to the axis along one line of
+# sight: two on opposite sides put the line of a cable of 7 mm 2.8 mm beside it.
+_ASIDE = 0.05
 _PLY = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _PLY |= {"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2"}
 _PLY |= {"uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
@@ -160,3 +166,71 @@ def _table(fields: Sequence[tuple[str, str, int]], body: bytes, count: int, styl
     if len(table) < count:
         raise MeasurementError(f"ends after {len(table)} of {counted(count, 'point')}.\n  {_AGAIN}")
     return table
+
+
+# ---- the cable in clouds -----------------------------------------------------------------------
+
+
+def cloud_lines(
+    recording: Recording,
+    stills: Sequence[Still],
+    start: Gripper | None,
+    end: Gripper | None,
+    wishes: Wishes,
+    remarks: list[str],
+) -> tuple[list[FloatArray], list[str]]:
+    """Line of the cable (K, 3) [m] in each pose, from all its clouds, and remarks on it."""
+    clouds = recording.clouds
+    asked = " and ".join(f"--{key}" for key in ("cable", "at") if getattr(wishes, key))
+    if asked:
+        raise MeasurementError(
+            f"{asked} tell of markers, but the cable is found in the clouds of this recording.\n"
+            f"  Try: without {asked}; or without the clouds."
+        )
+    missing = [key for key in ("length", "diameter") if key not in wishes.known]
+    if missing or start is None:
+        raise MeasurementError(
+            "a cable is found in a cloud by its size and its fixtures.\n  Try: "
+            f"{', '.join(f'--{key}' for key in missing) or 'a recording of the grippers beside it'}"
+        )
+    timed = np.isfinite(clouds[0].t)
+    if not timed and len(clouds) != len(stills):
+        raise MeasurementError(
+            f"{counted(len(clouds), 'cloud')} without a time for {counted(len(stills), 'pose')} of "
+            "the grippers.\n  Try: one file for each pose, in their order; --hold"
+        )
+    if timed and clouds[0].clock not in {stream.clock for stream in recording.streams}:
+        remarks.append("clouds: their times are taken as those of the grippers")
+    lines: list[FloatArray] = []
+    told = []
+    for k, still in enumerate(stills):
+        shown = [c for c in clouds if still.begin <= c.t <= still.end] if timed else [clouds[k]]
+        if not shown:
+            raise MeasurementError(
+                f"no cloud was seen in pose {k + 1} ({still.span}).\n  Try: hold it longer; "
+                "clouds and grippers with clocks that agree."
+            )
+        cable = vision.KnownCable(
+            start.places[k],
+            None if end is None else end.places[k],
+            wishes.known["diameter"],
+            wishes.known["length"],
+        )
+        camera = shown[0].camera
+        kept = [c for c in shown if _away(c.camera, camera) < _ASIDE]
+        line, messages = vision.line_in_cloud(np.vstack([c.points for c in kept]), cable, camera)
+        if len(kept) < len(shown):
+            others = counted(len(shown) - len(kept), "cloud")
+            messages = (*messages, f"{others} from another place of the camera left out")
+        lines.append(line)
+        told.append("; ".join([still.told, *messages]))
+    if camera is not None:
+        remarks.append("clouds: points moved from the surface to the axis, along the line of sight")
+    return lines, told
+
+
+def _away(place: FloatArray | None, camera: FloatArray | None) -> float:
+    """Distance [m] of a camera from another; without the other's place, no cloud is moved: 0."""
+    if camera is None:
+        return 0.0
+    return np.inf if place is None else float(np.linalg.norm(place - camera))

@@ -3,18 +3,19 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi import vision
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.sections import DENSITY
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
-from dlo_casadi.recordings.arc_lengths import arc_lengths
+from dlo_casadi.recordings.clouds import cloud_lines
 from dlo_casadi.recordings.fixtures import Gripper, along_cable, find_gripper, readings_of
 from dlo_casadi.recordings.recording import Cloud, Recording, Stream
 from dlo_casadi.recordings.stills import Still, align_clocks, find_stills
@@ -28,9 +29,10 @@ _LONGER = 0.03  # relative difference of declared and measured length beyond whi
 # % for three; errors of arc lengths are 0.5 to 1.6 times the scatter. Grippers 20 mm off: 0.3 %.
 _DOUBTFUL = 2e-3
 _FEW = 4  # markers through which a spline is often shorter than the cable
-# m, distance of two cameras beyond which their clouds are not moved to the axis along one line of
-# sight: two on opposite sides put the line of a cable of 7 mm 2.8 mm beside it.
-_ASIDE = 0.05
+# m, distance of a marker from a fixture below which their direction is not the cable's: a spline
+# through a marker 1 mm from a gripper's origin, in any direction, was 4 to 14 mm too long.
+_BESIDE = 0.01
+_SAMPLES = 50  # points of a spline between two markers, to compute its length: exact to 1e-5
 _LENGTH = DeclaredTolerances().length  # m
 
 Points = tuple[FloatArray, FloatArray | None]  # (K, 3) [m], and arc lengths (K,) [m] of markers
@@ -118,7 +120,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             "--start, --end with three markers each; an end that nothing holds is free"
         )
     if recording.clouds:
-        lines, told = _cloud_lines(recording, stills, start, end, wishes, remarks)
+        lines, told = cloud_lines(recording, stills, start, end, wishes, remarks)
         start, end = along_cable(start, end, lines, remarks)
         points: list[Points] = [(np.round(line, 6), None) for line in lines]
         length = wishes.known["length"]
@@ -197,74 +199,6 @@ def _row(values: FloatArray) -> str:
     return f"[{', '.join(f'{x:.6f}' for x in values + 0.0)}]"
 
 
-# ---- clouds -------------------------------------------------------------------------------------
-
-
-def _cloud_lines(
-    recording: Recording,
-    stills: Sequence[Still],
-    start: Gripper | None,
-    end: Gripper | None,
-    wishes: Wishes,
-    remarks: list[str],
-) -> tuple[list[FloatArray], list[str]]:
-    """Line of the cable (K, 3) [m] in each pose, from all its clouds, and remarks on it."""
-    clouds = recording.clouds
-    asked = " and ".join(f"--{key}" for key in ("cable", "at") if getattr(wishes, key))
-    if asked:
-        raise MeasurementError(
-            f"{asked} tell of markers, but the cable is found in the clouds of this recording.\n"
-            f"  Try: without {asked}; or without the clouds."
-        )
-    missing = [key for key in ("length", "diameter") if key not in wishes.known]
-    if missing or start is None:
-        raise MeasurementError(
-            "a cable is found in a cloud by its size and its fixtures.\n  Try: "
-            f"{', '.join(f'--{key}' for key in missing) or 'a recording of the grippers beside it'}"
-        )
-    timed = np.isfinite(clouds[0].t)
-    if not timed and len(clouds) != len(stills):
-        raise MeasurementError(
-            f"{counted(len(clouds), 'cloud')} without a time for {counted(len(stills), 'pose')} of "
-            "the grippers.\n  Try: one file for each pose, in their order; --hold"
-        )
-    if timed and clouds[0].clock not in {stream.clock for stream in recording.streams}:
-        remarks.append("clouds: their times are taken as those of the grippers")
-    lines: list[FloatArray] = []
-    told = []
-    for k, still in enumerate(stills):
-        shown = [c for c in clouds if still.begin <= c.t <= still.end] if timed else [clouds[k]]
-        if not shown:
-            raise MeasurementError(
-                f"no cloud was seen in pose {k + 1} ({still.span}).\n  Try: hold it longer; "
-                "clouds and grippers with clocks that agree."
-            )
-        cable = vision.KnownCable(
-            start.places[k],
-            None if end is None else end.places[k],
-            wishes.known["diameter"],
-            wishes.known["length"],
-        )
-        camera = shown[0].camera
-        kept = [c for c in shown if _away(c.camera, camera) < _ASIDE]
-        line, messages = vision.line_in_cloud(np.vstack([c.points for c in kept]), cable, camera)
-        if len(kept) < len(shown):
-            others = counted(len(shown) - len(kept), "cloud")
-            messages = (*messages, f"{others} from another place of the camera left out")
-        lines.append(line)
-        told.append("; ".join([still.told, *messages]))
-    if camera is not None:
-        remarks.append("clouds: points moved from the surface to the axis, along the line of sight")
-    return lines, told
-
-
-def _away(place: FloatArray | None, camera: FloatArray | None) -> float:
-    """Distance [m] of a camera from another; without the other's place, no cloud is moved: 0."""
-    if camera is None:
-        return 0.0
-    return np.inf if place is None else float(np.linalg.norm(place - camera))
-
-
 # ---- markers ------------------------------------------------------------------------------------
 
 
@@ -339,7 +273,7 @@ def _along(
     remarks: list[str],
 ) -> tuple[FloatArray, float, float]:
     """Arc lengths (M,) [m] of the markers; the measured length of the cable and its scatter [m]."""
-    s, length, scatter = arc_lengths(start, places, end)
+    s, length, scatter = _arc_lengths(start, places, end)
     if not wishes.at:
         _check_arc_lengths(s, length, scatter, places, names)
     fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
@@ -375,6 +309,65 @@ def _along(
         )
     remarks.append(f"markers: {', '.join(names)}, at the arc lengths of --at")
     return np.array(wishes.at), length, scatter
+
+
+def _arc_lengths(
+    start: Gripper | None, places: FloatArray, end: Gripper | None
+) -> tuple[FloatArray, float, float]:
+    """Arc lengths (M,) [m] of markers from the start; length of the cable and its scatter [m].
+
+    They are means over all poses of lengths along a cubic spline through fixtures and markers,
+    clamped in the grippers' directions. A marker beside a fixture is no knot of it.
+    """
+    knots = places
+    if start is not None:
+        knots = np.concatenate([start.places[None], knots])
+    if end is not None:
+        knots = np.concatenate([knots, end.places[None]])
+    spans = np.full((knots.shape[1], len(knots) - 1), np.nan)
+    for k, row in enumerate(spans):
+        seen = np.flatnonzero(np.isfinite(knots[:, k]).all(axis=1))
+        if len(seen) < 2:
+            continue
+        x = knots[seen, k]
+        ends: Any = tuple(
+            (1, gripper.frames[k, :, 0]) if gripper is not None else (2, np.zeros(3))
+            for gripper in (start, end)
+        )
+        chords = np.linalg.norm(np.diff(x, axis=0), axis=1)
+        at_start = start is not None and chords[0] < _BESIDE
+        at_end = end is not None and chords[-1] < _BESIDE
+        kept = np.ones(len(x), bool)
+        kept[1] &= not at_start
+        kept[-2] &= not at_end
+        s = np.zeros(len(x))
+        s[kept] = _along_spline(x[kept], ends)
+        if at_start:
+            s[1] = chords[0]
+        if at_end:
+            s[-2] = s[-1] - chords[-1]
+        near = np.diff(seen) == 1
+        row[seen[:-1][near]] = np.diff(s)[near]
+    if np.isnan(spans).all(axis=0).any():
+        raise MeasurementError(
+            "two neighbouring markers of the cable are seen together in no pose.\n  Try: fill "
+            "their gaps, or leave one of them out: --cable"
+        )
+    found = np.nanmean(spans, axis=0)
+    s = np.concatenate([[0.0], np.cumsum(found)])
+    first = 0 if start is None else 1
+    scatter = float(np.where(np.isnan(spans), found, spans).sum(axis=1).std())
+    return s[first : first + len(places)], float(s[-1]), scatter
+
+
+def _along_spline(x: FloatArray, ends: Any) -> FloatArray:
+    """Lengths (K,) [m] to each of the points (K, 3) along a cubic spline with these conditions."""
+    s = chord_lengths(x)
+    for _ in range(3):  # the parameter converges to the arc length
+        fine = np.linspace(s[:-1], s[1:], _SAMPLES + 1, axis=1)
+        curve = CubicSpline(s, x, bc_type=ends)(fine)
+        s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=1), axis=2).sum(axis=1)))
+    return s
 
 
 def _check_arc_lengths(
