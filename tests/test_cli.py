@@ -13,8 +13,7 @@ import pytest
 from rich.console import Console
 
 from dlo_casadi.cli import main
-from dlo_casadi.cli.options import plain_numbers
-from dlo_casadi.cli.watch import Watch
+from dlo_casadi.cli.common import Watch, plain_numbers
 from dlo_casadi.config import dump_yaml, read_yaml
 
 ROOT = Path(__file__).parents[1]

@@ -17,7 +17,7 @@ import pytest
 from rich.console import Console
 
 import dlo_casadi
-from dlo_casadi.cli import COMMANDS, main, watch
+from dlo_casadi.cli import COMMANDS, common, main
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.config.template import config_schema, schema_text
 from dlo_casadi.errors import ConfigError
@@ -293,9 +293,9 @@ def test_scripts_of_the_checkout_are_run_with_their_options(tmp_path, monkeypatc
 
 def test_the_remaining_time_is_told_line_by_line(monkeypatch):
     seconds = [0.0]
-    monkeypatch.setattr(watch, "time", SimpleNamespace(perf_counter=lambda: seconds[0]))
+    monkeypatch.setattr(common, "time", SimpleNamespace(perf_counter=lambda: seconds[0]))
     out = StringIO()
-    shown = watch.Watch(Console(file=out))
+    shown = common.Watch(Console(file=out))
     for done, seconds[0] in ((0, 0.0), (1, 4.0), (2, 12.0), (3, 15.0), (4, 20.0)):
         shown.step("search", done, 4)
     assert out.getvalue().splitlines() == ["search: 2 of 4, at most 12 s left", "search: 20.0 s"]
@@ -303,7 +303,7 @@ def test_the_remaining_time_is_told_line_by_line(monkeypatch):
 
 def test_quiet_shows_nothing():
     out = StringIO()
-    with watch.Watch(Console(file=out, force_terminal=True), quiet=True) as shown:
+    with common.Watch(Console(file=out, force_terminal=True), quiet=True) as shown:
         shown.step("search", 0, 1)
         shown.message("something")
     assert out.getvalue() == ""
@@ -311,7 +311,7 @@ def test_quiet_shows_nothing():
 
 def test_a_terminal_shows_bars_with_the_time_that_is_left():
     out = StringIO()
-    with watch.Watch(Console(file=out, force_terminal=True, width=100)) as shown:
+    with common.Watch(Console(file=out, force_terminal=True, width=100)) as shown:
         shown.step("read pose_01.jpg", 0, 2)
         shown.step("read pose_02.jpg", 1, 2)
         shown.step("read ", 2, 2)

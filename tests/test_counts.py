@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from dlo_casadi.cli.watch import Counter
+from dlo_casadi.cli.common import Counter
 from dlo_casadi.config.values import implausible_quaternion
 from dlo_casadi.errors import counted
 from dlo_casadi.fleet.rows import overview_html

@@ -7,8 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from dlo_casadi.cli import BAD_INPUT, OK
-from dlo_casadi.cli.options import CONFIG, Page, command, option
-from dlo_casadi.cli.watch import Watch
+from dlo_casadi.cli.common import CONFIG, Page, Watch, command, option
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.io.files import make_folder, write_file

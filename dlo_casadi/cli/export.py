@@ -7,9 +7,8 @@ from typing import Any
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cable.held import HELD
+from dlo_casadi.cli.common import PARAMETERS, Page, Watch, command, figure, option
 from dlo_casadi.cli.fitted import POSE
-from dlo_casadi.cli.options import PARAMETERS, Page, command, figure, option
-from dlo_casadi.cli.watch import Watch
 from dlo_casadi.errors import DloError
 from dlo_casadi.export.rod import Rod
 from dlo_casadi.export.targets import TARGETS, check_counts, losses, require, target_of

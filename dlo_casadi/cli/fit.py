@@ -8,7 +8,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 
 from dlo_casadi.cli import BAD_INPUT, OK
-from dlo_casadi.cli.options import CONFIG, SCHEDULER, Page, command, jobs, option
+from dlo_casadi.cli.common import CONFIG, SCHEDULER, Counter, Page, Watch, command, jobs, option
 from dlo_casadi.errors import counted, well_formed
 from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.runtime.executors import ended_first
@@ -82,7 +82,6 @@ def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
     with open_executor(chosen.jobs, here=True, libraries=libraries) as executor:
         begin(executor, os.getpid)
         # These imports take as long as those of the other process, which run in parallel.
-        from dlo_casadi.cli.watch import Watch
         from dlo_casadi.report.documents import report_dict
         from dlo_casadi.report.terminal import candidate_table, print_summary
         from dlo_casadi.report.writer import ResultsFolder
@@ -131,7 +130,6 @@ def fit_many(chosen: argparse.Namespace) -> int:
     dlo fit-many cables/ --scheduler tcp://10.0.0.5:8786  on a Dask cluster
     dlo fit-many cables/ --no-diagnosis --no-reports      the table alone, fast
     """
-    from dlo_casadi.cli.watch import Counter
     from dlo_casadi.fleet.rows import judge
     from dlo_casadi.fleet.run import Options, find_sessions, fit_fleet
 

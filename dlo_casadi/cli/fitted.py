@@ -9,9 +9,10 @@ from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.cable.held import HELD, listed_poses
 from dlo_casadi.cable.limits import LimitCheck
-from dlo_casadi.cli.options import (
+from dlo_casadi.cli.common import (
     PARAMETERS,
     SCHEDULER,
+    Counter,
     Page,
     command,
     figure,
@@ -19,7 +20,6 @@ from dlo_casadi.cli.options import (
     one_of,
     option,
 )
-from dlo_casadi.cli.watch import Counter
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.shapes import pose_size
 from dlo_casadi.config import read_yaml

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 import dlo_casadi
-from dlo_casadi.cli.options import Page, command, one_of, option
+from dlo_casadi.cli.common import Page, command, one_of, option
 from dlo_casadi.config.supports import KINDS
 from dlo_casadi.config.template import schema_text, template, to_fill_in
 from dlo_casadi.errors import DloError, counted

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from dlo_casadi.cli.options import Option, Page, command, option
-from dlo_casadi.cli.watch import Watch
+from dlo_casadi.cli.common import Option, Page, Watch, command, option
 from dlo_casadi.config import load_config
 from dlo_casadi.config.template import schema_text, to_fill_in
 from dlo_casadi.errors import ConfigError, DloError, MeasurementError, counted
