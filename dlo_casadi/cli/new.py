@@ -11,12 +11,11 @@ from typing import Literal
 
 import dlo_casadi
 from dlo_casadi.cli.common import Page, command, one_of, option
+from dlo_casadi.config.load import IMAGE_ENDINGS
 from dlo_casadi.config.supports import KINDS
 from dlo_casadi.config.template import schema_text, template, to_fill_in
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
-
-_PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 @command(
@@ -55,7 +54,7 @@ def new(chosen: argparse.Namespace) -> None:
         )
     files: list[str] = []
     if chosen.photographs is not None:
-        files = _listed(chosen.photographs, _PHOTOGRAPHS, "photograph", target.parent)
+        files = _listed(chosen.photographs, IMAGE_ENDINGS, "photograph", target.parent)
     elif chosen.centerlines is not None:
         files = _listed(chosen.centerlines, (".csv",), "CSV file", target.parent)
     kind: Literal["images", "centerlines"] = (

@@ -191,7 +191,7 @@ def _curvatures(given: Any, axes: int) -> FloatArray | None:
     return rows if 0 < rows.shape[1] <= REST_COEFFICIENTS.most else None
 
 
-_IMAGE_ENDINGS = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _RELATIVE = "files are found relative to the YAML, from Python relative to the working directory"
 
 
@@ -202,7 +202,7 @@ def any_photographs(poses: object) -> bool:
         given = vars(pose) if isinstance(pose, Pose) else pose if isinstance(pose, Mapping) else {}
         several = given.get("files")
         paths += [given.get("file"), *(several if isinstance(several, list | tuple) else ())]
-    return any(Path(str(path)).suffix.lower() in _IMAGE_ENDINGS for path in paths)
+    return any(Path(str(path)).suffix.lower() in IMAGE_ENDINGS for path in paths)
 
 
 # Names of results add up to forty characters to a pose's name; file systems allow 255 bytes.
@@ -266,11 +266,12 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
     if len(pose.name.encode()) > _LONGEST_NAME:
         yield f"results are named after the file, at most {_LONGEST_NAME} bytes long", None
     endings, kind = {path.suffix.lower() for path in pose.paths}, experiment.measurement.kind
+    pictures = endings.intersection(IMAGE_ENDINGS)
     # In space one session may mix photographs, lines and markers.
     mixed = experiment.in_space and pose.file is not None
     if kind == "images" and ".csv" in endings and not mixed:
         yield "a CSV is not a photograph; measurement kind: centerlines?", None
-    if kind == "centerlines" and endings & _IMAGE_ENDINGS:
+    if kind == "centerlines" and pictures:
         yield "a photograph is not a CSV; measurement kind: images?", None
     if pose.points is not None:
         own = AXES[len(experiment.gravity)]
@@ -278,7 +279,7 @@ def _file_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, st
             yield f"points: [{own.place}, ...] belong here ({own.gravity} of gravity)", "points"
         if kind == "images" and not experiment.in_space:
             yield "points are not a photograph; measurement kind: centerlines?", "points"
-    if len(pose.files) > 1 and not endings & _IMAGE_ENDINGS and kind == "centerlines":
+    if len(pose.files) > 1 and not pictures and kind == "centerlines":
         yield "files are photographs of one pose; one CSV belongs here, as file", "files"
     elif len(pose.files) > 1 and not experiment.in_space:
         yield "several photographs are of a cable in space; gravity: two numbers", "files"

@@ -129,13 +129,11 @@ def implausible_sizes(length: float, mass: float, diameter: float) -> list[Confi
     return [ConfigProblem((key,), text) for key, text in wrong]
 
 
-def implausible_quaternion(values: Sequence[float]) -> str:
+def _implausible_quaternion(values: Sequence[float]) -> str:
     """Problem with an orientation (x, y, z, w); empty if its length is one."""
-    belongs = "a unit quaternion [qx, qy, qz, qw] belongs here"
-    if len(values) != 4:
-        return f"{belongs}, not {counted(len(values), 'number')}"
     size = math.hypot(*values)
-    return "" if abs(size - 1) <= _UNIT else f"{belongs}, its length is {size:.4g}"
+    text = f"a unit quaternion [qx, qy, qz, qw] belongs here, its length is {size:.4g}"
+    return "" if abs(size - 1) <= _UNIT else text
 
 
 class Axes(NamedTuple):
@@ -381,5 +379,5 @@ Moment = Annotated[
 Quaternion = Annotated[
     tuple[Number, ...],
     _listed("a quaternion [qx, qy, qz, qw] belongs here", _Four, 4),
-    checked(implausible_quaternion),
+    checked(_implausible_quaternion),
 ]
