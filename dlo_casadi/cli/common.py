@@ -213,6 +213,7 @@ class Shown:
         self, part: str, done: int, total: int | None, line: str, description: str, detail: str = ""
     ) -> None:
         """Move the bar of a part, or print a line at its end and occasionally before."""
+        signals.check()
         if self.bars is not None:
             if part not in self._tasks:
                 self._tasks[part] = self.bars.add_task(part, detail="")
@@ -243,7 +244,6 @@ class Watch(Shown):
 
     def step(self, name: str, done: int, total: int) -> None:
         """Report that `done` of `total` parts of the named work are finished."""
-        signals.check()
         name, detail = ("read the poses", name[5:]) if name.startswith("read ") else (name, "")
         now = time.perf_counter()
         begun = self._begun.setdefault(name, now)
@@ -284,7 +284,6 @@ class Counter(Shown):
 
     def show(self, tally: Tally) -> None:
         """Show the progress of the tasks."""
-        signals.check()
         text = self._text(tally)
         line = f"{text}; {duration(tally.elapsed)} so far"
         self.update(self.noun, tally.done, tally.total, line, text)

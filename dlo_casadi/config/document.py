@@ -139,11 +139,6 @@ class Document(Source):
     root: yaml.Node
     data: Any
 
-    @property
-    def folder(self) -> Path:  # type: ignore[override]
-        """The folder of the file."""
-        return self.source.absolute().parent
-
     @classmethod
     def read(cls, source: Path, largest: int = _LARGEST) -> Self:
         """Read a file of at most `largest` bytes, or raise a ConfigError."""

@@ -100,13 +100,16 @@ class Source:
     data: Any
     source: Path | None
     """The file, if they are of one."""
-    folder: Path
-    """Where the files are that it names."""
     hidden: tuple[str, ...] = ()
     """Keys that are left out of the name of a place."""
     names: tuple[str, ...] = ()
     """What may stand at the top, where it is not the keys of the checked section."""
     top = "the top of the file"
+
+    @property
+    def folder(self) -> Path:
+        """Where the files are that it names."""
+        return Path() if self.source is None else self.source.absolute().parent
 
     def checked(self, model: type[Model], heading: str = "", remedy: str = "") -> Model:
         """Check the data against a model; raises one ConfigError with all problems, see `error`."""
@@ -172,7 +175,7 @@ class Arguments(Source):
     top = "the arguments"
 
     def __init__(self, data: dict[str, Any], names: tuple[str, ...] = ()) -> None:
-        self.data, self.source, self.folder, self.names = data, None, Path(), names
+        self.data, self.source, self.names = data, None, names
 
     def instead(self, section: str) -> str:
         """Advice to pass an object of the library, if there is one for the section."""
