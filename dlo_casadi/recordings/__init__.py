@@ -9,9 +9,8 @@ from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.recordings.bags import read_bag
 from dlo_casadi.recordings.clouds import CloudView, read_cloud
 from dlo_casadi.recordings.mocap import read_c3d, read_mocap_csv
-from dlo_casadi.recordings.recording import METRES, Cloud, Recording, Stream, together
+from dlo_casadi.recordings.recording import FREE, METRES, Cloud, Recording, Stream, Wishes, together
 from dlo_casadi.recordings.session import Imported, make_session
-from dlo_casadi.recordings.wishes import FREE, Wishes
 
 Record = TypeVar("Record", Stream, Cloud)
 WHOLE = CloudView()  # all points of clouds, in metres

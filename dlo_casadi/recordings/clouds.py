@@ -13,9 +13,8 @@ from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.fixtures import Gripper
-from dlo_casadi.recordings.recording import LARGEST, Cloud, Recording
+from dlo_casadi.recordings.recording import LARGEST, Cloud, Recording, Wishes, require
 from dlo_casadi.recordings.stills import Still
-from dlo_casadi.recordings.wishes import Wishes, require
 
 _AGAIN = "Try: save it again, whole, as binary or text."
 # m, distance of two cameras beyond which their clouds are not moved to the axis along one line of

@@ -17,9 +17,8 @@ from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.clouds import cloud_lines
 from dlo_casadi.recordings.fixtures import Gripper, along_cable, find_gripper, readings_of
-from dlo_casadi.recordings.recording import Cloud, Recording, Stream
+from dlo_casadi.recordings.recording import FREE, Cloud, Recording, Stream, Wishes
 from dlo_casadi.recordings.stills import Still, align_clocks, find_stills
-from dlo_casadi.recordings.wishes import FREE, Wishes
 from dlo_casadi.thresholds import STRETCHED
 
 _COLUMNS = 98  # width of a comment
