@@ -7,13 +7,12 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import dlo_casadi
 from dlo_casadi.cli.common import Page, command, one_of, option
 from dlo_casadi.config.load import IMAGE_ENDINGS
 from dlo_casadi.config.supports import KINDS
-from dlo_casadi.config.template import schema_text, template, to_fill_in
+from dlo_casadi.config.template import Kind, schema_text, template, to_fill_in
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
 
@@ -57,9 +56,7 @@ def new(chosen: argparse.Namespace) -> None:
         files = _listed(chosen.photographs, IMAGE_ENDINGS, "photograph", target.parent)
     elif chosen.centerlines is not None:
         files = _listed(chosen.centerlines, (".csv",), "CSV file", target.parent)
-    kind: Literal["images", "centerlines"] = (
-        "images" if chosen.centerlines is None else "centerlines"
-    )
+    kind: Kind = "images" if chosen.centerlines is None else "centerlines"
     text = template(target.stem, files, kind, chosen.space, clips=chosen.clips)
     schema = target.with_name("schema.json")
     written = [target]

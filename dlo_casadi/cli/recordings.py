@@ -121,7 +121,6 @@ def import_(chosen: argparse.Namespace) -> None:
 
 
 def _write(session: Imported, folder: Path) -> None:
-    """Write a configuration, its schema and its points into a folder."""
     for name, (points, s) in session.points.items():
         write_points(folder / name, points, s)
     write_file(folder / "schema.json", schema_text())

@@ -103,7 +103,6 @@ def wrong_limits(config: Config) -> list[ConfigProblem]:
 
 
 def _wrong(item: DeclaredEffect, at: Place, setup: Setup, kept: bool) -> Iterator[ConfigProblem]:
-    """Find what is wrong with one declared effect."""
     if item.name not in EFFECTS:
         yield ConfigProblem((*at, "name"), f"model.effects: {_unknown(item.name)}")
         return

@@ -12,11 +12,13 @@ from dlo_casadi.config.problems import PLACEHOLDER
 from dlo_casadi.config.sections import Config
 from dlo_casadi.errors import counted
 
+Kind = Literal["images", "centerlines"]
+
 
 def template(
     name: str,
     files: Sequence[str] = (),
-    kind: Literal["images", "centerlines"] = "images",
+    kind: Kind = "images",
     in_space: bool = False,
     *,
     cable: Mapping[str, str] = {},

@@ -104,7 +104,7 @@ def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
         ] = c
     for (label, name), at in columns.items():
         places = [at.get(f"Position {axis}", -1) for axis in "XYZ"]
-        if min(places) < 0 or "Unlabeled" in name:
+        if label not in _KINDS or min(places) < 0 or "Unlabeled" in name:
             continue
         values = scale * table[:, places]
         if label == "Rigid Body":
@@ -115,8 +115,7 @@ def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
                     "\n  Try: an export with Rotation Type: Quaternion"
                 )
             values = np.hstack([values, table[:, turns]])
-        if label in _KINDS:
-            yield Stream(name, _KINDS[label], t, values)
+        yield Stream(name, _KINDS[label], t, values)
 
 
 def _vicon(rows: Rows) -> Iterator[Stream]:
