@@ -1,6 +1,6 @@
 """Tables for the terminal: findings, their accuracy, what remains unknown, and run time."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -16,14 +16,15 @@ from dlo_casadi.report import tables, words
 from dlo_casadi.session.outcome import Outcome, ReadingErrors
 from dlo_casadi.show.text import millimetres
 
-# Columns of a check's table: key of a pose's row, format of its number, factor of its unit.
-_CHECKED: dict[str, tuple[str, str, float]] = {
-    "length": ("length", "{:.3f} m", 1.0),
-    "of declared": ("length_over_declared", "{:.0f} %", 100.0),
-    "off fixtures": ("largest_distance_from_fixture", "{:.1f} mm", 1e3),
-    "seen": ("coverage", "{:.0f} %", 100.0),
-    "confidence": ("confidence", "{:.0f} %", 100.0),
-    "pixel": ("pixel", "{:.2f} mm", 1e3),
+# Columns of a check's table: key of a pose's row, and how its value is written.
+_CHECKED: dict[str, tuple[str, Callable[[Any], str]]] = {
+    "length": ("length", "{:.3f} m".format),
+    "of declared": ("length_over_declared", lambda share: f"{100 * share:.0f} %"),
+    "off fixtures": ("largest_distance_from_fixture", lambda away: f"{1e3 * away:.1f} mm"),
+    "seen": ("coverage", lambda share: f"{100 * share:.0f} %"),
+    "confidence": ("confidence", lambda share: f"{100 * share:.0f} %"),
+    "pixel": ("pixel", lambda size: f"{1e3 * size:.2f} mm"),
+    "markers": ("markers", lambda numbers: " ".join(map(str, numbers))),
 }
 # Columns left out if no pose has a value for them.
 _OPTIONAL = ("seen", "confidence", "pixel", "markers")
@@ -193,19 +194,16 @@ def limits_table(name: str, checks: Sequence[LimitCheck]) -> Table:
 
 def check_table(config: Config, rows: Sequence[Mapping[str, Any]]) -> Table:
     """One line for each pose of `check_dict`; empty columns are left out."""
-    keys = {name: key for name, (key, *_) in _CHECKED.items()} | {"markers": "markers"}
-    known = {name for name, key in keys.items() if any(row[key] is not None for row in rows)}
-    shown = [name for name in keys if name in known or name not in _OPTIONAL]
+    shown = {
+        name: (key, text)
+        for name, (key, text) in _CHECKED.items()
+        if name not in _OPTIONAL or any(row[key] is not None for row in rows)
+    }
     title = f"{config.cable.name}: what was found, {config.cable.length:g} m declared"
-    table = plain_table(title, ["pose", "role"], shown)
+    table = plain_table(title, ["pose", "role"], list(shown))
     for row in rows:
-        cells = dict.fromkeys(keys, "-")
-        for name, (key, form, times) in _CHECKED.items():
-            if row[key] is not None:
-                cells[name] = form.format(times * row[key])
-        if row["markers"] is not None:
-            cells["markers"] = " ".join(map(str, row["markers"]))
+        cells = ["-" if row[key] is None else text(row[key]) for key, text in shown.values()]
         role = "held out" if row["role"] == "held_out" else "fit"
         style = "red" if row["problem"] else ""
-        table.add_row(row["name"], role, *(cells[name] for name in shown), style=style)
+        table.add_row(row["name"], role, *cells, style=style)
     return table
