@@ -47,35 +47,28 @@ _PER_POINT = 4  # points of a predicted curve drawn for each point of the photog
 class Line:
     """A line of a picture, or a word in it."""
 
-    kind: str
-    """"measured", "before", "after", or that of a `scene.Mark`."""
-    points: str
-    """"u,v u,v ..." as SVG has it."""
+    kind: str  # "measured", "before", "after", or that of a `scene.Mark`
+    points: str  # "u,v u,v ..." as SVG has it
     near: str = ""
     """Of a prediction: its points beside the measured ones, one for one.
 
     Deviations are enlarged by moving them away from those.
     """
-    solid: str = ""
-    """The points in a room, "x,y,z x,y,z ..."."""
-    near_solid: str = ""
-    """Those of `near` in a room."""
-    label: str = ""
-    """The word, if it is one."""
+    solid: str = ""  # the points in a room, "x,y,z x,y,z ..."
+    near_solid: str = ""  # those of `near` in a room
+    label: str = ""  # the word, if it is one
 
 
 @dataclass(frozen=True)
 class Background:
     """What lies below the lines: a photograph [px], the board or a room [mm, y down]."""
 
-    whole: Box
-    """All there is."""
+    whole: Box  # all there is
     scene: Scene | None
     """Where the pose stands; None of a photograph in space, which has the world's coordinates."""
     place: Callable[[FloatArray], FloatArray] | None
     """Maps points of the scene into it; None where the camera was not located."""
-    photograph: str = ""
-    """As a data URI; empty for the board."""
+    photograph: str = ""  # as a data URI; empty for the board
 
     @property
     def room(self) -> Room | None:
@@ -136,18 +129,15 @@ class Picture:
     role: str
     alt: str
     behind: Background
-    box: Box
-    """What is shown of `behind` at first: the part with the cable."""
+    box: Box  # what is shown of `behind` at first: the part with the cable
     lines: tuple[Line, ...] = ()
     start: tuple[float, float] | None = None
     end: tuple[float, float] | None = None
     """Where the cable begins and ends: predicted, or declared where nothing was."""
     facts: tuple[tuple[str, str, str], ...] = ()
     """(kind, name, text); the kind is that of the line that a fact is about."""
-    problem: str = ""
-    """Why the pose could not be read."""
-    notes: tuple[str, ...] = ()
-    """What the camera step noticed."""
+    problem: str = ""  # why the pose could not be read
+    notes: tuple[str, ...] = ()  # what the camera step noticed
     under: tuple[Line, ...] = ()
     over: tuple[Line, ...] = ()
     """What stands behind the cable and in front of it; in a plane the forces that were read."""

@@ -44,11 +44,9 @@ _POINTS = 60
 class Mark:
     """A line (K, d) in a scene, or a word at a point of it."""
 
-    kind: str
-    """How it is drawn."""
+    kind: str  # how it is drawn
     points: FloatArray
-    label: str = ""
-    """The word, if it is one."""
+    label: str = ""  # the word, if it is one
 
 
 def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray:
@@ -63,12 +61,9 @@ def beside(pose: PoseInput, shape: PoseShape, factor: float = 1.0) -> FloatArray
 class Plane:
     """The plane of a cable."""
 
-    length: float
-    """Of the cable [m]."""
-    newton: float
-    """How long a force is drawn [m/N]."""
-    markers: FloatArray | tuple[()] = ()
-    """Outlines (K, 5, 2) [m] of the squares printed on it."""
+    length: float  # of the cable [m]
+    newton: float  # how long a force is drawn [m/N]
+    markers: FloatArray | tuple[()] = ()  # outlines (K, 5, 2) [m] of the squares printed on it
 
     def points(self, points: FloatArray) -> FloatArray:
         """Points (K, 2) [m], or a single one, unchanged."""
@@ -87,18 +82,12 @@ class Plane:
 class Room:
     """The surroundings of one pose in space."""
 
-    upright: FloatArray
-    """Rows (3, 3): two level directions of the world, and the one up."""
-    center: FloatArray
-    """Its middle (3,) [mm], in those directions from the world's origin."""
-    radius: float
-    """Of a ball [mm] that holds the cable and the arrows in every pose."""
-    floor: float
-    """Height of the floor [mm]."""
-    length: float
-    """Of the cable [mm]."""
-    newton: float = 0.0
-    """How long a force is drawn [mm/N]."""
+    upright: FloatArray  # rows (3, 3): two level directions of the world, and the one up
+    center: FloatArray  # its middle (3,) [mm], in those directions from the world's origin
+    radius: float  # of a ball [mm] that holds the cable and the arrows in every pose
+    floor: float  # height of the floor [mm]
+    length: float  # of the cable [mm]
+    newton: float  # how long a force is drawn [mm/N]
 
     @property
     def square(self) -> float:
