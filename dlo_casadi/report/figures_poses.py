@@ -1,4 +1,4 @@
-"""Figures pose by pose: measured points on predicted shapes, and the use of each limit."""
+"""Figures pose by pose: measured points on predicted shapes and photographs, use of each limit."""
 
 import math
 from collections.abc import Sequence
@@ -6,24 +6,29 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
+from PIL import Image
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.equilibrium.spread import EDGE
+from dlo_casadi.errors import MeasurementError
+from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report import canvas
 from dlo_casadi.report.scene import Room, Scene, beside, scene_of, scenes_of, seen
 from dlo_casadi.report.tables import error_rows
 from dlo_casadi.report.words import ComparedStage, compared, label_of, missing
 from dlo_casadi.session.outcome import Outcome, PoseInput
 from dlo_casadi.show import style
-from dlo_casadi.show.style import band_outline
 from dlo_casadi.show.text import millimetres
+from dlo_casadi.vision import read_image
 
 _POSES_A_PAGE = 20
 # Approximate number of points drawn per measured line: on a page of poses, and in one frame.
@@ -37,6 +42,9 @@ _NARROWEST, _PANEL, _TALLEST = 7.5, 3.1, 8.0
 _ABOVE, _AROUND = 0.15, 1.4
 # Width [inch] of an entry of the legend.
 _ENTRY = 1.9
+# Sizes [px] of a drawn photograph: the largest, the narrowest with its legend, the legend's height.
+_LARGEST, _LEGEND, _STRIP = (1200, 900), 640, 56
+_DPI = 100
 
 
 # ---- pages of poses ----------------------------------------------------------------------------
@@ -155,7 +163,7 @@ def _draw_pose(
             axes.plot(*place(curve).T, **canvas.STAGE_LINES[kind])
             spread = shape.spread if factor == 1 and stage is stages[-1].stage else None
             if spread is not None and spread.ndim == 1:
-                outline = place(band_outline(shape.curve, EDGE * spread))
+                outline = place(style.band_outline(shape.curve, EDGE * spread))
                 axes.fill(*outline.T, color=canvas.STAGE_LINES[kind]["color"], alpha=0.2)
     if len(pose.points):
         shown = pose.points[:: max(1, len(pose.points) // _POINTS)]
@@ -221,6 +229,81 @@ def _arranged(count: int) -> tuple[int, int]:
 
     columns = min((3, 4, 5, 6), key=price)
     return math.ceil(count / columns), columns
+
+
+# ---- photographs under all lines ---------------------------------------------------------------
+
+
+def write_overlays(folder: Path, outcome: Outcome) -> None:
+    """Draw a JPEG for each pose with a photograph into a new folder, if there is any."""
+    if any(pose.image is not None for pose in outcome.poses):
+        make_folder(folder)
+    for pose in outcome.poses:
+        if pose.image is not None and pose.to_pixels is not None:
+            try:
+                image = read_image(pose.image)[..., ::-1]
+            except MeasurementError:  # deleted since it was measured
+                continue
+            _draw_overlay(folder / f"{pose.name}.jpg", image, pose, outcome)
+
+
+def _draw_overlay(path: Path, image: NDArray[np.uint8], pose: PoseInput, outcome: Outcome) -> None:
+    """Draw the part of a photograph (H, W, 3; red, green, blue) that holds the cable."""
+    lines = []
+    for kind, label, stage in compared(outcome):
+        shape = stage.shapes.get(pose.name)
+        if shape is not None:
+            label += "" if shape.rmse is None else f", {millimetres(shape.rmse)}"
+            lines.append((np.asarray(pose.to_pixels(shape.curve)), kind, label))
+    measured = np.zeros((0, 2)) if pose.pixels is None else pose.pixels
+    (left, top), (right, bottom) = _cut_out(image, [measured, *(line[0] for line in lines)])
+    zoom = min(_LARGEST[0] / (right - left), _LARGEST[1] / (bottom - top))
+    width, height = round((right - left) * zoom), round((bottom - top) * zoom)
+    part = Image.fromarray(image[top:bottom, left:right]).resize(
+        (width, height), Image.Resampling.BILINEAR
+    )
+    whole = max(width, _LEGEND)
+    with style.styled((whole / _DPI, (height + _STRIP) / _DPI), layout=None) as drawing:
+        share = _STRIP / (height + _STRIP)
+        axes = drawing.add_axes(((1 - width / whole) / 2, share, width / whole, 1 - share))
+        axes.set_axis_off()
+        axes.plot(*measured.T, ".", color="white", ms=4.2)
+        axes.plot(*measured.T, ".", color="black", ms=2.2, label="measured")
+        for line, kind, label in lines:
+            axes.plot(*line.T, color="white", lw=2.6, alpha=0.6)
+            axes.plot(*line.T, **canvas.STAGE_LINES[kind], lw=1.5, label=label)
+        axes.set_xlim(left - 0.5, right - 0.5)
+        axes.set_ylim(bottom - 0.5, top - 0.5)
+        role = "held out" if pose.role == "held_out" else "fit"
+        drawing.legend(
+            loc="lower center", ncols=3, fontsize=9, frameon=False, title=f"{pose.name} ({role})"
+        )
+        drawing.set_dpi(_DPI)
+        drawing.patch.set_alpha(0.0)
+        painter = FigureCanvasAgg(drawing)
+        painter.draw()
+        over = Image.fromarray(np.asarray(painter.buffer_rgba()))
+    # Matplotlib takes longer for a photograph than for all the lines over it.
+    page = Image.new("RGB", over.size, "white")
+    page.paste(part, ((whole - width) // 2, 0))
+    page.paste(over, mask=over)
+    write_file(path, lambda stream: page.save(stream, "JPEG", quality=88))
+
+
+def _cut_out(
+    image: NDArray[np.uint8], lines: Sequence[FloatArray]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Corners (left, top), (right, bottom) [px] of a window around all lines, with a margin."""
+    size = np.array([image.shape[1], image.shape[0]])
+    drawn = np.concatenate(lines)
+    drawn = np.clip(drawn[np.isfinite(drawn).all(axis=1)], 0, size - 1)
+    if not len(drawn):
+        return (0, 0), (int(size[0]), int(size[1]))
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    margin = 0.12 * float((high - low).max()) + 8
+    low = np.maximum(np.floor(low - margin), 0).astype(int)
+    high = np.minimum(np.ceil(high + margin), size).astype(int)
+    return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
 
 
 # ---- in one frame ------------------------------------------------------------------------------

@@ -6,16 +6,19 @@ and can be hidden one by one. A cable in space stands in a room: its lines also 
 coordinates in the room, and the page redraws them when the room is rotated.
 """
 
+import base64
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.config import Config
 from dlo_casadi.config.sections import Pose
-from dlo_casadi.errors import counted
-from dlo_casadi.report.photographs import PHOTOGRAPHS, photograph_of
+from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.report.scene import (
     Mark,
     Room,
@@ -33,7 +36,7 @@ from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput
 from dlo_casadi.session.pose_shape import PoseShape
 from dlo_casadi.show.text import millimetres
-from dlo_casadi.vision import nearest_in_order
+from dlo_casadi.vision import nearest_in_order, read_image
 
 Box = tuple[float, float, float, float]  # left, top, width, height
 
@@ -41,6 +44,10 @@ Box = tuple[float, float, float, float]  # left, top, width, height
 _ROOM = 1.3
 _GRID = 100.0  # mm
 _PER_POINT = 4  # points of a predicted curve drawn for each point of the photograph
+# Size [bytes] of all photographs of a page; as base64 text they take a third more.
+PHOTOGRAPHS = 3_000_000
+_WIDEST, _NARROWEST = 1280, 320  # px
+_QUALITIES = (82, 70, 55)
 
 
 @dataclass(frozen=True)
@@ -246,6 +253,40 @@ def _photographed(declared: Pose, pose: PoseInput, board: Background, budget: in
         return board
     uri, width, height = photograph
     return Background((-0.5, -0.5, float(width), float(height)), board.scene, pose.to_pixels, uri)
+
+
+def photograph_of(path: Path, budget: int) -> tuple[str, int, int] | None:
+    """Read a photograph as a small JPEG in a data URI, with its true width and height [px].
+
+    Parameters
+    ----------
+    budget : int
+        Largest size [bytes] of the JPEG; quality is reduced first, then width.
+
+    None where the file cannot be read.
+    """
+    try:
+        pixels = read_image(path)[..., ::-1]
+    except MeasurementError:
+        return None
+    height, width = pixels.shape[:2]
+    whole = Image.fromarray(np.ascontiguousarray(pixels))
+    wide = float(min(_WIDEST, width))
+    while True:
+        size = (round(wide), max(1, round(wide * height / width)))
+        small = (
+            whole if size == whole.size else whole.resize(size, Image.Resampling.LANCZOS, None, 2)
+        )
+        for quality in _QUALITIES:
+            buffer = io.BytesIO()
+            small.save(buffer, "JPEG", quality=quality)
+            if buffer.tell() <= budget:
+                break
+        if buffer.tell() <= budget or wide <= _NARROWEST:
+            break
+        wide = max(_NARROWEST, min(0.8, 0.95 * (budget / buffer.tell()) ** 0.5) * wide)
+    text = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return f"data:image/jpeg;base64,{text}", width, height
 
 
 # ---- one picture -------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from dlo_casadi.cable.picture import draw_shape
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.report import figures, figures_poses
-from dlo_casadi.report.photographs import write_overlays
+from dlo_casadi.report.figures_poses import write_overlays
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.words import compared
 from dlo_casadi.session.outcome import FoundEffect, PoseInput

@@ -28,8 +28,7 @@ from dlo_casadi.report.page import (
     symmetric_interval,
     units,
 )
-from dlo_casadi.report.page_pictures import pictures
-from dlo_casadi.report.photographs import PHOTOGRAPHS, photograph_of
+from dlo_casadi.report.page_pictures import PHOTOGRAPHS, photograph_of, pictures
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.tables import stage_rows
 from dlo_casadi.show import style
