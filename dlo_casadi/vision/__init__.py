@@ -10,31 +10,3 @@ from dlo_casadi.vision.image import draw_steps, encoded, read_image
 from dlo_casadi.vision.image_curve import ImageCurve, nearest_in_order, see_cable
 from dlo_casadi.vision.space_line import SpaceLine, Views, measure_views
 from dlo_casadi.vision.workplane import KnownCable
-
-__all__ = [
-    "Board",
-    "Calibration",
-    "Camera",
-    "CameraPose",
-    "ExtractedCenterline",
-    "ImageCurve",
-    "KnownCable",
-    "SpaceLine",
-    "View",
-    "Views",
-    "Workings",
-    "calibrate_camera",
-    "compare_pixels",
-    "draw_steps",
-    "encoded",
-    "extract_centerline",
-    "from_reference",
-    "line_in_cloud",
-    "locate_board",
-    "locate_camera",
-    "measure_views",
-    "nearest_in_order",
-    "of_color",
-    "read_image",
-    "see_cable",
-]
