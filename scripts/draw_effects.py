@@ -20,9 +20,10 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipKind, HeldClip
-from dlo_casadi.report.canvas import BLACK, BLUE, GREY, WIDTH, line_of, styled
+from dlo_casadi.report.canvas import WIDTH, line_of
 from dlo_casadi.report.scene import seen
 from dlo_casadi.rod.obstacles import Plane
+from dlo_casadi.show.style import BLACK, BLUE, GREY, styled
 
 PICTURES = Path(__file__).parents[1] / "docs/pages/effects"
 LENGTH, ELEMENTS = 0.8, 40

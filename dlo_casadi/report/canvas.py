@@ -15,49 +15,39 @@ from matplotlib.lines import Line2D
 
 from dlo_casadi.report.scene import Mark, Room, Scene, seen
 from dlo_casadi.session.outcome import Outcome
-from dlo_casadi.show.style import (
-    BLACK,
-    BLUE,
-    CONTACT,
-    FORCE,
-    GREY,
-    OBSTACLE,
-    ORANGE,
-    STYLE,
-    VERMILLION,
-    lay_out,
-    styled,
-)
+from dlo_casadi.show import style
 
 # Stages that every figure compares.
 STAGE_LINES: dict[str, dict[str, Any]] = {
-    "before": {"color": ORANGE, "ls": "--"},
-    "after": {"color": BLUE, "ls": "-"},
+    "before": {"color": style.ORANGE, "ls": "--"},
+    "after": {"color": style.BLUE, "ls": "-"},
 }
+# A fixture is a line too short to be seen, with a marker at its first point.
+_FIXTURE: dict[str, Any] = {"color": style.BLACK, "markevery": [0]}
 # Style of each kind of mark in a scene.
 STYLES: dict[str, dict[str, Any]] = {
     "grid": {"color": "#E3E3E3", "lw": 0.6},
     "shadow": {"color": "#9AA5B1", "lw": 1.0},
     "plumb": {"color": "#9AA5B1", "lw": 0.8, "ls": ":"},
-    "world": {"color": GREY, "lw": 0.9},
-    "weight": {"color": GREY, "lw": 0.9},
-    "force": {"color": FORCE, "lw": 1.2},
-    "force-read": {"color": BLACK, "lw": 1.0, "ls": ":"},
+    "world": {"color": style.GREY, "lw": 0.9},
+    "weight": {"color": style.GREY, "lw": 0.9},
+    "force": {"color": style.FORCE, "lw": 1.2},
+    "force-read": {"color": style.BLACK, "lw": 1.0, "ls": ":"},
     "taken": {"color": "#9AA5B1", "lw": 1.2},
-    "pulled": {"color": BLUE, "lw": 5, "solid_capstyle": "butt"},
-    "pull": {"color": VERMILLION, "lw": 1.6},
-    "next": {"color": VERMILLION, "lw": 2.2},
-    "next-letter": {"color": VERMILLION, "fontsize": 10},
-    "letter": {"color": GREY, "fontsize": 7},
+    "pulled": {"color": style.BLUE, "lw": 5, "solid_capstyle": "butt"},
+    "pull": {"color": style.VERMILLION, "lw": 1.6},
+    "next": {"color": style.VERMILLION, "lw": 2.2},
+    "next-letter": {"color": style.VERMILLION, "fontsize": 10},
+    "letter": {"color": style.GREY, "fontsize": 7},
     "marker": {"color": "#C9D0D8", "lw": 1.0},
-    "obstacle": OBSTACLE,
-    "contact": CONTACT,
+    "obstacle": style.OBSTACLE,
+    "contact": style.CONTACT,
     "axis-x": {"color": "#D0103A", "lw": 1.2},
     "axis-y": {"color": "#00805A", "lw": 1.2},
     "axis-z": {"color": "#3A3AD6", "lw": 1.2},
-    "fixture start": {"color": BLACK, "marker": "s", "ms": 3, "markevery": [0]},
-    "fixture end": {"color": BLACK, "marker": "o", "ms": 3, "markevery": [0]},
-    "fixture clip": {"color": BLACK, "marker": "D", "mfc": "white", "ms": 5, "markevery": [0]},
+    "fixture start": _FIXTURE | {"marker": "s", "ms": 3},
+    "fixture end": _FIXTURE | {"marker": "o", "ms": 3},
+    "fixture clip": _FIXTURE | {"marker": "D", "mfc": "white", "ms": 5},
 }
 
 # Width [inch] of a chart: its text is as large as a footnote even on a phone.
@@ -72,8 +62,8 @@ def inline_svg(drawing: Figure, name: str) -> str:
     start with the `name` of the chart.
     """
     text = io.StringIO()
-    with mpl.rc_context(STYLE | {"svg.fonttype": "none", "svg.hashsalt": name}):
-        lay_out(drawing, 72)
+    with mpl.rc_context(style.STYLE | {"svg.fonttype": "none", "svg.hashsalt": name}):
+        style.lay_out(drawing, 72)
         drawing.savefig(text, format="svg", metadata={"Date": None})
     root = ET.fromstring(text.getvalue())
     for unwanted in root[:2]:  # metadata, and a style sheet that would change the whole page
@@ -106,7 +96,7 @@ def chart(
     outcome: Outcome, said: str, height: float, panels: int = 1, width: float = WIDTH
 ) -> Iterator[tuple[Figure, list[Axes]]]:
     """Open a figure of a run with panels below one another and a headline."""
-    with styled((width, height)) as drawing:
+    with style.styled((width, height)) as drawing:
         yield drawing, list(drawing.subplots(panels, 1, squeeze=False, sharex=True)[:, 0])
         headline(drawing, f"{outcome.config.cable.name}: {said}")
 

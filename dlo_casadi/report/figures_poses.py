@@ -143,11 +143,7 @@ def _legend_of(
 
 
 def _draw_pose(
-    axes: Axes,
-    pose: PoseInput,
-    stages: Sequence[ComparedStage],
-    factor: int,
-    scene: Scene,
+    axes: Axes, pose: PoseInput, stages: Sequence[ComparedStage], factor: int, scene: Scene
 ) -> None:
     def place(points: FloatArray) -> FloatArray:
         return seen(scene.points(points))
