@@ -80,17 +80,19 @@ def errors_figure(outcome: Outcome) -> Figure:
     floor = outcome.measurement.noise_distance
     shown = ["fit", *["cross-validated"] * bool(validated)]
     shown += ["held out"] * bool(outcome.measurement.poses_held_out)
-    rows = []
+    rows: list[tuple[float, str, float | None]] = []
+    middles = []
     for k, stage in enumerate(outcome.stages):
         values = (stage.rmse_fit, validated.get(stage.name), stage.rmse_held_out)
         known = dict(zip(_KINDS, values, strict=True))
         own = [kind for kind in shown if kind != "cross-validated" or known[kind] is not None]
-        rows += [(k, kind, known[kind]) for kind in own]
-    places = [-(i + 0.8 * k) for i, (k, *_) in enumerate(rows)]
+        places = [-(len(rows) + i + 0.8 * k) for i in range(len(own))]
+        rows += [(y, kind, known[kind]) for y, kind in zip(places, own, strict=True)]
+        middles.append(np.mean(places))
     height = 1.6 + 0.2 * len(rows) + 0.2 * len(outcome.stages)
     with canvas.chart(outcome, "error of each stage", height) as (drawing, (axes,)):
         left, right = _error_axis(axes, [value for *_, value in rows], floor, 4.0)
-        for y, (_, kind, value) in zip(places, rows, strict=True):
+        for y, kind, value in rows:
             if value is None or not np.isfinite(value):
                 axes.text(1.1 * left, y, "no value", va="center", color=style.GREY, bbox=_PAPER)
                 continue
@@ -108,14 +110,10 @@ def errors_figure(outcome: Outcome) -> Figure:
                 va="center",
                 bbox=_PAPER,
             )
-        middles = [
-            np.mean([y for y, (own, *_) in zip(places, rows, strict=True) if own == k])
-            for k in range(len(outcome.stages))
-        ]
         labels = [words.label_of(stage, outcome) for stage in outcome.stages]
         names = [textwrap.fill(label, 18, break_long_words=False) for label in labels]
         axes.set_yticks(middles, names)
-        axes.set_ylim(min(places) - 0.7, 0.7)
+        axes.set_ylim(rows[-1][0] - 0.7, 0.7)
         handles = [canvas.dot(kind, *_KINDS[kind]) for kind in shown]
         drawing.legend(handles=[*handles, _floor(floor)], loc="outside lower center", ncols=2)
     return drawing

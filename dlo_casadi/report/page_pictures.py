@@ -274,9 +274,7 @@ def photograph_of(path: Path, budget: int) -> tuple[str, int, int] | None:
     wide = float(min(_WIDEST, width))
     while True:
         size = (round(wide), max(1, round(wide * height / width)))
-        small = (
-            whole if size == whole.size else whole.resize(size, Image.Resampling.LANCZOS, None, 2)
-        )
+        small = whole.resize(size, Image.Resampling.LANCZOS, None, 2)
         for quality in _QUALITIES:
             buffer = io.BytesIO()
             small.save(buffer, "JPEG", quality=quality)

@@ -84,9 +84,7 @@ class CurveFit:
 
     curve: SpaceCurve
     covariance: FloatArray  # (n, 3, n, 3) [m^2] of its coefficients, across the curve
-    params: tuple[
-        FloatArray, ...
-    ]  # (K,), t of each photograph's pixels; nan where not of the curve
+    params: tuple[FloatArray, ...]  # (K,), t of each photograph's pixels; nan where not of it
     residuals: tuple[FloatArray, ...]  # (K,) [px], distances across the projected curve, or nan
     surprise: float  # -2 log of the marginal likelihood, up to a constant: compares hypotheses
 
