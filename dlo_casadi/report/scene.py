@@ -226,16 +226,12 @@ def _rooms(
     directions = upright(config.experiment.gravity)
     standing = [_MM * np.concatenate(lines) @ directions.T for lines in drawn]
     middles = [(points.min(axis=0) + points.max(axis=0)) / 2 for points in standing]
-    away = [np.linalg.norm(x - c, axis=1).max() for x, c in zip(standing, middles, strict=True)]
-    radius = float(max(away)) + _IN_ROOM * length
+    about = [points - middle for points, middle in zip(standing, middles, strict=True)]
+    radius = float(max(np.linalg.norm(x, axis=1).max() for x in about)) + _IN_ROOM * length
     newton = _scale(_IN_ROOM * length, forces)
-    floors = [
-        float((points[:, 2] - middle[2]).min()) - _AIR * length
-        for points, middle in zip(standing, middles, strict=True)
-    ]
     return [
-        Room(directions, middle, radius, floor, length, newton)
-        for middle, floor in zip(middles, floors, strict=True)
+        Room(directions, middle, radius, float(x[:, 2].min()) - _AIR * length, length, newton)
+        for middle, x in zip(middles, about, strict=True)
     ]
 
 
