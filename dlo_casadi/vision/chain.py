@@ -220,7 +220,6 @@ def _links(ways: list[FloatArray], diameter: float, scene: Scene) -> tuple[Float
 
     def angle(a: FloatArray, b: FloatArray) -> FloatArray:
         """Angle [rad] of unit vectors (..., d), in any dimension."""
-        a, b = np.broadcast_arrays(a, b)
         return 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
 
     across = np.array([way[0] for way in ways])[None] - np.array([way[-1] for way in ways])[:, None]
