@@ -284,9 +284,7 @@ def _cable_dict(
         "schema": SCHEMA,
         "cable": {
             **fields_of(model.cable, "name", "length", "mass", "diameter"),
-            **fields_of(
-                model.cable, "bending_stiffness", *["torsional_stiffness"] * model.in_space
-            ),
+            **fields_of(model.cable, *STIFFNESSES[: 1 + model.in_space]),
             "rest_shape": "straight" if model.cable.straight else "curved",
         },
         "boundary": {"start": model.start, "end": model.end},

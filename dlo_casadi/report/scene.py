@@ -182,6 +182,8 @@ def scenes_of(
     """
     last, length = stages[-1].shapes if stages else {}, config.cable.length
     declared = {pose.name: pose for pose in config.experiment.poses}
+    shapes = last.values()
+    pressed = [np.array(one["force"]) for shape in shapes for one in shape.contacts]
     scenes: Sequence[Scene]
     if config.experiment.in_space:
         drawn = [
@@ -189,13 +191,13 @@ def scenes_of(
             + [stage.shapes[pose.name].curve for stage in stages if pose.name in stage.shapes]
             for pose in poses
         ]
-        scenes = _rooms(config, drawn, [x for shape in last.values() for x in _all_forces(shape)])
+        ends = [force for shape in shapes for force in shape.forces]
+        clips = [np.array(one["force"]) for shape in shapes for one in shape.clips]
+        scenes = _rooms(config, drawn, [*ends, *clips, *pressed])
     else:
-        pairs = [pair for shape in last.values() for pair in _forces_read(shape).values()]
+        pairs = [pair for shape in shapes for pair in _forces_read(shape).values()]
         known = [force for pair in pairs for force in pair]
-        known += [np.array(one["force"]) for shape in last.values() for one in shape.contacts]
-        board = Plane(length, _scale(_AT_END * length, known))
-        scenes = [board] * len(poses)
+        scenes = [Plane(length, _scale(_AT_END * length, [*known, *pressed]))] * len(poses)
     surfaces = stages[-1].surfaces if stages else config.experiment.surfaces
     marks = []
     for pose, scene in zip(poses, scenes, strict=True):
@@ -210,12 +212,6 @@ def scenes_of(
 def held_places(pose: Pose) -> FloatArray:
     """Points (1 or 2, d) [m] at which the ends of a pose are held."""
     return np.array([place for place in (pose.start, pose.end) if place is not None])
-
-
-def _all_forces(shape: PoseShape) -> list[FloatArray]:
-    """Forces (d,) [N] of the cable on everything it touches."""
-    touched = (*shape.clips, *shape.contacts)
-    return [*shape.forces, *(np.array(one["force"]) for one in touched)]
 
 
 def _rooms(
