@@ -24,6 +24,8 @@ STAGE_LINES: dict[str, dict[str, Any]] = {
 }
 # A fixture is a line too short to be seen, with a marker at its first point.
 _FIXTURE: dict[str, Any] = {"color": style.BLACK, "markevery": [0]}
+_PAPER = {"fc": "white", "ec": "none", "alpha": 0.8, "pad": 0.5}
+_LETTER: dict[str, Any] = {"ha": "center", "va": "center", "bbox": _PAPER}
 # Style of each kind of mark in a scene.
 STYLES: dict[str, dict[str, Any]] = {
     "grid": {"color": "#E3E3E3", "lw": 0.6},
@@ -37,8 +39,8 @@ STYLES: dict[str, dict[str, Any]] = {
     "pulled": {"color": style.BLUE, "lw": 5, "solid_capstyle": "butt"},
     "pull": {"color": style.VERMILLION, "lw": 1.6},
     "next": {"color": style.VERMILLION, "lw": 2.2},
-    "next-letter": {"color": style.VERMILLION, "fontsize": 10},
-    "letter": {"color": style.GREY, "fontsize": 7},
+    "next-letter": _LETTER | {"color": style.VERMILLION, "fontsize": 10},
+    "letter": _LETTER | {"color": style.GREY, "fontsize": 7},
     "marker": {"color": "#C9D0D8", "lw": 1.0},
     "obstacle": style.OBSTACLE,
     "contact": style.CONTACT,
@@ -117,15 +119,7 @@ def draw_marks(axes: Axes, marks: Iterable[Mark]) -> None:
     for mark in marks:
         points = seen(mark.points)
         if mark.label:
-            axes.text(
-                points[0, 0],
-                points[0, 1],
-                mark.label,
-                **STYLES[mark.kind],
-                ha="center",
-                va="center",
-                bbox={"fc": "white", "ec": "none", "alpha": 0.8, "pad": 0.5},
-            )
+            axes.text(*points[0], mark.label, **STYLES[mark.kind])
         elif mark.kind in STYLES:
             axes.plot(*points.T, **STYLES[mark.kind])
 

@@ -209,10 +209,8 @@ def find_edges(
             shade = 0.5 * np.median(right[:, clear] - left[:, clear], axis=1)
             shade[np.abs(shade) > _MOST_SHADE * np.abs(core - around)] = 0.0
             tilt = median_filter(shade, size=near, mode="nearest")
-        (to_left, left_blur), (to_right, right_blur) = (
-            _mean_crossing(left, core - tilt, beside[0], step),
-            _mean_crossing(right, core + tilt, beside[1], step),
-        )
+        to_left, left_blur = _mean_crossing(left, core - tilt, beside[0], step)
+        to_right, right_blur = _mean_crossing(right, core + tilt, beside[1], step)
         move = np.clip(0.5 * (to_right - to_left), -0.3 * shape.width, 0.3 * shape.width)
         centre = np.clip(centre + move, -0.5 * shape.width, 0.5 * shape.width)
     return Crossings(centre, to_left + to_right, 0.5 * (left_blur + right_blur), core - around)

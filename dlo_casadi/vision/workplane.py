@@ -283,9 +283,7 @@ def find_strands(mask: BoolArray, width_px: float) -> list[tuple[IntArray, float
     around = np.array([padded[i : i + height, j : j + width] for i, j in ring])
     meeting = lines & (np.sum(~around & np.roll(around, -1, axis=0), axis=0) >= 3)
     lines &= cv2.dilate(meeting.astype(np.uint8), square) == 0
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(
-        lines.astype(np.uint8), connectivity=8
-    )
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(lines.astype(np.uint8))
     large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= width_px]
     large.sort(key=lambda i: -stats[i, cv2.CC_STAT_AREA])
     strands = []
