@@ -87,20 +87,15 @@ def inline_svg(drawing: Figure, name: str) -> str:
     return ET.tostring(root, encoding="unicode")
 
 
-def headline(drawing: Figure, text: str) -> None:
-    """Write above a figure what it shows, in lines no wider than the figure."""
-    letters = int(12 * drawing.get_figwidth())
-    drawing.suptitle(textwrap.fill(text, letters, break_on_hyphens=False), fontsize=11)
-
-
 @contextmanager
 def chart(
     outcome: Outcome, said: str, height: float, panels: int = 1, width: float = WIDTH
 ) -> Iterator[tuple[Figure, list[Axes]]]:
-    """Open a figure of a run with panels below one another and a headline."""
+    """Open a figure of a run with panels below one another and a headline no wider than it."""
     with style.styled((width, height)) as drawing:
         yield drawing, list(drawing.subplots(panels, 1, squeeze=False, sharex=True)[:, 0])
-        headline(drawing, f"{outcome.config.cable.name}: {said}")
+        text, letters = f"{outcome.config.cable.name}: {said}", int(12 * width)
+        drawing.suptitle(textwrap.fill(text, letters, break_on_hyphens=False), fontsize=11)
 
 
 def line_of(label: str, **style: Any) -> Line2D:

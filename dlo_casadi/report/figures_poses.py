@@ -307,10 +307,10 @@ def _cut_out(
 
 def outcome_figure(outcome: Outcome) -> Figure:
     """All poses in one frame: measured points, and the shapes predicted from their ends alone."""
-    stage = outcome.stages[-1]
-    with style.styled((7.0, 5.0)) as drawing:
-        axes = drawing.subplots()
-        scene, _ = scene_of(outcome)
+    stage, (scene, _) = outcome.stages[-1], scene_of(outcome)
+    errors = ", ".join(f"{name} {value}" for name, value in error_rows(outcome)[:2])
+    squares = f"; squares of {scene.square:g} mm" if isinstance(scene, Room) else ""
+    with canvas.chart(outcome, errors + squares, 5.0, width=7.0) as (drawing, (axes,)):
         canvas.draw_marks(axes, scene.ground())
         for pose in outcome.poses:
             color = style.HELD_OUT if pose.role == "held_out" else style.BLUE
@@ -325,9 +325,6 @@ def outcome_figure(outcome: Outcome) -> Figure:
         if any(pose.role == "held_out" for pose in outcome.poses):
             axes.plot([], [], color=style.HELD_OUT, label="held out of the fit")
         canvas.frame(axes, scene)
-        errors = ", ".join(f"{name} {value}" for name, value in error_rows(outcome)[:2])
-        squares = f"; squares of {scene.square:g} mm" if isinstance(scene, Room) else ""
-        canvas.headline(drawing, f"{outcome.config.cable.name}: {errors}{squares}")
         drawing.legend(loc="outside lower center", ncols=3)
     return drawing
 
@@ -346,9 +343,8 @@ def limits_figure(outcome: Outcome) -> Figure:
     gaps = {item: k + names.index(item.quantity) for k, item in enumerate(checks)}
     height = 1.8 + 0.22 * (len(checks) + len(names))
     length = outcome.config.cable.length
-    with canvas.chart(
-        outcome, "how much of each limit is used, how likely it is violated", height
-    ) as (drawing, (axes,)):
+    said = "how much of each limit is used, how likely it is violated"
+    with canvas.chart(outcome, said, height) as (drawing, (axes,)):
         for item, row in gaps.items():
             _draw_row(axes, item, -row, length)
         labels = [f"{item.label}  {item.pose}" for item in checks]
