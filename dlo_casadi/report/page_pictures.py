@@ -8,7 +8,7 @@ coordinates in the room, and the page redraws them when the room is rotated.
 
 import base64
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -335,7 +335,7 @@ def _picture(
         force = float(np.linalg.norm(one["force"]))
         facts.append(("contact", f"force on {one['obstacle']}", f"{force:.3g} N"))
     if last is not None and measurement is not None:
-        facts += [("force-read", *fact) for fact in _readings(measurement, last)]
+        facts += _readings(measurement, last)
     what = "Photograph" if behind.photograph else "Drawing of the board"
     what = f"{'Drawing in space' if behind.room else what}, pose {pose.name}"
     if not len(pose.points):
@@ -366,15 +366,13 @@ def _picture(
     )
 
 
-def _readings(measurement: MeasurementSummary, shape: PoseShape) -> list[tuple[str, str]]:
+def _readings(measurement: MeasurementSummary, shape: PoseShape) -> Iterator[tuple[str, str, str]]:
     """Each reading by name: difference from the predicted one, in units and relative to noise."""
-    facts = []
     for name, (known, model) in shape.readings.items():
         std, unit = measurement.std_of(name.split("_")[-1])
         off, size = float(np.linalg.norm(known - model)), float(np.linalg.norm(known))
         text = f"{size:.3g} {unit}, off by {off:.2g} {unit} ({off / std:.1f} std)"
-        facts.append((name.replace("_", " "), text))
-    return facts
+        yield "force-read", name.replace("_", " "), text
 
 
 def _view_picture(

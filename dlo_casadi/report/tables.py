@@ -17,8 +17,6 @@ from dlo_casadi.show.text import html_table
 _STRONG = 0.9
 # A row of the tables of parameters: name, value, 95 % interval, remark.
 Row = tuple[str, str, str, str]
-
-
 NO_FIT = "of a model that does not fit"
 
 
