@@ -114,7 +114,7 @@ def draw_marks(axes: Axes, marks: Iterable[Mark]) -> None:
     for mark in marks:
         points = seen(mark.points)
         if mark.label:
-            axes.text(*points[0], mark.label, **STYLES[mark.kind])
+            axes.text(points[0, 0], points[0, 1], mark.label, **STYLES[mark.kind])
         elif mark.kind in STYLES:
             axes.plot(*points.T, **STYLES[mark.kind])
 
