@@ -92,7 +92,7 @@ class Room:
     @property
     def square(self) -> float:
         """Side of the floor's squares [mm]: 1, 2 or 5 times a power of ten."""
-        wanted = self.length / 5
+        wanted = self.length / 5 * (1 + 1e-9)  # log10 of a number just below a power rounds up
         tens = 10.0 ** np.floor(np.log10(wanted))
         return float(tens * max(step for step in (1, 2, 5) if step * tens <= wanted))
 

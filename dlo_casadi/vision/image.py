@@ -1,10 +1,11 @@
 """Read photographs, refusing incomplete ones, and draw the steps of an extraction."""
 
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ _BLURRED_PX = 2.0  # std of blurred edges beyond which markers of some 30 px can
 # 1.5 GB for this number, which shows a board of 1 m at 0.1 mm per pixel.
 MOST_PIXELS = 100_000_000
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
+_QUIET = Lock()
 
 
 def read_image(path: Path | str) -> Picture:
@@ -82,20 +84,29 @@ def read_image(path: Path | str) -> Picture:
     return np.asarray(image, np.uint8)
 
 
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Ignore warnings about damaged tags, which are not used.
+
+    One thread at a time: each restores the filters that it has found.
+    """
+    with _QUIET, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
 def _opened(data: bytes) -> ImageFile.ImageFile | None:
     """The picture, only its header read; None if it is no known image."""
     Image.init()
     for name in _FORMATS:
-        with warnings.catch_warnings(), suppress(SyntaxError, OSError, ValueError):
-            warnings.simplefilter("ignore")  # on damaged tags, which are not used
+        with _without_warnings(), suppress(SyntaxError, OSError, ValueError):
             return Image.OPEN[name][0](BytesIO(data), "")  # raises for files of other formats
     return None
 
 
 def _is_whole(picture: ImageFile.ImageFile) -> bool:
     """Whether the file holds all of a picture; a JPEG is read at an eighth of its size."""
-    with warnings.catch_warnings(), suppress(SyntaxError, OSError, ValueError, EOFError):
-        warnings.simplefilter("ignore")
+    with _without_warnings(), suppress(SyntaxError, OSError, ValueError, EOFError):
         picture.draft(None, (1, 1))
         picture.load()
         return True

@@ -98,6 +98,8 @@ def see_cable(
     shared = np.nonzero(hidden)[0][::every]
     kept = np.sort(np.concatenate([line.kept[~hidden[line.kept]], shared]))
     workings.pixels = view.to_pixels(trace.points[kept])
+    before = np.searchsorted(kept, line.kept[list(line.gaps)], side="right") - 1
+    workings.gaps = tuple(before.tolist())
     tips = [
         f"the line in the photograph ends {away / pixel:.0f} px from where the {name} is declared"
         for name, _, _, away in expected.tips(trace.points[kept])

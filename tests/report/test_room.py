@@ -15,7 +15,7 @@ from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.figures import figures_of, write_figures
 from dlo_casadi.report.figures_poses import draw_poses, outcome_figure
 from dlo_casadi.report.page import report_page
-from dlo_casadi.report.scene import VIEWS, scenes_of, seen, upright
+from dlo_casadi.report.scene import VIEWS, Room, scenes_of, seen, upright
 from dlo_casadi.report.terminal import print_summary
 from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
 from dlo_casadi.show.style import arrow
@@ -25,6 +25,14 @@ def in_room_pulled(outcome):
     """The outcome as if something had pulled the cable, and a next pose were known."""
     proposal, load = replace(PROPOSAL, end=(0.6, -0.2, 0.3)), pull((0, 0, 0.2), (0, 0.2, 0.2))
     return diagnosed(outcome, unexplained=load, verdict="unexplained", next_pose=proposal)
+
+
+@pytest.mark.parametrize("length", [0.5, np.nextafter(0.5, 0.0), 0.7, 1.9, 5.0])
+def test_squares_of_the_floor_are_a_round_fifth_of_the_cable(length):
+    room = Room(np.eye(3), np.zeros(3), 1.0, 0.0, 1e3 * length, 1.0)
+    round_sizes = [k * ten for ten in (10, 100, 1000) for k in (1, 2, 5)]
+    fifth = 200 * length * (1 + 1e-9)
+    assert room.square == max(size for size in round_sizes if size <= fifth)
 
 
 def test_gravity_points_down_whichever_axis_it_has():

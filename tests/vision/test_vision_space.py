@@ -23,6 +23,7 @@ from dlo_casadi.errors import VisionError
 from dlo_casadi.vision import (
     Camera,
     KnownCable,
+    Workings,
     compare_pixels,
     locate_camera,
     measure_views,
@@ -172,6 +173,18 @@ def test_the_line_in_space(pictures, name, places):
     assert np.mean(cKDTree(found.line.points).query(curve)[0] < 2.5e-3) > 0.95
     assert 0.7 < rms(away / found.line.std) < 2.0
     assert set(found.curves) == set(places)
+
+
+def test_a_covered_stretch_is_a_gap_of_the_line_that_is_drawn(pictures):
+    curve, image = CURVES["bow"], pictures["bow"]["left"].copy()
+    middle = true_pixels(curve, "left")[len(curve) // 2].round().astype(int)
+    cv2.circle(image, middle.tolist(), 40, (185, 185, 185), -1)
+    workings = Workings()
+    see_cable(image, locate_camera(image, BOARD, CAMERA), known(curve), workings)
+
+    steps = np.linalg.norm(np.diff(workings.pixels, axis=0), axis=1)
+    assert steps.max() > 60
+    assert workings.gaps == (int(steps.argmax()),)
 
 
 def test_pixels_are_compared_with_a_curve_across_it(pictures):
