@@ -33,8 +33,6 @@ from dlo_casadi.equilibrium.spread import (
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.export.targets import check_counts, samples_of, target_of, write_rods
-from dlo_casadi.model.assembly import Inputs, assembly_of
-from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, clip_rows
 from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.show.text import bend_radius, html_table
@@ -202,13 +200,7 @@ class FittedCable(EstimatedCable):
 
     def shape_in(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
         """The shape in an equilibrium."""
-
-        def curve(model: CableModel, p: FloatArray) -> CableCurve:
-            given = Inputs.of(p, self.rest, pose.vector[None])
-            return CableCurve.of(self.length, assembly_of(model).curve(eq.shapes, given)[0])
-
-        true = curve(*self.model.without_kind(MeasurementEffect, self.p))
-        return Shape(self, pose, eq, true, curve(self.model, self.p))
+        return Shape(self, pose, eq)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +216,6 @@ class Shape:
         either of two sides.
     equilibrium : Equilibrium
         Nodes, reactions, energy and stability.
-    curve : CableCurve
-        The true curve of the cable, at any arc length: `curve.at(s)`.
-    seen : CableCurve
-        The same curve as measured by the session's camera.
     other_side : Shape or None
         The same pose on the other side: fallen to the other side with a free end, or twisted the
         other way between two clamps in space. Set only if parameters and fixtures leave the lower
@@ -239,10 +227,25 @@ class Shape:
     cable: FittedCable
     pose: HeldPose
     equilibrium: Equilibrium
-    curve: CableCurve
-    seen: CableCurve
     other_side: Self | None = None
     tipping: Tipping | None = None
+
+    @cached_property
+    def held(self) -> SolvedCable:
+        """The state from which an export is made, without effects of the camera."""
+        model, p = self.cable.model.without_kind(MeasurementEffect, self.cable.p)
+        return SolvedCable(model, p, self.cable.rest, self.pose, self.equilibrium)
+
+    @cached_property
+    def curve(self) -> CableCurve:
+        """The true curve of the cable, at any arc length: `curve.at(s)`."""
+        return CableCurve.of(self.cable.length, self.held.curve.numbers)
+
+    @cached_property
+    def seen(self) -> CableCurve:
+        """The same curve as measured by the session's camera."""
+        measured = replace(self.held, model=self.cable.model, p=self.cable.p)
+        return CableCurve.of(self.cable.length, measured.curve.numbers)
 
     @property
     def s(self) -> FloatArray:
@@ -257,21 +260,7 @@ class Shape:
     @cached_property
     def frames(self) -> FloatArray:
         """Material frames (101, d, d) at `s`, see `CableCurve.frames`."""
-        return self.curve.frames(self.s, self._places, self.equilibrium.x)
-
-    @property
-    def _places(self) -> FloatArray:
-        """Arc lengths (n_nodes,) [m] of the model's nodes; those of saddles are moved to these."""
-        cable = self.cable
-        given = Inputs.of(cable.p, cable.rest, self.pose.vector[None])
-        return assembly_of(cable.model).clipped(self.equilibrium.shapes, given).places[0]
-
-    @property
-    def held(self) -> SolvedCable:
-        """The state from which an export is made."""
-        model, p = self.cable.model.without_kind(MeasurementEffect, self.cable.p)
-        shape = self.curve, self.equilibrium.x, self._places
-        return SolvedCable(model, p, self.cable.rest, self.pose, *shape)
+        return self.curve.frames(self.s, self.held.places, self.equilibrium.x)
 
     @property
     def start_force(self) -> FloatArray:

@@ -28,15 +28,15 @@ from dlo_casadi.cable.held import HELD, held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
-from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.limits import Varied, fixtures_of, sizes_of
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
+from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError, counted
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.export.rod import SolvedCable
+from dlo_casadi.model.assembly import Inputs
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.show.text import vector
@@ -316,12 +316,8 @@ class _Search:
 
     def _guesses(self) -> list[FloatArray]:
         """First guesses: points of the cable without clips, moved until each span has room."""
-        known, curves = self.cable.with_clips(()), []
-        for pose in self.poses:
-            eq = solve_equilibrium(known.model, known.p, known.rest, pose)
-            given = Inputs.of(known.p, known.rest, pose.vector[None])
-            curve = assembly_of(known.model).curve(eq.shapes, given)[0]
-            curves.append(NodeCurve.of(self.length, curve))
+        bare = self.cable.with_clips(())
+        curves = [SolvedCable.of(bare.model, bare.p, bare.rest, pose).curve for pose in self.poses]
         rng, guesses, most = np.random.default_rng(0), [], -np.inf
         for _ in range(GUESSES):
             at = np.arange(1, self.count + 1) + rng.uniform(-0.3, 0.3, self.count)

@@ -7,6 +7,7 @@ with second order in h.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, Self
 
 import casadi as ca
@@ -24,6 +25,7 @@ from dlo_casadi.effects import (
     StateEffect,
 )
 from dlo_casadi.equilibrium.curve import NodeCurve
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.export.common import printable
@@ -65,33 +67,35 @@ class SolvedCable:
     Parameters
     ----------
     model : CableModel
-        Without effects of the camera.
     p : (n_parameters,)
     rest : (n_rests,) [1/m]
-    curve : NodeCurve
-        The true curve, by declared arc length.
-    x : (n_nodes, coordinates)
-        States of the model's nodes.
-    places : (n_nodes,) [m]
-        Arc lengths of the model's nodes; nodes of saddles are moved to these.
     """
 
     model: CableModel
     p: FloatArray
     rest: FloatArray
     pose: HeldPose
-    curve: NodeCurve
-    x: FloatArray
-    places: FloatArray
+    equilibrium: Equilibrium
 
     @classmethod
     def of(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> Self:
         """The cable in its predicted shape."""
-        eq = solve_equilibrium(model, p, rest, pose)
-        given, assembly = Inputs.of(p, rest, pose.vector[None]), assembly_of(model)
-        curve = NodeCurve.of(model.cable.length, assembly.curve(eq.shapes, given)[0])
-        places = assembly.clipped(eq.shapes, given).places[0]
-        return cls(model, p, rest, pose, curve, eq.x, places)
+        return cls(model, p, rest, pose, solve_equilibrium(model, p, rest, pose))
+
+    @property
+    def _given(self) -> Inputs:
+        return Inputs.of(self.p, self.rest, self.pose.vector[None])
+
+    @cached_property
+    def curve(self) -> NodeCurve:
+        """The curve by declared arc length; the true one if the model has no camera's effects."""
+        table = assembly_of(self.model).curve(self.equilibrium.shapes, self._given)[0]
+        return NodeCurve.of(self.model.cable.length, table)
+
+    @property
+    def places(self) -> FloatArray:
+        """Arc lengths (n_nodes,) [m] of the model's nodes; those of saddles are moved to these."""
+        return assembly_of(self.model).clipped(self.equilibrium.shapes, self._given).places[0]
 
 
 @dataclass(frozen=True)
@@ -375,7 +379,9 @@ def _segments(
     start, end = fixtures
     model, length = cable.model, cable.model.cable.length
     middles = np.clip((s[:-1] + s[1:]) / 2, 0.0, length)
-    frames = model.node.rotations(model.node.interpolated(middles, cable.places, cable.x))
+    frames = model.node.rotations(
+        model.node.interpolated(middles, cable.places, cable.equilibrium.x)
+    )
     ways = np.diff(_spatial(cable.curve.at(np.clip(s, 0.0, length))), axis=0)
     first, last = start.cable_place, end.cable_place
     held = [k for k, side in ((0, start), (-1, end)) if side.kind == "clamped"]
