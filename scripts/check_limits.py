@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.cable.limits import LimitCheck, limit_checks
+from dlo_casadi.cable.limits import LimitCheck, Resolved
 from dlo_casadi.config import Limits
 from dlo_casadi.effects import CableData
 from dlo_casadi.effects.clips import ClipSlip
@@ -99,7 +99,8 @@ class Case:
     def checked(self, limits: dict[str, float]) -> tuple[LimitCheck, ...]:
         """What is checked here."""
         none = np.zeros(self.cable.model.n_coefficients)
-        return limit_checks(self.cable, none, self.pose, self.found, self.known, Limits(**limits))
+        shape = Resolved(self.cable, none, self.pose, self.found, Limits(**limits))
+        return shape.checks(self.known)
 
 
 def uncertainty_of(model: CableModel) -> Uncertainty:

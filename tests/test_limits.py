@@ -12,7 +12,7 @@ import yaml
 from scipy.stats import norm
 
 import dlo_casadi as dlo
-from dlo_casadi.cable.limits import LimitCheck, _main_cause, limit_checks
+from dlo_casadi.cable.limits import LimitCheck, Resolved, _main_cause
 from dlo_casadi.cli import main
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Limits, dump_yaml, load_config, read_yaml
@@ -40,7 +40,7 @@ def check(model, pose, uncertainty, **limits) -> dict[str, LimitCheck]:
     found = solve_equilibrium(model, model.nominal, rest, pose)
     cable = CasadiCable(model, model.nominal, rest)
     none = np.zeros(model.n_coefficients)
-    checks = limit_checks(cable, none, pose, found, uncertainty, Limits(**limits))
+    checks = Resolved(cable, none, pose, found, Limits(**limits)).checks(uncertainty)
     return {item.quantity: item for item in checks}
 
 
@@ -132,7 +132,7 @@ def test_repeats_that_snap_to_the_other_side_violate_any_limit():
     pose, found = at(fold - 0.05, eq.x)
     known = Uncertainty((), np.zeros((0, 0)), {"start_heading": 0.05}, PoseScatter())
     cable, none = CasadiCable(model, model.nominal, rest), np.zeros(model.n_coefficients)
-    (item,) = limit_checks(cable, none, pose, found, known, Limits(force=100 * weight))
+    (item,) = Resolved(cable, none, pose, found, Limits(force=100 * weight)).checks(known)
     # Three standard errors of 2,000 draws, and the step of the search.
     assert item.probability == pytest.approx(norm.sf(1.0), abs=0.03)
     assert (item.lost / item.draws, item.verdict) == (item.probability, "risk")

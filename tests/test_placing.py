@@ -37,8 +37,7 @@ def used(known: CasadiCable, clips: list[dict], limits: dict, poses=POSES):
     for pose in poses:
         own = held_pose(held.model, {}, asked | pose)
         eq = solve_equilibrium(held.model, held.p, held.rest, own)
-        bounds = Limits(**limits)
-        yield from Resolved.of(held, KNOWN.coefficients, own, eq, bounds).uses(bounds)
+        yield from Resolved(held, KNOWN.coefficients, own, eq, Limits(**limits)).uses
 
 
 def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():

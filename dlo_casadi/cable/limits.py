@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self, TypeVar
+from functools import cached_property
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -181,10 +182,8 @@ def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Li
     if not asked.given:
         raise DloError(f"no limit is given, and none was declared.\n  Try: {_TRY}")
     held = (model.start, model.end, *model.clips)
-    sprung, avoided = (
-        bool(functions_of(model).moment_ends),
-        any(not x.touch for x in model.obstacles),
-    )
+    sprung = bool(functions_of(model).moment_ends)
+    avoided = any(not x.touch for x in model.obstacles)
     if wrong := [*asked.problems(held, sprung, model.node.twists, model.cable.length, avoided)]:
         raise DloError(wrong[0].message.replace(". Try:", ".\n  Try:"))
     return asked
@@ -221,7 +220,7 @@ def check_limits(
     added = model.nominal[len(cable.p) :]
     cable = replace(cable, model=model, p=np.concatenate([cable.p, added]))
     uncertainty = known.uncertainty.installed(model, stds)
-    return limit_checks(cable, known.coefficients, pose, found, uncertainty, asked)
+    return Resolved(cable, known.coefficients, pose, found, asked).checks(uncertainty)
 
 
 def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
@@ -248,32 +247,26 @@ def _size(quantity: str) -> str:
 
 @dataclass(frozen=True)
 class Resolved:
-    """A shape on several meshes, the last of which resolves its sharpest bend.
+    """A shape on the meshes that limits need; the last of them resolves its sharpest bend.
 
     If a state has changed the rest curvature, that is known only on the fit's elements, and only
-    these are used.
+    these are used. `coefficients` (n_coefficients,) [1/m]: of the rest curvature. `limits`:
+    meaningful for this cable, see `Limits.problems`.
     """
 
     cable: CasadiCable
     coefficients: FloatArray
     pose: HeldPose
-    meshes: list[tuple[CableModel, Equilibrium]]
+    found: Equilibrium
+    limits: Limits
 
-    @classmethod
-    def of(
-        cls,
-        cable: CasadiCable,
-        coefficients: FloatArray,
-        pose: HeldPose,
-        found: Equilibrium,
-        limits: Limits,
-    ) -> Self:
-        """Solve on the meshes that the limits need."""
-        meshes = [(cable.model, found)]
-        curved = limits.bend_radius is not None or limits.twist is not None
-        if curved and not cable.model.has_state:
-            meshes = resolved(cable.model, cable.p, coefficients, pose, found)
-        return cls(cable, coefficients, pose, meshes)
+    @cached_property
+    def meshes(self) -> list[tuple[CableModel, Equilibrium]]:
+        """Each mesh with the shape there."""
+        model, curved = self.cable.model, self.limits.given.keys() & {"bend_radius", "twist"}
+        if model.has_state or not curved:
+            return [(model, self.found)]
+        return resolved(model, self.cable.p, self.coefficients, self.pose, self.found)
 
     def rest_on(self, mesh: CableModel) -> FloatArray:
         """Rest curvature (n_rests,) [1/m] on one of the meshes."""
@@ -291,10 +284,11 @@ class Resolved:
     def _given(self, mesh: CableModel) -> Inputs:
         return Inputs.of(self.cable.p, self.rest_on(mesh), self.pose.vector[None])
 
-    def uses(self, limits: Limits) -> tuple[LimitUse, ...]:
+    @property
+    def uses(self) -> tuple[LimitUse, ...]:
         """Use of each limit by the shape, in their order."""
-        out, bounds = [], bounds_of(limits)
-        for quantity, limit in limits.given.items():
+        out, bounds = [], bounds_of(self.limits)
+        for quantity, limit in self.limits.given.items():
             mesh, shape = self.on(quantity)
             here = self.sizes(mesh, shape, quantity)
             places, holders = places_of(mesh, self.pose, shape, self._given(mesh), _size(quantity))
@@ -309,46 +303,32 @@ class Resolved:
             out.append(LimitUse(self.pose.name, quantity, limit, float(value), *where, *both))
         return tuple(out)
 
+    def checks(self, uncertainty: Uncertainty) -> tuple[LimitCheck, ...]:
+        """Check the predicted shape, one limit after the other.
 
-def limit_checks(
-    cable: CasadiCable,
-    coefficients: FloatArray,
-    pose: HeldPose,
-    found: Equilibrium,
-    uncertainty: Uncertainty,
-    limits: Limits,
-) -> tuple[LimitCheck, ...]:
-    """Check one predicted shape, one limit after the other.
-
-    Bend and twist are measured on a mesh that resolves the bend. Draws are solved there, too: how
-    places compete for the sharpest bend depends on the mesh. `coefficients` (n_coefficients,)
-    [1/m]: of the rest curvature. `limits`: meaningful for this cable, see `Limits.problems`.
-    """
-    shape, bounds = Resolved.of(cable, coefficients, pose, found, limits), bounds_of(limits)
-    drawn, near = shape.meshes[-1]
-    # Ratio of a size on the mesh of the draws to its resolved value.
-    ratio = {
-        _size(x): shape.sizes(drawn, near, x).max() / size if size else 1.0
-        for x in limits.given
-        if x != "clearance"  # a clearance hardly depends on the mesh
-        for size in [shape.sizes(*shape.on(x), x).max()]
-    } | {"clearance": 1.0}
-    varied = Varied(drawn, cable.p, shape.rest_on(drawn), pose, near, uncertainty)
-    likely = varied.exceedances({name: ratio[name] * bound for name, bound in bounds.items()})
-    out = []
-    for use in shape.uses(limits):
-        name = _size(use.quantity)
-        chance, std = likely[name], float(likely[name].std / ratio[name])
-        if use.quantity == "bend_radius":
-            std = std * use.value * use.value  # infinite, or 0, of a straight cable
-        out.append(
-            LimitCheck(
-                **vars(use),
-                **(vars(chance) | {"std": std}),
-                decided_by=_main_cause(cable.model, uncertainty, chance),
-            )
-        )
-    return tuple(out)
+        Bend and twist are measured on a mesh that resolves the bend. Draws are solved there, too:
+        how places compete for the sharpest bend depends on the mesh.
+        """
+        drawn, near = self.meshes[-1]
+        # Ratio of a size on the mesh of the draws to its resolved value.
+        ratio = {
+            _size(x): self.sizes(drawn, near, x).max() / size if size else 1.0
+            for x in self.limits.given
+            if x != "clearance"  # a clearance hardly depends on the mesh
+            for size in [self.sizes(*self.on(x), x).max()]
+        } | {"clearance": 1.0}
+        varied = Varied(drawn, self.cable.p, self.rest_on(drawn), self.pose, near, uncertainty)
+        bounds = {name: ratio[name] * bound for name, bound in bounds_of(self.limits).items()}
+        likely, out = varied.exceedances(bounds), []
+        for use in self.uses:
+            name = _size(use.quantity)
+            chance, std = likely[name], float(likely[name].std / ratio[name])
+            if use.quantity == "bend_radius":
+                std = std * use.value * use.value  # infinite, or 0, of a straight cable
+            cause = _main_cause(self.cable.model, uncertainty, chance)
+            known = vars(use) | vars(chance) | {"std": std}
+            out.append(LimitCheck(**known, decided_by=cause))
+        return tuple(out)
 
 
 def _main_cause(model: CableModel, known: Uncertainty, chance: Exceedance) -> str:

@@ -366,9 +366,7 @@ class _Search:
         for _ in range(ROUNDS):
             now, before = self._descended(now, scales, STEPS), scales
             uses = [
-                Resolved.of(self.slipping, self.coefficients, pose, eq, self.limits).uses(
-                    self.limits
-                )
+                Resolved(self.slipping, self.coefficients, pose, eq, self.limits).uses
                 for pose, eq in zip(self.held(now.z), now.shapes, strict=True)
             ]
             found.append(self._placing_of(now, [use for row in uses for use in row]))

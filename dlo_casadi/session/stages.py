@@ -9,7 +9,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate
-from dlo_casadi.cable.limits import LimitCheck, limit_checks
+from dlo_casadi.cable.limits import LimitCheck, Resolved
 from dlo_casadi.config import Limits
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -276,14 +276,13 @@ def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple
         check
         for pose, one in zip(poses, found, strict=True)
         if one is not None
-        for check in limit_checks(
+        for check in Resolved(
             CasadiCable(fit.model, fit.p, one.rest),
             fit.coefficients,
             pose,
             one.equilibrium,
-            known,
             limits,
-        )
+        ).checks(known)
     )
 
 
