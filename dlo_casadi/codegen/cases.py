@@ -1,25 +1,27 @@
-"""Differences between the solvers of a cable in a plane and in space."""
+"""Contents of the templates: what differs between cables, in a plane and in space."""
 
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.kernels import Holding, Kernels, kernels_of
+from dlo_casadi.codegen.kernels import Holding, Kernels, c_number, kernels_of
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.equilibrium.solve import coarse_rest
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
+from dlo_casadi.rod.obstacles import Obstacle, Plane
 
 
 def template(name: str) -> str:
@@ -27,8 +29,77 @@ def template(name: str) -> str:
     return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
 
 
+@dataclass(frozen=True)
+class Obstacles:
+    """Obstacles of a solver: at most `most` per call, and those of the model if a fit has them."""
+
+    most: int = 0
+    declared: tuple[Obstacle, ...] = ()
+
+    @classmethod
+    def of(cls, model: CableModel, p: FloatArray, most: int) -> Self:
+        """Make room for at least the model's own obstacles.
+
+        Raises
+        ------
+        DloError
+            If `most` is not a valid number, or the cable is one of links.
+        """
+        whole = isinstance(most, int | np.integer) and not isinstance(most, bool)
+        if not whole or not 0 <= most <= 1000:
+            raise DloError(f"obstacles: a whole number, 0 to 1000, found {most!r}\n  Try: 1")
+        if most and not model.chain.kind.smooth:
+            raise DloError(
+                "a cable of links cannot lie on obstacles\n"
+                "  Try: another element, --element quadratic"
+            )
+        declared = surfaces_at(model, p)
+        return cls(max(int(most), len(declared)), declared)
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Text parts of the templates, by mark; empty for a solver without obstacles."""
+        found = {
+            "AMONG": "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     ",
+            "GIVEN": "obstacles, n_obstacles, ",
+            "DECLARED_GIVEN": "DECLARED_OBSTACLES, DLO_DECLARED, " if self.declared else "0, 0, ",
+            "NO_OBSTACLES": "NULL, 0, ",
+            "OBSTACLES_ARE": _SAID,
+            "HPP_OBSTACLES": "    std::vector<dlo_obstacle> obstacles; "
+            "/* on which the cable may lie */\n\n",
+            "HPP_GIVEN": "obstacles.data(), obstacles.size(), ",
+            "DECLARED_OBSTACLES": ", ".join(map(_initializer, self.declared)),
+        }
+        return found if self.most else dict.fromkeys(found, "")
+
+
+# Text about obstacles in the header.
+_SAID = """\
+ *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie. Where
+ *                   the status is DLO_OK the whole cable, its radius and its fixtures are outside
+ *                   of them but for 1e-6 of its length. Places at which it touches slide along
+ *                   it in derivatives. Along a path it touches down and lifts off without a jump
+ *   n_obstacles in  at most DLO_OBSTACLES
+"""
+
+
+def row_of(obstacle: Obstacle) -> tuple[int, tuple[float, ...], tuple[float, ...], float]:
+    """Kind, places a and b, and radius of an obstacle: the layout of dlo_obstacle."""
+    if isinstance(obstacle, Plane):
+        return 1, obstacle.point, obstacle.normal, 0.0
+    return 0, obstacle.a, obstacle.b, obstacle.radius
+
+
+def _initializer(obstacle: Obstacle) -> str:
+    """An obstacle as an initialiser of dlo_obstacle."""
+    kind, *places, radius = row_of(obstacle)
+    a, b = (", ".join(c_number(float(x)) for x in place) for place in places)
+    name = ("DLO_CAPSULE", "DLO_HALF_SPACE")[kind]
+    return f"{{{name}, {{{a}}}, {{{b}}}, {c_number(radius)}}}"
+
+
 def case_of(
-    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, obstacles: int = 0
+    model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, obstacles: Obstacles
 ) -> "Case":
     """Contents of the templates for this cable."""
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
@@ -39,15 +110,15 @@ def case_of(
 class Case:
     """Contents of the templates: the cable's numbers, and the text parts of its kind.
 
-    `obstacles`: their maximum number. `name`: prefix of its templates. `try_steps`: Newton steps
-    for a part of a path; `iterations`: of a descent.
+    `name`: prefix of its templates. `try_steps`: Newton steps for a part of a path; `iterations`:
+    of a descent.
     """
 
     model: CableModel
     p: FloatArray
     rest: FloatArray
     inline: bool
-    obstacles: int
+    obstacles: Obstacles
     name: ClassVar[str]
     try_steps: ClassVar[int]
     iterations: ClassVar[int]
@@ -65,7 +136,7 @@ class Case:
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
-        if bare.end == "free" and (self.obstacles or self.holds):
+        if bare.end == "free" and (self.obstacles.most or self.holds):
             bare = replace(bare, end="pinned")  # segments before a clip or a contact carry a force
         if not self.holds:
             return kernels_of(bare, p, rest, self.inline)
@@ -159,6 +230,18 @@ class Case:
         raise NotImplementedError
 
     @property
+    def contact_size(self) -> int:
+        """Doubles of a workspace for obstacles: 0 without any."""
+        d, n, most = self.model.node.dimension, self.model.n, self.obstacles.most
+        slots, columns = 4 * most * n, (1 + d) * n
+        rows = self.model.node.increment * self.model.chain.n_nodes + self.border
+        # Two points per plane, columns with their block, sums and forces; as in the template.
+        size = (2 if d == 2 else 1) * ((3 + d) * slots + d * (3 * n + 2))
+        size += columns * (4 * d + 5 + 2 * rows) + columns * (columns + 1) + columns
+        size += d * (d + 1) // 2 * n + d * n + (7 + 3 * d) * slots
+        return size if most else 0
+
+    @property
     def values(self) -> dict[str, int | str]:
         """Values that replace the templates' marks."""
         raise NotImplementedError
@@ -174,7 +257,8 @@ class Case:
         """Text parts of the templates, by mark."""
         text = template(f"{self.name}_words.in")
         _, *parts = re.split(r"^@([A-Z_]+)@\n", text, flags=re.MULTILINE)
-        return {mark: part[:-1] for mark, part in zip(parts[::2], parts[1::2], strict=True)}
+        found = {mark: part[:-1] for mark, part in zip(parts[::2], parts[1::2], strict=True)}
+        return found | self.obstacles.words
 
     @property
     def lagrangian(self) -> Lagrangian:
@@ -236,21 +320,17 @@ class _PlaneCase(Case):
             held += (self.border - 2) * count + 2 * self.held_doubles
         if spans := len(model.clips) and len(model.clips) + 1:
             guesses = (2**spans if spans <= 4 else spans + 2) * (3 if model.sliding else 1)
-        mixing = 10 if model.clamped_between and not self.obstacles else 0
-        landings = 2 + 4 * (guesses + self.obstacles) if self.obstacles else 0
+        mixing = 10 if model.clamped_between and not self.obstacles.most else 0
+        landings = 2 + 4 * (guesses + self.obstacles.most) if self.obstacles.most else 0
         return {
             "WORKSPACE": self.doubles * (count + 1) + held,
-            "EXAMPLE_CLIPS": self.example_clips,
             "ELEMENTS": chain.n_segments,
             "FIRST": chain.layout.advancing[0],
             "LOW": model.start == "clamped" and not gives[0],
             "HIGH": count - (model.end == "clamped" and not gives[1]),
-            "GIVES_START": gives[0],
-            "GIVES_END": gives[1],
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
             "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings + mixing,
-            "SPRUNG": kernels.ends is not None,
         }
 
 
@@ -338,14 +418,10 @@ class _SpaceCase(Case):
             "WORKSPACE": (self.doubles + 3 * self.border) * (n + 2)
             + 4 * guesses * (coarse + 1)
             + held,
-            "EXAMPLE_CLIPS": self.example_clips,
             "COARSE": coarse,
             "SHAPES": guesses,
             "FIRST": 0,
-            "GIVES_START": self.compliances[0] > 0,
-            "GIVES_END": self.compliances[1] > 0,
-            "SPRUNG": False,
             # Elimination and solution: about 500 operations a node.
             "OPERATIONS": self.meshes["kernel"].operations + 500 * (n + 1),
-            "STEPS": (1 + 3 * guesses + 3 * self.obstacles) * 80,
+            "STEPS": (1 + 3 * guesses + 3 * self.obstacles.most) * 80,
         }

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.codegen.cases import row_of
 from dlo_casadi.codegen.generate import Solver, generate
-from dlo_casadi.codegen.obstacles import row_of
 from dlo_casadi.codegen.shapes import (
     QUANTITIES,
     STATUSES,

@@ -10,15 +10,15 @@ import numpy as np
 
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.cases import Case, case_of, template
-from dlo_casadi.codegen.kernels import KernelText, c_number, size_of_code, table_to_c
-from dlo_casadi.codegen.obstacles import Obstacles
+from dlo_casadi.codegen.cases import Case, Obstacles, case_of, template
+from dlo_casadi.codegen.kernels import c_number, kernel_texts, size_of_code, table_to_c
 from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS
+from dlo_casadi.model.contact import gap_per_force
 
 # Maximum number of steps between two poses of a path, as in the templates.
 FINEST = 4096
@@ -112,21 +112,20 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[str, int | str]:
-    """Values of the templates' marks for any cable."""
+def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
+    """Values of the templates' marks."""
     model, node, kind = case.model, case.model.node, case.model.chain.kind
     effects = comment(", ".join(effect.label for effect in model.effects)) or "none"
-    contact = obstacles.values(model)
-    ends = f"start {model.start}, end {model.end}"
+    ends, among = f"start {model.start}, end {model.end}", case.obstacles.most
     held = [*model.clips, *["pinned"] * len(case.tethers)]
-    table, text = case.table, KernelText.of(case.meshes)
-    values, tries = case.values, case.try_steps * (2 if case.obstacles else 1)
-    most = tries + (case.iterations if case.obstacles else 0)
-    values["WORKSPACE"] = int(values["WORKSPACE"]) + int(contact["CONTACT_SIZE"])
+    table, values = case.table, case.values
+    tries = case.try_steps * (2 if among else 1)
+    most = tries + (case.iterations if among else 0)
     return (
         values
-        | contact
+        | kernel_texts(case.meshes)
         | {
+            "WORKSPACE": int(values["WORKSPACE"]) + case.contact_size,
             "PREFIX": prefix,
             "FILE": f"{prefix}_solver",
             "TITLE": comment(model.cable.name),
@@ -136,13 +135,15 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
             "DIMENSION": node.dimension,
             "COORDINATES": node.coordinates,
             "AXES": node.increment,
-            "COLUMNS": records_of(model, obstacles.most).columns,
+            "COLUMNS": records_of(model, among).columns,
             "N": model.n,
             "NODES": model.chain.n_nodes,
             "NODES_ARE": kind.nodes_are,
             "START_CLAMPED": model.start == "clamped",
             "END_CLAMPED": model.end == "clamped",
             "END_FREE": model.end == "free",
+            "GIVES_START": case.compliances[0] > 0,
+            "GIVES_END": case.compliances[1] > 0,
             "LENGTH": c_number(case.length),
             "DECLARED_LENGTH": c_number(model.cable.length),
             "RADIUS": c_number(model.cable.diameter / 2),
@@ -150,13 +151,9 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
             "STRETCHES": model.extensible,
             "SMOOTH": kind.smooth,
             "SPINS": model.may_spin and not case.rest.any(),
+            "SPRUNG": case.meshes["kernel"].ends is not None,
             "TABLE": table_to_c(table),
-            "EXTRA": text.size,
             "CODE": size_of_code(case.meshes.values(), table),
-            "KERNELS": text.functions,
-            "LOOPS": text.loops,
-            "HELD": text.holders,
-            "EVEN": text.even,
             "ROW": 2 + 3 * len(node.strains),
             "HOLDS": case.holds,
             "CLIPS": len(model.clips),
@@ -165,6 +162,11 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
             "CLAMP_KINDS": ", ".join(str(_CLAMP_KINDS.get(kind, 0)) for kind in held),
             "EYELETS": len(model.sliding),
             "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
+            "EXAMPLE_CLIPS": case.example_clips,
+            "OBSTACLES": among,
+            "DECLARED": len(case.obstacles.declared),
+            "CONTACT_SIZE": case.contact_size,
+            "PER_FORCE": c_number(gap_per_force(model, 1.0)),
             "TRY_STEPS": tries,
             "PATH_STEPS": int(values["STEPS"]) + most * (2 * FINEST + 13),
         }
@@ -173,7 +175,7 @@ def _values(case: Case, obstacles: Obstacles, prefix: str, digest: str) -> dict[
 
 def table_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:
     """The table for another cable, for a solver of this kind generated with `inline=False`."""
-    return case_of(model, p, rest, inline=False).table
+    return case_of(model, p, rest, inline=False, obstacles=Obstacles()).table
 
 
 def check_prefix(prefix: str) -> None:
@@ -256,7 +258,7 @@ def generate(
     digest = solver_hash(model, p, rest)
     among = Obstacles.of(model, p, obstacles)
     bare, p = replace(model, obstacles=()).without_kind(ContactEffect, p)
-    case = case_of(bare, p, rest, inline, among.most)
+    case = case_of(bare, p, rest, inline, among)
     # One at the end is in the last element.
     elements = [min(int(tether[0] * bare.n), bare.n - 1) for tether in case.tethers]
     if len({*elements}) < len(elements):
@@ -266,7 +268,7 @@ def generate(
         )
     values = {
         mark: value if isinstance(value, str) else str(int(value))
-        for mark, value in _values(case, among, prefix, digest).items()
+        for mark, value in _values(case, prefix, digest).items()
     }
     own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
     first = ("common", case.name, "contact", "newton", "columns", own[0], "between", "landing")
@@ -287,6 +289,5 @@ def generate(
                 f"the prefix {prefix!r} would make {renamed} of {name}, a name that the solver has "
                 "already; choose another one, e.g. --prefix harness"
             )
-    words = case.words | among.words
-    filled = {name: fill(marked(text, words), values, prefix) for name, text in found.items()}
+    filled = {name: fill(marked(text, case.words), values, prefix) for name, text in found.items()}
     return Solver(prefix, digest, filled, int(values["WORKSPACE"]), among)

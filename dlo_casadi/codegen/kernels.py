@@ -131,47 +131,41 @@ class Kernels:
         return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.all))
 
 
-@dataclass(frozen=True)
-class KernelText:
-    """C text of the kernels of all meshes.
+def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
+    """C text of the kernels of meshes by the mesh's name, as values of the templates' marks.
 
-    `functions`; `loops` call them for the segments, `holders` for one that holds the cable; the
-    rows of the latter begin at `even` in their table, of length `size`. With two meshes the second
-    one is called if `w->coarse` is set.
+    LOOPS call the KERNELS for the segments, HELD the one for a segment that holds the cable; the
+    rows of the latter begin at EVEN in their table, of length EXTRA. With two meshes the second one
+    is called if `w->coarse` is set.
     """
-
-    functions: str
-    loops: str
-    holders: str
-    even: str
-    size: int
-
-    @classmethod
-    def of(cls, meshes: dict[str, Kernels]) -> "KernelText":
-        """Text of the kernels of meshes by the mesh's name."""
-        functions: list[str] = []
-        loops: list[str] = []
-        holders: list[str] = []
-        even: list[str] = []
-        at = 0
-        for name, kernels in meshes.items():
-            statements, at = [], at + len(kernels.shared)
-            for k, kernel in enumerate(kernels.segments):
-                functions.append(kernel.text(f"{name}_{k}"))
-                statements.append(kernel.loop(f"{name}_{k}", at))
-                at += kernel.rows.size
-            if kernels.holder is not None:
-                functions.append(kernels.holder.text(f"{name}_held"))
-                holders.append(kernels.holder.at_holder(f"{name}_held"))
-                even.append(str(at))
-                at += kernels.holder.rows.size
-            if kernels.ends is not None:
-                functions.append(_ends_text(kernels.ends))
-            loops.append("\n".join(statements))
-        text = "\n".join(functions)
-        helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
-        rows = f"w->coarse ? {even[1]} : {even[0]}" if len(even) > 1 else "".join(even)
-        return cls("\n".join([*helpers, text]), _by_mesh(loops), _by_mesh(holders), rows, at)
+    functions: list[str] = []
+    loops: list[str] = []
+    holders: list[str] = []
+    even: list[str] = []
+    at = 0
+    for name, kernels in meshes.items():
+        statements, at = [], at + len(kernels.shared)
+        for k, kernel in enumerate(kernels.segments):
+            functions.append(kernel.text(f"{name}_{k}"))
+            statements.append(kernel.loop(f"{name}_{k}", at))
+            at += kernel.rows.size
+        if kernels.holder is not None:
+            functions.append(kernels.holder.text(f"{name}_held"))
+            holders.append(kernels.holder.at_holder(f"{name}_held"))
+            even.append(str(at))
+            at += kernels.holder.rows.size
+        if kernels.ends is not None:
+            functions.append(_ends_text(kernels.ends))
+        loops.append("\n".join(statements))
+    text = "\n".join(functions)
+    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
+    return {
+        "KERNELS": "\n".join([*helpers, text]),
+        "LOOPS": _by_mesh(loops),
+        "HELD": _by_mesh(holders),
+        "EVEN": f"w->coarse ? {even[1]} : {even[0]}" if len(even) > 1 else "".join(even),
+        "EXTRA": at,
+    }
 
 
 def _by_mesh(statements: list[str]) -> str:

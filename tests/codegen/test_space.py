@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from solvers import QUICK, STRICT, WARNINGS, all_zero, moved
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate
-from dlo_casadi.codegen.cases import case_of
+from dlo_casadi.codegen.cases import Obstacles, case_of
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.effects import AxialStretch, BendingSoftening, CableData, LumpedMass, PointForce
 from dlo_casadi.equilibrium.guesses import guessed_frames
@@ -501,7 +501,9 @@ def test_links_nothing_but_libm(optimised):
 
 
 def test_the_coarse_mesh_is_never_finer_than_the_fine_one():
-    found = [case_of(*problem(n=n), inline=True).coarse_elements for n in (2, 4, 12, 30, 1000)]
+    found = [
+        case_of(*problem(n=n), True, Obstacles()).coarse_elements for n in (2, 4, 12, 30, 1000)
+    ]
     assert found == [2, 4, 6, 15, 500]
 
 
