@@ -15,7 +15,7 @@ from functools import cached_property
 from inspect import Signature, signature
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
@@ -43,8 +43,6 @@ from dlo_casadi.report.tables import estimates_of, outcome_html, outcome_text, s
 from dlo_casadi.report.writer import ResultsFolder
 from dlo_casadi.session import Outcome, Progress, run_session
 from dlo_casadi.session.fitting import declared_model
-
-Kind = TypeVar("Kind")
 
 
 class Result(Outcome):
@@ -281,7 +279,8 @@ class Session(Config):
         if not isinstance(diagnosis, bool | None):
             raise DloError(f"diagnosis is True, False or None, found {diagnosis!r}")
         session = self if diagnosis is None else self.changed(diagnosis={"enabled": diagnosis})
-        return _as(Result, run_session(session, progress, executor))
+        found = run_session(session, progress, executor)
+        return Result(**{field.name: getattr(found, field.name) for field in fields(found)})
 
 
 # Arguments of a session: without `self` and the unknown ones, which are refused.
@@ -381,8 +380,3 @@ def predict(
     """
     cable = parameters if isinstance(parameters, FittedCable) else load(parameters)
     return cable.solve(end, **ends)
-
-
-def _as(kind: type[Kind], found: Any) -> Kind:
-    """Copy the values into an object of a class that can show itself."""
-    return kind(**{field.name: getattr(found, field.name) for field in fields(found)})
