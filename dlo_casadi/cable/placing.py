@@ -28,15 +28,13 @@ from dlo_casadi.cable.held import HELD, held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
-from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.limits import Varied, fixtures_of, sizes_of
+from dlo_casadi.equilibrium.limits import Varied, fixtures_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.export.rod import SolvedCable
-from dlo_casadi.model.assembly import Inputs
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.show.text import vector
@@ -155,14 +153,13 @@ class _Trial:
     """
 
     z: FloatArray
-    shapes: tuple[Equilibrium, ...]
+    shapes: tuple[Resolved, ...]
     sizes: tuple[Sizes, ...]
     aims: FloatArray
     others: FloatArray
 
     @property
     def merit(self) -> float:
-        """The objective."""
         return float(self.aims.max() + PENALTY * max(self.others.max(initial=0.0) - 1, 0.0))
 
 
@@ -182,7 +179,6 @@ class _Search:
 
     @cached_property
     def count(self) -> int:
-        """Number of clips."""
         return len(self.cable.model.clips)
 
     @cached_property
@@ -250,17 +246,15 @@ class _Search:
 
     def solved_at(self, z: FloatArray, scales: FloatArray) -> _Trial:
         """The lowest shapes at z; raises EquilibriumError if there are none."""
-        known, poses = self.slipping, self.held(z)
-        shapes, sizes = [], []
-        for eq in solve_equilibria(known.model, known.p, known.rest, poses):
+        known, poses, shapes = self.slipping, self.held(z), []
+        found = solve_equilibria(known.model, known.p, known.rest, poses)
+        for pose, eq in zip(poses, found, strict=True):
             if isinstance(eq, EquilibriumError):
                 raise eq
-            shapes.append(eq)
-        for pose, eq in zip(poses, shapes, strict=True):
-            given = Inputs.of(known.p, known.rest, pose.vector[None])
-            names = (*self.bounded, "force")
-            sizes.append({x: sizes_of(known.model, eq.shapes, given, x)[0] for x in names})
-        return _Trial(z, tuple(shapes), tuple(sizes), *self._split(sizes, scales))
+            shapes.append(Resolved(known, self.coefficients, pose, eq, self.limits))
+        names = (*self.bounded, "force")
+        sizes = tuple({x: one.sizes(known.model, one.found, x) for x in names} for one in shapes)
+        return _Trial(z, tuple(shapes), sizes, *self._split(sizes, scales))
 
     @cached_property
     def bounded(self) -> dict[str, float]:
@@ -284,8 +278,8 @@ class _Search:
     def slopes(self, now: _Trial, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (R, size of z), (S, size of z) of `aims` and `others`."""
         known, names, sizes = self.slipping, (*self.bounded, "force"), []
-        for pose, eq in zip(self.held(now.z), now.shapes, strict=True):
-            varied = Varied(known.model, known.p, known.rest, pose, eq, self.clip_moves)
+        for one in now.shapes:
+            varied = Varied(known.model, known.p, known.rest, one.pose, one.found, self.clip_moves)
             by_moves = varied.linear(tuple(dict.fromkeys(names)))[1]
             sizes.append({k: self.length * x[:, self.columns] for k, x in by_moves.items()})
         return self._split(sizes, scales)
@@ -365,10 +359,7 @@ class _Search:
         found: list[Placing] = []
         for _ in range(ROUNDS):
             now, before = self._descended(now, scales, STEPS), scales
-            uses = [
-                Resolved(self.slipping, self.coefficients, pose, eq, self.limits).uses
-                for pose, eq in zip(self.held(now.z), now.shapes, strict=True)
-            ]
+            uses = [one.uses for one in now.shapes]
             found.append(self._placing_of(now, [use for row in uses for use in row]))
             used = np.array([[use.used.max() for use in row] for row in uses])
             own = [[x[name].max() / y for name, y in self.bounded.items()] for x in now.sizes]
@@ -431,10 +422,10 @@ class _Search:
 
     def _placing_of(self, now: _Trial, uses: Sequence[LimitUse]) -> Placing:
         """Convert a result to a placing in a configuration's terms."""
-        poses = self.held(now.z)
         model, worst = self.slipping.model, []
-        for pose, eq, sizes in zip(poses, now.shapes, now.sizes, strict=True):
-            named = zip(sizes["force"], fixtures_of(model, pose, eq), strict=True)
-            worst += [(float(force), f"{holder.name} in {pose.name}") for force, holder in named]
-        clips = (Clip(name=x.name, kind="pinned", at=x.at, place=x.place) for x in poses[0].clips)
+        for one, sizes in zip(now.shapes, now.sizes, strict=True):
+            named = zip(sizes["force"], fixtures_of(model, one.pose, one.found), strict=True)
+            worst += [(float(x), f"{holder.name} in {one.pose.name}") for x, holder in named]
+        held = now.shapes[0].pose.clips
+        clips = (Clip(name=x.name, kind="pinned", at=x.at, place=x.place) for x in held)
         return Placing(tuple(clips), tuple(uses), *max(worst))
