@@ -18,8 +18,8 @@ from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, ClipLoad, HeldClip
-from dlo_casadi.model.contact import Contact, outwards
+from dlo_casadi.model.clips import CLAMPS
+from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.show.text import millimetres, vector
 
@@ -44,41 +44,24 @@ def side_texts(
     return [("this side", f"`{own}`"), ("also stable", said)]
 
 
-def clip_texts(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[tuple[str, str]]:
-    """Clips with the forces and moments of the cable on them, as text."""
-    rows = []
-    for clip, load in zip(clips, loads, strict=True):
-        at = f"{clip.kind} at {load.at:.4g} m of the cable, {vector(clip.place, 'g', 'm')}"
-        rows.append((clip.name, at))
-        rows.append((f"force of the cable on {clip.name}", vector(load.force, ".4g", "N")))
-        if clip.kind in CLAMPS:
-            rows.append((f"moment of the cable on {clip.name}", _moment_text(load.moment)))
-    return rows
-
-
-def _moment_text(moment: FloatArray) -> str:
-    return vector(moment, ".4g", "N m") if np.ndim(moment) else f"{moment:.4g} N m"
-
-
-def contact_texts(contacts: Sequence[Contact]) -> list[tuple[str, str]]:
-    """Contacts of a cable with obstacles and its forces on them, as text."""
-    rows = []
-    for one in contacts:
-        where = f"at {one.start:.4g}"
-        if one.end > one.start:
-            where = f"from {one.start:.4g} to {one.end:.4g}"
-        said = f"{vector(one.force, '.4g', 'N')} {where} m of the cable"
-        rows.append((f"force of the cable on {one.obstacle}", said))
+def _load_texts(on: str, force: FloatArray, moment: FloatArray | None) -> list[tuple[str, str]]:
+    rows = [(f"force of the cable on {on}", vector(force, ".4g", "N"))]
+    if moment is not None:
+        said = vector(moment, ".4g", "N m") if np.ndim(moment) else f"{moment:.4g} N m"
+        rows.append((f"moment of the cable on {on}", said))
     return rows
 
 
 def reaction_texts(
     model: CableModel, pose: HeldPose, found: Equilibrium, points: FloatArray
 ) -> list[tuple[str, str]]:
-    """All supports of a cable whose points (K, d) [m] start and end there, and its reactions."""
+    """All that holds or touches a cable whose points (K, d) [m] start and end there, as text.
+
+    Forces and moments are those of the cable on its ends, clips and obstacles.
+    """
     rows: list[tuple[str, str]] = []
     ends = (("start", pose.start, points[0]), ("end", pose.end, points[-1]))
-    forces = (found.start_force, found.end_force)
+    forces, turned = (found.start_force, found.end_force), functions_of(model).moment_ends
     for (side, at, reached), force, moment in zip(ends, forces, found.moments, strict=True):
         if at is None:
             rows.append((side, "free"))
@@ -87,10 +70,17 @@ def reaction_texts(
         if math.dist(at, reached) > _SHOWN:
             place = vector(reached, ".5f", "m")
             rows.append((f"{side} of the cable", f"{place}: fixture errors of the fit included"))
-        rows.append((f"force of the cable on its {side}", vector(force, ".4g", "N")))
-        if side in functions_of(model).moment_ends:
-            rows.append((f"moment of the cable on its {side}", _moment_text(moment)))
-    return rows + clip_texts(pose.clips, found.clips) + contact_texts(found.contacts)
+        rows += _load_texts(f"its {side}", force, moment if side in turned else None)
+    for clip, load in zip(pose.clips, found.clips, strict=True):
+        place = vector(clip.place, "g", "m")
+        rows.append((clip.name, f"{clip.kind} at {load.at:.4g} m of the cable, {place}"))
+        rows += _load_texts(clip.name, load.force, load.moment if clip.kind in CLAMPS else None)
+    for one in found.contacts:
+        apart = one.end > one.start
+        where = f"from {one.start:.4g} to {one.end:.4g}" if apart else f"at {one.start:.4g}"
+        ((on, force_text),) = _load_texts(one.obstacle, one.force, None)
+        rows.append((on, f"{force_text} {where} m of the cable"))
+    return rows
 
 
 class _Obstacles(ConfigSection):
