@@ -224,7 +224,6 @@ def check_limits(
 
 
 def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
-    """Convert what a caller gives to a section."""
     if given is None or isinstance(given, kind):
         return given
     if not isinstance(given, Mapping):

@@ -172,7 +172,7 @@ class Rod:
         """Cut a cable into segments, by default as many as keep each joint's turn below `TURN`."""
         model, p, pose, curve = held.model, held.p, held.pose, held.curve
         terms, length = lagrangian_of(model), model.cable.length
-        true, true_length = _numbers(terms, p, pose, *_held(terms))
+        true, true_length = _numbers(terms, p, pose, terms.true_ends.vector, length * terms.stretch)
         if segments is None:
             sharpest = np.linalg.norm(curve.at(np.linspace(0, length, 400), 2), axis=1).max()
             segments = int(np.clip(np.ceil(sharpest * length / TURN), *SEGMENTS))
@@ -330,10 +330,6 @@ def _features(
     elif isinstance(effect, StateEffect):
         found.append("change of the rest shape")
     return found
-
-
-def _held(terms: Lagrangian) -> tuple[ca.SX, ca.SX]:
-    return terms.true_ends.vector, terms.model.cable.length * terms.stretch
 
 
 def _numbers(

@@ -24,6 +24,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     doc = "\n".join(head).replace('"', "'")
     rest_nodes, rest_frames = rod.unloaded
     count, stiff = len(rod.nodes), rod.inextensible(newton.STIFF)
+    extent = np.array([rod.nodes.min(axis=0) - rod.radius, rod.nodes.max(axis=0) + rod.radius])
     gravity = float(np.linalg.norm(rod.gravity))
     down = rod.gravity / gravity if gravity else np.array([0.0, 0.0, -1.0])
     # A link's normal is its axis z; the last point starts no link.
@@ -62,7 +63,7 @@ def Xform "World"
         float[] widths = [{2 * rod.radius:.9g}] (
             interpolation = "constant"
         )
-        float3[] extent = {_rows(_extent(rod))}
+        float3[] extent = {_rows(extent)}
         rel material:binding:physics = </World/material>
         point3f[] physics:restShapePoints = {_rows(rest_nodes)}
         normal3f[] physics:restNormals = {_rows(rest_normals)}
@@ -128,10 +129,6 @@ def _row(values: FloatArray) -> str:
 
 def _rows(values: FloatArray) -> str:
     return f"[{', '.join(map(_row, values))}]"
-
-
-def _extent(rod: Rod) -> FloatArray:
-    return np.array([rod.nodes.min(axis=0) - rod.radius, rod.nodes.max(axis=0) + rod.radius])
 
 
 def settle(text: str, rod: Rod) -> Relaxed:
