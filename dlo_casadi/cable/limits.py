@@ -203,7 +203,7 @@ def check_limits(
     """
     asked = asked_limits(cable.model, known, limits)
     beside = _given(DeclaredTolerances, tolerances, "tolerances={'end': 2e-3} [m]")
-    stds = {} if beside is None else beside.model_dump(exclude_unset=True)
+    stds = (beside or DeclaredTolerances()).model_dump(exclude_unset=True)
     possible = tolerances_of(with_tolerances(cable.model, DeclaredTolerances.model_fields))
     if strange := [name for name in stds if name not in possible]:
         text = f"tolerances.{strange[0]}: the shape of this cable does not depend on it"

@@ -171,7 +171,7 @@ class CompiledSolver:
         """
         table, branch = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.shape)
-        kept = self._record_of(warm)
+        kept = self._record_of(CompiledShape, warm)
         status = self._call("dlo_solve", table, branch, kept, out, obstacles=obstacles)
         if status and throw:
             raise EquilibriumError(
@@ -199,7 +199,7 @@ class CompiledSolver:
             raise DloError(f"steps: a whole number of Newton steps belongs here, found {steps!r}")
         table, _ = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.shape)
-        kept = self._record_of(shape)
+        kept = self._record_of(CompiledShape, shape)
         status = self._call("dlo_step", table, kept, steps, out, obstacles=obstacles)
         return _shape(out[0], status)
 
@@ -259,7 +259,7 @@ class CompiledSolver:
         """
         table, number = pose_table(self.model, poses, branch)
         out, statuses = np.zeros(len(table), self._records.shape), np.zeros(len(table), np.intc)
-        kept, jump = self._record_of(warm), np.zeros(1, np.uintp)
+        kept, jump = self._record_of(CompiledShape, warm), np.zeros(1, np.uintp)
         given = (table, len(table), number, kept, out, statuses, jump)
         self._call("dlo_path", *given, obstacles=obstacles)
         shapes = tuple(_shape(record, int(k)) for record, k in zip(out, statuses, strict=True))
@@ -281,7 +281,7 @@ class CompiledSolver:
         """
         table, _ = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.slope)
-        kept = self._record_of(shape)
+        kept = self._record_of(CompiledShape, shape)
         status = self._call("dlo_sensitivity", table, kept, out, obstacles=obstacles)
         if status:
             raise EquilibriumError(
@@ -307,8 +307,8 @@ class CompiledSolver:
             If there is no obstacle or another object, a number is not finite, or the shape is empty
             because its pose has no equilibrium.
         """
-        given, along = self._table_of(obstacles), self._along(slope)
-        kept, out = self._record_of(shape), np.zeros(1, self._records.gap)
+        given, along = self._table_of(obstacles), self._record_of(Slope, slope)
+        kept, out = self._record_of(CompiledShape, shape), np.zeros(1, self._records.gap)
         status = self._call("dlo_clearance", kept, given, len(given), along, out)
         if status:
             count = counted(len(given), "obstacle")
@@ -356,9 +356,9 @@ class CompiledSolver:
         if "clearance" in limits and not len(obstacles):
             raise DloError("a limit of the clearance, and no obstacle\n  Try: obstacles=[...]")
         bounds = np.array([limits.get(name, 0.0) for name in QUANTITIES], float)
-        given, along = self._table_of(obstacles), self._along(slope)
-        kept, out = self._record_of(shape), np.zeros(len(QUANTITIES), self._records.usage)
-        tightest = np.zeros(1, np.intc)
+        given, along = self._table_of(obstacles), self._record_of(Slope, slope)
+        kept = self._record_of(CompiledShape, shape)
+        out, tightest = np.zeros(len(QUANTITIES), self._records.usage), np.zeros(1, np.intc)
         status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
         out["value"][out["value"] == _NOTHING] = np.inf
         if status:
@@ -392,11 +392,22 @@ class CompiledSolver:
                 raise DloError(f"the normal of a plane must not be zero, found {obstacle!r}")
         return np.array(list(map(row_of, obstacles)), self._records.obstacle)
 
-    def _along(self, slope: Slope | None) -> Any:
-        return None if slope is None else _filled(self._records.slope, slope, Slope)
-
-    def _record_of(self, shape: CompiledShape | None) -> Any:
-        return None if shape is None else _filled(self._records.shape, shape, CompiledShape)
+    def _record_of(self, kind: type[CompiledShape | Slope], values: object) -> Any:
+        """A record of the library, from a shape or a slope of this solver; None for None."""
+        if values is None:
+            return None
+        if not isinstance(values, kind):
+            raise DloError(f"a {kind.__name__} of this solver belongs here, found {values!r}")
+        out = np.zeros(1, self._records.slope if kind is Slope else self._records.shape)
+        for name in out.dtype.names or ():
+            value, own = getattr(values, name), out[name].shape[1:]
+            if np.shape(value) != own:
+                raise DloError(
+                    f"a {kind.__name__} of this solver belongs here: its {name} has the shape "
+                    f"{own}, found {np.shape(value)}"
+                )
+            out[name] = value
+        return out
 
     def _call(self, name: str, *arguments: Any, obstacles: Sequence[Obstacle] | None = None) -> int:
         """Call the library and return its status; functions that solve get a workspace."""
@@ -423,19 +434,3 @@ def _values(record: Any) -> dict[str, Any]:
     """Fields of a record of the library, by name."""
     values = {name: record[name] for name in record.dtype.names}
     return {name: v.copy() if v.ndim else v.item() for name, v in values.items()}
-
-
-def _filled(record: np.dtype[Any], values: object, kind: type[CompiledShape | Slope]) -> Any:
-    """A record of the library, from a shape or a slope of this solver."""
-    if not isinstance(values, kind):
-        raise DloError(f"a {kind.__name__} of this solver belongs here, found {values!r}")
-    out = np.zeros(1, record)
-    for name in record.names or ():
-        value, own = getattr(values, name), out[name].shape[1:]
-        if np.shape(value) != own:
-            raise DloError(
-                f"a {kind.__name__} of this solver belongs here: its {name} has the shape {own}, "
-                f"found {np.shape(value)}"
-            )
-        out[name] = value
-    return out

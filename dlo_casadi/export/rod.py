@@ -28,6 +28,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.export.common import printable
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
@@ -61,19 +62,9 @@ _CLOSING = 200
 
 
 @dataclass(frozen=True, eq=False)
-class SolvedCable:
-    """A cable in an equilibrium of one pose, from which a `Rod` is cut.
+class SolvedCable(CasadiCable):
+    """A cable in an equilibrium of one pose, from which a `Rod` is cut."""
 
-    Parameters
-    ----------
-    model : CableModel
-    p : (n_parameters,)
-    rest : (n_rests,) [1/m]
-    """
-
-    model: CableModel
-    p: FloatArray
-    rest: FloatArray
     pose: HeldPose
     equilibrium: Equilibrium
 
