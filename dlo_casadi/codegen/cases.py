@@ -281,8 +281,6 @@ def _braces(parts: Iterable[str]) -> str:
 
 
 class _PlaneCase(Case):
-    """A cable in a plane."""
-
     name, try_steps, iterations = "plane", 13, 100
     # Doubles of a workspace per node, as in the template: arrays, border, two-point segments.
     doubles = 12 + 2 + 2 * 15
@@ -335,8 +333,6 @@ class _PlaneCase(Case):
 
 
 class _SpaceCase(Case):
-    """A cable in space."""
-
     name, try_steps, iterations = "space", 12, 80
     # Doubles of a workspace per node, and those of eight coarse shapes; as in the template.
     doubles = 4 + 4 + 4 + 3 + 6 + 9 + 58

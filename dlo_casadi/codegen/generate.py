@@ -113,7 +113,6 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
 
 
 def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
-    """Values of the templates' marks."""
     model, node, kind = case.model, case.model.node, case.model.chain.kind
     effects = comment(", ".join(effect.label for effect in model.effects)) or "none"
     ends, among = f"start {model.start}, end {model.end}", case.obstacles.most
