@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dlo_casadi.cable.estimate import EstimatedCable
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.limits import Resolved
 from dlo_casadi.cable.placing import ROOM, _Search, placed
@@ -12,7 +13,6 @@ from dlo_casadi.config import Limits
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
@@ -24,13 +24,13 @@ POSES = [{"end": (0.5, 0.0)}, {"end": (0.4, 0.2)}]
 pytestmark = pytest.mark.usefixtures("fewer_starts")
 
 
-def cable(n=12, **more) -> CasadiCable:
+def cable(n=12, **more) -> EstimatedCable:
     data = CableData(0.8, 0.05, 0.006, 0.02, **more.pop("also", {}))
     model = CableModel(data, n, n_rest=0, **more)
-    return CasadiCable(model, model.nominal, np.zeros(model.chain.n_rests))
+    return EstimatedCable(model, model.nominal, np.zeros(model.chain.n_rests), KNOWN)
 
 
-def used(known: CasadiCable, clips: list[dict], limits: dict, poses=POSES):
+def used(known: EstimatedCable, clips: list[dict], limits: dict, poses=POSES):
     """What solved shapes use of the limits."""
     held = known.with_clips(["pinned"] * len(clips))
     asked = {"turns": 0.0, "branch": None, "clips": clips}
@@ -42,7 +42,7 @@ def used(known: CasadiCable, clips: list[dict], limits: dict, poses=POSES):
 
 def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():
     known, place = cable(), (0.25, -0.15)
-    found = placed(known, KNOWN, 1, POSES, (place, place), LIMITS, "margin")
+    found = placed(known, 1, POSES, (place, place), LIMITS, "margin")
     chords = [0.0, 0.8] + np.array([1, -1]) * [
         np.hypot(*place) / ROOM,
         max(np.hypot(*np.subtract(pose["end"], place)) for pose in POSES) / ROOM,
@@ -58,7 +58,7 @@ def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():
 
 def test_two_clips_on_a_wall_keep_limits_with_what_is_said_of_them():
     known, wall = cable(), ((0.05, -0.1), (0.4, -0.1))
-    found = placed(known, KNOWN, 2, POSES, wall, LIMITS, "margin")
+    found = placed(known, 2, POSES, wall, LIMITS, "margin")
     clips = [clip.model_dump() for clip in found.clips]
     again = list(used(known, clips, LIMITS))
     assert [x.value for x in again] == pytest.approx([x.value for x in found.uses], rel=1e-3)
@@ -80,12 +80,12 @@ def test_two_clips_on_a_wall_keep_limits_with_what_is_said_of_them():
 def test_the_least_force_may_use_more_of_the_bend_radius():
     known, wall, poses = cable(), ((0.05, -0.1), (0.4, -0.1)), POSES[:1]
     sharp = {"bend_radius": 0.07}
-    least = placed(known, KNOWN, 1, poses, wall, sharp, "force")
-    mild = placed(known, KNOWN, 1, poses, wall, sharp, "margin")
+    least = placed(known, 1, poses, wall, sharp, "force")
+    mild = placed(known, 1, poses, wall, sharp, "margin")
     assert least.force < mild.force
     assert 0 <= least.margin < mild.margin
     corners = (wall[1][0], wall[0][1]), (wall[0][0], wall[1][1])  # in any order
-    free = placed(known, KNOWN, 1, poses, corners, None, "force")
+    free = placed(known, 1, poses, corners, None, "force")
     assert (free.uses, free.binding, free.margin) == ((), None, 1.0)
     assert free.force <= least.force + 1e-3
 
@@ -95,7 +95,7 @@ def test_the_first_order_model_is_the_derivative_of_solved_shapes(aim):
     """Room of spans is compared exactly, sizes along a direction of all places and arc lengths."""
     held = tuple(HeldPose((0.0, 0.0), pose["end"]) for pose in POSES)
     between, box = cable().with_clips(["pinned"] * 2), np.array([[0.0, -0.3], [0.6, 0.1]]) / 0.8
-    search = _Search(between, KNOWN.coefficients, held, box, Limits(**LIMITS), aim)
+    search = _Search(between, held, box, Limits(**LIMITS), aim)
     z, way = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 6))
     z = np.array([0.3, 0.2, -0.1, 0.6, 0.42, -0.05]) + 0.02 * z
     spare, by_z = search.spare(z)
@@ -128,7 +128,7 @@ def test_the_first_order_model_is_the_derivative_of_solved_shapes(aim):
 def test_no_place_near_a_clip_in_space_is_better():
     known = cable(8, gravity=(0.0, 0.0, -9.81), also={"torsional_stiffness": 0.015})
     poses, box = [{"end": (0.5, 0.1, 0.0)}], ((0.1, -0.1, -0.3), (0.4, 0.2, 0.0))
-    found = placed(known, KNOWN, 1, poses, box, {"force": 3.0}, "margin")
+    found = placed(known, 1, poses, box, {"force": 3.0}, "margin")
     (clip,) = (one.model_dump() for one in found.clips)
     rng = np.random.default_rng(0)
     for ds, *step in rng.uniform(-0.01, 0.01, (5, 4)):
@@ -164,4 +164,4 @@ def test_messages(changed, said):
     wall = ((0.05, -0.1), (0.4, -0.1))
     asked = {"count": 1, "poses": POSES, "within": wall, "limits": LIMITS, "aim": "margin"}
     with pytest.raises(DloError, match=f"(?s){said}"):
-        placed(cable(), KNOWN, **(asked | changed))
+        placed(cable(), **(asked | changed))

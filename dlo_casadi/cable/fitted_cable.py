@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimated_cable import CableCurve, EstimatedCable
+from dlo_casadi.cable.estimate import CableCurve, EstimatedCable
 from dlo_casadi.cable.held import among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
-from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.cable.placing import Aim, Placing, placed
 from dlo_casadi.config import Clip, Obstacle
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -150,22 +150,44 @@ class FittedCable(EstimatedCable):
         other_side = self.shape_in(others, beyond)
         return replace(self.shape_in(own, eq), other_side=other_side, tipping=near)
 
-    def compile(self, *, flags: Sequence[str] = ("-O2",), obstacles: int = 0) -> CompiledSolver:
-        """The cable as C, compiled and loaded: thousands of shapes a second.
+    def place(
+        self,
+        count: int,
+        poses: Sequence[Mapping[str, Any]],
+        within: ArrayLike,
+        limits: Asked = None,
+        *,
+        aim: Aim = "margin",
+    ) -> Placing:
+        """Find arc lengths and places of pinned clips that keep limits in several poses.
+
+        Maximizes the smallest margin of all limits in all poses, or minimizes the largest force on
+        fixtures and clips within the limits. Shapes are the stable ones of lowest energy. The
+        optimum is local: the best of those found from several first guesses.
 
         Parameters
         ----------
-        flags : sequence of str
-            For the compiler.
-        obstacles : int
-            Maximum number of obstacles on which the cable may lie, see `CompiledSolver`.
+        count : int
+            Number of clips.
+        poses : sequence of mapping
+            End conditions in each pose, as keywords of `solve`: [{"end": (0.3, -0.1)}, ...].
+        within : ((d,), (d,)) [m]
+            Two corners of the region for clips: smallest and largest coordinates. For a wall both
+            corners share a coordinate.
+        limits : Limits or mapping, optional
+            As in `Shape.check`; by default the session's.
+        aim : "margin" or "force"
+            The quantity to optimize; "force" needs no limits.
 
         Raises
         ------
         DloError
-            If there is no C compiler, or if it rejects the flags.
+            If no clips in the region keep the limits, if an argument is meaningless for this cable,
+            or if a span has no room.
+        EquilibriumError
+            If the cable has no shape in one of the poses without clips.
         """
-        return CompiledSolver(self.model, self.p, self.rest, flags=flags, obstacles=obstacles)
+        return placed(self, count, poses, within, limits, aim)
 
     def export(
         self,
@@ -335,8 +357,7 @@ class Shape:
         ConfigError, DloError
             If there is no limit, or if a limit or tolerance is meaningless for this cable.
         """
-        known, found = self.cable.metadata, self.equilibrium
-        return check_limits(self.cable, known, self.pose, found, limits, tolerances)
+        return check_limits(self.cable, self.pose, self.equilibrium, limits, tolerances)
 
     def plot(self) -> Figure:
         """Draw the shape with the forces of the cable on its supports; in a plane also its band."""

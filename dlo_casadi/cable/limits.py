@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import Metadata
+from dlo_casadi.cable.estimate import EstimatedCable
 from dlo_casadi.config import DeclaredTolerances, Limits
 from dlo_casadi.config.values import ConfigSection
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -173,12 +173,12 @@ _LOOSE = 0.1
 _TRY = "limits={'bend_radius': 0.05, 'force': 8.0}; of a command --limits bend_radius=0.05 force=8"
 
 
-def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Limits:
+def asked_limits(cable: EstimatedCable, limits: Asked = None) -> Limits:
     """Limits given by the caller, or else the session's.
 
     Raises DloError if there are none, or if one is meaningless for this cable.
     """
-    asked = _given(Limits, limits, _TRY) or known.limits
+    model, asked = cable.model, _given(Limits, limits, _TRY) or cable.metadata.limits
     if not asked.given:
         raise DloError(f"no limit is given, and none was declared.\n  Try: {_TRY}")
     held = (model.start, model.end, *model.clips)
@@ -190,8 +190,7 @@ def asked_limits(model: CableModel, known: Metadata, limits: Asked = None) -> Li
 
 
 def check_limits(
-    cable: CasadiCable,
-    known: Metadata,
+    cable: EstimatedCable,
     pose: HeldPose,
     found: Equilibrium,
     limits: Asked = None,
@@ -201,7 +200,7 @@ def check_limits(
 
     Effects that carry a given tolerance are added to the model at zero: the shape stays.
     """
-    asked = asked_limits(cable.model, known, limits)
+    known, asked = cable.metadata, asked_limits(cable, limits)
     beside = _given(DeclaredTolerances, tolerances, "tolerances={'end': 2e-3} [m]")
     stds = (beside or DeclaredTolerances()).model_dump(exclude_unset=True)
     possible = tolerances_of(with_tolerances(cable.model, DeclaredTolerances.model_fields))

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linprog, minimize
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import Metadata
+from dlo_casadi.cable.estimate import EstimatedCable
 from dlo_casadi.cable.held import HELD, held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
@@ -32,7 +32,6 @@ from dlo_casadi.equilibrium.limits import Varied, fixtures_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.model.clips import HeldClip
@@ -104,8 +103,7 @@ class Placing:
 
 
 def placed(
-    cable: CasadiCable,
-    known: Metadata,
+    cable: EstimatedCable,
     count: int,
     poses: Sequence[Mapping[str, Any]],
     within: ArrayLike,
@@ -133,6 +131,7 @@ def placed(
         raise DloError(
             f"within: two corners of a region belong here, found {within!r}.\n  Try: {_TRY}"
         )
+    known = cable.metadata
     default: dict[str, Any] = {"turns": 0.0, "branch": None, "clips": []}
     held = tuple(
         replace(held_pose(cable.model, known.fixtures, default | dict(pose)), name=f"pose_{k}")
@@ -140,9 +139,9 @@ def placed(
     )
     between, asked = cable.with_clips(["pinned"] * int(count)), Limits()
     if aim == "margin" or limits is not None or known.limits.given:
-        asked = asked_limits(between.model, known, limits)
+        asked = asked_limits(between, limits)
     box = np.sort(region, axis=0) / cable.model.cable.length
-    return _Search(between, known.coefficients, held, box, asked, aim).best()
+    return _Search(between, held, box, asked, aim).best()
 
 
 @dataclass(frozen=True)
@@ -170,8 +169,7 @@ class _Search:
     `poses`: without clips; `region` (2, d): in cable lengths.
     """
 
-    cable: CasadiCable
-    coefficients: FloatArray
+    cable: EstimatedCable
     poses: tuple[HeldPose, ...]
     region: FloatArray
     limits: Limits
@@ -187,7 +185,7 @@ class _Search:
         return self.cable.model.cable.length
 
     @cached_property
-    def slipping(self) -> CasadiCable:
+    def slipping(self) -> EstimatedCable:
         """The cable with each clip's slip as a parameter: derivatives by it are those by `at`."""
         model, p = self.cable.model, self.cable.p
         for k in range(self.count):
@@ -195,7 +193,7 @@ class _Search:
                 effect.label for effect in model.effects
             ]:
                 model, p = model.with_effect(slip), np.append(p, 0.0)
-        return CasadiCable(model, p, self.cable.rest)
+        return replace(self.cable, model=model, p=p)
 
     @cached_property
     def clip_moves(self) -> Uncertainty:
@@ -251,7 +249,7 @@ class _Search:
         for pose, eq in zip(poses, found, strict=True):
             if isinstance(eq, EquilibriumError):
                 raise eq
-            shapes.append(Resolved(known, self.coefficients, pose, eq, self.limits))
+            shapes.append(Resolved(known, known.metadata.coefficients, pose, eq, self.limits))
         names = (*self.bounded, "force")
         sizes = tuple({x: one.sizes(known.model, one.found, x) for x in names} for one in shapes)
         return _Trial(z, tuple(shapes), sizes, *self._split(sizes, scales))
