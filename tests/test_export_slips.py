@@ -49,6 +49,7 @@ def test_a_small_side_load_is_one_across_gravity():
         ({"segments": 4.5}, "found 4.5"),
         ({"seed": -1}, "seed: a whole number, 0 or more, found -1"),
         ({"samples": -1}, "samples: a whole number, 0 or more, found -1"),
+        ({"samples": True}, "samples: a whole number, 0 or more, found True"),
     ],
 )
 def test_numbers_that_are_too_small(options, said, tmp_path):

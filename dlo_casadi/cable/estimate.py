@@ -281,7 +281,7 @@ class CableCurve(NodeCurve):
         if len(outside):
             raise DloError(
                 f"s = {outside[0]:g} m is not on the cable: {len(outside)} of "
-                f"{counted(len(places), 'arc length')} lie outside 0 to {self.length:g} m.\n"
+                f"{counted(len(places), 'arc length')} outside 0 to {self.length:g} m.\n"
                 "  Try: arc lengths in metres from the start."
             )
         return super().at(np.clip(places, 0.0, self.length), derivative)

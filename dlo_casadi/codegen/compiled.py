@@ -171,7 +171,7 @@ class CompiledSolver:
         """
         table, branch = pose_table(self.model, [pose])
         out = np.zeros(1, self._records.shape)
-        kept = self._record_of(CompiledShape, warm)
+        kept = None if warm is None else self._record_of(CompiledShape, warm)
         status = self._call("dlo_solve", table, branch, kept, out, obstacles=obstacles)
         if status and throw:
             raise EquilibriumError(
@@ -259,7 +259,8 @@ class CompiledSolver:
         """
         table, number = pose_table(self.model, poses, branch)
         out, statuses = np.zeros(len(table), self._records.shape), np.zeros(len(table), np.intc)
-        kept, jump = self._record_of(CompiledShape, warm), np.zeros(1, np.uintp)
+        kept = None if warm is None else self._record_of(CompiledShape, warm)
+        jump = np.zeros(1, np.uintp)
         given = (table, len(table), number, kept, out, statuses, jump)
         self._call("dlo_path", *given, obstacles=obstacles)
         shapes = tuple(_shape(record, int(k)) for record, k in zip(out, statuses, strict=True))
@@ -307,7 +308,8 @@ class CompiledSolver:
             If there is no obstacle or another object, a number is not finite, or the shape is empty
             because its pose has no equilibrium.
         """
-        given, along = self._table_of(obstacles), self._record_of(Slope, slope)
+        given = self._table_of(obstacles)
+        along = None if slope is None else self._record_of(Slope, slope)
         kept, out = self._record_of(CompiledShape, shape), np.zeros(1, self._records.gap)
         status = self._call("dlo_clearance", kept, given, len(given), along, out)
         if status:
@@ -356,7 +358,8 @@ class CompiledSolver:
         if "clearance" in limits and not len(obstacles):
             raise DloError("a limit of the clearance, and no obstacle\n  Try: obstacles=[...]")
         bounds = np.array([limits.get(name, 0.0) for name in QUANTITIES], float)
-        given, along = self._table_of(obstacles), self._record_of(Slope, slope)
+        given = self._table_of(obstacles)
+        along = None if slope is None else self._record_of(Slope, slope)
         kept = self._record_of(CompiledShape, shape)
         out, tightest = np.zeros(len(QUANTITIES), self._records.usage), np.zeros(1, np.intc)
         status = self._call("dlo_limits", kept, bounds, given, len(given), along, out, tightest)
@@ -393,9 +396,7 @@ class CompiledSolver:
         return np.array(list(map(row_of, obstacles)), self._records.obstacle)
 
     def _record_of(self, kind: type[CompiledShape | Slope], values: object) -> Any:
-        """A record of the library, from a shape or a slope of this solver; None for None."""
-        if values is None:
-            return None
+        """A record of the library, from a shape or a slope of this solver."""
         if not isinstance(values, kind):
             raise DloError(f"a {kind.__name__} of this solver belongs here, found {values!r}")
         out = np.zeros(1, self._records.slope if kind is Slope else self._records.shape)

@@ -163,7 +163,8 @@ def check_counts(segments: int | None, samples: int, seed: int) -> None:
         ("samples", samples, 0),
         ("seed", seed, 0),
     ):
-        if not isinstance(value, int | np.integer) or value < least:
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not whole or value < least:
             text = f"{name}: a whole number, {least} or more, found {value!r}"
             raise DloError(f"{text}\n  Try: {name}={least}")
 

@@ -113,6 +113,8 @@ def test_a_place_is_no_pose_and_three_is_no_shape(links):
         links.step(at((0.3, -0.1)), links.solve(at((0.3, -0.1))))
     with pytest.raises(DloError, match="a CompiledShape of this solver belongs here, found 3"):
         links.solve(at((0.3, -0.1)), warm=3)
+    with pytest.raises(DloError, match="a CompiledShape of this solver belongs here, found None"):
+        links.step(None, at((0.3, -0.1)))
 
 
 def test_many_poses_are_of_one_branch_or_rows_of_numbers(links):
