@@ -42,7 +42,6 @@ class SensorBias(MeasurementEffect):
 
     @property
     def _measured(self) -> list[str]:
-        """Names of what is measured."""
         ends = [name for name in REACTIONS if getattr(self, name)]
         return [*ends, *map(clip_force, self.clips)]
 
@@ -78,12 +77,11 @@ class SensorBias(MeasurementEffect):
 
     def feel(self, reactions: Mapping[str, ca.SX], params: Params) -> dict[str, ca.SX]:
         """Add the bias."""
-        return {
-            name: value + ca.vertcat(*(params[key] for key in params if key.startswith(name)))
-            if name in self._measured
-            else value
-            for name, value in reactions.items()
-        }
+        felt = dict(reactions)
+        for name in self._measured:
+            if name in felt:
+                felt[name] += ca.vertcat(*(params[key] for key in params if key.startswith(name)))
+        return felt
 
 
 # Harmonics of the cable's direction: light from one side shifts the whole picture, which is the
@@ -128,11 +126,7 @@ class EdgeBias(MeasurementEffect):
 
     def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Move the point along the cable's normal."""
-        offset = sum(
-            (
-                params[f"a{k}"] * ca.cos(k * frame) + params[f"b{k}"] * ca.sin(k * frame)
-                for k in HARMONICS
-            ),
-            start=ca.SX(0),
-        )
+        offset = ca.SX(0)
+        for k in HARMONICS:
+            offset += params[f"a{k}"] * ca.cos(k * frame) + params[f"b{k}"] * ca.sin(k * frame)
         return point + offset * ca.vertcat(-ca.sin(frame), ca.cos(frame))

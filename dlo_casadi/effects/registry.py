@@ -6,13 +6,7 @@ from collections.abc import Iterator
 import casadi as ca
 
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
-from dlo_casadi.effects.effect import (
-    ContactEffect,
-    Effect,
-    Load,
-    PointForceAt,
-    SpringAt,
-)
+from dlo_casadi.effects.effect import ContactEffect, Effect, Load, PointForceAt, SpringAt
 from dlo_casadi.errors import DloError, counted
 
 
