@@ -17,7 +17,7 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
-from dlo_casadi.rod.node import Heading, Node, quaternion_product
+from dlo_casadi.rod.node import Heading, Node, conjugate, quaternion_product
 
 # A swivel is a clamp in space in which the cable may roll about its axis.
 ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
@@ -252,13 +252,11 @@ class Clipped:
         """
         if not self.clamps:
             return inside
-        low, width = self.places[:, :-1, None], np.diff(self.places)[..., None]
-        even = self.chain.places[:-1, None]
-        own, x, w = np.empty_like(inside), (low + width / 2 - even) / self.chain.h - 0.5, width
-        for k in range(0, inside.shape[2], 3):
-            own[:, :, k], own[:, :, k + 1], own[:, :, k + 2] = _within(
-                inside[:, :, k], inside[:, :, k + 1], inside[:, :, k + 2], x, w / self.chain.h
-            )
+        low, width = self.places[:, :-1, None, None], np.diff(self.places)[..., None, None]
+        x = (low + width / 2 - self.chain.places[:-1, None, None]) / self.chain.h - 0.5
+        own, parts = np.empty_like(inside), (inside[:, :, k::3] for k in range(3))
+        for k, part in enumerate(_within(*parts, x, width / self.chain.h)):
+            own[:, :, k::3] = part
         return own
 
     def hold(self, force: Vector, x: FloatArray, stiffness: FloatArray) -> None:
@@ -357,7 +355,7 @@ def _alike(frame: FloatArray, beside: FloatArray) -> FloatArray:
 
 def _rolled_with(frame: FloatArray, x: FloatArray) -> FloatArray:
     """Frames (m, 4) rolled about their x axes as the quaternions x (m, 4) are, relative to them."""
-    a, _, _, w = quaternion_product((*-frame.T[:3], frame.T[3]), x.T)
+    a, _, _, w = quaternion_product(conjugate(frame.T), x.T)
     size = np.maximum(np.hypot(a, w), 1e-300)
     zero = np.zeros_like(a)
     return np.stack(quaternion_product(frame.T, (a / size, zero, zero, w / size)), axis=1)
