@@ -122,12 +122,8 @@ def effect_of(source: str, model: CableModel) -> Effect | None:
     kind = random_effects().get(source)
     if kind is None or not kind.applies(setup):
         return None
-    return replace(kind.made_for(setup), label=_label(source))
-
-
-def _label(source: str) -> str:
-    """Label of a random effect in a model, which may also have that effect as one of all poses."""
-    return f"{source}_from_pose_to_pose"
+    # The model may also have that effect as one of all poses.
+    return replace(kind.made_for(setup), label=f"{source}_from_pose_to_pose")
 
 
 def modes_in(model: CableModel) -> FloatArray:

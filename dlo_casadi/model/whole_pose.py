@@ -14,7 +14,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, clip_size, moved_rest
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
-from dlo_casadi.rod.node import quaternion_product
+from dlo_casadi.rod.node import conjugate, quaternion_product
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,8 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
     energy, gradient, _ = functions.at_ends(*_end_arguments(model, s))
-    own, reached = functions.compact("segment_potential")(
-        *_segment_arguments(model, s, clamped), inner
-    )
+    segments = _segment_arguments(model, s, clamped)
+    own, reached = functions.compact("segment_potential")(*segments, inner)
     energy = sum(ca.horzsplit(own), start=energy)
     conditions = sum(ca.horzsplit(reached), start=gradient[2 * model.node.increment :])
     multipliers = np.flatnonzero(model.are_multipliers[: model.n_lam]).tolist()
@@ -82,8 +81,7 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     if lagrangian.compliant:
         energy += ca.sumsqr(given_way) / 2
         conditions[lagrangian.compliant] -= ca.sqrt(lagrangian.compliances(s.p)) * given_way
-    given, zero = [energy, conditions[multipliers]], ca.SX.zeros(len(multipliers))
-    given.append(reached)
+    given, zero = [energy, conditions[multipliers], reached], ca.SX.zeros(len(multipliers))
     energy, conditions, reached = ca.substitute(given, [s.lam[multipliers]], [zero])
     for node, frame in zip(clamped, _clip_frames(model, s, clamped), strict=True):
         # Nothing else depends on the coordinates of a node that a clip holds.
@@ -161,9 +159,8 @@ def shape(model: CableModel, s: PoseSymbols) -> ShapeExpressions:
 def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Measured curve ((n + 1) d or 2 d,), by node: place, and dr/ds of smooth elements."""
     layout, d, functions = model.chain.layout, model.node.dimension, functions_of(model)
-    steps = functions.compact("segment_curve")(*_segment_arguments(model, s))[
-        :, layout.advancing.tolist()
-    ]
+    advance = functions.compact("segment_curve")(*_segment_arguments(model, s))
+    steps = advance[:, layout.advancing.tolist()]
     points = ca.cumsum(ca.horzcat(s.pose[:d], steps[:d, :]), 1)
     rates = steps[d:, :]
     rates = ca.horzcat(rates[:, 0], (rates[:, :-1] + rates[:, 1:]) / 2, rates[:, -1])
@@ -208,9 +205,8 @@ def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) ->
         last = model.n_pose - size * (count - k) + size - 1
         frame = model.node.moved(s.pose[last - c : last], ca.SX(turns[:, k]))
         if model.clips[k] == "swivel":
-            x, y, z, w = parts = ca.vertsplit(frame)
-            own = ca.vertsplit(s.x[_rows(model, node)])
-            roll, _, _, rest = quaternion_product((-x, -y, -z, w), own)
+            parts, own = ca.vertsplit(frame), ca.vertsplit(s.x[_rows(model, node)])
+            roll, _, _, rest = quaternion_product(conjugate(parts), own)
             length = ca.sqrt(roll**2 + rest**2)
             turn = (roll / length, ca.SX(0), ca.SX(0), rest / length)
             frame = ca.vertcat(*quaternion_product(parts, turn))
