@@ -36,26 +36,22 @@ class Sensor(ABC):
         Relative standard deviations of the points.
     marked : bool
         Whether the arc lengths of all its points are known.
+    correlation_length : float [m]
+        Length over which the otherwise white errors of points are correlated.
+    count : (K,) or one number for all
+        Number of measured points of which each point is the mean.
     """
 
     points: FloatArray
     weight: FloatArray
     marked = False
+    correlation_length: float = 0.0
+    count: Count = 1.0
 
     @property
     @abstractmethod
     def per_point(self) -> int:
         """Number of residuals per point."""
-
-    @property
-    def correlation_length(self) -> float:
-        """Length [m] over which the otherwise white errors of points are correlated."""
-        return 0.0
-
-    @property
-    def count(self) -> Count:
-        """Number (K,) of measured points of which each point is the mean, or one number for all."""
-        return 1.0
 
     @property
     def kinds(self) -> NDArray[np.str_]:
