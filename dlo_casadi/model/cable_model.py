@@ -319,8 +319,8 @@ class CableModel:
         free = self.end == "free"
         if free and not self.surfaces:
             return []
-        names = [f"free_end_{axis}" for axis in self.node.axes] if free else self._end_position
-        return [self.border_names.index(name) for name in names]
+        what = "free_end" if free else "end_position"
+        return [self.border_names.index(f"{what}_{axis}") for axis in self.node.axes]
 
     @property
     def no_pull(self) -> list[int]:
@@ -339,7 +339,7 @@ class CableModel:
         places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
         kinds: dict[str, Literal["distance", "angle", "place"]] = {}
         for name in self.condition_names:
-            kinds[name] = "distance" if name in self._end_position else "angle"
+            kinds[name] = "distance" if name.startswith("end_position") else "angle"
         for k in range(self.n_springs):
             kinds |= {f"spring_{k}.{name}": "place" for name in places}
             kinds |= {f"spring_{k}.{name}": "distance" for name in pulls}
@@ -391,10 +391,6 @@ class CableModel:
     def condition_names(self) -> tuple[str, ...]:
         """Names of the end conditions: end position, then frames of clamps."""
         return self._held("end_position")
-
-    @property
-    def _end_position(self) -> tuple[str, ...]:
-        return tuple(f"end_position_{axis}" for axis in self.node.axes)
 
     def _held(self, place: str) -> tuple[str, ...]:
         """Names of the held components: of the end's place, named `place`, and of clamps."""
