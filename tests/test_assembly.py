@@ -110,7 +110,7 @@ def test_gradient_by_what_the_equilibrium_depends_on(element, boundary):
     a, shapes, given = posed(element, boundary)
     names = ("p", "rest", "deviation")
     along, d = directions(a, M, *names), steps(a, *names)
-    exact = a.balance_slopes(shapes, given).along(along).rows
+    exact = a.balance_along(shapes, given, along).rows
     slope = central(a, lambda s, g: a.balance(s, g)[1].rows[..., 0], shapes, given, along, d)
     assert_close(exact, slope, d, 10.0)
 
@@ -121,10 +121,10 @@ def test_measured_curve_by_all_it_depends_on(element, boundary):
     a, shapes, given = posed(element, boundary)
     names = ("x", "lam", "p", "rest", "deviation")
     along, d = directions(a, M, *names), steps(a, *names)
-    slopes = a.curve_slopes(shapes, given)
-    np.testing.assert_allclose(slopes.z, a.curve(shapes, given), atol=1e-14)  # rounding
-    assert slopes.z.shape == (M, a.chain.n + 1, 4 if a.chain.kind.smooth else 2)
-    assert_close(slopes.along(along), central(a, a.curve, shapes, given, along, d), d, 10.0)
+    curves, change = a.curve_along(shapes, given, along)
+    np.testing.assert_allclose(curves, a.curve(shapes, given), atol=1e-14)  # rounding
+    assert curves.shape == (M, a.chain.n + 1, 4 if a.chain.kind.smooth else 2)
+    assert_close(change, central(a, a.curve, shapes, given, along, d), d, 10.0)
 
 
 @ALL

@@ -143,14 +143,14 @@ def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[
     total, slope, matrix = a.balance(shapes, given)
     along = directions(a, 1, "x", "lam", "p", "rest", "deviation")
     kept = ~along.p[0, own_indices(model)].any(axis=0)
-    curve, after = a.curve_slopes(shapes, given), a.state_after(shapes, given)
+    (curve, change), after = a.curve_along(shapes, given, along), a.state_after(shapes, given)
     return {
         "Lagrangian": total,
         "gradient": slope.rows,
         "Hessian": matrix.dense(),
-        "gradient by all": a.balance_slopes(shapes, given).along(along).rows[..., kept],
-        "curve": curve.z,
-        "curve by all": curve.along(along)[..., kept],
+        "gradient by all": a.balance_along(shapes, given, along).rows[..., kept],
+        "curve": curve,
+        "curve by all": change[..., kept],
         "rest after": after[0],
         "rest after by all": a.state_along(after, along)[..., kept],
     }
@@ -214,8 +214,8 @@ def test_gradients_and_hessians_are_finite(case, headings, values):
     shapes, given = posed(model, p, headings)
     blocks = outputs(model, p, headings)
     own = directions(assembly_of(model), 1, "p")
-    blocks["gradient by p"] = assembly_of(model).balance_slopes(shapes, given).along(own).rows
-    blocks["curve by p"] = assembly_of(model).curve_slopes(shapes, given).along(own)
+    blocks["gradient by p"] = assembly_of(model).balance_along(shapes, given, own).rows
+    blocks["curve by p"] = assembly_of(model).curve_along(shapes, given, own)[1]
     for what, block in blocks.items():
         assert np.all(np.isfinite(block)), what
 
@@ -252,10 +252,10 @@ def test_derivatives_by_parameters_against_finite_differences(case):
     for what, exact, function in (
         (
             "balance",
-            a.balance_slopes(shapes, given).along(along).rows,
+            a.balance_along(shapes, given, along).rows,
             lambda s, g: a.balance(s, g)[1].rows[..., 0],
         ),
-        ("curve", a.curve_slopes(shapes, given).along(along), a.curve),
+        ("curve", a.curve_along(shapes, given, along)[1], a.curve),
         (
             "state",
             a.state_along(after, along),

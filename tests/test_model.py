@@ -108,7 +108,7 @@ def test_section_laws_multiply(element):
         a = assembly_of(model)
         shapes = replace(any_shapes(a), lam=np.zeros((1, a.k)))
         where = given(model, np.array([0.02, *own]), any_rest(a)[0])
-        return a.balance_slopes(shapes, where).along(directions(a, 1, "rest")).x
+        return a.balance_along(shapes, where, directions(a, 1, "rest")).x
 
     plain = bending((), [])
     first, second = bending(laws[:1], values[0]), bending(laws[1:], values[1])

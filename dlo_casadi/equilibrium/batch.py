@@ -356,7 +356,7 @@ class BatchEquilibrium:
     def _solved(self, shapes: Shapes, given: Inputs, still: Tangents) -> Tangents:
         """Directions, completed by the resulting change of nodes and multipliers."""
         _, _, matrix = self.assembly.balance(shapes, given)
-        found = matrix.factor().solve(self.assembly.balance_slopes(shapes, given).along(still))
+        found = matrix.factor().solve(self.assembly.balance_along(shapes, given, still))
         return replace(still, x=still.x - found.x, lam=still.lam - found.y, tangent=matrix)
 
     def _in_order(
@@ -377,7 +377,8 @@ class BatchEquilibrium:
             moving = np.any([part.any(axis=tuple(range(part.ndim - 1))) for part in parts], axis=0)
             now = Tangents(*(part[..., moving] for part in parts))
             if now.p.any() or now.rest.any() or now.deviation.any():
-                found = factor.subset(one).solve(by_inputs.subset(one).along(now))
+                here, own = (shapes.subset(one), given.subset(one)), [y[one] for y in by_inputs]
+                found = factor.subset(one).solve(self.assembly.balance_along(*here, now, own))
                 now = replace(now, x=now.x - found.x, lam=now.lam - found.y)
             x[j][..., moving], lam[j][..., moving] = now.x[0], now.lam[0]
             if j + 1 < self.m:
@@ -390,13 +391,13 @@ class BatchEquilibrium:
     ) -> list[tuple[Observed, ObservedChange]]:
         """Predicted measurements of each pose, and their derivatives along directions."""
         given, length = self.given(shapes, p, rest), self.model.cable.length
-        slopes = self.assembly.curve_slopes(shapes, given)
+        curves, moved = self.assembly.curve_along(shapes, given, along)
         felt: FloatArray = np.zeros((self.m, 0))
         changes: FloatArray = np.zeros((self.m, 0, along.x.shape[3]))
         if self.wrenches:
             felt = self.assembly.readings(shapes, given)
             changes = self.assembly.readings_along(shapes, given, along)
-        each = zip(slopes.z, felt, slopes.along(along), changes, strict=True)
+        each = zip(curves, felt, moved, changes, strict=True)
         return [
             (Observed(NodeCurve.of(length, z), readings), ObservedChange(change, reading_change))
             for z, readings, change, reading_change in each

@@ -274,7 +274,7 @@ class Relaxation:
         along = self._along(values, given)
         _, force, matrix = self._assembly.balance(values.shapes, given)
         still = replace(along, x=np.zeros_like(along.x), lam=np.zeros_like(along.lam))
-        rows = self._assembly.balance_slopes(values.shapes, given).along(still).rows
+        rows = self._assembly.balance_along(values.shapes, given, still).rows
         tangent = matrix.dense()
         rows[:, :, :nodes] += tangent[:, :, :nodes]
         rows += tangent[:, :, nodes:] @ along.lam

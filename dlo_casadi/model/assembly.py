@@ -7,8 +7,9 @@ to the derivatives of both and of the measured curve.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -20,7 +21,6 @@ from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, LastTouching, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
-from dlo_casadi.model.moved_clips import moved_clips
 from dlo_casadi.model.stacked import Inputs as Inputs
 from dlo_casadi.model.stacked import Mapped, repeated
 from dlo_casadi.model.stacked import Shapes as Shapes
@@ -31,6 +31,8 @@ from dlo_casadi.rod.ends import reaction_rows
 
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
+# Step of differences by slips of clips, relative to the length, and by turns [rad].
+_STEP = 1e-6
 
 
 class Assembly:
@@ -45,8 +47,6 @@ class Assembly:
         # Rows of a force at the end of the cable, in derivatives of a segment.
         self._pull = [2 * self.b + row for row in model.end_pull]
         self._segments, self.n_lam = self.chain.n_segments, model.n_lam
-        # Number of values that determine the rest strains inside a segment.
-        self.n_inside = 3 * len(self.node.strains)
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self.depth, self.everywhere, self._outwards = DEPTH, False, outwards(model)
         self._touched = LastTouching()
@@ -240,22 +240,64 @@ class Assembly:
         pulls = shapes.lam * self.model.are_multipliers
         return np.asarray((pulls * gradient.y[:, :, 0]).sum(axis=1))
 
-    def balance_slopes(self, shapes: Shapes, given: Inputs) -> BalanceSlopes:
-        """Parts of the derivatives of the gradient at fixed nodes and multipliers."""
+    def balance_slopes(self, shapes: Shapes, given: Inputs) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of the gradient by p, rest and deviation, of each segment and of the ends."""
         (segments,) = self._call_segments("segment_sensitivity", shapes, given)
         (ends,) = self._call_ends("end_sensitivity", shapes, given)
-        return BalanceSlopes(self, shapes, given, segments, ends)
+        return segments, ends
 
-    def add_by_numbers(
-        self, total: FloatArray | float, blocks: FloatArray, along: Tangents, clipped: Clipped
+    def balance_along(
+        self,
+        shapes: Shapes,
+        given: Inputs,
+        along: Tangents,
+        slopes: Sequence[FloatArray] | None = None,
+    ) -> Vector:
+        """Change of the gradient at fixed nodes and multipliers along directions.
+
+        `slopes`: the `balance_slopes` if they are known.
+        """
+        segments, ends = slopes or self.balance_slopes(shapes, given)
+        clipped = self.clipped(shapes, given)
+        changed = self._by_numbers(segments, along, clipped)
+        total = self._added(changed, ends @ np.concatenate([along.p, along.deviation], axis=1))
+        if touching := self.touching(shapes, given):
+            total = touching.along(total, changed[:, :, self._pull], self._outwards @ along.p)
+        clipped.hold(total, shapes.x, np.zeros(len(shapes.x)))
+        for rate, (more, less) in self._moved_clips(given, along.p):
+            change = self.imbalance(shapes, more) - self.imbalance(shapes, less)
+            total = total + Vector(change.x * rate[:, None, None], change.y * rate[:, None])
+        return total
+
+    def _by_numbers(
+        self,
+        blocks: FloatArray,
+        along: Tangents,
+        clipped: Clipped,
+        total: FloatArray | float = 0.0,
     ) -> FloatArray:
         """Add the change along p, rest and deviation to a total, given segments' derivatives."""
-        n_p = along.p.shape[1]
-        n_r = n_p + self.n_inside
+        rest = clipped.rest(self.chain.rest_inside(along.rest))
+        n_p, n_r = along.p.shape[1], along.p.shape[1] + rest.shape[2]
         total = total + blocks[..., :n_p] @ along.p[:, None]
-        total += blocks[..., n_p:n_r] @ clipped.rest(self.chain.rest_inside(along.rest))
+        total += blocks[..., n_p:n_r] @ rest
         total += blocks[..., n_r:] @ along.deviation[:, None]
         return np.asarray(total)
+
+    def _moved_clips(
+        self, given: Inputs, p: FloatArray, *, turned: bool = True
+    ) -> Iterator[tuple[FloatArray, tuple[Inputs, Inputs]]]:
+        """Central differences by slips and turns of clips: rates (m, q), and both inputs.
+
+        `p` (m, n_parameters, q): directions. Without `turned` those by slips alone.
+        """
+        slips, turns = functions_of(self.model).clip_slopes
+        for k in np.flatnonzero(slips.any(axis=0) | (turned & turns.any(axis=(0, 2)))):
+            step = _STEP * (self.chain.length if slips[:, k].any() else 1.0)
+            unit = step * np.eye(given.p.shape[1])[k]
+            both = (replace(given, p=given.p + unit), replace(given, p=given.p - unit))
+            if p[:, k].any():
+                yield p[:, k] / (2 * step), both
 
     # ---- the curve ------------------------------------------------------------------------------
 
@@ -293,14 +335,30 @@ class Assembly:
         p, ends = repeated(given.p, count), repeated(given.poses, count)
         return self._mapped(name)(places, rates, x, p, ends)
 
-    def curve_slopes(self, shapes: Shapes, given: Inputs) -> CurveSlopes:
-        """`curve` and the parts of its derivatives."""
+    def curve_along(
+        self, shapes: Shapes, given: Inputs, along: Tangents
+    ) -> tuple[FloatArray, FloatArray]:
+        """`curve`, and its change (m, n + 1, d or 2 d, q) along directions."""
         advance, by_moving, by_others = self._call_segments("segment_curve_slopes", shapes, given)
         rows, by_station, by_p = self._call_stations(
             "station_slopes", advance[..., 0], shapes, given
         )
-        z = self.clipped(shapes, given).evenly(rows)[..., 0]
-        return CurveSlopes(self, shapes, given, z, by_moving, by_others, by_station, by_p)
+        clipped, touching = self.clipped(shapes, given), self.touching(shapes, given)
+        by_nodes, by_lam = np.split(by_moving, [2 * self.b], axis=-1)
+        lam = touching.lam_along(along.lam) if touching else along.lam[:, None]
+        x = clipped.free(along.x)  # frames of clips have moved in `_moved_clips`
+        steps: FloatArray = by_nodes @ self._both(x) + by_lam @ lam
+        steps = self._by_numbers(by_others, along, clipped, steps)
+        start = np.zeros((len(steps), self.node.dimension, steps.shape[3]))
+        places, rates = self._stations(steps, start)
+        shape = (len(steps), self.chain.n + 1, 2 * self.b, steps.shape[3])
+        own = x[:, self.chain.layout.stations].reshape(shape)
+        moved = by_station @ np.concatenate([places, rates, own], axis=2)
+        change = clipped.evenly(moved + by_p @ along.p[:, None])
+        for rate, (more, less) in self._moved_clips(given, along.p):
+            gap = self.curve(shapes, more) - self.curve(shapes, less)
+            change = change + gap[..., None] * rate[:, None, None]
+        return clipped.evenly(rows)[..., 0], np.asarray(change)
 
     def reactions(self, shapes: Shapes, given: Inputs, name: str = "reactions") -> FloatArray:
         """Forces and moments (m, n_reactions) of the cable on its fixtures, `reaction_rows`."""
@@ -352,7 +410,7 @@ class Assembly:
         m, n_p = given.p.shape
         # Only saddles move the edges of cells.
         every = self.model.clamped_between * np.broadcast_to(np.eye(n_p), (m, n_p, n_p))
-        for rate, pair in moved_clips(self.model, given, every, turned=False):
+        for rate, pair in self._moved_clips(given, every, turned=False):
             more, less = (self._cells_after(shapes, one)[0] for one in pair)
             by[2] = by[2] + (more - less) * rate[:, None]
         return (after[..., 0], *by)
@@ -381,68 +439,3 @@ class Assembly:
 def assembly_of(model: CableModel) -> Assembly:
     """The assembly of a model, made once."""
     return Assembly(model)
-
-
-@dataclass(frozen=True)
-class BalanceSlopes:
-    """Derivatives of the gradient by p, rest and deviation, of each segment and of the ends."""
-
-    assembly: Assembly
-    shapes: Shapes
-    given: Inputs
-    segments: FloatArray
-    ends: FloatArray
-
-    def subset(self, index: Any) -> BalanceSlopes:
-        """Derivatives of some of the poses."""
-        inputs = self.shapes.subset(index), self.given.subset(index)
-        return BalanceSlopes(self.assembly, *inputs, self.segments[index], self.ends[index])
-
-    def along(self, directions: Tangents) -> Vector:
-        """Change of the gradient at fixed nodes and multipliers."""
-        a, d, shapes, given = self.assembly, directions, self.shapes, self.given
-        clipped = a.clipped(shapes, given)
-        changed = a.add_by_numbers(0.0, self.segments, d, clipped)
-        total = a._added(changed, self.ends @ np.concatenate([d.p, d.deviation], axis=1))
-        if touching := a.touching(shapes, given):
-            total = touching.along(total, changed[:, :, a._pull], a._outwards @ d.p)
-        clipped.hold(total, shapes.x, np.zeros(len(shapes.x)))
-        for rate, (more, less) in moved_clips(a.model, given, d.p):
-            change = a.imbalance(shapes, more) - a.imbalance(shapes, less)
-            total = total + Vector(change.x * rate[:, None, None], change.y * rate[:, None])
-        return total
-
-
-@dataclass(frozen=True)
-class CurveSlopes:
-    """Measured curves `z` (m, n + 1, d or 2 d) and their derivatives, segment by segment."""
-
-    assembly: Assembly
-    shapes: Shapes
-    given: Inputs
-    z: FloatArray
-    by_moving: FloatArray
-    by_others: FloatArray
-    by_station: FloatArray
-    by_p: FloatArray
-
-    def along(self, directions: Tangents) -> FloatArray:
-        """Change (m, n + 1, d or 2 d, q) of the measured curves."""
-        a, d = self.assembly, directions
-        clipped = a.clipped(self.shapes, self.given)
-        by_nodes, by_lam = np.split(self.by_moving, [2 * a.b], axis=-1)
-        touching = a.touching(self.shapes, self.given)
-        lam = touching.lam_along(d.lam) if touching else d.lam[:, None]
-        x = clipped.free(d.x)  # frames of clips have moved in `moved_clips`
-        steps: FloatArray = by_nodes @ a._both(x) + by_lam @ lam
-        steps = a.add_by_numbers(steps, self.by_others, d, clipped)
-        start = np.zeros((len(steps), a.node.dimension, steps.shape[3]))
-        places, rates = a._stations(steps, start)
-        shape = (len(steps), a.chain.n + 1, 2 * a.b, steps.shape[3])
-        own = x[:, a.chain.layout.stations].reshape(shape)
-        moved = self.by_station @ np.concatenate([places, rates, own], axis=2)
-        change = clipped.evenly(moved + self.by_p @ d.p[:, None])
-        for rate, (more, less) in moved_clips(a.model, self.given, d.p):
-            gap = a.curve(self.shapes, more) - a.curve(self.shapes, less)
-            change = change + gap[..., None] * rate[:, None, None]
-        return np.asarray(change)
