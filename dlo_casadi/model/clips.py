@@ -254,8 +254,8 @@ class Clipped:
             return inside
         low, width = self.places[:, :-1, None, None], np.diff(self.places)[..., None, None]
         x = (low + width / 2 - self.chain.places[:-1, None, None]) / self.chain.h - 0.5
-        own, parts = np.empty_like(inside), (inside[:, :, k::3] for k in range(3))
-        for k, part in enumerate(_within(*parts, x, width / self.chain.h)):
+        own, (mean, a, c) = np.empty_like(inside), (inside[:, :, k::3] for k in range(3))
+        for k, part in enumerate(_within(mean, a, c, x, width / self.chain.h)):
             own[:, :, k::3] = part
         return own
 
