@@ -22,10 +22,9 @@ from dlo_casadi.model.contact import DEPTH, Contact, LastTouching, Touching, out
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.stacked import Inputs as Inputs
-from dlo_casadi.model.stacked import Mapped, repeated
+from dlo_casadi.model.stacked import Mapped, Unheld, repeated
 from dlo_casadi.model.stacked import Shapes as Shapes
 from dlo_casadi.model.stacked import Tangents as Tangents
-from dlo_casadi.model.unheld import Unheld
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
 
@@ -97,12 +96,10 @@ class Assembly:
             own = clipped.rest(own[..., None])[..., 0]
         p, deviation = (repeated(one, count) for one in (given.p, shapes.deviation))
         both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
-        if not self.model.clips:
-            return self._mapped(name)(both, lam, p, own, table, deviation)
-        pulls = [self.model.end_pull, *self.model.pulls[self.model.n_springs :]]
-        width = None if self.model.clamped_between else self.chain.h
-        unheld = Unheld.of(table, self.model.clips, pulls, width)
         arguments = both, lam, p, own, table, deviation
+        if not self.model.clips:
+            return self._mapped(name)(*arguments)
+        unheld = Unheld.of(self.model, table)
         return unheld.evaluated(name, self._mapped, arguments, 2 * self.b)
 
     def clipped(self, shapes: Shapes, given: Inputs) -> Clipped:

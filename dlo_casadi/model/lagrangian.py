@@ -117,14 +117,6 @@ class Lagrangian:
         return Viewpoint(start, ca.vertcat(x, y), inverse)
 
     @property
-    def declared_clips(self) -> tuple[ClipConditions, ...]:
-        """Each clip as declared."""
-        numbers, d = self.pose[self.model.n_pose - self.model.clip_numbers :], self.node.dimension
-        rows = ca.vertsplit(numbers, clip_size(self.node)) if self.model.clips else []
-        none = ca.SX.zeros(self.node.increment)
-        return tuple(ClipConditions(row[:d], row[-1], none) for row in rows)
-
-    @property
     def moved(self) -> list[ca.SX]:
         """The two nodes, moved by their increments."""
         rows, steps = (ca.vertsplit(both, both.numel() // 2) for both in (self.x, self.delta))
@@ -142,10 +134,11 @@ class Lagrangian:
         fixed, clips = 2 * (d + b), 2 * (d + b) + d * len(self.model.clips)
         edges = [0, d, d + b, d + 2 * b, fixed, clips, self.deviation.numel()]
         place, first, last, _, moved, _ = ca.vertsplit(self.deviation, edges)
-        declared = EndConditions.of(self.declared_ends, self.node)
-        steps = ca.vertsplit(moved, d) if self.model.clips else []
-        pairs = zip(self.declared_clips, steps, strict=True)
-        held = [clip._replace(place=clip.place + step) for clip, step in pairs]
+        declared, held = EndConditions.of(self.declared_ends, self.node), []
+        if self.model.clips:
+            rows = ca.vertsplit(self.pose[-self.model.clip_numbers :], clip_size(self.node))
+            pairs = zip(rows, ca.vertsplit(moved, d), strict=True)
+            held = [ClipConditions(row[:d] + step, row[-1], ca.SX.zeros(b)) for row, step in pairs]
         ends = replace(declared, end=declared.end + place, clips=tuple(held)).turned(first, last)
         for effect, local in self.effects_of(BoundaryEffect):
             ends = effect.conditions(ends, local)
