@@ -45,7 +45,5 @@ class StandoffError(MeasurementEffect):
 
     def observe(self, point: ca.SX, frame: ca.SX, viewpoint: Viewpoint, params: Params) -> ca.SX:
         """Follow the ray through the point to the declared plane."""
-        d = params["distance"]
-        return point + d * (viewpoint.nearness * point - viewpoint.camera) / (
-            1 - d * viewpoint.nearness
-        )
+        d, nearness = params["distance"], viewpoint.nearness
+        return point + d * (nearness * point - viewpoint.camera) / (1 - d * nearness)

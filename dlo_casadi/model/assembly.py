@@ -319,14 +319,15 @@ class Assembly:
     def curve(self, shapes: Shapes, given: Inputs) -> FloatArray:
         """Measured places (m, n + 1, d), for smooth elements with dr/ds (m, n + 1, 2 d)."""
         (advance,) = self._call_segments("segment_curve", shapes, given)
-        (rows,) = self._call_stations("station", advance[..., 0], shapes, given)
+        (rows,) = self._call_stations("station", advance, shapes, given)
         return self.clipped(shapes, given).evenly(rows)[..., 0]
 
     def _call_stations(
         self, name: str, advance: FloatArray, shapes: Shapes, given: Inputs
     ) -> list[FloatArray]:
         m, count = len(shapes.x), self.chain.n + 1
-        places, rates = self._stations(advance, given.poses[:, : self.node.dimension])
+        start = given.poses[:, : self.node.dimension]
+        places, rates = self._stations(advance[..., 0], start)
         nodes = self.clipped(shapes, given).in_frames(shapes.x)
         x = nodes[:, self.chain.layout.stations].reshape((m, count, -1))
         p, ends = repeated(given.p, count), repeated(given.poses, count)
@@ -337,9 +338,7 @@ class Assembly:
     ) -> tuple[FloatArray, FloatArray]:
         """`curve`, and its change (m, n + 1, d or 2 d, q) along directions."""
         advance, by_moving, by_others = self._call_segments("segment_curve_slopes", shapes, given)
-        rows, by_station, by_p = self._call_stations(
-            "station_slopes", advance[..., 0], shapes, given
-        )
+        rows, by_station, by_p = self._call_stations("station_slopes", advance, shapes, given)
         clipped, touching = self.clipped(shapes, given), self.touching(shapes, given)
         by_nodes, by_lam = np.split(by_moving, [2 * self.b], axis=-1)
         lam = touching.lam_along(along.lam) if touching else along.lam[:, None]

@@ -222,9 +222,8 @@ class CableModel:
 
     def with_effect(self, effect: Effect, priors: dict[str, float] | None = None) -> Self:
         """Return this model with one more effect."""
-        return replace(
-            self, effects=(*self.effects, effect), priors={**self.priors, **(priors or {})}
-        )
+        known = {**self.priors, **(priors or {})}
+        return replace(self, effects=(*self.effects, effect), priors=known)
 
     def without_effect(self, label: str) -> Self:
         """Return this model without the effect that has this label."""

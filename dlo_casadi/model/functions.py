@@ -33,18 +33,17 @@ class Functions:
     def __init__(self, model: CableModel, unheld: bool = False) -> None:
         self.model, self.terms = model, lagrangian_of(model, unheld)
         self.node, self.kind = model.node, model.chain.kind
-        x, lam, p, deviation = (getattr(self.terms, k) for k in ("x", "lam", "p", "deviation"))
-        rest, place = self.terms.rest_strains, self.terms.place
-        self._segment_arguments = [x, lam, p, rest, place, deviation]
-        self._end_arguments = [x, lam, p, self.terms.pose, deviation]
+        own, lam, place = self.terms, self.terms.lam, self.terms.place
+        self._segment_arguments = [own.x, lam, own.p, own.rest_strains, place, own.deviation]
+        self._end_arguments = [own.x, lam, own.p, own.pose, own.deviation]
         # Variables of the first and second derivatives; values by which gradients of segments are
         # also differentiated. Arc lengths of eyelets are part of `place`.
         border = ca.vertsplit(lam) if lam.numel() else []
         self._sliding = [(row, place[LAYOUT_SIZE + k]) for k, row in model.sliding.items()]
         for row, s in self._sliding:
             border[row] = s
-        self._by = ca.vertcat(self.terms.delta, *border)
-        self._numbers = ca.vertcat(p, rest, deviation)
+        self._by = ca.vertcat(own.delta, *border)
+        self._numbers = ca.vertcat(own.p, own.rest_strains, own.deviation)
         self._mapped: dict[str, Mapped] = {}
         self._compact: dict[str, ca.Function] = {}
 
@@ -288,10 +287,8 @@ class Functions:
     @cached_property
     def segment_shape(self) -> ca.Function:
         """As `segment` -> L_e, advance [m], mean strains of the cell [1/m]."""
-        terms = self.terms.segment_terms
-        return self._of_segment(
-            "segment_shape", terms.lagrangian, terms.advance, self.kind.strain(self._plain)
-        )
+        terms, strain = self.terms.segment_terms, self.kind.strain(self._plain)
+        return self._of_segment("segment_shape", terms.lagrangian, terms.advance, strain)
 
     @cached_property
     def segment_strain(self) -> ca.Function:

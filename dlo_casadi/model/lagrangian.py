@@ -323,11 +323,8 @@ class Lagrangian:
         condensed = kind.condensed(segment, rigid(plain), self.elastic_energy)
         lagrangian, stretched = condensed.lagrangian, self.stretch
         if self.model.extensible:
-            (tension,) = ca.substitute(
-                [-ca.gradient(plain, ratio) / h],
-                [ratio, inner],
-                [self.stretch, ca.SX.zeros(inner.shape)],
-            )
+            tension = rigid(-ca.gradient(plain, ratio) / h)
+            tension = ca.substitute(tension, inner, ca.SX.zeros(inner.shape))
             lagrangian -= self.axial_compliance * h * tension**2 / 2
             stretched = self.stretch + self.axial_compliance * tension
         true = self.segment(stretched, condensed.inner, condensed.square)

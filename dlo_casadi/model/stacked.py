@@ -81,10 +81,8 @@ class Inputs:
     @classmethod
     def of(cls, p: FloatArray, rest: FloatArray, poses: FloatArray) -> Inputs:
         """Inputs from parameters and rest curvature of each pose, or the same for all."""
-        m = len(poses)
-        return cls(
-            np.broadcast_to(p, (m, p.shape[-1])), np.broadcast_to(rest, (m, rest.shape[-1])), poses
-        )
+        p, rest = (np.broadcast_to(x, (len(poses), x.shape[-1])) for x in (p, rest))
+        return cls(p, rest, poses)
 
     def subset(self, index: Any) -> Inputs:
         """Inputs of some of the poses."""

@@ -64,9 +64,8 @@ class MeasuredPose:
         if not readings or not self.readable:
             return self
         known = {name: np.array(value, dtype=float) for name, value in readings.items()}
-        return replace(
-            self, sensors=(*self.sensors, Wrench(known, self.pose.node, len(self.pose.clips)))
-        )
+        wrench = Wrench(known, self.pose.node, len(self.pose.clips))
+        return replace(self, sensors=(*self.sensors, wrench))
 
     @property
     def readable(self) -> bool:

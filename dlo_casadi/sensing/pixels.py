@@ -179,10 +179,8 @@ def pixels_of(view: ViewInput, std: float, on_line: bool = False) -> Pixels | No
     sure = curve.whole & (curve.std < _UNSURE * np.median(curve.std))
     sure &= _across(view) > _STEEP
     foreign = np.concatenate([[0.0], along[~sure], along[-1:]])
-    away = np.abs(along[:, None] - foreign).min(axis=1) > _REACH * curve.correlation / np.sqrt(
-        np.pi
-    )
-    kept = np.flatnonzero(away & sure)[::every]
+    away, reach = np.abs(along[:, None] - foreign).min(axis=1), _REACH * curve.correlation
+    kept = np.flatnonzero((away > reach / np.sqrt(np.pi)) & sure)[::every]
     if len(kept) < 2:
         return None
     size, pixels, points = _size(view), curve.pixels[kept], view.places[kept]

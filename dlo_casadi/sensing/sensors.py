@@ -274,9 +274,8 @@ class Wrench(_Known):
     @property
     def kinds(self) -> NDArray[np.str_]:
         """Kind of each residual (R,): a force or a moment."""
-        return np.concatenate(
-            [np.full(at.stop - at.start, name.split("_")[-1]) for name, at in self._rows.items()]
-        )
+        rows = self._rows.items()
+        return np.concatenate([np.full(x.stop - x.start, name.split("_")[-1]) for name, x in rows])
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """Zeros (R, q): it measures no points."""
