@@ -21,10 +21,7 @@ from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, LastTouching, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
-from dlo_casadi.model.stacked import Inputs as Inputs
-from dlo_casadi.model.stacked import Mapped, Unheld, repeated
-from dlo_casadi.model.stacked import Shapes as Shapes
-from dlo_casadi.model.stacked import Tangents as Tangents
+from dlo_casadi.model.stacked import Inputs, Mapped, Shapes, Tangents, Unheld, repeated
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
 
