@@ -36,13 +36,12 @@ class Functions:
         own, lam, place = self.terms, self.terms.lam, self.terms.place
         self._segment_arguments = [own.x, lam, own.p, own.rest_strains, place, own.deviation]
         self._end_arguments = [own.x, lam, own.p, own.pose, own.deviation]
-        # Variables of the first and second derivatives; values by which gradients of segments are
-        # also differentiated. Arc lengths of eyelets are part of `place`.
-        border = ca.vertsplit(lam) if lam.numel() else []
-        self._sliding = [(row, place[LAYOUT_SIZE + k]) for k, row in model.sliding.items()]
+        # Variables of the first and second derivatives; the rows of eyelets' arc lengths, which are
+        # part of `place`; values by which gradients of segments are also differentiated.
+        self._by, first = ca.vertcat(own.delta, lam), own.delta.numel()
+        self._sliding = [(first + row, place[LAYOUT_SIZE + k]) for k, row in model.sliding.items()]
         for row, s in self._sliding:
-            border[row] = s
-        self._by = ca.vertcat(own.delta, *border)
+            self._by[row] = s
         self._numbers = ca.vertcat(own.p, own.rest_strains, own.deviation)
         self._mapped: dict[str, Mapped] = {}
         self._compact: dict[str, ca.Function] = {}
@@ -89,7 +88,7 @@ class Functions:
         if self.kind.framed:
             gradient = self._of_forces @ self._about_nodes.gradient
             for row, s in self._sliding:
-                gradient[2 * self.node.increment + row] = ca.gradient(self._about_nodes.value, s)
+                gradient[row] = ca.gradient(self._about_nodes.value, s)
             return gradient
         return ca.gradient(self.terms.segment_terms.lagrangian, self._by)
 
@@ -100,9 +99,8 @@ class Functions:
             found, spread = self._about_nodes, self._of_forces
             value, hessian = found.value, spread @ found.hessian @ spread.T
             for row, s in self._sliding:
-                k = 2 * self.node.increment + row
-                hessian[:, k] = ca.jacobian(self._gradient, s)
-                hessian[k, :] = hessian[:, k].T
+                hessian[:, row] = ca.jacobian(self._gradient, s)
+                hessian[row, :] = hessian[:, row].T
         else:
             value = self.terms.segment_terms.lagrangian
             hessian, _ = ca.hessian(value, self._by)
@@ -203,8 +201,7 @@ class Functions:
             turns = self._framed.node_turns
             mixed = self._of_forces @ ca.vertcat(turns[0] @ first, turns[1] @ last, by_lam)
             for row, _ in self._sliding:
-                k = 2 * self.node.increment + row
-                mixed[k, :] = ca.jacobian(self._gradient[k], self._numbers)
+                mixed[row, :] = ca.jacobian(self._gradient[row], self._numbers)
         else:
             mixed = ca.jacobian(self._gradient, self._numbers)
         return self._of_segment("segment_sensitivity", mixed)
@@ -242,7 +239,7 @@ class Functions:
             # The advance is the derivative of the Lagrangian by the force on the end's holder.
             by_nodes = (self._of_forces @ self._about_nodes.hessian)[:, 6:9].T
             for row, s in self._sliding:
-                by_nodes[:, 6 + row] = ca.jacobian(self._about_nodes.by_lam[:3], s)
+                by_nodes[:, row] = ca.jacobian(self._about_nodes.by_lam[:3], s)
             advance = [by_nodes, self._framed.by_numbers(self._numbers)[2][:3, :]]
             ratio = [ca.jacobian(self._rates, one) for one in by]
             blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
