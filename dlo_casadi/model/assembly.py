@@ -18,7 +18,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
-from dlo_casadi.model.contact import DEPTH, Contact, LastTouching, Touching, outwards
+from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.stacked import Inputs, Mapped, Shapes, Tangents, Unheld, repeated
@@ -45,11 +45,13 @@ class Assembly:
         self._segments, self.n_lam = self.chain.n_segments, model.n_lam
         self._next = np.minimum(np.arange(self._segments) + 1, self.n - 1)
         self.depth, self.everywhere, self._outwards = DEPTH, False, outwards(model)
-        self._touched = LastTouching()
+        # The last result of `touching` and its poses: a Newton step asks three times about the same
+        # shapes. Replaced as a whole: threads share the assembly of a model.
+        self._touched: tuple[dict[bytes, int], Touching] | None = None
 
     def _changed(self, **values: Any) -> Assembly:
         other = copy(self)
-        vars(other).update(values, _touched=LastTouching())
+        vars(other).update(values, _touched=None)
         return other
 
     def softened(self, depth: float) -> Assembly:
@@ -121,10 +123,15 @@ class Assembly:
             some = shapes.subset(rows), given.subset(rows)
             return self._under(lam, "segment_curve", *some)[0][:, :, :d, 0]
 
-        every = shapes.x, shapes.lam, shapes.deviation, given.p, given.rest, given.poses
-        nodes = shapes.lam.copy(), given.poses[:, :d], given.p @ self._outwards.T
-        soft = self.depth, self.everywhere
-        return self._touched.of(every, lambda: Touching.of(self.model, *nodes, *soft, advances))
+        x = shapes.x.reshape((len(shapes.x), self.n * self.node.coordinates))
+        every = x, shapes.lam, shapes.deviation, given.p, given.rest, given.poses
+        poses, last = [row.tobytes() for row in np.concatenate(every, axis=1)], self._touched
+        if last is None or not last[0].keys() >= set(poses):
+            nodes = shapes.lam.copy(), given.poses[:, :d], given.p @ self._outwards.T
+            found = Touching.of(self.model, *nodes, self.depth, self.everywhere, advances)
+            self._touched = last = {pose: k for k, pose in enumerate(poses)}, found
+        known, found = last
+        return found.subset(np.array([known[pose] for pose in poses], dtype=int))
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, from (m, n_nodes, k, ...)."""

@@ -20,8 +20,7 @@ Hintermueller, Ito, Kunisch, SIAM J. Optim. 13 (2002): primal-dual active sets a
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -328,28 +327,6 @@ class Touching:
         y = np.concatenate([change.y, rows], axis=1)
         y[:, self.model.no_pull] = 0.0
         return Vector(change.x, y)
-
-
-class LastTouching:
-    """The last result of `Touching.of`: a Newton step asks three times about the same shapes."""
-
-    def __init__(self) -> None:
-        # Replaced as a whole: threads share the assembly of a model.
-        self._last: tuple[dict[bytes, int], Touching] | None = None
-
-    def of(self, poses: Sequence[FloatArray], find: Callable[[], Touching]) -> Touching:
-        """The kept result for some poses, or a new one.
-
-        `poses`: arrays (m, ...) of everything on which it depends.
-        """
-        flat = [one.reshape((len(one), math.prod(one.shape[1:]))) for one in poses]
-        rows = np.concatenate(flat, axis=1)
-        names = [row.tobytes() for row in rows]
-        last = self._last
-        if last is None or not last[0].keys() >= set(names):
-            self._last = last = {name: k for k, name in enumerate(names)}, find()
-        known, found = last
-        return found.subset(np.array([known[name] for name in names], dtype=int))
 
 
 def _inwards(force: FloatArray, h: float) -> float:
