@@ -6,10 +6,10 @@ It contains the energy of bending, weight and loads, and the end conditions time
 multipliers. An equilibrium is a stationary point.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from math import prod
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 
@@ -38,8 +38,7 @@ from dlo_casadi.rod.section import Section
 MODELS = 64
 
 
-@dataclass(frozen=True)
-class _SegmentTerms:
+class _SegmentTerms(NamedTuple):
     """Expressions of one segment: its Lagrangian, its advance and its length ratio."""
 
     lagrangian: ca.SX
@@ -301,8 +300,7 @@ class Lagrangian:
     @cached_property
     def segment_terms(self) -> _SegmentTerms:
         """A segment's Lagrangian and curve."""
-        terms = self.segment_terms_by_share
-        return _SegmentTerms(*self.with_shares([terms.lagrangian, terms.advance, terms.ratio]))
+        return _SegmentTerms(*self.with_shares(list(self.segment_terms_by_share)))
 
     @cached_property
     def segment_terms_by_share(self) -> _SegmentTerms:
