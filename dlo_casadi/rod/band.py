@@ -64,10 +64,6 @@ def _product(a: FloatArray, b: FloatArray) -> FloatArray:
     return a * b if a.shape[-2:] == (1, 1) else a @ b
 
 
-def _transposed(a: FloatArray) -> FloatArray:
-    return np.swapaxes(a, -1, -2)
-
-
 @dataclass(frozen=True)
 class _Level:
     """One reduction: inverse pivots of the odd nodes and their couplings to both sides."""
@@ -89,8 +85,8 @@ class _Level:
         """Diagonal and couplings of the even nodes after elimination of the odd ones."""
         even, (odd, inner) = diagonal[:, 0::2].copy(), self.counts
         to_left = _product(self.left, self.inverse)
-        even[:, :odd] -= _product(to_left, _transposed(self.left))
-        to_right = _product(_transposed(self.right), self.inverse[:, :inner])
+        even[:, :odd] -= _product(to_left, self.left.mT)
+        to_right = _product(self.right.mT, self.inverse[:, :inner])
         even[:, 1 : inner + 1] -= _product(to_right, self.right)
         return even, -_product(to_left[:, :inner], self.right)
 
@@ -175,12 +171,12 @@ class BandMatrix:
         """Products of the matrices with (m, n, b, q), (m, k, q)."""
         x = _product(self.diagonal, vector.x)
         x[:, :-1] += _product(self.upper, vector.x[:, 1:])
-        x[:, 1:] += _product(_transposed(self.upper), vector.x[:, :-1])
+        x[:, 1:] += _product(self.upper.mT, vector.x[:, :-1])
         if not self.corner.shape[1]:
             return Vector(x, vector.y)
         x += self.border @ vector.y[:, None]
         m, rows, _ = self.columns.shape
-        across = _transposed(self.columns) @ vector.x.reshape((m, rows, -1))
+        across = self.columns.mT @ vector.x.reshape((m, rows, -1))
         return Vector(x, across + self.corner @ vector.y)
 
     def dense(self) -> FloatArray:
@@ -192,13 +188,13 @@ class BandMatrix:
             full[:, here, here] = self.diagonal[:, i]
             if i + 1 < n:
                 full[:, here, after] = self.upper[:, i]
-                full[:, after, here] = _transposed(self.upper[:, i])
+                full[:, after, here] = self.upper[:, i].mT
         full[:, : n * b, n * b :] = self.columns
-        full[:, n * b :, : n * b] = _transposed(self.columns)
+        full[:, n * b :, : n * b] = self.columns.mT
         full[:, n * b :, n * b :] = self.corner
         kept = full.shape[1] - self.internal
         own, across = full[:, kept:, kept:], full[:, :kept, kept:]
-        return full[:, :kept, :kept] - across @ np.linalg.solve(own, _transposed(across))
+        return full[:, :kept, :kept] - across @ np.linalg.solve(own, across.mT)
 
     @property
     def coupled(self) -> BoolArray:
@@ -250,7 +246,7 @@ class BandFactor:
         # The border columns are eliminated once; the result serves every right-hand side.
         self._arm = self._nodes(matrix.border)
         arm = self._arm.reshape(matrix.columns.shape)
-        self.schur = matrix.corner - _transposed(matrix.columns) @ arm
+        self.schur = matrix.corner - matrix.columns.mT @ arm
 
     def subset(self, index: IntArray) -> BandFactor:
         """The elimination of some of the poses."""
@@ -275,7 +271,7 @@ class BandFactor:
         )
         if vectors is None:
             return 1 / values[..., None]
-        return np.asarray((vectors / values[..., None, :]) @ _transposed(vectors))
+        return np.asarray((vectors / values[..., None, :]) @ vectors.mT)
 
     def _nodes(self, f: FloatArray) -> FloatArray:
         """Solve A x = f for columns (m, n, b, q)."""
@@ -284,13 +280,13 @@ class BandFactor:
             even, (count, inner) = f[:, 0::2].copy(), level.counts
             taken = _product(level.inverse, f[:, 1::2])
             even[:, :count] -= _product(level.left, taken)
-            even[:, 1 : inner + 1] -= _product(_transposed(level.right), taken[:, :inner])
+            even[:, 1 : inner + 1] -= _product(level.right.mT, taken[:, :inner])
             halves.append((taken, even))
             f = even
         x = _product(self._top, f)
         for level, (taken, even) in zip(self._levels[::-1], halves[::-1], strict=True):
             count, inner = level.counts
-            coupling = _product(_transposed(level.left), x[:, :count])
+            coupling = _product(level.left.mT, x[:, :count])
             coupling[:, :inner] += _product(level.right, x[:, 1 : inner + 1])
             out = np.empty((*even.shape[:1], even.shape[1] + count, *even.shape[2:]))
             out[:, 0::2], out[:, 1::2] = x, taken - _product(level.inverse, coupling)
@@ -302,11 +298,11 @@ class BandFactor:
         m, rows, k = self.matrix.columns.shape
         if not k:
             return Vector(x, right.y)
-        gap = right.y - _transposed(self.matrix.columns) @ x.reshape((m, rows, -1))
+        gap = right.y - self.matrix.columns.mT @ x.reshape((m, rows, -1))
         values, vectors = self._conditions
         dependent = np.abs(values) < ZERO_PIVOT
         inverse = np.where(dependent, 0.0, 1 / np.where(dependent, 1.0, values))
-        y = vectors @ (inverse[..., None] * (_transposed(vectors) @ gap))
+        y = vectors @ (inverse[..., None] * (vectors.mT @ gap))
         return Vector(x - self._arm @ y[:, None], y)
 
     @cached_property
