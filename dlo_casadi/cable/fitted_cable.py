@@ -22,14 +22,7 @@ from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import (
-    EDGE,
-    Tipping,
-    displacements,
-    sides_of,
-    spread_across,
-    tipping_of,
-)
+from dlo_casadi.equilibrium.spread import EDGE, Repeats, Tipping, sides_of, spread_across
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.export.targets import check_counts, samples_of, target_of, write_rods
@@ -143,7 +136,7 @@ class FittedCable(EstimatedCable):
         beyond, known = eq.other_side, self.metadata.uncertainty
         if beyond is None:
             return self.shape_in(pose, eq)
-        near = tipping_of(self.model, self.p, self.rest, pose, eq, beyond, known)
+        near = Repeats(self.model, self.p, self.rest, pose, eq, known).tipping(beyond)
         if not near.either:
             return self.shape_in(pose, eq)
         own, others = sides_of(self.model, pose, eq, beyond)
@@ -340,10 +333,8 @@ class Shape:
         To first order in parameter errors, scatter of fixtures and scatter of repeats.
         """
         cable, s = self.cable, self.s
-        known = cable.metadata.uncertainty
-        curve, moved = displacements(
-            cable.model, cable.p, cable.rest, self.pose, self.equilibrium, known, s
-        )
+        own = self.pose, self.equilibrium, cable.metadata.uncertainty
+        curve, moved = Repeats(cable.model, cable.p, cable.rest, *own).displacements(s)
         return np.asarray(EDGE * np.linalg.norm(spread_across(curve, s, moved), axis=1))
 
     def check(self, limits: Asked = None, *, tolerances: Asked = None) -> tuple[LimitCheck, ...]:

@@ -13,7 +13,7 @@ from dlo_casadi.diagnosis.selection import AddedEffect, HiddenWeight
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spread import displacements
+from dlo_casadi.equilibrium.spread import Repeats
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import student_95
 from dlo_casadi.estimation.descent import refit
@@ -278,8 +278,8 @@ def _displaced(
 ) -> tuple[FloatArray, FloatArray]:
     """`displacements` (K, d, q) [m] by the fit's parameters, and those that each repeat draws."""
     known = uncertainty_of(fit)
-    shape = (fit.model, fit.p, fit.rest_now, pose, found.equilibrium, known)
-    _, moved = displacements(*shape, s)
+    repeats = Repeats(fit.model, fit.p, fit.rest_now, pose, found.equilibrium, known)
+    _, moved = repeats.displacements(s)
     causes = known.causes_in(fit.model)
     kept = np.zeros(moved.shape[2], bool)
     kept[: len(causes)] = [cause == "parameters" for cause in causes]

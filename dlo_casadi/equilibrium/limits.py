@@ -5,8 +5,7 @@ computed to first order if newly solved shapes agree with it; otherwise it is co
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +16,8 @@ from dlo_casadi.equilibrium.batch import REACH, BatchEquilibrium
 from dlo_casadi.equilibrium.equilibrium import Equilibrium, curvatures_along, places_along
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
+from dlo_casadi.equilibrium.spread import Repeats
+from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, tangents
 from dlo_casadi.model.contact import outwards
@@ -161,22 +160,8 @@ class Exceedance:
     shares: Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class Varied:
-    """A cable in a pose, and every way in which a new repeat of it may differ.
-
-    Parameters
-    ----------
-    model, p, rest, pose, found
-        As of `spread.displacements`.
-    """
-
-    model: CableModel
-    p: FloatArray
-    rest: FloatArray
-    pose: HeldPose
-    found: Equilibrium
-    uncertainty: Uncertainty
+class Varied(Repeats):
+    """Repeats of a cable's pose, and how likely they exceed limits."""
 
     def exceedances(self, bounds: Mapping[str, float]) -> dict[str, Exceedance]:
         """Probability that each quantity of `sizes_of` exceeds its bound, and the size's std.
@@ -201,7 +186,7 @@ class Varied:
         names = tuple(bounds)
         causes = self.uncertainty.causes_in(self.model)
         sizes, slopes = self.linear(names)
-        if not any(map(np.any, self._ways)):
+        if not any(map(np.any, self.ways)):
             sure = {x: float((sizes[x] > bounds[x]).any()) for x in names}
             return {x: Exceedance(0.0, sure[x], 0.0, 0, 0, {}) for x in names}
         z = np.random.default_rng(0).standard_normal((LINEAR, len(causes)))
@@ -245,37 +230,19 @@ class Varied:
             )
         return out
 
-    @property
-    def _larger(self) -> CableModel:
-        """The model with the deviations that each repeat has of its own."""
-        return self.uncertainty.pose_scatter.within(self.model)
-
-    @cached_property
-    def _ways(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return self.uncertainty.ways_in(self.model)
-
-    @cached_property
-    def _along(self) -> Tangents:
-        """Derivatives of the shape by the ways in which a repeat may differ."""
-        by_p, by_rest, by_deviation = self._ways
-        shapes = replace(self.found.shapes, deviation=np.zeros((1, len(by_deviation))))
-        return BatchEquilibrium(self._larger, [self.pose]).by_rest(
-            shapes, self.p, self.rest, by_rest, by_p, by_deviation
-        )
-
     def linear(self, names: tuple[str, ...]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
         """Sizes (K,) and their derivatives (K, q) by the ways in which a repeat may differ."""
         count = len(self.uncertainty.causes_in(self.model))
         z = _STEP * np.vstack([np.eye(count), -np.eye(count), np.zeros((1, count))])
         near, given = self._near(z), self._given(z)
-        found = {name: sizes_of(self._larger, near, given, name) for name in names}
+        found = {name: sizes_of(self.larger, near, given, name) for name in names}
         slopes = {name: x[:count] - x[count : 2 * count] for name, x in found.items()}
         sizes = {name: x[-1] for name, x in found.items()}
         return sizes, {name: np.asarray(x.T / (2 * _STEP)) for name, x in slopes.items()}
 
     def _given(self, z: FloatArray) -> Inputs:
         """Inputs of repeats z (m, q); stiffnesses are log-normal, all values within bounds."""
-        by_p, by_rest, _ = self._ways
+        by_p, by_rest, _ = self.ways
         known, steps = self.model.parameters, z @ by_p.T
         log = np.array([q.log for q in known])
         p = self.p + np.where(log, 0.0, steps)
@@ -288,7 +255,7 @@ class Varied:
 
     def _near(self, z: FloatArray) -> Shapes:
         """Shapes of repeats z (m, q) to first order."""
-        shapes, along = self.found.shapes, self._along
+        shapes, along = self.found.shapes, self.along
         start = np.repeat(shapes.x, len(z), axis=0)
         x = self.model.node.moved(start, np.einsum("nbq,mq->mnb", along.x[0], z))
         return Shapes(x, shapes.lam + z @ along.lam[0].T, z @ along.deviation[0].T)
@@ -303,14 +270,14 @@ class Varied:
         for begin in range(0, len(z), CHUNK):
             some = slice(begin, begin + CHUNK)
             own, start = given.subset(some), guesses.subset(some)
-            batch = BatchEquilibrium(self._larger, [self.pose] * len(start.x))
+            batch = BatchEquilibrium(self.larger, [self.pose] * len(start.x))
             shapes, converged = batch.solve_or_descend(start, own.p, own.rest, tolerance=_TOLERANCE)
             # A descent may end in a shape far away, to which the cable snaps.
             way = np.abs(self.model.node.difference(start.x, shapes.x)).max(axis=(1, 2))
             near = converged & (way <= REACH)
             lost.append(~(near & batch.stable(shapes, own.p, own.rest)))
             for name in names:
-                parts[name].append(sizes_of(self._larger, shapes, own, name))
+                parts[name].append(sizes_of(self.larger, shapes, own, name))
         return {name: np.concatenate(x) for name, x in parts.items()}, np.concatenate(lost)
 
 

@@ -1,8 +1,11 @@
 """Uncertainty of a prediction: the spread of new repeats of a pose, and the side it takes."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -15,7 +18,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import ways_of
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.thresholds import EITHER
@@ -185,35 +188,95 @@ def _carried_beside(effect: Effect, deviations: Sequence[tuple[str, str]]) -> di
     return {k: x for k, x in effect.tolerances.items() if (x, of_clip) not in covered}
 
 
-def displacements(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    pose: HeldPose,
-    found: Equilibrium,
-    uncertainty: Uncertainty,
-    s: FloatArray,
-) -> tuple[NodeCurve, FloatArray]:
-    """Curve of a pose, and displacements (K, d, q) [m] of its places s [m] in a new repeat.
+@dataclass(frozen=True)
+class Repeats:
+    """New repeats of a cable's pose, and every way in which they may differ.
 
-    The displacements are independent, of one standard deviation each. They are the covariance of
-    the fitted parameters, the fixtures' scatter and each repeat's own random quantity, propagated
-    through the equilibrium. The measured difference of repeats is added, equal at all places.
+    Parameters
+    ----------
+    model, p, rest, pose
+        As in `solve_equilibrium`.
+    found : Equilibrium
+        The predicted shape.
+    uncertainty : Uncertainty
     """
-    by_p, by_rest, by_deviation = uncertainty.ways_in(model)
-    equilibria = BatchEquilibrium(uncertainty.pose_scatter.within(model), [pose])
-    shapes = replace(found.shapes, deviation=np.zeros((1, len(by_deviation))))
-    along = equilibria.by_rest(shapes, p, rest, by_rest, by_p, by_deviation)
-    ((seen, change),) = equilibria.observe(shapes, p, rest, along)
-    curve, d = seen.curve, seen.curve.d
-    alike = np.broadcast_to(uncertainty.repeat_std * np.eye(d), (len(s), d, d))
-    return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    pose: HeldPose
+    found: Equilibrium
+    uncertainty: Uncertainty
+
+    @cached_property
+    def ways(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """See `Uncertainty.ways_in`."""
+        return self.uncertainty.ways_in(self.model)
+
+    @cached_property
+    def larger(self) -> CableModel:
+        """The model with the deviations that each repeat has of its own."""
+        return self.uncertainty.pose_scatter.within(self.model)
+
+    @cached_property
+    def _batch(self) -> BatchEquilibrium:
+        return BatchEquilibrium(self.larger, [self.pose])
+
+    @property
+    def _shapes(self) -> Shapes:
+        return replace(self.found.shapes, deviation=np.zeros((1, len(self.ways[2]))))
+
+    @cached_property
+    def along(self) -> Tangents:
+        """Derivatives of the shape along the `ways`."""
+        by_p, by_rest, by_deviation = self.ways
+        return self._batch.by_rest(self._shapes, self.p, self.rest, by_rest, by_p, by_deviation)
+
+    def displacements(self, s: FloatArray) -> tuple[NodeCurve, FloatArray]:
+        """Curve of the pose, and displacements (K, d, q) [m] of its places s [m] in a new repeat.
+
+        The displacements are independent, of one standard deviation each. They are the covariance
+        of the fitted parameters, the fixtures' scatter and each repeat's own random quantity,
+        propagated through the equilibrium. The measured difference of repeats is added, equal at
+        all places.
+        """
+        ((seen, change),) = self._batch.observe(self._shapes, self.p, self.rest, self.along)
+        curve, d = seen.curve, seen.curve.d
+        alike = np.broadcast_to(self.uncertainty.repeat_std * np.eye(d), (len(s), d, d))
+        return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
+
+    def tipping(self, other: Equilibrium) -> Tipping:
+        """Tipping of the pose, from the equilibrium on its other side.
+
+        It is of first order in all uncertainties of a prediction: the derivative of an
+        equilibrium's energy by any input is that of the Lagrangian at fixed nodes and multipliers.
+        """
+        std = float(np.linalg.norm(self._gap_slopes(other)))
+        lever = _lever(self.model, self.found, other)
+        return Tipping(tipping(self.model, self.found, other), std / lever)
+
+    def gap_std(self, other: Equilibrium) -> float:
+        """Standard deviation [J] between repeats of the energy difference to another equilibrium.
+
+        Causes are the fixtures and each repeat's own random quantity; the parameters are exact.
+        """
+        slopes = self._gap_slopes(other)
+        return float(np.linalg.norm(slopes[len(self.uncertainty.names) :]))
+
+    def _gap_slopes(self, other: Equilibrium) -> FloatArray:
+        """Changes (q,) [J] of the difference in energy along the `ways`."""
+        given = self.p, self.rest
+        own, beyond = (
+            energy_slope(self.larger, self.pose, eq, given, self.ways, _SHARE)
+            for eq in (self.found, other)
+        )
+        return np.asarray(beyond - own)
 
 
 def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatArray:
-    """Standard deviation (K, d - 1) [m] across the cable of `displacements` at places s [m].
+    """Standard deviation (K, d - 1) [m] across the cable at places s [m] that are `moved`.
 
-    The noise of a measurement is not included.
+    `moved`: see `Repeats.displacements`. The noise of a measurement is not included.
     """
     return np.linalg.norm(np.einsum("knd,kdq->knq", curve.normals(s), moved), axis=2)
 
@@ -253,54 +316,6 @@ class Tipping:
     def either(self) -> bool:
         """Whether it is uncertain which side is the lower one."""
         return self.angle < max(EITHER * self.std, _ROUNDING)
-
-
-def tipping_of(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    pose: HeldPose,
-    eq: Equilibrium,
-    other: Equilibrium,
-    uncertainty: Uncertainty,
-) -> Tipping:
-    """Tipping of a pose, from the equilibria on its two sides.
-
-    It is of first order in all uncertainties of a prediction: the derivative of an equilibrium's
-    energy by any input is that of the Lagrangian at fixed nodes and multipliers.
-    """
-    std = float(np.linalg.norm(_gap_slopes(model, p, rest, pose, (eq, other), uncertainty)))
-    return Tipping(tipping(model, eq, other), std / _lever(model, eq, other))
-
-
-def gap_std_of_repeats(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    pose: HeldPose,
-    pair: tuple[Equilibrium, Equilibrium],
-    uncertainty: Uncertainty,
-) -> float:
-    """Standard deviation [J] between repeats of the energy difference of a pose's two equilibria.
-
-    Causes are the fixtures and each repeat's own random quantity; the parameters are exact.
-    """
-    slopes = _gap_slopes(model, p, rest, pose, pair, uncertainty)
-    return float(np.linalg.norm(slopes[len(uncertainty.names) :]))
-
-
-def _gap_slopes(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    pose: HeldPose,
-    pair: tuple[Equilibrium, Equilibrium],
-    uncertainty: Uncertainty,
-) -> FloatArray:
-    """Changes (q,) [J] of the difference in energy along `Uncertainty.ways_in`."""
-    along, larger = uncertainty.ways_in(model), uncertainty.pose_scatter.within(model)
-    own, other = (energy_slope(larger, pose, eq, (p, rest), along, _SHARE) for eq in pair)
-    return np.asarray(other - own)
 
 
 def energy_slope(

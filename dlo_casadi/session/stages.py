@@ -14,14 +14,7 @@ from dlo_casadi.config import Limits
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import on_other_side
-from dlo_casadi.equilibrium.spread import (
-    Uncertainty,
-    displacements,
-    gap_std_of_repeats,
-    sides_of,
-    spread_across,
-    tipping_of,
-)
+from dlo_casadi.equilibrium.spread import Repeats, Uncertainty, sides_of, spread_across
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.estimation.constrained import EnergyGap, Interval
 from dlo_casadi.estimation.prediction import (
@@ -183,15 +176,9 @@ class _Model:
         if self.uncertainty is None:
             return shape
         places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
-        curve, moved = displacements(
-            self.model,
-            self.p,
-            known.rest,
-            item.pose,
-            known.equilibrium,
-            self.uncertainty,
-            np.concatenate([places, shape.s]),
-        )
+        own = known.rest, item.pose, known.equilibrium, self.uncertainty
+        repeats = Repeats(self.model, self.p, *own)
+        curve, moved = repeats.displacements(np.concatenate([places, shape.s]))
         expected: FloatArray = np.zeros(0)
         missed = expected
         if len(shape.s):
@@ -206,7 +193,7 @@ class _Model:
             expected = np.hypot(distances(moved[len(places) :]), self.noise * line.noise_distances)
         return replace(
             shape,
-            either_side=self._either_side(item, known, other, self.uncertainty),
+            either_side=self._either_side(item, known, other, repeats),
             undecided=other is not None and self._undecided(item, known, other),
             spread=spread_across(curve, places, moved[: len(places)]).squeeze(),
             expected=expected,
@@ -218,7 +205,7 @@ class _Model:
         item: MeasuredPose,
         known: Prediction,
         measured: MeasuredBranch | None,
-        uncertainty: Uncertainty,
+        repeats: Repeats,
     ) -> EitherSide | None:
         """A held-out pose on both sides, see `EitherSide`; None where there is only one."""
         if not (item.held_out and item.readable):
@@ -246,7 +233,7 @@ class _Model:
             )
             for one, way in zip((known, other), ways, strict=True)
         ]
-        tipping = tipping_of(self.model, self.p, known.rest, item.pose, *pair, uncertainty)
+        tipping = repeats.tipping(other.equilibrium)
         return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
 
     def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
@@ -263,8 +250,8 @@ class _Model:
             (by_p * std, by_rest * std),
             uncertain.covariance / np.outer(std, std),
         )
-        own = gap_std_of_repeats(self.model, self.p, known.rest, item.pose, pair, uncertain)
-        return bool(gap.value < UNSEEN * np.hypot(gap.std, own))
+        repeats = Repeats(self.model, self.p, known.rest, item.pose, pair[0], uncertain)
+        return bool(gap.value < UNSEEN * np.hypot(gap.std, repeats.gap_std(pair[1])))
 
 
 def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple[LimitCheck, ...]:

@@ -25,7 +25,7 @@ from dlo_casadi.diagnosis.trials import Trials
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty, displacements, gap_std_of_repeats
+from dlo_casadi.equilibrium.spread import Repeats, Uncertainty
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.constrained import EnergyGap, profile_interval
 from dlo_casadi.estimation.descent import descend
@@ -81,7 +81,7 @@ def test_displacements_are_those_of_shapes_solved_anew(case):
     for source in (REST_CURVATURE, *sources_in(model)):
         scatter = PoseScatter(1e-5, source=source)
         uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
-        found = displacements(model, model.nominal, rest, pose, eq, uncertainty, s)[1]
+        found = Repeats(model, model.nominal, rest, pose, eq, uncertainty).displacements(s)[1]
         found = found[:, :, len(model.deviations) :]
         sizes = scatter.sizes(found.shape[2] - len(pose.start))
         for k, size in enumerate(sizes):
@@ -440,8 +440,8 @@ def test_gap_of_two_equilibria_moves_with_each_repeat_as_energies_solved_anew():
             (a, b), (c, d) = energies
             moved.append(size * (a - b - c + d) / 2e-3)
         uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
-        found = gap_std_of_repeats(model, model.nominal, rest, pose, pair, uncertainty)
-        assert found == pytest.approx(np.linalg.norm(moved), rel=1e-4)
+        repeats = Repeats(model, model.nominal, rest, pose, pair[0], uncertainty)
+        assert repeats.gap_std(pair[1]) == pytest.approx(np.linalg.norm(moved), rel=1e-4)
 
 
 @pytest.mark.parametrize("bend", [0.0, 4.0])

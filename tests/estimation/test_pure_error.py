@@ -9,7 +9,7 @@ import pytest
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, RestCurvatureDrift
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spread import displacements, spread_across
+from dlo_casadi.equilibrium.spread import Repeats, spread_across
 from dlo_casadi.estimation import repeats
 from dlo_casadi.estimation.prediction import (
     measured_branches,
@@ -189,7 +189,7 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     (found,) = (item.equilibrium for item in predictions[left_out : left_out + 1])
     at = np.array([0.4, 0.7])
     known = (fit.model, fit.p, fit.rest, poses[left_out], found, uncertainty)
-    curve, moved = displacements(*known, at)
+    curve, moved = Repeats(*known).displacements(at)
     assert np.all(spread_across(curve, at, moved) > uncertainty.repeat_std)
     assert fit_dict(fit)["scatter"]["hanging"] == uncertainty.repeat_std
     # Noise that repeats tell is no declared one.

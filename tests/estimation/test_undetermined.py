@@ -5,7 +5,7 @@ import pytest
 
 from dlo_casadi.effects import CableData, LumpedMass
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spread import Uncertainty, displacements, spread_across
+from dlo_casadi.equilibrium.spread import Repeats, Uncertainty, spread_across
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses, uncertainty_of
 from dlo_casadi.model.cable_model import CableModel, Tolerances
@@ -76,7 +76,7 @@ def test_an_unknown_place_widens_no_band(fitted):
 
     def band(uncertainty):
         known = (shape.rest, pose, shape.equilibrium, uncertainty)
-        curve, moved = displacements(fit.model, fit.p, *known, s)
+        curve, moved = Repeats(fit.model, fit.p, *known).displacements(s)
         return spread_across(curve, s, moved)
 
     whole = uncertainty_of(fit)

@@ -11,7 +11,7 @@ from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium import solve as solve_module
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import MOST_MOVED, continued, solve_equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty, tipping, tipping_of
+from dlo_casadi.equilibrium.spread import Repeats, Uncertainty, tipping
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -158,7 +158,8 @@ def test_a_cable_that_does_not_repeat_may_fall_to_either_side():
 
     def near(std):
         known = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter(std))
-        return tipping_of(MODEL, MODEL.nominal, STRAIGHT, pose, eq, eq.other_side, known)
+        repeats = Repeats(MODEL, MODEL.nominal, STRAIGHT, pose, eq, known)
+        return repeats.tipping(eq.other_side)
 
     assert near(0.3).std == pytest.approx(10 * near(0.03).std, rel=1e-6)
     assert near(0.3).std < 0.15

@@ -160,7 +160,7 @@ def test_scatter_alone_may_leave_an_equilibrium_undecided(scatter, undecided, mo
     """A gap of 1 J is decided from two standard deviations on: 2 sqrt(0.1^2 + 0.49^2)."""
     gap = SimpleNamespace(value=1.0, std=0.1)
     monkeypatch.setattr(stages_module.EnergyGap, "between", lambda *_: gap)
-    monkeypatch.setattr(stages_module, "gap_std_of_repeats", lambda *_: scatter)
+    monkeypatch.setattr(stages_module.Repeats, "gap_std", lambda *_: scatter)
     uncertainty = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter(0.3))
     own = SimpleNamespace(model=MODEL, p=MODEL.nominal, uncertainty=uncertainty)
     known = SimpleNamespace(equilibrium=None, rest=None)
