@@ -116,35 +116,27 @@ class _SearchCallback(ca.Callback):
         return self._found(pose.tobytes(), p.tobytes())
 
     def _find(self, pose: bytes, p: bytes) -> list[ca.DM]:
-        numbers, known = np.frombuffer(pose), np.frombuffer(p)
-        found = _solved(self.model, known, self.rest, numbers, self.branch)
+        found = self._solved(np.frombuffer(pose), np.frombuffer(p))
         if isinstance(found, Equilibrium):
             multipliers = found.multipliers[self.model.are_multipliers]
             return [ca.DM(found.x.T), ca.DM(multipliers), ca.DM(0), ca.DM(1)]
         none = [ca.DM.nan(*size) for size in self._sizes]
         return [*none[:2], ca.DM(found), none[3]]
 
-
-def _solved(
-    model: CableModel,
-    p: FloatArray,
-    rest: FloatArray,
-    numbers: FloatArray,
-    branch: Branch | None,
-) -> Equilibrium | int:
-    """The stable equilibrium of a pose, or the number of the reason that there is none."""
-    pose = pose_of(model, numbers, branch)
-    if not np.all(np.isfinite([*pose.vector, pose.turns, *p])):
-        return 3
-    if np.any(model.node.excess(np.array(pose.frames)) < -0.5):
-        return 6
-    if out_of_reach(model, p, pose) is not None:
-        return 1
-    try:
-        found = solve_equilibrium(model, p, rest, pose)
-    except EquilibriumError:
-        return 2
-    return found if found.stable else 4
+    def _solved(self, numbers: FloatArray, p: FloatArray) -> Equilibrium | int:
+        """The stable equilibrium of a pose, or the number of the reason that there is none."""
+        model, pose = self.model, pose_of(self.model, numbers, self.branch)
+        if not np.all(np.isfinite([*pose.vector, pose.turns, *p])):
+            return 3
+        if np.any(model.node.excess(np.array(pose.frames)) < -0.5):
+            return 6
+        if out_of_reach(model, p, pose) is not None:
+            return 1
+        try:
+            found = solve_equilibrium(model, p, self.rest, pose)
+        except EquilibriumError:
+            return 2
+        return found if found.stable else 4
 
 
 @cache
