@@ -207,16 +207,14 @@ def _span_guesses(
     for share in shares:
         at = _arc_lengths(held, share)
         spans, border = spans_of(held, at), np.zeros(model.n_border)
-        chosen = sides or _sides(spans, model.node.sides)
         for k, row in model.sliding.items():
             border[row] = at[clips[k]]
-        if model.node is Frame:
-            edges = [(at[k], held[k].frame) for k in rolls]
-            found = _frames(model, pose, spans, edges, chosen)
-        else:
-            found = _joined_headings(model, spans, chosen)
-        for x in found:
-            yield x, border
+        edges = [(at[k], held[k].frame) for k in rolls]
+        for chosen in sides or _sides(spans, model.node.sides):
+            if model.node is Frame:
+                yield _frames(model, pose, spans, edges, chosen), border
+            else:
+                yield _joined_headings(model, spans, chosen), border
 
 
 def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
@@ -253,20 +251,17 @@ def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
 
 
 def _joined_headings(
-    model: CableModel, spans: Sequence[Span], combinations: Sequence[tuple[int, ...]]
-) -> Iterator[FloatArray]:
+    model: CableModel, spans: Sequence[Span], sides: tuple[int, ...]
+) -> FloatArray:
     """Headings (n_nodes, 1) [rad]."""
     gravity = np.array(model.gravity)
-    for sides in combinations:
-        parts = [
-            _headings(model, span, (1 - 2 * side) * _sagging(span, gravity))
-            for span, side in zip(spans, sides, strict=True)
-        ]
-        fixed = [any(frame is not None for frame in span.frames) for span in spans]
-        _joined(parts, fixed)
-        at = np.concatenate([s for s, _ in parts])
-        phi = np.interp(model.chain.places, at, np.concatenate([phi for _, phi in parts]))
-        yield phi[:, None]
+    parts = [
+        _headings(model, span, (1 - 2 * side) * _sagging(span, gravity))
+        for span, side in zip(spans, sides, strict=True)
+    ]
+    _joined(parts, [any(frame is not None for frame in span.frames) for span in spans])
+    at, phi = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return np.interp(model.chain.places, at, phi)[:, None]
 
 
 def _sagging(span: Span, gravity: FloatArray) -> int:
@@ -315,22 +310,21 @@ def _frames(
     pose: HeldPose,
     spans: Sequence[Span],
     clamps: Sequence[tuple[float, FloatArray | None]],
-    combinations: Sequence[tuple[int, ...]],
-) -> Iterator[FloatArray]:
+    sides: tuple[int, ...],
+) -> FloatArray:
     """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all holders that fix the roll."""
     places, length = model.chain.places, model.chain.length
-    for sides in combinations:
-        axes = np.zeros((len(places), 3))
-        for span, quarter in zip(spans, sides, strict=True):
-            inside = (places >= span.start - 1e-9) & (places <= span.end + 1e-9)
-            u = np.clip((places[inside] - span.start) / span.length, 0.0, 1.0)
-            axes[inside] = _axes(model, span, quarter, u)
-        edges: list[tuple[float, FloatArray | None]] = list(clamps)
-        if not edges or edges[0][0] > 0:
-            edges.insert(0, (0.0, None))
-        if edges[-1][0] < length:
-            edges.append((length, None))
-        yield frames_along(places, axes, edges, pose.turns)
+    axes = np.zeros((len(places), 3))
+    for span, quarter in zip(spans, sides, strict=True):
+        inside = (places >= span.start - 1e-9) & (places <= span.end + 1e-9)
+        u = np.clip((places[inside] - span.start) / span.length, 0.0, 1.0)
+        axes[inside] = _axes(model, span, quarter, u)
+    edges: list[tuple[float, FloatArray | None]] = list(clamps)
+    if not edges or edges[0][0] > 0:
+        edges.insert(0, (0.0, None))
+    if edges[-1][0] < length:
+        edges.append((length, None))
+    return frames_along(places, axes, edges, pose.turns)
 
 
 def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatArray:
@@ -363,11 +357,7 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
     if pose.end is None and model.end != "free":
         what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
         return no_equilibrium(pose, what, "Pose(start, end).")
-    if wrong := _meaningless(pose):
-        return no_equilibrium(pose, *wrong)
-    if wrong := _wrong_clips(model, p, pose):
-        return no_equilibrium(pose, *wrong)
-    if wrong := _inside(model, p, pose):
+    if wrong := _meaningless(pose) or _wrong_clips(model, p, pose) or _inside(model, p, pose):
         return no_equilibrium(pose, *wrong)
     if pose.end is None or model.extensible:
         return None
