@@ -115,32 +115,28 @@ def solve_equilibria(
         `x_init` of each pose.
     """
     given = list(starts) if starts is not None else [None] * len(poses)
-    errors = {j: out_of_reach(model, p, pose) for j, pose in enumerate(poses)}
-    asked = [j for j, error in errors.items() if error is None]
+    errors = [out_of_reach(model, p, pose) for pose in poses]
+    asked = [j for j, error in enumerate(errors) if error is None]
     search = _PoseSearch(model, p, rest)
     reached = search.reached([poses[j] for j in asked], [given[j] for j in asked])
-    found: dict[int, Equilibrium] = {}
-    sided: list[int] = []
+    found: dict[int, Equilibrium | EquilibriumError] = {}
+    sided: list[tuple[int, Equilibrium]] = []
     for j, minima in zip(asked, reached, strict=True):
-        chosen = _chosen(model, poses[j], given[j], minima)
-        if isinstance(chosen, EquilibriumError):
-            errors[j] = chosen
-            continue
-        found[j] = chosen
+        found[j] = chosen = _chosen(model, poses[j], given[j], minima)
         stable = [eq.x for eq in minima if eq.stable and given[j] is None]
-        if stable and on_other_side(model, poses[j], chosen.x, np.array(stable)).any():
-            sided.append(j)
-    told = [way for j in sided for way in ways_of(model, poses[j])]
+        if isinstance(chosen, EquilibriumError) or not stable:
+            continue
+        if on_other_side(model, poses[j], chosen.x, np.array(stable)).any():
+            sided.append((j, chosen))
+    told = [way for j, _ in sided for way in ways_of(model, poses[j])]
     ways = solve_equilibria(model, p, rest, told) if told else []
-    for j, *pair in zip(sided, ways[::2], ways[1::2], strict=True):
+    for (j, chosen), *pair in zip(sided, ways[::2], ways[1::2], strict=True):
         for own, other in (pair, pair[::-1]):
-            if not (isinstance(own, Equilibrium) and isinstance(other, Equilibrium)):
-                continue
-            same = model.node.same(own.x, found[j].x, NEARBY)
-            apart = on_other_side(model, poses[j], found[j].x, other.x[None])[0]
-            if same and apart and other.stable:
-                found[j] = replace(found[j], other_side=other)
-    return [one for j, error in errors.items() if (one := found.get(j) or error)]
+            if isinstance(own, Equilibrium) and isinstance(other, Equilibrium) and other.stable:
+                same = model.node.same(own.x, chosen.x, NEARBY)
+                if same and on_other_side(model, poses[j], chosen.x, other.x[None])[0]:
+                    found[j] = replace(chosen, other_side=other)
+    return [error or found[j] for j, error in enumerate(errors)]
 
 
 def ways_of(model: CableModel, pose: HeldPose) -> list[HeldPose]:
@@ -234,20 +230,20 @@ class _PoseSearch:
         """Equilibria of each pose, in the order of the first guesses that led to them."""
         found: list[list[Equilibrium]] = [[] for _ in poses]
         free = [j for j, start in enumerate(starts) if start is None]
-        everywhere = np.ones(len(poses), dtype=bool)
-        if free and self.model.in_space and self.model.n > self.model.coarse.n:
-            of, likely = self._likely([poses[j] for j in free])
+        better = self._beside if self.model.surfaces else None
+        if self.model.in_space and self.model.n > self.model.coarse.n:
+            better = self._likely
+        if free and better:
+            of, first = better([poses[j] for j in free])
             if len(of):
-                found = self._descended(poses, np.array(free)[of], likely, everywhere)
-        elif free and self.model.surfaces:
-            of, beside = self._beside([poses[j] for j in free])
-            found = self._descended(poses, np.array(free)[of], beside, everywhere)
+                near = np.ones(len(poses), dtype=bool)
+                found = self._descended(poses, np.array(free)[of], first, near)
         left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
         if left:
             others = [poses[j] for j in left]
             near = np.array([starts[j] is not None for j in left])
-            first = self._first(others, [starts[j] for j in left])
-            again = self._descended(others, *first, near)
+            of, first = self._first(others, [starts[j] for j in left])
+            again = self._descended(others, of, first, near)
             for j, minima in zip(left, again, strict=True):
                 found[j] += minima
         return found
