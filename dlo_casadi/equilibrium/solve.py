@@ -47,6 +47,8 @@ WAYS_ROUND = (0.5, -0.5)
 # Largest difference [turns] between a twist and that asked for before turns count as shed. In 7,500
 # random problems with up to four turns 1,369 differ by more than 1.35, and 7 by 1.15 to 1.35.
 MOST_SHED = 1.3
+# First guesses: index of the pose, nodes (n_nodes, coordinates), border (n_border,).
+Guesses = list[tuple[int, FloatArray, FloatArray]]
 
 
 def solve_equilibrium(
@@ -231,40 +233,32 @@ class _PoseSearch:
         found: list[list[Equilibrium]] = [[] for _ in poses]
         free = [j for j, start in enumerate(starts) if start is None]
         better = self._beside if self.model.surfaces else None
-        if self.model.in_space and self.model.n > self.model.coarse.n:
+        if free and self.model.in_space and self.model.n > self.model.coarse.n:
             better = self._likely
-        if free and better:
-            of, first = better([poses[j] for j in free])
-            if len(of):
-                near = np.ones(len(poses), dtype=bool)
-                found = self._descended(poses, np.array(free)[of], first, near)
+        if guesses := better([poses[j] for j in free]) if free and better else []:
+            guesses = [(free[j], x, border) for j, x, border in guesses]
+            found = self._descended(poses, guesses, np.ones(len(poses), dtype=bool))
         left = [j for j, minima in enumerate(found) if not any(eq.stable for eq in minima)]
         if left:
             others = [poses[j] for j in left]
             near = np.array([starts[j] is not None for j in left])
-            of, first = self._first(others, [starts[j] for j in left])
-            again = self._descended(others, of, first, near)
+            again = self._descended(others, self._first(others, [starts[j] for j in left]), near)
             for j, minima in zip(left, again, strict=True):
                 found[j] += minima
         return found
 
-    def _first(
-        self, poses: Sequence[HeldPose], starts: Sequence[FloatArray | None]
-    ) -> tuple[IntArray, Shapes]:
-        """First guesses of all poses, or the given starts, and the pose index of each."""
-        model = self.model
-        rows = [
-            list(first_guesses(model, self.p, self.rest, pose))
-            if start is None
-            else [(start, border_of(model, pose, start))]
-            for pose, start in zip(poses, starts, strict=True)
-        ]
-        of = np.repeat(np.arange(len(poses)), [len(guesses) for guesses in rows])
-        x, border = zip(*(guess for guesses in rows for guess in guesses), strict=True)
-        return of, Shapes.declared(np.array(x), np.array(border), len(model.clips))
+    def _first(self, poses: Sequence[HeldPose], starts: Sequence[FloatArray | None]) -> Guesses:
+        """First guesses of all poses, or the given starts."""
+        model, found = self.model, []
+        for j, (pose, start) in enumerate(zip(poses, starts, strict=True)):
+            if start is None:
+                found += [(j, *guess) for guess in first_guesses(model, self.p, self.rest, pose)]
+            else:
+                found.append((j, start, border_of(model, pose, start)))
+        return found
 
-    def _beside(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
-        """Guesses with obstacles, and the pose of each: first ones, and minima without obstacles.
+    def _beside(self, poses: Sequence[HeldPose]) -> Guesses:
+        """Guesses with obstacles: first ones, and minima without obstacles.
 
         All these minima are pushed out of the obstacles. The lowest one also gets both sides of
         bars, see `sides`, and touches a plane where it is deepest, with its slack on either side.
@@ -272,36 +266,36 @@ class _PoseSearch:
         model, none = self.model, [None] * len(poses)
         alone, p = replace(model, obstacles=()).without_kind(ContactEffect, self.p)
         search = _PoseSearch(alone, p, self.rest)
-        of, first = self._first(poses, none)
-        pairs = list(zip(of.tolist(), first.x, first.lam, strict=True))
+        guesses = self._first(poses, none)
         for j, minima in enumerate(search.reached(poses, none)):
             stable = sorted((eq for eq in minima if eq.stable), key=lambda eq: eq.energy)
             for k, i in enumerate(_distinct(model, [eq.x for eq in stable])):
                 x, points = stable[i].x, stable[i].points
                 every = [x] if k else beside_bars(model, x, points[: len(x)])
-                pairs += [(j, one, border_of(model, poses[j], one)) for one in every]
+                guesses += [(j, one, border_of(model, poses[j], one)) for one in every]
                 for place in () if k else touchdowns(model, points):
-                    ways = arches(model, self.p, poses[j], place)
-                    pairs += [(j, one, border) for one, border in ways]
-        rows, nodes, lam = zip(*pairs, strict=True)
-        return np.array(rows), Shapes.declared(np.array(nodes), np.array(lam), len(model.clips))
+                    guesses += [(j, *arch) for arch in arches(model, self.p, poses[j], place)]
+        return guesses
 
     def _descend(
-        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, near: BoolArray
-    ) -> tuple[Inputs, Minima]:
+        self, poses: Sequence[HeldPose], guesses: Guesses, near: BoolArray
+    ) -> tuple[IntArray, Inputs, Minima]:
+        """Pose of each guess, its inputs, and the minima reached; `near` as in `_descended`."""
+        of, x, border = (np.array(part) for part in zip(*guesses, strict=True))
+        shapes = Shapes.declared(x, border, len(self.model.clips))
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
         sided = np.array([bool(named_sides(self.model, poses[j])) for j in of])
         skipped = (KEEPING_SIDE + sided) * near[of]
-        return given, descend_to_contact(assembly_of(self.model), shapes, given, skipped)
+        return of, given, descend_to_contact(assembly_of(self.model), shapes, given, skipped)
 
     def _descended(
-        self, poses: Sequence[HeldPose], of: IntArray, shapes: Shapes, near: BoolArray
+        self, poses: Sequence[HeldPose], guesses: Guesses, near: BoolArray
     ) -> list[list[Equilibrium]]:
-        """Equilibria reached by minimising the energy from shapes `of` poses.
+        """Equilibria of each pose reached by minimising the energy from its guesses.
 
-        `near` (poses,): whether its shapes are to stay on their side of obstacles.
+        `near` (poses,): whether they are to stay on their side of obstacles.
         """
-        given, minima = self._descend(poses, of, shapes, near)
+        _, given, minima = self._descend(poses, guesses, near)
         kept = minima.balanced
         if not self.model.in_space:
             bends = np.abs(np.diff(minima.shapes.x[..., 0], axis=1))
@@ -315,23 +309,21 @@ class _PoseSearch:
         )
         out: list[list[Equilibrium]] = [[] for _ in poses]
         untold = self.model.end == "free" and bool(self.model.surfaces)  # not in IPOPT's problem
-        for k, j in enumerate(of.tolist()):
+        for k, (j, x, _) in enumerate(guesses):
             eq = equilibria.pop(0) if kept[k] else None
             if eq is None and not (self.model.in_space or untold):
-                eq = by_ipopt(self.model, self.p, self.rest, poses[j], shapes.x[k, :, 0])
+                eq = by_ipopt(self.model, self.p, self.rest, poses[j], x[:, 0])
             if eq is not None:
                 out[j].append(eq)
         return out
 
-    def _likely(self, poses: Sequence[HeldPose]) -> tuple[IntArray, Shapes]:
-        """Lowest distinct minima of a coarse mesh, on the model's mesh, and the pose of each."""
+    def _likely(self, poses: Sequence[HeldPose]) -> Guesses:
+        """Lowest distinct minima of a coarse mesh, on the model's mesh."""
         model, coarse = self.model, self.model.coarse
         search = _PoseSearch(coarse, self.p, coarse_rest(model, coarse, self.rest))
         touching = bool(model.surfaces)
-        of, shapes = (
-            search._beside(poses) if touching else search._first(poses, [None] * len(poses))
-        )
-        given, found = search._descend(poses, of, shapes, np.full(len(poses), touching))
+        guesses = search._beside(poses) if touching else search._first(poses, [None] * len(poses))
+        of, given, found = search._descend(poses, guesses, np.full(len(poses), touching))
         strains = assembly_of(coarse).strain(found.shapes, given)
         twist = strains[:, : coarse.chain.n_cells]
         x, kept = found.shapes.x, []
@@ -349,7 +341,7 @@ class _PoseSearch:
         nodes = model.node.interpolated(model.chain.places, coarse.chain.places, x[kept])
         lam = np.zeros((len(kept), model.n_border))
         lam[:, : model.n_lam] = found.shapes.lam[kept, : model.n_lam]
-        return of[kept], Shapes.declared(nodes, lam, len(model.clips))
+        return list(zip(of[kept].tolist(), nodes, lam, strict=True))
 
 
 def _distinct(model: CableModel, shapes: Sequence[FloatArray] | FloatArray) -> list[int]:
