@@ -119,12 +119,8 @@ def _along(model: CableModel, shapes: Shapes, given: Inputs) -> FloatArray:
         x = np.array([model.node.interpolated(even, *each) for each in zip(moved, x, strict=True)])
     slopes = model.chain.h * tangents(model.node, x)
     u = np.arange(4)[:, None] / 4
-    start, end, out, into = (
-        points[..., :-1, None, :],
-        points[..., 1:, None, :],
-        slopes[..., :-1, None, :],
-        slopes[..., 1:, None, :],
-    )
+    start, end = points[..., :-1, None, :], points[..., 1:, None, :]
+    out, into = slopes[..., :-1, None, :], slopes[..., 1:, None, :]
     bulge = u * (1 - u) * ((1 - u) * (out - (end - start)) - u * (into - (end - start)))
     inner = start + u * (end - start) + bulge
     flat = inner.reshape((*points.shape[:-2], -1, points.shape[-1]))
