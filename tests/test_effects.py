@@ -44,8 +44,8 @@ from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
+from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.obstacles import Plane
-from dlo_casadi.rod.section import Cell
 
 CABLE = CableData(length=0.8, mass=0.2, diameter=0.01, bending_stiffness=0.05)
 # Start, end [m], headings [rad]; a camera 2 m in front of (0.6, -0.4).

@@ -16,9 +16,9 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.errors import counted
+from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.obstacles import Obstacle
-from dlo_casadi.rod.section import Cell
 from dlo_casadi.thresholds import NEAR_END
 
 Params = Mapping[str, ca.SX]

@@ -6,7 +6,7 @@ import casadi as ca
 
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import PLACES, Params, Scan, SectionLaw
-from dlo_casadi.rod.section import Cell
+from dlo_casadi.rod.element import Cell
 
 # Trial lengths of sections, as shares of the cable's length.
 SECTIONS = (0.08, 0.2)

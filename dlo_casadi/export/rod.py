@@ -33,8 +33,8 @@ from dlo_casadi.export.common import printable
 from dlo_casadi.model.assembly import Inputs, assembly_of
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
+from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.node import Node
-from dlo_casadi.rod.section import Cell
 
 # Features beyond a straight uniform round cable with its weight; targets support some of them.
 Feature = Literal[

@@ -8,8 +8,8 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.model.lagrangian import MODELS, Lagrangian
+from dlo_casadi.rod.element import Expansion
 from dlo_casadi.rod.in_frame import SegmentInFrame
-from dlo_casadi.rod.section import Expansion
 
 
 class SegmentNumbers(NamedTuple):

@@ -15,10 +15,9 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.framed import SegmentNumbers, in_frame
 from dlo_casadi.model.lagrangian import MODELS, lagrangian_of
 from dlo_casadi.model.stacked import Mapped, simplified
-from dlo_casadi.rod.element import LAYOUT_SIZE, Segment
+from dlo_casadi.rod.element import LAYOUT_SIZE, Cell, Segment
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
-from dlo_casadi.rod.section import Cell
 
 
 class Functions:

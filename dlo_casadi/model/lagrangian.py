@@ -30,9 +30,8 @@ from dlo_casadi.model.cable_model import (
     CableModel,
 )
 from dlo_casadi.model.clips import BESIDE, clip_size
-from dlo_casadi.rod.element import LAYOUT_SIZE, Segment
+from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
 from dlo_casadi.rod.ends import ClipConditions, EndConditions
-from dlo_casadi.rod.section import Section
 
 # Number of models whose expressions and functions are cached: a diagnosis compares about thirty.
 MODELS = 64

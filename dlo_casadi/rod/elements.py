@@ -19,7 +19,7 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.rod.element import Condensed, Element, Layout, Segment
+from dlo_casadi.rod.element import Condensed, Element, Layout, Section, Segment
 from dlo_casadi.rod.node import (
     SINE,
     Frame,
@@ -28,9 +28,8 @@ from dlo_casadi.rod.node import (
     quaternion_product,
     rotated,
     series,
+    traced,
 )
-from dlo_casadi.rod.section import Section
-from dlo_casadi.rod.traced import traced
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
 _GAUSS = 0.5 / np.sqrt(3)

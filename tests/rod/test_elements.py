@@ -11,8 +11,7 @@ import pytest
 
 from dlo_casadi.errors import DloError
 from dlo_casadi.rod.chain import ELEMENTS, Chain
-from dlo_casadi.rod.element import Segment
-from dlo_casadi.rod.section import Section
+from dlo_casadi.rod.element import Section, Segment
 
 LENGTH = 0.8  # m
 ROUNDING = 1e-14  # a dozen sums of numbers of order one

@@ -8,7 +8,7 @@ from dlo_casadi.effects import BendingSoftening, CableData, StiffnessGradient
 from dlo_casadi.model import framed
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
-from dlo_casadi.rod.section import Expansion
+from dlo_casadi.rod.element import Expansion
 
 
 def test_an_expanded_law_has_the_derivatives_of_the_law():

@@ -6,8 +6,7 @@ import pytest
 
 from dlo_casadi.rod import elements, in_frame, node
 from dlo_casadi.rod.elements import Helix
-from dlo_casadi.rod.node import Frame, rotation
-from dlo_casadi.rod.traced import traced
+from dlo_casadi.rod.node import Frame, rotation, traced
 
 
 def random(*sizes):
