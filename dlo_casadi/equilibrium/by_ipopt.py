@@ -182,13 +182,8 @@ def _balanced(
     if not (inside and balanced and residual <= END_TOLERANCE):
         return None
     stable = int(matrix.negative()[0]) == model.n_multipliers + len(active)
-    bound_lam = np.zeros((1, len(bent)))
-    bound_lam[0, active] = moments
-    return equilibria_of(
-        model,
-        now,
-        given,
-        stable=np.array([stable]),
-        iterations=np.array([iterations]),
-        bound_multipliers=bound_lam,
-    )[0]
+    numbers = {"stable": np.array([stable]), "iterations": np.array([iterations])}
+    (found,) = equilibria_of(model, now, given, **numbers)
+    bound_lam = np.zeros(len(bent))
+    bound_lam[active] = moments
+    return replace(found, bound_multipliers=bound_lam)

@@ -168,17 +168,8 @@ def equilibria_of(
     *,
     stable: BoolArray,
     iterations: IntArray,
-    bound_multipliers: FloatArray | None = None,
 ) -> list[Equilibrium]:
-    """Equilibria of m shapes.
-
-    Parameters
-    ----------
-    stable : (m,) bool
-    iterations : (m,) int
-    bound_multipliers : (m, n_nodes - 1) [N m], optional
-        Zero if they are not given.
-    """
+    """Equilibria of m shapes, whose joints bend freely; `stable` and `iterations` (m,)."""
     assembly, chain, node = assembly_of(model), model.chain, model.node
     total, force, _ = assembly.balance(shapes, given)
     energies = total - assembly.work(shapes, force)
@@ -191,8 +182,6 @@ def equilibria_of(
     curvatures = chain.curvatures(strains)
     sizes = curvatures_along(curvatures, assembly.clipped(shapes, given)).max(axis=1)
     on_clips, contacts = assembly.clip_loads(shapes, given), assembly.contacts(shapes, given)
-    if bound_multipliers is None:
-        bound_multipliers = np.zeros((len(shapes.x), chain.n_nodes - 1))
     out = []
     for j in range(len(shapes.x)):
         moments = [on_fixtures[j, rows[f"{side}_moment"]] for side in ("start", "end")]
@@ -206,7 +195,7 @@ def equilibria_of(
                 start_force=on_fixtures[j, rows["start_force"]],
                 moments=np.squeeze(np.array(moments)),
                 multipliers=shapes.lam[j],
-                bound_multipliers=bound_multipliers[j],
+                bound_multipliers=np.zeros(chain.n_nodes - 1),
                 curvature=curvatures[j].ravel(),
                 twist=strains[j, : chain.n_cells] if twisted else np.zeros(chain.n_cells),
                 min_bend_radius=1 / max(float(sizes[j]), 1e-300),
