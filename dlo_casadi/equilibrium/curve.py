@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray, IntArray, cross
+from dlo_casadi.arrays import FloatArray, IntArray, chord_lengths, cross, unit
 from dlo_casadi.equilibrium.pose import HeldPose
 
 _NEWTON_STEPS = 12
@@ -67,18 +67,12 @@ class NodeCurve:
         return e, u - e
 
     @cached_property
-    def _handles(self) -> FloatArray:
-        """Per element [r_e, r_(e+1), h t_e, h t_(e+1)] (n, 4, d)."""
-        if self.slopes is None:
-            zero = np.zeros((self.n, self.d))
-            return np.stack([self.nodes[:-1], self.nodes[1:], zero, zero], axis=1)
-        slopes = self.slopes * (self.length / self.n)
-        return np.stack([self.nodes[:-1], self.nodes[1:], slopes[:-1], slopes[1:]], axis=1)
-
-    @cached_property
     def _polynomials(self) -> FloatArray:
         """Coefficients (4, d, n) of the positions in each element, by powers of u."""
-        return np.ascontiguousarray((self._table @ self._handles).transpose(1, 2, 0))
+        h = self.length / self.n
+        slopes = np.zeros_like(self.nodes) if self.slopes is None else self.slopes * h
+        handles = [self.nodes[:-1], self.nodes[1:], slopes[:-1], slopes[1:]]
+        return np.ascontiguousarray((self._table @ np.stack(handles, axis=1)).transpose(1, 2, 0))
 
     def frame(self, s: FloatArray, derivatives: int) -> list[FloatArray]:
         """Position (K, d) [m] and its first derivatives by s, at most two, at arc lengths s."""
@@ -148,8 +142,7 @@ class NodeCurve:
 
     def tangents(self, s: FloatArray) -> FloatArray:
         """Unit tangents (K, d) at arc lengths s [m]."""
-        t = self.at(s, 1)
-        return np.asarray(t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300))
+        return unit(self.at(s, 1))
 
     def normals(self, s: FloatArray) -> FloatArray:
         """Unit normals (K, d - 1, d), see `across`."""
@@ -186,20 +179,18 @@ def chord_places(points: FloatArray, pose: HeldPose, length: float) -> FloatArra
 
     Chords are shorter than the cable across gaps: with two fixtures, they are scaled to L.
     """
-    polyline = pose.joined(points)
-    steps = np.linalg.norm(np.diff(polyline, axis=0), axis=1)
     # Noise lengthens a dense polyline, so lengths are those of a smoothed one.
-    s = _denoised_length(polyline, steps)
+    s = _denoised_length(pose.joined(points))
     places = s[1 : len(points) + 1]
     if pose.end is not None:
         places = places * (length / s[-1])
     return np.clip(places, 0.0, length)
 
 
-def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:
+def _denoised_length(polyline: FloatArray) -> FloatArray:
     """Cumulative length of the polyline smoothed over about 1/50 of itself."""
-    total = steps.sum()
-    s = np.concatenate([[0.0], np.cumsum(steps)])
+    s = chord_lengths(polyline)
+    total = np.linalg.norm(np.diff(polyline, axis=0), axis=1).sum()
     width = max(total / 50, 1e-12)
     knots = np.linspace(0.0, total, 51)
     kernel = np.exp(-0.5 * ((knots[:, None] - s[None]) / (0.5 * width)) ** 2)
@@ -208,8 +199,7 @@ def _denoised_length(polyline: FloatArray, steps: FloatArray) -> FloatArray:
     straight = np.stack([np.interp(knots, s, column) for column in polyline.T], axis=1)
     smooth = np.where(np.isfinite(smooth), smooth, straight)
     smooth[0], smooth[-1] = polyline[0], polyline[-1]
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
-    return np.interp(s, knots, arc)
+    return np.interp(s, knots, chord_lengths(smooth))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray, cross
+from dlo_casadi.arrays import FloatArray, cross, unit
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -291,8 +291,7 @@ def smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
     axis, real = cross(a, b), 1 + (a * b).sum(axis=-1, keepdims=True)
     opposite = real < 1e-12
     if opposite.any():
-        aside = cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)])
-        aside /= np.linalg.norm(aside, axis=-1, keepdims=True)
+        aside = unit(cross(a, np.eye(3)[np.abs(a).argmin(axis=-1)]))
         axis, real = np.where(opposite, aside, axis), np.where(opposite, 0.0, real)
     return Rotation.from_quat(np.concatenate([axis, real], axis=-1))
 
@@ -432,8 +431,7 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
         if heading is not None:
             headings += 2 * np.pi * np.round((heading - headings[there]) / (2 * np.pi))
         return np.interp(chain.places, middles, headings)[:, None]
-    tangents = np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-300)
+    tangents = unit(np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1))
     clips = [(clip.at, clip.frame) for clip in pose.clips if clip.kind == "clamped"]
     held = [
         (0.0, pose.start_orientation if chain.start_clamped else None),
