@@ -499,7 +499,8 @@ def test_among_many_poses_no_joint_is_bent_beyond_its_bound(bend, stable):
     rest = bend / np.diff(model.chain.cells, axis=1).ravel()
     shapes = Shapes.declared(x[None], np.zeros((1, model.n_border)))
     batch = BatchEquilibrium(model, [pose])
-    assert np.abs(batch.imbalance(shapes, model.nominal, rest).rows).max() < 1e-14
+    given = batch.given(shapes, model.nominal, rest)
+    assert np.abs(batch.assembly.imbalance(shapes, given).rows).max() < 1e-14
     assert batch.stable(shapes, model.nominal, rest).tolist() == [stable]
 
 

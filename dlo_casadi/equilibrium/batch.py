@@ -130,10 +130,6 @@ class BatchEquilibrium:
         """Imbalance and tangent matrices; `rest` is that before the first pose, or each pose's."""
         return self.assembly.balance(shapes, self.given(shapes, p, rest))[1:]
 
-    def imbalance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Vector:
-        """Imbalance alone, at far lower cost."""
-        return self.assembly.imbalance(shapes, self.given(shapes, p, rest))
-
     def moved(self, shapes: Shapes, step: Vector) -> Shapes:
         """Shapes after a step of one column."""
         x = self.node.moved(shapes.x, step.x[..., 0])
