@@ -86,21 +86,19 @@ class Uncertainty:
         Causes: the fitted unknowns, the fixtures, each repeat's own random quantity, and what is
         `added`.
         """
-        by_p, by_rest = (by @ self.root for by in self.unknowns_in(model))
         own, modes = self.pose_scatter.ways(model)
         sizes = self.pose_scatter.sizes(modes.shape[1])
-        n, m, k = by_p.shape[1], len(model.deviations), len(self.added)
+        counts = [len(self.names), len(model.deviations), len(sizes), len(self.added)]
+        fit, fixtures, repeat, new = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        heights = len(model.names), len(modes), len(own)
+        by_p, by_rest, by_deviation = (np.zeros((rows, sum(counts))) for rows in heights)
+        by_p[:, fit], by_rest[:, fit] = (by @ self.root for by in self.unknowns_in(model))
         scatter = np.array([self.scatter.get(name, 0.0) for name in model.deviations])
         used = [model.deviation_names.index(name) for name in model.deviations]
-        fixtures = np.zeros((len(own), m))
-        fixtures[used, np.arange(m)] = np.where(np.isfinite(scatter), scatter, 0.0)
-        new = np.zeros((len(by_p), k))
-        at = [model.names.index(name) for name in self.added]
-        new[at, np.arange(k)] = [*self.added.values()]
-        by_p = np.hstack([np.pad(by_p, [(0, 0), (0, m + len(sizes))]), new])
-        by_rest = np.hstack([np.pad(by_rest, [(0, 0), (0, m)]), modes * sizes])
-        by_deviation = np.pad(np.hstack([fixtures, own * sizes]), [(0, 0), (n, k)])
-        return by_p, np.pad(by_rest, [(0, 0), (0, k)]), by_deviation
+        by_deviation[used, fixtures] = np.where(np.isfinite(scatter), scatter, 0.0)
+        by_rest[:, repeat], by_deviation[:, repeat] = modes * sizes, own * sizes
+        by_p[[model.names.index(name) for name in self.added], new] = [*self.added.values()]
+        return by_p, by_rest, by_deviation
 
     def causes_in(self, model: CableModel) -> tuple[str, ...]:
         """Cause of each direction of `ways_in`.
