@@ -206,24 +206,18 @@ class Varied(Repeats):
             anew = {x: np.concatenate([anew[x], beyond[x]]) for x in names}
         out = {}
         for name in names:
-            chance, error, draws = likely[name], 0.0, 0
+            found: tuple[float, float, int, int] = (likely[name], 0.0, 0, 0)
             if not enough[name]:
-                chance, error = _counted(anew[name], linear[name], chance)
-                draws = len(lost)
+                counted = _counted(anew[name], linear[name], likely[name])
+                found = *counted, len(lost), int(lost.sum())
             parts = slopes[name][sizes[name].argmax()] ** 2
             total = float(parts.sum())
             shares = {
                 cause: float(parts[[x == cause for x in causes]].sum()) / max(total, 1e-300)
                 for cause in dict.fromkeys(causes)
             }
-            out[name] = Exceedance(
-                float(np.sqrt(total)),
-                chance,
-                error,
-                draws,
-                int(lost.sum()) if draws else 0,
-                dict(sorted(shares.items(), key=lambda item: -item[1])),
-            )
+            largest_first = dict(sorted(shares.items(), key=lambda item: -item[1]))
+            out[name] = Exceedance(float(np.sqrt(total)), *found, largest_first)
         return out
 
     def linear(self, names: tuple[str, ...]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
