@@ -63,6 +63,10 @@ class _Holder:
     rolls: bool = False
     passed: bool = False
 
+    def chord_to(self, other: "_Holder") -> FloatArray | None:
+        """Vector (dimension,) [m] to the next holder; None to a free end."""
+        return None if self.place is None or other.place is None else other.place - self.place
+
 
 @dataclass(frozen=True)
 class Span:
@@ -139,10 +143,8 @@ def arches(
 
 def chords(held: Sequence[_Holder]) -> list[float]:
     """Distances [m] from each holder to the next; zero to a free end."""
-    return [
-        0.0 if a.place is None or b.place is None else float(np.linalg.norm(b.place - a.place))
-        for a, b in pairwise(held)
-    ]
+    steps = (a.chord_to(b) for a, b in pairwise(held))
+    return [0.0 if step is None else float(np.linalg.norm(step)) for step in steps]
 
 
 def fixed_stretches(held: Sequence[_Holder]) -> list[tuple[int, int, float]]:
@@ -168,11 +170,8 @@ def _arc_lengths(held: Sequence[_Holder], share: float) -> list[float]:
 
 def spans_of(held: Sequence[_Holder], at: Sequence[float]) -> list[Span]:
     """The spans between holders at these arc lengths [m]."""
-    found = []
-    for (a, b), (s, e) in zip(pairwise(held), pairwise(at), strict=True):
-        chord = None if a.place is None or b.place is None else b.place - a.place
-        found.append(Span(s, e, chord, (a.frame, b.frame)))
-    return found
+    both = zip(pairwise(held), pairwise(at), strict=True)
+    return [Span(s, e, a.chord_to(b), (a.frame, b.frame)) for (a, b), (s, e) in both]
 
 
 def first_guesses(
