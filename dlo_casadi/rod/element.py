@@ -319,10 +319,7 @@ class Element(ABC):
 
     def advance(self, segment: Segment, u: ca.SX | float = 1.0) -> ca.SX:
         """Vector (dimension,) [m] from the start of the element to the fraction u of it."""
-        parts = [
-            weight * self.tangent(segment, u * node)
-            for node, weight in zip(*self.rule, strict=True)
-        ]
+        parts = [w * self.tangent(segment, u * x) for x, w in zip(*self.rule, strict=True)]
         return segment.length * u * sum(parts[1:], start=parts[0])
 
     def elastic(self, segment: Segment, section: Section) -> ca.SX:
