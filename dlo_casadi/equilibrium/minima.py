@@ -14,11 +14,10 @@ References
 Inertia-corrected Newton steps: Nocedal and Wright, Numerical Optimization, 2006, section 18.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
@@ -55,8 +54,7 @@ SHORTENED = 6
 NO_ROOM = 1e-6
 
 
-@dataclass(frozen=True)
-class Minima:
+class Minima(NamedTuple):
     """Results of the descents.
 
     Parameters
@@ -74,18 +72,6 @@ class Minima:
     converged: BoolArray
     energy: FloatArray
     iterations: IntArray
-
-    @property
-    def parts(self) -> tuple[NDArray[Any], ...]:
-        """The arrays of the result."""
-        return (
-            self.shapes.x,
-            self.shapes.lam,
-            self.balanced,
-            self.converged,
-            self.energy,
-            self.iterations,
-        )
 
 
 def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
@@ -183,7 +169,8 @@ def _hardened(
     lost, near = lost[half.balanced], half.shapes.subset(half.balanced)
     if len(lost):
         other = _hardened(assembly, between, near, given.subset(lost), *few)
-        for mine, theirs in zip(found.parts, other.parts, strict=True):
+        parts = ((one.shapes.x, one.shapes.lam, *one[1:]) for one in (found, other))
+        for mine, theirs in zip(*parts, strict=True):
             mine[lost] = theirs
     return found
 
