@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray, unit
 from dlo_casadi.equilibrium.guesses import smallest_turn
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
@@ -101,8 +101,7 @@ def _turned(model: CableModel, x: FloatArray, old: FloatArray, new: FloatArray) 
     before, after = (np.gradient(points, axis=0) for points in (old, new))
     out = x.copy()
     if model.node is Frame:
-        units = [one / np.linalg.norm(one, axis=1, keepdims=True) for one in (before, after)]
-        turned = smallest_turn(units[0], units[1]) * Rotation.from_quat(x)
+        turned = smallest_turn(unit(before), unit(after)) * Rotation.from_quat(x)
         out[1:-1] = turned.as_quat()[1:-1]
     else:
         across = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
