@@ -9,7 +9,6 @@ from test_relaxation import HELD, NOISE, ROLL, problem_of
 
 from dlo_casadi.effects import BendingAnisotropy, CableData, PointForce
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.estimation.continuation import relaxed
 from dlo_casadi.estimation.measured_shapes import _along, measured_shapes
 from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.prediction import predict_poses
@@ -19,6 +18,7 @@ from dlo_casadi.estimation.start import (
     _either_way,
     begin,
     fit_from,
+    relaxed,
     retry_outlying_poses,
 )
 from dlo_casadi.estimation.unknowns import Unknowns
