@@ -14,7 +14,7 @@ another problem of the same poses with `replace`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -356,24 +356,10 @@ class Problem:
         return out
 
     def normal_equations(self, point: Values, lin: Linearization) -> Normal:
-        """Gauss-Newton normal equations of theta, deviations eliminated."""
-        hessian = self.precision.copy()
-        gradient = self.precision @ (point.theta - self.mean)
-        inner: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        precision = np.diag(1 / self.deviation_std**2)
-        columns = self.equilibria.used_deviations
-        rows = zip(self.used, lin.residuals, lin.by_theta, lin.by_deviation, strict=True)
-        for j, e, a, b in rows:
-            hessian += a.T @ a
-            gradient += a.T @ e
-            block = b.T @ b + precision
-            cross = b.T @ a
-            slope = b.T @ e + precision @ point.shapes.deviation[j, columns]
-            solved = _solved(block, np.column_stack([cross, slope]))
-            hessian -= cross.T @ solved[:, :-1]
-            gradient -= cross.T @ solved[:, -1]
-            inner.append((block, cross, slope))
-        return Normal(hessian, gradient, inner)
+        """Gauss-Newton normal equations of theta, each pose's deviations eliminated."""
+        each = lin.residuals, lin.by_theta, lin.by_deviation
+        own = point.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
+        return self._eliminated(point, zip(*each, own[:, None], strict=True))
 
     def step_equations(self, point: Values, lin: Linearization) -> Normal:
         """Normal equations of a descent: with a state, a deviation also moves all later poses.
@@ -382,14 +368,33 @@ class Problem:
         """
         if not lin.by_all:
             return self.normal_equations(point, lin)
-        a, b, e = (np.concatenate(rows) for rows in (lin.by_theta, lin.by_all, lin.residuals))
-        precision = np.tile(1 / self.deviation_std**2, len(self.used))
-        own = point.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)].ravel()
-        block, cross, slope = b.T @ b + np.diag(precision), b.T @ a, b.T @ e + precision * own
-        solved = _solved(block, np.column_stack([cross, slope]))
-        hessian = self.precision + a.T @ a - cross.T @ solved[:, :-1]
-        gradient = self.precision @ (point.theta - self.mean) + a.T @ e - cross.T @ solved[:, -1]
-        return Normal(hessian, gradient, [(block, cross, slope)])
+        e, a, b = (np.concatenate(x) for x in (lin.residuals, lin.by_theta, lin.by_all))
+        own = point.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
+        return self._eliminated(point, [(e, a, b, own)])
+
+    def _eliminated(self, point: Values, groups: Iterable[tuple[FloatArray, ...]]) -> Normal:
+        """Normal equations of groups of poses: residuals, derivatives by theta and by deviations.
+
+        The last array of a group has the deviations (poses, n_deviations) themselves.
+        """
+        hessian = self.precision.copy()
+        gradient = self.precision @ (point.theta - self.mean)
+        inner: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        for e, a, b, own in groups:
+            precision = np.tile(1 / self.deviation_std**2, len(own))
+            block, cross = b.T @ b + np.diag(precision), b.T @ a
+            slope = b.T @ e + precision * own.ravel()
+            try:
+                solved = np.linalg.solve(block, np.column_stack([cross, slope]))
+            except np.linalg.LinAlgError as error:
+                message = "a pose of the fit has come to a fold of its equilibria"
+                raise EstimationError(message) from error
+            hessian += a.T @ a
+            hessian -= cross.T @ solved[:, :-1]
+            gradient += a.T @ e
+            gradient -= cross.T @ solved[:, -1]
+            inner.append((block, cross, slope))
+        return Normal(hessian, gradient, inner)
 
     def moved(self, along: Tangents, normal: Normal, step: FloatArray) -> tuple[Vector, FloatArray]:
         """Change of shapes (one column) and deviations (m, n_deviations) by a step of theta."""
@@ -403,11 +408,3 @@ class Problem:
         deviation = np.zeros((len(own), len(self.equilibria.model.deviation_names)))
         deviation[:, self.equilibria.used_deviations] = own
         return shapes, deviation
-
-
-def _solved(block: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of normal equations; `EstimationError` at a fold, where it is not finite."""
-    try:
-        return np.asarray(np.linalg.solve(block, right))
-    except np.linalg.LinAlgError as error:
-        raise EstimationError("a pose of the fit has come to a fold of its equilibria") from error
