@@ -12,7 +12,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.solve import solve_after
 from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.errors import EquilibriumError, EstimationError
-from dlo_casadi.estimation.point import NO_INFORMATION, Linearization, Normal, Point, Values
+from dlo_casadi.estimation.point import NO_INFORMATION, Normal, Point, Values
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -72,42 +72,40 @@ def descend(
         iterations, or finds no worthwhile step although the gradient promises one, has not. One
         that ends by its `share` has, unless it is damped.
     """
-    problem, point = fit.problem, fit.point
-    damping, gains, above = 0.0, [np.inf] * STALLED, 0
-    lin = fit.linearization
-    normal = problem.step_equations(point, lin)
-    curvature = Curvature.none(len(point.theta))
+    problem, damping, gains, above = fit.problem, 0.0, [np.inf] * STALLED, 0
+    normal = problem.step_equations(fit.point, fit.linearization)
+    curvature = Curvature(np.zeros_like(normal.hessian))
     for done in range(1, steps + 1):
-        limit = point.objective + 1e-9 * abs(point.objective)
+        limit = fit.point.objective + 1e-9 * abs(fit.point.objective)
         model, before = curvature.added(normal), damping
-        trial = _ahead(problem, point, lin, model, damping, limit, WATCHED)
-        least = least_decrease(problem, point, tolerance)
+        trial = _ahead(fit, model, damping, limit)
+        least = least_decrease(problem, fit.point, tolerance)
         if trial is None and normal.promised() < least:
-            return Fit(problem, point, converged=True)
+            return Fit(problem, fit.point, converged=True)
         while trial is None:
             damping = max(10 * damping, FIRST_DAMPING)
             if damping > 1e8 or model.promised(damping) < least:
-                return Fit(problem, point)
-            trial = _ahead(problem, point, lin, model, damping, limit, WATCHED)
-        gains = [*gains[1:], point.objective - trial.objective]
+                return Fit(problem, fit.point)
+            trial = _ahead(fit, model, damping, limit)
+        gains = [*gains[1:], fit.point.objective - trial.point.objective]
         if damping == before:
             damping = damping / 10 if damping > 1e-6 else 0.0
-        least = least_decrease(problem, trial, tolerance)
+        least = least_decrease(problem, trial.point, tolerance)
         if gains[-1] < least and damping < 1e-2:
-            return Fit(problem, trial, converged=True)
-        small = share > 0 and sum(gains) < share * trial.objective
+            return Fit(problem, trial.point, converged=True)
+        small = share > 0 and sum(gains) < share * trial.point.objective
         if small or sum(gains) < least:
-            return Fit(problem, trial, converged=small and damping < 1e-2)
-        step, lin = trial.theta - point.theta, problem.linearize(trial)
-        ahead = problem.step_equations(trial, lin)
+            return Fit(problem, trial.point, converged=small and damping < 1e-2)
+        ahead = problem.step_equations(trial.point, trial.linearization)
+        step = trial.point.theta - fit.point.theta
         curvature = curvature.after(step, normal, ahead, gains[-1])
-        point, normal = trial, ahead
+        fit, normal = trial, ahead
         if ceiling < np.inf and done < steps:
             within = min(normal.promised(), max(gains) * (steps - done))
-            above = above + 1 if point.objective - within > ceiling else 0
+            above = above + 1 if fit.point.objective - within > ceiling else 0
         if above == HOPELESS:
-            return Fit(problem, point)
-    return Fit(problem, point)
+            break
+    return Fit(problem, fit.point)
 
 
 @dataclass(frozen=True)
@@ -120,6 +118,7 @@ class Curvature:
     Parameters
     ----------
     matrix : (size, size)
+        Zero at first: plain Gauss-Newton.
 
     References
     ----------
@@ -128,11 +127,6 @@ class Curvature:
 
     matrix: FloatArray
     used: bool = False
-
-    @classmethod
-    def none(cls, size: int) -> Self:
-        """No correction: plain Gauss-Newton."""
-        return cls(np.zeros((size, size)))
 
     def added(self, normal: Normal) -> Normal:
         """Normal equations plus this part, if it is used and they stay convex."""
@@ -169,15 +163,9 @@ def least_decrease(problem: Problem, point: Point, tolerance: float = CONVERGED)
 
 
 def _ahead(
-    problem: Problem,
-    point: Point,
-    lin: Linearization,
-    normal: Normal,
-    damping: float,
-    limit: float,
-    more: int,
-) -> Point | None:
-    """A point below a limit, by one step or by further steps from one above it; else None.
+    fit: Fit, normal: Normal, damping: float, limit: float, more: int = WATCHED
+) -> Fit | None:
+    """A fit below a limit, by one step or by further steps from one above it; else None.
 
     Shapes determine mainly the product of stiffness and rest curvature, so the objective has a
     curved valley: a full step along it leads up its side, and the next one back to its bottom.
@@ -186,32 +174,32 @@ def _ahead(
     ----------
     The watchdog technique: Chamberlain et al., Math. Programming Study 16 (1982).
     """
-    trial = _stepped(problem, point, lin, normal, damping)
-    if trial is None or trial.objective <= limit:
+    trial = _stepped(fit, normal, damping)
+    if trial is None or trial.point.objective <= limit:
         return trial
-    if not more or trial.objective > WORSE * limit:
+    if not more or trial.point.objective > WORSE * limit:
         return None
-    lin = problem.linearize(trial)
-    normal = problem.step_equations(trial, lin)
-    return _ahead(problem, trial, lin, normal, damping, limit, more - 1)
+    normal = trial.problem.step_equations(trial.point, trial.linearization)
+    return _ahead(trial, normal, damping, limit, more - 1)
 
 
-def _stepped(
-    problem: Problem, point: Point, lin: Linearization, normal: Normal, damping: float
-) -> Point | None:
-    """Point after a damped step within reach; None if some pose loses its equilibrium."""
+def _stepped(fit: Fit, normal: Normal, damping: float) -> Fit | None:
+    """Fit after a damped step within reach; None if some pose loses its equilibrium."""
+    problem, point = fit.problem, fit.point
     lower, upper = problem.unknowns.reach(point.theta)
     matrix = normal.damped(damping)
     step = -np.linalg.solve(matrix, normal.gradient)
     new = point.theta + step
     if np.any(new < lower) or np.any(new > upper):
         step = _bounded_step(matrix, normal.gradient, lower - point.theta, upper - point.theta)
-    change, deviation = problem.moved(lin.shapes, normal, step)
+    change, deviation = problem.moved(fit.linearization.shapes, normal, step)
     if float(np.abs(change.x).max()) > LONGEST_MOVE:
         return None
     guess = problem.equilibria.moved(point.shapes, change)
     guess = replace(guess, deviation=point.shapes.deviation + deviation)
-    return problem.balanced(Values(point.theta + step, guess, point.projections), reach=1.0)
+    values = Values(point.theta + step, guess, point.projections)
+    found = problem.balanced(values, reach=1.0)
+    return None if found is None else Fit(problem, found)
 
 
 def _bounded_step(

@@ -473,9 +473,9 @@ def test_a_descent_is_given_up_if_its_steps_are_too_short(depth, steps, monkeypa
     """Each gains 1: forty of them reach a ceiling 30 below, but not one 100 below."""
     start, taken = start_without_a_mass(), []
 
-    def ahead(problem, point, *_):
-        taken.append(point)
-        return replace(point, objective=point.objective - 1.0)
+    def ahead(fit, *_):
+        taken.append(fit)
+        return Fit(fit.problem, replace(fit.point, objective=fit.point.objective - 1.0))
 
     monkeypatch.setattr(descent, "_ahead", ahead)
     monkeypatch.setattr(Normal, "promised", lambda *_: np.inf)
@@ -491,11 +491,11 @@ def test_a_misfit_need_not_be_known_exactly(share, needed, steps, converged, mon
     """Each step gains one percent, and four less than a tenth; if damped, they may creep."""
     start, taken = start_without_a_mass(), []
 
-    def ahead(problem, point, lin, model, damping, *_):
+    def ahead(fit, model, damping, *_):
         if damping < needed:
             return None
-        taken.append(point)
-        return replace(point, objective=0.99 * point.objective)
+        taken.append(fit)
+        return Fit(fit.problem, replace(fit.point, objective=0.99 * fit.point.objective))
 
     monkeypatch.setattr(descent, "_ahead", ahead)
     monkeypatch.setattr(descent, "least_decrease", lambda *_: 0.0)
