@@ -30,7 +30,6 @@ from dlo_casadi.estimation.point import Point, Values
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
-from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after
 
 # Projections that move less than this share of the noise between solves have converged.
@@ -60,16 +59,7 @@ def solve_batch(problem: Problem, start: Point) -> tuple[Point, float]:
     nlp = _BatchNlp(problem, problem.unknowns.p(start.theta))
     point = start
     for _ in range(MOST_SOLVES):
-        rows, targets = zip(*_compressed(problem, point), strict=True)
-        vector, stats, residual = nlp.solve(point, rows, targets)
-        if not stats["success"]:
-            raise EstimationError(
-                f"the batch problem of {counted(len(problem.used), 'pose')} was not solved (IPOPT: "
-                f"{stats['return_status']} after "
-                f"{counted(int(stats['iter_count']), 'iteration')}).\n"
-                "  Try: more poses, or estimation.robust: true if some points are far off."
-            )
-        theta, shapes = nlp.unpack(vector, point.shapes)
+        theta, shapes, residual = nlp.solve(point)
         moved = problem.evaluate(Values(theta, shapes, point.projections))
         shift = max(
             float(np.abs(new - old).max())
@@ -79,40 +69,6 @@ def solve_batch(problem: Problem, start: Point) -> tuple[Point, float]:
         if shift < SHIFT_TOLERANCE * problem.noise.std:
             break
     return point, residual
-
-
-def _compressed(problem: Problem, point: Point) -> list[tuple[FloatArray, FloatArray]]:
-    """Triangular factor (n_rows, n_z) and target (n_rows,) of each fitted pose's residuals."""
-    seen = problem.observed(point)
-    count, size = _n_rows(problem), _observed_size(problem)
-    unit = np.eye(size)
-    out: list[tuple[FloatArray, FloatArray]] = []
-    for j, s, white in zip(problem.used, point.projections, problem.whitening, strict=True):
-        curve, readings = seen[j].curve.numbers, seen[j].readings
-        each = ObservedChange(unit[: curve.size].reshape((*curve.shape, size)), unit[curve.size :])
-        residual, change = problem.measured[j].linearized(seen[j], s, each)
-        rows = -white @ change
-        here = np.concatenate([curve.ravel(), readings])
-        target = white @ residual + rows @ here
-        triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
-        padded = np.zeros((count, size + 1))
-        keep = min(count, len(triangle))
-        padded[:keep] = triangle[:keep]
-        out.append((padded[:, :size], padded[:, size]))
-    return out
-
-
-def _observed_size(problem: Problem) -> int:
-    """Number of quantities the residuals depend on: the measured curve's and the wrenches'."""
-    model = problem.equilibria.model
-    curve = (model.chain.n + 1) * int(functions_of(model).station.size1_out(0))
-    return curve + problem.equilibria.wrenches * int(functions_of(model).readings.size1_out(0))
-
-
-def _n_rows(problem: Problem) -> int:
-    """Number of rows of a pose's compressed residuals: the smaller of n_z and n_residuals."""
-    most = max(problem.measured[j].n_residuals for j in problem.used)
-    return min(most, _observed_size(problem))
 
 
 class _BatchNlp:
@@ -126,22 +82,26 @@ class _BatchNlp:
     def __init__(self, problem: Problem, p: FloatArray) -> None:
         self.problem = problem
         unknowns, model = problem.unknowns, problem.equilibria.model
-        self.poses = list(range(problem.equilibria.m)) if model.has_state else list(problem.used)
+        self.m = problem.equilibria.m
         self.n_x, self.n_lam = problem.equilibria.assembly.n, model.n_border
         self.columns = problem.equilibria.used_deviations
-        self.n_dev = len(self.columns)
         self.n_rest = model.chain.n_rests if model.has_state else 0
-        self.stride = self.n_x + self.n_lam + self.n_dev + self.n_rest
+        first = self.n_x + self.n_lam
+        self.own = slice(first, first + len(self.columns))  # a pose's deviations
+        self.stride = self.own.stop + self.n_rest
         # Multipliers and balance in units of a typical force: EI turns^2.
         self.force = float(p[model.names.index(BENDING_STIFFNESS)]) * model.cable.curvature_scale**2
         self._differentiate()
+        # Quantities that the residuals depend on: the measured curve's and the wrenches'. A pose's
+        # compressed residuals have as many rows, or fewer.
+        self.n_z = self.value.size1_out(1)
+        self.n_rows = min(max(item.n_residuals for item in problem.fit_poses), self.n_z)
         lower, upper = unknowns.bounds
-        free = np.full(self.stride * len(self.poses), np.inf)
+        free = np.full(self.stride * self.m, np.inf)
         self.lower, self.upper = np.concatenate([lower, -free]), np.concatenate([upper, free])
         # As in `descend`, deviations of poses that are not fitted stay: no prior of them counts.
-        held = np.zeros((len(self.poses), self.stride), dtype=bool)
-        unfitted = ~np.isin(self.poses, problem.used)
-        held[unfitted, self.n_x + self.n_lam : self.stride - self.n_rest] = True
+        held = np.zeros((self.m, self.stride), dtype=bool)
+        held[~np.isin(range(self.m), problem.used), self.own] = True
         self.held = np.concatenate([np.zeros(unknowns.size, dtype=bool), held.ravel()])
         self._assemble()
 
@@ -180,36 +140,34 @@ class _BatchNlp:
 
     def _assemble(self) -> None:
         """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
-        problem, m = self.problem, len(self.poses)
+        problem, m = self.problem, self.m
         unknowns, model = problem.unknowns, problem.equilibria.model
-        size, n_z, n_rows = unknowns.size, _observed_size(problem), _n_rows(problem)
+        size, n_z, n_rows = unknowns.size, self.n_z, self.n_rows
         x = ca.MX.sym("x", size + self.stride * m)
         factor = ca.MX.sym("factor", n_rows, n_z * len(problem.used))
         target = ca.MX.sym("target", n_rows, len(problem.used))
         p = ca.vertcat(ca.vec(factor), ca.vec(target))
         theta, own = x[:size], ca.reshape(x[size:], self.stride, m)
         thetas = ca.repmat(theta, 1, m)
-        fixed = ca.DM(np.array([problem.measured[j].pose.vector for j in self.poses]).T)
+        fixed = ca.DM(np.array([item.pose.vector for item in problem.measured]).T)
         balance, z, after = self.value.map(m)(own, thetas, fixed)
         slopes = self.slope.map(m)(own, thetas, fixed)
         width = self.stride + size
         gap = theta - ca.DM(problem.mean)
         precision = ca.DM(problem.precision)
-        at = self.n_x + self.n_lam
         pick = ca.DM.zeros(self.stride)
-        pick[at : at + self.n_dev] = 1.0
+        pick[self.own] = 1.0
 
         objective = ca.bilin(precision, gap, gap) / 2
-        by_theta, by_own = precision @ gap, [ca.MX.zeros(self.stride) for _ in self.poses]
-        pulls = [ca.MX.zeros(n_z) for _ in self.poses]
-        squares = [ca.MX.zeros(width, width) for _ in self.poses]
-        for k, j in enumerate(problem.used):
-            c = self.poses.index(j)
-            block = factor[:, k * n_z : (k + 1) * n_z]
+        by_theta, by_own = precision @ gap, [ca.MX.zeros(self.stride) for _ in range(m)]
+        factors, jacobians = ca.horzsplit(factor, n_z), ca.horzsplit(slopes[1], width)
+        pulls = [ca.MX.zeros(n_z) for _ in range(m)]
+        squares = [ca.MX.zeros(width, width) for _ in range(m)]
+        for k, c in enumerate(problem.used):
+            block, jacobian = factors[k], jacobians[c]
             residual = block @ z[:, c] - target[:, k]
             deviation = pick * own[:, c]
             objective += ca.sumsqr(residual) / 2 + ca.sumsqr(deviation) / 2
-            jacobian = slopes[1][:, c * width : (c + 1) * width]
             pulls[c] = block.T @ residual
             gradient = jacobian.T @ pulls[c]
             by_own[c] = gradient[: self.stride] + deviation
@@ -217,9 +175,9 @@ class _BatchNlp:
             whitened = block @ jacobian
             squares[c] = whitened.T @ whitened
             squares[c] += ca.diag(ca.vertcat(pick, ca.DM.zeros(size)))
-        constraints, rows = [ca.vec(balance)], [self._blocks(slopes[0], m, width)]
+        constraints, rows = [ca.vec(balance)], [self._blocks(slopes[0])]
         if model.has_state:
-            carried, row = self._carry(theta, own, after, slopes[2], width)
+            carried, row = self._carry(theta, own, after, slopes[2])
             constraints.append(carried)
             rows.append(row)
         g = ca.vertcat(*constraints)
@@ -236,8 +194,8 @@ class _BatchNlp:
             own, thetas, fixed, of_balance, lam_f * ca.horzcat(*pulls), of_after
         )
         corner, side, diagonal = lam_f * precision, [], []
-        for c in range(m):
-            whole = bends[:, c * width : (c + 1) * width] + lam_f * squares[c]
+        for bend, square in zip(ca.horzsplit(bends, width), squares, strict=True):
+            whole = bend + lam_f * square
             diagonal.append(whole[: self.stride, : self.stride])
             side.append(whole[self.stride :, : self.stride])
             corner += whole[self.stride :, self.stride :]
@@ -268,69 +226,83 @@ class _BatchNlp:
             },
         )
 
-    def _blocks(self, slopes: ca.MX, m: int, width: int) -> ca.MX:
+    def _blocks(self, slopes: ca.MX) -> ca.MX:
         """Jacobian of a function of each pose: theta's columns, then the poses' on the diagonal."""
-        parts = [slopes[:, c * width : (c + 1) * width] for c in range(m)]
+        parts = ca.horzsplit(slopes, self.stride + self.problem.unknowns.size)
         thetas = ca.vertcat(*(part[:, self.stride :] for part in parts))
         owns = ca.diagcat(*(part[:, : self.stride] for part in parts))
         return ca.horzcat(thetas, owns)
 
-    def _carry(
-        self, theta: ca.MX, own: ca.MX, after: ca.MX, slopes: ca.MX, width: int
-    ) -> tuple[ca.MX, ca.MX]:
+    def _carry(self, theta: ca.MX, own: ca.MX, after: ca.MX, slopes: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Rest curvature that each pose finds minus that left by the pose before; its Jacobian."""
-        m, unknowns = len(self.poses), self.problem.unknowns
+        m, unknowns = self.m, self.problem.unknowns
         scale = unknowns.model.cable.curvature_scale
         first = ca.DM(unknowns.rest_slopes) / scale
         begins = own[self.stride - self.n_rest :, :] / scale
         gap = ca.vec(begins - ca.horzcat(first @ theta, after[:, :-1]))
         select = ca.DM.zeros(self.n_rest, self.stride)
         select[:, self.stride - self.n_rest :] = ca.DM.eye(self.n_rest) / scale
-        left = self._blocks(slopes, m, width)
+        left = self._blocks(slopes)
         n, size = self.n_rest, unknowns.size
         shifted = ca.vertcat(ca.MX(n, left.shape[1]), left[: n * (m - 1), :])
         start = ca.vertcat(ca.MX(first), ca.MX(n * (m - 1), size))
         direct = ca.horzcat(-start, ca.MX(ca.diagcat(*([select] * m))))
         return gap, direct - shifted
 
-    def _split(self, own: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        a, b, c = self.n_x, self.n_x + self.n_lam, self.n_x + self.n_lam + self.n_dev
+    def _split(self, own: Any) -> tuple[Any, Any, Any, Any]:
+        """Headings, multipliers, deviations and rest curvature among a pose's unknowns."""
+        a, b, c = self.n_x, self.own.start, self.own.stop
         return own[:a], own[a:b], own[b:c], own[c:]
 
-    def solve(
-        self, point: Point, rows: tuple[FloatArray, ...], targets: tuple[FloatArray, ...]
-    ) -> tuple[FloatArray, dict[str, Any], float]:
-        """One IPOPT run with frozen projections."""
+    def _compressed(self, point: Point) -> list[FloatArray]:
+        """Triangular factor and target (n_rows, n_z + 1) of each fitted pose's residuals."""
         problem = self.problem
-        rests = problem.equilibria.rests(*problem.state(point))
-        own = []
-        for j in self.poses:
-            scaled = point.shapes.deviation[j, self.columns] / problem.deviation_std
-            parts = [point.shapes.x[j, :, 0], point.shapes.lam[j] / self.force, scaled]
-            if problem.equilibria.model.has_state:
-                parts.append(rests[j])
-            own.append(np.concatenate(parts))
-        x0 = np.concatenate([point.theta, *own])
+        out: list[FloatArray] = []
+        unit, seen = np.eye(self.n_z), problem.observed(point)
+        for j, s, white in zip(problem.used, point.projections, problem.whitening, strict=True):
+            curve, readings = seen[j].curve.numbers, seen[j].readings
+            by_curve = unit[: curve.size].reshape((*curve.shape, self.n_z))
+            each = ObservedChange(by_curve, unit[curve.size :])
+            residual, change = problem.measured[j].linearized(seen[j], s, each)
+            rows = -white @ change
+            target = white @ residual + rows @ np.concatenate([curve.ravel(), readings])
+            triangle = np.linalg.qr(np.column_stack([rows, target]), mode="r")
+            padded = np.zeros((self.n_rows, self.n_z + 1))
+            keep = min(self.n_rows, len(triangle))
+            padded[:keep] = triangle[:keep]
+            out.append(padded)
+        return out
+
+    def solve(self, point: Point) -> tuple[FloatArray, Shapes, float]:
+        """Unknowns, shapes and largest violation after one IPOPT run with frozen projections."""
+        problem, shapes = self.problem, point.shapes
+        own = shapes.deviation[:, self.columns] / problem.deviation_std
+        parts = [shapes.x[..., 0], shapes.lam / self.force, own]
+        if problem.equilibria.model.has_state:
+            parts.append(problem.equilibria.rests(*problem.state(point)))
+        x0 = np.concatenate([point.theta, np.concatenate(parts, axis=1).ravel()])
+        factors = self._compressed(point)
+        p = [part[:, :-1].ravel(order="F") for part in factors] + [part[:, -1] for part in factors]
         out, stats = run_ipopt(
             self.solver,
             x0=x0,
-            p=np.concatenate([np.concatenate([r.ravel(order="F") for r in rows]), *targets]),
+            p=np.concatenate(p),
             lbx=np.where(self.held, x0, self.lower),
             ubx=np.where(self.held, x0, self.upper),
             lbg=0.0,
             ubg=0.0,
         )
+        if not stats["success"]:
+            raise EstimationError(
+                f"the batch problem of {counted(len(problem.used), 'pose')} was not solved (IPOPT: "
+                f"{stats['return_status']} after "
+                f"{counted(int(stats['iter_count']), 'iteration')}).\n"
+                "  Try: more poses, or estimation.robust: true if some points are far off."
+            )
         residual = float(np.abs(np.array(out["g"])).max())
-        return np.array(out["x"]).ravel(), stats, residual
-
-    def unpack(self, vector: FloatArray, shapes: Shapes) -> tuple[FloatArray, Shapes]:
-        """Unknowns and shapes of the solution."""
-        size = self.problem.unknowns.size
-        theta, own = vector[:size], vector[size:].reshape((len(self.poses), self.stride))
-        x, lam, deviation = shapes.x.copy(), shapes.lam.copy(), shapes.deviation.copy()
-        at = self.n_x + self.n_lam
-        for j, row in zip(self.poses, own, strict=True):
-            x[j, :, 0], lam[j] = row[: self.n_x], row[self.n_x : at] * self.force
-            scaled = row[at : at + len(self.columns)]
-            deviation[j, self.columns] = scaled * self.problem.deviation_std
-        return theta, Shapes(x, lam, deviation)
+        theta, found = np.split(np.array(out["x"]).ravel(), [problem.unknowns.size])
+        headings, forces, scaled, _ = self._split(found.reshape((-1, self.stride)).T)
+        deviation = shapes.deviation.copy()
+        deviation[:, self.columns] = scaled.T * problem.deviation_std
+        shapes = Shapes(np.array(headings.T)[..., None], forces.T * self.force, deviation)
+        return theta, shapes, residual

@@ -119,6 +119,11 @@ class Problem:
         """The problem's own poses."""
         return tuple(self.history[k] for k in self.indices)
 
+    @property
+    def fit_poses(self) -> list[MeasuredPose]:
+        """The fitted poses."""
+        return [self.history[k] for k in self.fitted]
+
     @cached_property
     def equilibria(self) -> BatchEquilibrium:
         """The model over the problem's own poses; random effects are deviations of each pose."""
