@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import replace
 
 from dlo_casadi.diagnosis import refits
-from dlo_casadi.diagnosis.candidates import candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.refits import Confirmed
 from dlo_casadi.diagnosis.screening import p_values_of
@@ -46,7 +45,7 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
             continue
         needless = smaller.log_evidence > fit.log_evidence
         if not needless and effect not in significant:
-            tried = len(candidates_of(smaller, trials.center, trials.exclude))
+            tried = len(trials.listed(smaller))
             needless = p_of_removal(fit, smaller, effect.candidate, tried) > trials.significance
         if needless:
             with suppress(EstimationError):  # else there is no fit without it

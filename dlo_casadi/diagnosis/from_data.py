@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
+from dlo_casadi.diagnosis.candidates import Candidate, Listing
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.fit import FIRST_STD
 from dlo_casadi.estimation.measured_shapes import measured_shapes
@@ -257,17 +257,12 @@ class RelaxedStart:
         return {x.candidate.name for x in (*self.beside, self.screened)}
 
     def and_second(
-        self,
-        softness: float,
-        executor: Executor,
-        center: tuple[float, float] | None,
-        exclude: Sequence[str],
+        self, softness: float, executor: Executor, listing: Listing
     ) -> list[RelaxedStart]:
         """Starts with a likely second candidate added to this one, screened at a softness."""
         values = relaxed(self.problem, self.values, (softness,))
         near = Fit(self.problem, self.problem.evaluate(values))
-        listed = candidates_of(near, center, exclude)
-        likely = likeliest(screened_from_data(near, softness, listed))[:SECOND]
+        likely = likeliest(screened_from_data(near, softness, listing(near)))[:SECOND]
         second = partial(RelaxedStart.of, near, beside=(*self.beside, self.screened))
         return map_in_order(executor, second, likely)
 
@@ -299,8 +294,7 @@ def nearest(
     alone: Sequence[RelaxedStart],
     later: Sequence[Screened],
     executor: Executor,
-    center: tuple[float, float] | None = None,
-    exclude: Sequence[str] = (),
+    listing: Listing,
     *,
     pairs: bool = True,
     least: float = np.inf,
@@ -319,13 +313,7 @@ def nearest(
     """
     expected = expected_left(near)
     noise, start = REACHED * expected, partial(RelaxedStart.of, near)
-    second = partial(
-        RelaxedStart.and_second,
-        softness=softness,
-        executor=executor,
-        center=center,
-        exclude=exclude,
-    )
+    second = partial(RelaxedStart.and_second, softness=softness, executor=executor, listing=listing)
     begun = _near_least(alone, noise, least)
     nearest_left = begun[0].left if begun else np.inf
     told = begun if nearest_left < CLOSE * noise or not pairs else []

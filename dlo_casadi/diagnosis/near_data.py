@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import candidates_of
+from dlo_casadi.diagnosis.candidates import Listing
 from dlo_casadi.diagnosis.from_data import (
     CLOSE,
     NEAR_LEAST,
@@ -64,8 +64,7 @@ def near_data(
     base: Fit,
     relaxed: tuple[Fit, float],
     executor: Executor,
-    center: tuple[float, float] | None,
-    exclude: Sequence[str],
+    listing: Listing,
     *,
     pairs: bool,
 ) -> Tried:
@@ -79,7 +78,7 @@ def near_data(
     `relaxed`: the relaxed base and its softness, see `from_data`.
     """
     near, softness = relaxed
-    screened = screened_from_data(near, softness, candidates_of(near, center, exclude))
+    screened = screened_from_data(near, softness, listing(near))
     likely = likeliest(screened)
     contacts = [x for x in screened if not x.candidate.effect.gradual]
     first = [*contacts, *likely[:REFITTED]]
@@ -96,12 +95,14 @@ def near_data(
     touching = confirm_contacts(base, touches, executor)
     explained = any(explains(item.fit) for item in touching)
     least = min(start.left for start in touches) if explained else np.inf
-    later, among = likely[REFITTED:], (executor, center, exclude)
+    later = likely[REFITTED:]
     pairs = pairs and not explained
     kept: list[RelaxedStart] = []
     tried: list[Confirmed] = []
     far = dict.fromkeys((x.candidate.name for x in (*contacts, *likely[:REFITTED])), NOT_NEAR)
-    for starts in nearest(near, softness, singles, later, *among, pairs=pairs, least=least):
+    for starts in nearest(
+        near, softness, singles, later, executor, listing, pairs=pairs, least=least
+    ):
         close, found = confirmed(base, starts[:REFITTED], executor, rolls=not explained)
         kept += close
         tried += found

@@ -11,7 +11,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from dlo_casadi.diagnosis import refits
-from dlo_casadi.diagnosis.candidates import candidates_of
+from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.near_data import near_data
@@ -73,10 +73,13 @@ class Trials:
         """Refits of the declared model with a candidate, by name, made only as needed."""
         return self.wider.refitted if self.wider is not None else {}
 
+    def listed(self, current: Fit) -> list[Candidate]:
+        """All `candidates_of` a fit."""
+        return candidates_of(current, self.center, self.exclude)
+
     def screened(self, current: Fit, among: Collection[str] | None = None) -> list[Screened]:
-        """Score tests of all `candidates_of` a fit, or of those named, best first."""
-        listed = candidates_of(current, self.center, self.exclude)
-        listed = [x for x in listed if among is None or x.name in among]
+        """Score tests of all candidates for a fit, or of those named, best first."""
+        listed = [x for x in self.listed(current) if among is None or x.name in among]
         given = screening_degrees(current), self.significance, self.executor
         with suppress(EstimationError):
             return refits.scored(current, listed, *given)
@@ -91,7 +94,7 @@ class Trials:
         """
         if self.starts_at_shapes(current):
             near = self.relaxed if current is self.declared else from_data(current)
-            return near_data(current, near, self.executor, self.center, self.exclude, pairs=pairs)
+            return near_data(current, near, self.executor, self.listed, pairs=pairs)
         screened = self.first if current is self.declared else self.screened(current)
         p_values = p_values_of(screened)
         known = self.refitted if current is self.declared else {}

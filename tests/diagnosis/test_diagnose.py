@@ -347,11 +347,10 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(
     added = [SimpleNamespace(candidate=k, rivals=rivals, after=x) for k, x in enumerate(steps)]
     monkeypatch.setattr(refits, "refit_without", lambda *_: smaller)
     monkeypatch.setattr(backward, "misfits", lambda _: misfit)
-    monkeypatch.setattr(backward, "candidates_of", lambda *_: ())
     monkeypatch.setattr(backward, "p_of_removal", lambda *_: 0.0)
     monkeypatch.setattr(backward, "judged_again", judged_again)
     among = SimpleNamespace(
-        fine=lambda found, _: found, from_shapes=True, declared=None, center=None, exclude=(),
+        fine=lambda found, _: found, from_shapes=True, declared=None, listed=lambda _: (),
         significance=0.01,
     )  # fmt: skip
     _, left = backward.pruned(among, fit, added)
@@ -362,10 +361,9 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(
 def test_only_effects_that_are_asked_for_are_screened(monkeypatch):
     """Where only rivals are judged again, no others are scored."""
     listed = [SimpleNamespace(name=name) for name in ("set", "drift", "table")]
-    monkeypatch.setattr(trials, "candidates_of", lambda *_: listed)
     monkeypatch.setattr(trials, "screening_degrees", lambda _: np.inf)
     monkeypatch.setattr(refits, "scored", lambda _, among, *__: [x.name for x in among])
-    among = SimpleNamespace(center=None, exclude=(), significance=0.01, executor=InProcess())
+    among = SimpleNamespace(listed=lambda _: listed, significance=0.01, executor=InProcess())
     assert Trials.screened(among, None) == ["set", "drift", "table"]
     assert Trials.screened(among, None, {"drift", "set"}) == ["set", "drift"]
     assert Trials.screened(among, None, set()) == []

@@ -159,7 +159,7 @@ def test_no_pair_is_tried_where_one_effect_may_be_added(relaxed_fit, screened, m
     monkeypatch.setattr(RelaxedStart, "and_second", lambda start, **_: asked.append(start) or [])
     wrong = [RelaxedStart.of(near, screened["stiffness_gradient"])]
     for pairs in (False, True):
-        (found,) = nearest(near, softness, wrong, (), InProcess(), pairs=pairs)
+        (found,) = nearest(near, softness, wrong, (), InProcess(), None, pairs=pairs)
         assert [start.names for start in found] == [{"stiffness_gradient"}]
         assert bool(asked) == pairs
 
@@ -178,7 +178,7 @@ def test_pairs_are_tried_until_one_reaches_the_noise(monkeypatch):
 
     def found_among(listed):
         first = [RelaxedStart.of(near, x) for x in listed[:REFITTED]]
-        return nearest(near, 0.01, first, listed[REFITTED:], InProcess())
+        return nearest(near, 0.01, first, listed[REFITTED:], InProcess(), None)
 
     monkeypatch.setattr(RelaxedStart, "of", lambda near, x: start(100.0 + int(x), x))
     monkeypatch.setattr(RelaxedStart, "and_second", and_second)
@@ -253,7 +253,10 @@ def test_a_pair_found_from_both_of_its_candidates_is_fitted_once(monkeypatch):
         return [SimpleNamespace(names={"0", "1"}, left=3.0 - 0.01 * (first is alone[1]))]
 
     monkeypatch.setattr(RelaxedStart, "and_second", and_second)
-    assert [len(x) for x in nearest(relaxed_stub(1.0), 0.01, alone, (), InProcess())] == [1, 0]
+    assert [len(x) for x in nearest(relaxed_stub(1.0), 0.01, alone, (), InProcess(), None)] == [
+        1,
+        0,
+    ]
 
 
 def relaxed_stub(data, n_residuals=1, *, known=True):
@@ -272,7 +275,7 @@ def test_shapes_that_fit_a_known_noise_do_not_lower_what_counts_as_reaching_it(
     monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [])
     alone = [SimpleNamespace(names={"0"}, left=1.4)]
     near = relaxed_stub(0.1, known=known)
-    assert len(list(nearest(near, 0.1, alone, (), InProcess()))) == lists
+    assert len(list(nearest(near, 0.1, alone, (), InProcess(), None))) == lists
 
 
 def test_later_candidates_are_tried_unless_one_reaches_the_noise(monkeypatch):
@@ -281,12 +284,12 @@ def test_later_candidates_are_tried_unless_one_reaches_the_noise(monkeypatch):
     monkeypatch.setattr(RelaxedStart, "of", lambda _, x: SimpleNamespace(names={x}, left=lefts[x]))
     monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [])
     alone = [SimpleNamespace(names={"0"}, left=2.0)]
-    first, last = nearest(relaxed_stub(1.0), 0.1, alone, ["late"], InProcess())
+    first, last = nearest(relaxed_stub(1.0), 0.1, alone, ["late"], InProcess(), None)
     assert [x.names for x in first] == [{"0"}]
     assert [x.names for x in last] == [{"late"}]
     lefts["late"] = 7.0
     assert [
-        x.names for x in [*nearest(relaxed_stub(1.0), 0.1, alone, ["late"], InProcess())][1]
+        x.names for x in [*nearest(relaxed_stub(1.0), 0.1, alone, ["late"], InProcess(), None)][1]
     ] == []
 
 
@@ -297,11 +300,11 @@ def test_pairs_follow_a_single_candidate_that_came_near_the_noise_in_vain(left, 
     pair = SimpleNamespace(names={"0", "other"}, left=1.0)
     alone = [SimpleNamespace(names={x}, left=left + int(x) * left) for x in "01"]
     monkeypatch.setattr(RelaxedStart, "and_second", lambda *_, **__: [pair])
-    lists = nearest(near, 0.01, alone, (), InProcess())
+    lists = nearest(near, 0.01, alone, (), InProcess(), None)
     assert next(lists) == alone[:first]
     assert next(lists) == [pair]
     assert next(lists, None) is None
-    assert len(list(nearest(near, 0.01, alone, (), InProcess(), pairs=False))) == 1
+    assert len(list(nearest(near, 0.01, alone, (), InProcess(), None, pairs=False))) == 1
 
 
 TABLE = -0.25
@@ -356,7 +359,7 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table, m
     assert found.fit.value("contact_plane.height") == pytest.approx(TABLE, abs=5e-4)
 
     # The tether leaves far more than the table, which explains the shapes: it is no rival.
-    among = (near, softness, [RelaxedStart.of(near, tether)], (), InProcess())
+    among = (near, softness, [RelaxedStart.of(near, tether)], (), InProcess(), None)
     assert next(nearest(*among, pairs=False))
     assert not next(nearest(*among, pairs=False, least=start.left))
 
@@ -388,7 +391,6 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
 
     asked = []
     monkeypatch.setattr(RelaxedStart, "of", start)
-    monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
     screened = [named(name, gradual=name != "table") for name in left]
     monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: screened)
     monkeypatch.setattr(
@@ -396,7 +398,7 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
     )
     monkeypatch.setattr(fits_near_data, "nearest", lambda *_, **__: [])
     monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *_: [])
-    tried = near_data(None, (None, 0.01), InProcess(), None, (), pairs=False)
+    tried = near_data(None, (None, 0.01), InProcess(), lambda _: (), pairs=False)
     assert [x.names for x in asked] == [{"table"}] * fitted
     assert set(tried.far) == set(left)
 
@@ -425,12 +427,11 @@ def test_unlikely_candidates_are_tried_if_no_likely_one_reaches_the_noise(
 
     screened = [named("force"), named("stretch")]
     monkeypatch.setattr(RelaxedStart, "of", start)
-    monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
     monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: screened)
     monkeypatch.setattr(fits_near_data, "likeliest", lambda _: screened[:1])
     monkeypatch.setattr(fits_near_data, "nearest", nearest)
     monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *_: [])
-    near_data(None, (None, 0.01), InProcess(), None, (), pairs=True)
+    near_data(None, (None, 0.01), InProcess(), lambda _: (), pairs=True)
     assert told == alone
 
 
@@ -447,14 +448,13 @@ def test_a_pair_ends_the_search_only_if_it_surely_explains_the_shapes(
     item = SimpleNamespace(fit=fit, beside=beside, each=(tether,), screened=tether)
     begun = SimpleNamespace(screened=tether, names={"tether"}, left=1.0, reached=True)
     monkeypatch.setattr(RelaxedStart, "of", lambda *_: begun)
-    monkeypatch.setattr(fits_near_data, "candidates_of", lambda *_: ())
     monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: [tether])
     monkeypatch.setattr(fits_near_data, "nearest", lambda *_, **__: iter([[begun], [begun]]))
     monkeypatch.setattr(
         fits_near_data, "confirmed", lambda _, starts, *__, **___: (asked.append(1) or [], [item])
     )
     monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *args: args[2])
-    near_data(None, (None, 0.01), InProcess(), None, (), pairs=True)
+    near_data(None, (None, 0.01), InProcess(), lambda _: (), pairs=True)
     assert len(asked) == lists
 
 
