@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.diagnosis.backward import pruned
 from dlo_casadi.diagnosis.candidates import equivalents
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.from_pose_to_pose import (
@@ -33,7 +32,7 @@ from dlo_casadi.diagnosis.selection import (
     with_new_noise,
 )
 from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
-from dlo_casadi.diagnosis.trials import Trials
+from dlo_casadi.diagnosis.trials import Trials, pruned
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import explains

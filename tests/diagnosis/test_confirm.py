@@ -8,13 +8,12 @@ import pytest
 from scipy.linalg import block_diag
 
 from dlo_casadi.diagnosis import refits
-from dlo_casadi.diagnosis.backward import judged_again
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
 from dlo_casadi.diagnosis.screening import Screen, sidak
 from dlo_casadi.diagnosis.selection import AddedEffect
-from dlo_casadi.diagnosis.trials import Trials
+from dlo_casadi.diagnosis.trials import Trials, judged_again
 from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose

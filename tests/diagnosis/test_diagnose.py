@@ -11,8 +11,8 @@ import pytest
 from hidden_sets import simulated
 
 from dlo_casadi.config import load_config
-from dlo_casadi.diagnosis import backward, from_pose_to_pose, refits, trials
 from dlo_casadi.diagnosis import diagnose as module
+from dlo_casadi.diagnosis import from_pose_to_pose, refits, trials
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.crossval import (
     CrossValidation,
@@ -346,14 +346,14 @@ def test_in_a_misfit_only_an_effect_with_rivals_is_judged_again(
     fit, smaller = (SimpleNamespace(log_evidence=value) for value in (0.0, -1e5))
     added = [SimpleNamespace(candidate=k, rivals=rivals, after=x) for k, x in enumerate(steps)]
     monkeypatch.setattr(refits, "refit_without", lambda *_: smaller)
-    monkeypatch.setattr(backward, "misfits", lambda _: misfit)
-    monkeypatch.setattr(backward, "p_of_removal", lambda *_: 0.0)
-    monkeypatch.setattr(backward, "judged_again", judged_again)
+    monkeypatch.setattr(trials, "misfits", lambda _: misfit)
+    monkeypatch.setattr(trials, "p_of_removal", lambda *_: 0.0)
+    monkeypatch.setattr(trials, "judged_again", judged_again)
     among = SimpleNamespace(
         fine=lambda found, _: found, from_shapes=True, declared=None, listed=lambda _: (),
         significance=0.01,
     )  # fmt: skip
-    _, left = backward.pruned(among, fit, added)
+    _, left = trials.pruned(among, fit, added)
     assert asked == [added[k] for k in again]
     assert left == added
 

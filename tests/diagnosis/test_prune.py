@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from dlo_casadi.diagnosis import selection
-from dlo_casadi.diagnosis.backward import pruned
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.screening import sidak, survival
 from dlo_casadi.diagnosis.selection import AddedEffect
-from dlo_casadi.diagnosis.trials import Trials
+from dlo_casadi.diagnosis.trials import Trials, pruned
 from dlo_casadi.effects import CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model

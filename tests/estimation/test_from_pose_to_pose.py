@@ -9,7 +9,6 @@ import pytest
 from hidden_sets import simulated
 
 from dlo_casadi.cable.file import metadata_of
-from dlo_casadi.diagnosis.backward import judged_again
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import Search
 from dlo_casadi.diagnosis.from_data import from_data
@@ -21,7 +20,7 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
 )
 from dlo_casadi.diagnosis.refits import confirm
 from dlo_casadi.diagnosis.selection import AddedEffect
-from dlo_casadi.diagnosis.trials import Trials
+from dlo_casadi.diagnosis.trials import Trials, judged_again
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
