@@ -279,8 +279,11 @@ def measured_branches(
             if way is not None:
                 named, side = None if way.turns else way.branch, _tells_no_side(model, item.pose)
                 branch = MeasuredBranch(found, named, way.turns or None, side)
-            elif _continues(model, p, item.pose, found, last):
-                branch = MeasuredBranch(found, "previous")
+            elif last is not None:
+                with suppress(EquilibriumError):
+                    eq = continued(model, p, found.rest, item.pose, *last)
+                    if model.node.same(eq.x, found.equilibrium.x, NEARBY):
+                        branch = MeasuredBranch(found, "previous")
         out.append(branch)
         there = found or known
         last = last if there is None else (item.pose, there.equilibrium.x)
@@ -314,21 +317,6 @@ def _named_ways(
                 same = model.node.same(eq.x, there.equilibrium.x, NEARBY)
                 out[j] = way if same else None
     return out
-
-
-def _continues(
-    model: CableModel,
-    p: FloatArray,
-    pose: HeldPose,
-    found: Prediction,
-    last: tuple[HeldPose, FloatArray] | None,
-) -> bool:
-    """Whether continuing the pose before, as measured, leads to this equilibrium."""
-    if last is not None:
-        with suppress(EquilibriumError):
-            eq = continued(model, p, found.rest, pose, *last)
-            return bool(model.node.same(eq.x, found.equilibrium.x, NEARBY))
-    return False
 
 
 def noise_distance(measured: Sequence[MeasuredPose], std: float) -> float:
