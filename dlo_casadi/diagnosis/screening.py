@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
 from dlo_casadi.arrays import FloatArray
@@ -169,11 +168,6 @@ class Screen:
         self.listed = list(listed)
         self.model = extended(fit, listed)
 
-    @property
-    def n_scans(self) -> int:
-        """Largest number of scans of any candidate."""
-        return max(len(candidate.scans) for candidate in self.listed)
-
     def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
         """Normal equations at scans.
 
@@ -221,11 +215,12 @@ class Screen:
                     if known is None or tried.score > known[0].score:
                         best[candidate.name] = tried, normal.k
 
-        first = range(0, self.n_scans, SCANS_APART)
+        n_scans = max(len(candidate.scans) for candidate in self.listed)
+        first = range(0, n_scans, SCANS_APART)
         improved(first)
         likely = [(x, k) for x, k in best.values() if x.p_value < IN_QUESTION and self.between]
         near = {j for x, k in likely for j in (k - 1, k + 1) if j < len(x.candidate.scans)}
-        improved(sorted(near & {*range(1, self.n_scans)} - {*first}))
+        improved(sorted(near & {*range(1, n_scans)} - {*first}))
         return in_order(item for item, _ in best.values())
 
     def _score(self, candidate: Candidate, normal: AtScan, noise_dof: float) -> Screened:
@@ -250,7 +245,10 @@ class Screen:
         scale = np.sqrt(np.maximum(np.diag(h_cc), 1e-300))
         scaled = information / np.outer(scale, scale)
         score, step, dof = _best_step((scaled + scaled.T) / 2, u / scale)
-        inside = ~self._below(candidate, step / scale)
+        parameters = [self.model.parameters[self.model.names.index(q)] for q in candidate.screened]
+        # Not below a bound at which a parameter vanishes; other bounds are left to the refit.
+        vanish = np.array([q.lower == q.nominal for q in parameters], dtype=bool)
+        inside = ~(vanish & (step / scale < 0))
         if not inside.all():
             part = scaled[np.ix_(inside, inside)]
             score, step[inside], _ = _best_step((part + part.T) / 2, (u / scale)[inside])
@@ -262,21 +260,9 @@ class Screen:
         values = dict(candidate.scans[normal.k])
         # The fitted value of a nuisance counts only once: beside a copy without a prior, the copy
         # that has one returns to its mean.
-        for name, change in zip(candidate.screened, step, strict=True):
-            q = self.model.parameters[self.model.names.index(name)]
+        for name, q, change in zip(candidate.screened, parameters, step, strict=True):
             values[name] = float(np.clip(q.nominal + change * q.scale, q.lower, q.upper))
         return Screened(candidate, score, p_value, candidate.of_linear(self.model.cable, values))
-
-    def _below(self, candidate: Candidate, step: FloatArray) -> NDArray[np.bool_]:
-        """Whether each parameter would fall below a bound at which it vanishes.
-
-        Steps beyond other bounds are left to the refit.
-        """
-        below = []
-        for name, change in zip(candidate.screened, step, strict=True):
-            q = self.model.parameters[self.model.names.index(name)]
-            below.append(q.lower == q.nominal and change < 0)
-        return np.array(below)
 
 
 class RelaxedScreen(Screen):
