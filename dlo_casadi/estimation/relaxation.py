@@ -127,12 +127,9 @@ class Relaxation:
         """Weights (n b + k,) of the rows of F at these unknowns."""
         model, p = self.problem.unknowns.model, self.problem.unknowns.p(theta)
         force = model.weight + p[0] / model.cable.length**2
-        border = []
-        for kind in model.border_kinds.values():
-            if kind == "place":  # its row is the balance of forces there [N]
-                border.append(1 / force)
-            else:  # the row of a multiplier is its condition
-                border.append(1 / END / (model.cable.length if kind == "distance" else 1.0))
+        # The row of a place is the balance of forces there [N], of a multiplier its condition.
+        known = {"place": 1 / force, "distance": 1 / END / model.cable.length}
+        border = [known.get(kind, 1 / END) for kind in model.border_kinds.values()]
         moments = model.chain.h / np.exp(self._stiffness(theta)[0])
         return np.concatenate([moments, border]) / self.softness
 
@@ -222,12 +219,9 @@ class Relaxation:
         else:
             rest[:, :, known:] = unknowns.rest_slopes
         x = unit[:, :nodes].reshape((m, a.n, a.b, q))
-        lam = unit[:, nodes:border] + self._forces(values)[:, :, None] * self._growth(values)
+        forces = values.shapes.lam * model.are_multipliers  # these scale with the stiffness
+        lam = unit[:, nodes:border] + forces[:, :, None] * self._growth(values)
         return Tangents(x, lam, p, rest, deviation)
-
-    def _forces(self, values: Values) -> FloatArray:
-        """Multipliers (m, k), which scale with the stiffness; zero in the columns of places."""
-        return values.shapes.lam * self.problem.unknowns.model.are_multipliers
 
     @cached_property
     def _are_forces(self) -> BoolArray:
@@ -288,7 +282,9 @@ class Relaxation:
         rows, left = rows * weights[:, None], left * weights
         std, used = problem.deviation_std, equilibria.used_deviations
         priors = along.deviation[:, used] / std[:, None]
-        data = dict(zip(problem.used, self._data(values, along), strict=True))
+        found = zip(problem.whitening, problem.residuals(values, along), strict=True)
+        whitened = [(white @ change, white @ e) for white, (e, change) in found]
+        data = dict(zip(problem.used, whitened, strict=True))
         stacked = []
         for j in range(equilibria.m):
             parts = [(rows[j], left[j]), (priors[j], values.shapes.deviation[j, used] / std)]
@@ -331,12 +327,6 @@ class Relaxation:
         shared = [later[:, known:], linearized.prior[:, np.append(free, True)], more]
         left_over: FloatArray = np.asarray(np.linalg.qr(np.concatenate(shared), mode="r"))
         return _Reduced(triangles, [state[:, :-1] for state in states], left_over)
-
-    def _data(self, values: Values, along: Tangents) -> list[tuple[FloatArray, FloatArray]]:
-        """Whitened derivatives and residuals of each fitted pose."""
-        found = self.problem.residuals(values, along)
-        whites = self.problem.whitening
-        return [(w @ change, w @ e) for w, (e, change) in zip(whites, found, strict=True)]
 
     @cached_property
     def _prior(self) -> FloatArray:
