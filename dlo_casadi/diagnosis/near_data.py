@@ -92,7 +92,7 @@ def near_data(
         singles += [start for start in more if start.reached]
     most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
     touches = [start for start in touches if start.left <= most]
-    touching = confirm_contacts(base, touches, executor)
+    touching = [x for x in map_in_order(executor, partial(confirm_contact, base), touches) if x]
     explained = any(explains(item.fit) for item in touching)
     least = min(start.left for start in touches) if explained else np.inf
     later = likely[REFITTED:]
@@ -177,19 +177,12 @@ def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> C
     return max(both, key=lambda item: (explains(item.fit), item.fit.log_evidence), default=None)
 
 
-def confirm_contacts(
-    base: Fit, begun: Sequence[RelaxedStart], executor: Executor
-) -> list[Confirmed]:
-    """`confirm_from_data` of effects without derivative where they vanish, scored by gain.
+def confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
+    """`confirm_from_data` of an effect without derivative where it vanishes, scored by gain.
 
-    For a contact, a soft balance is less informative than a fit. Gains are computed with the
-    noise of the base, which may hide what the base lacks: they are at least this large.
+    For a contact, a soft balance is less informative than a fit. The gain is computed with the
+    noise of the base, which may hide what the base lacks: it is at least this large.
     """
-    found = map_in_order(executor, partial(_confirm_contact, base), begun)
-    return [item for item in found if item is not None]
-
-
-def _confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
     item, screened = confirm_from_data(base, start), start.screened
     if item is None:
         return None

@@ -18,7 +18,7 @@ from dlo_casadi.diagnosis.from_data import (
     screened_from_data,
 )
 from dlo_casadi.diagnosis.near_data import (
-    confirm_contacts,
+    confirm_contact,
     confirm_from_data,
     confirm_rolled,
     near_data,
@@ -351,7 +351,7 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table, m
     monkeypatch.setattr(RelaxedStart, "_strict", lambda x: followed.append(x) or strict(x))
     start = RelaxedStart.of(near, contact)
     assert len(followed) == 1  # four stiffnesses lead to one minimum
-    (found,) = confirm_contacts(on_a_table, [start], InProcess())
+    found = confirm_contact(on_a_table, start)
     assert found.name == "contact_plane"
     assert explains(found.fit)
     assert found.screened.p_value < 1e-9
@@ -393,9 +393,7 @@ def test_a_contact_that_leaves_far_more_than_others_is_not_fitted(left, fitted, 
     monkeypatch.setattr(RelaxedStart, "of", start)
     screened = [named(name, gradual=name != "table") for name in left]
     monkeypatch.setattr(fits_near_data, "screened_from_data", lambda *_: screened)
-    monkeypatch.setattr(
-        fits_near_data, "confirm_contacts", lambda _, starts, __: asked.extend(starts) or []
-    )
+    monkeypatch.setattr(fits_near_data, "confirm_contact", lambda _, start: asked.append(start))
     monkeypatch.setattr(fits_near_data, "nearest", lambda *_, **__: [])
     monkeypatch.setattr(fits_near_data, "loads_from_best", lambda *_: [])
     tried = near_data(None, (None, 0.01), InProcess(), lambda _: (), pairs=False)
