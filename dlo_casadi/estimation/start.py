@@ -148,16 +148,7 @@ def _lower_of_each(
     each = (relaxation.objectives(one)[0] for one in (values, other))
     lefts = [np.where(np.isnan(left), np.inf, left) for left in each]
     taken = among & (lefts[1] < lefts[0])
-
-    def merged(mine: FloatArray, theirs: FloatArray) -> FloatArray:
-        return np.where(taken.reshape((-1,) + (1,) * (mine.ndim - 1)), theirs, mine)
-
-    mine, theirs = values.shapes, other.shapes
-    shapes = Shapes(
-        merged(mine.x, theirs.x),
-        merged(mine.lam, theirs.lam),
-        merged(mine.deviation, theirs.deviation),
-    )
+    shapes = values.shapes.replaced(taken, other.shapes.subset(taken))
     places = zip(problem.used, values.projections, other.projections, strict=True)
     return Values(values.theta, shapes, [t if taken[j] else s for j, s, t in places])
 
@@ -256,15 +247,13 @@ def _led_by(
     chosen = np.flatnonzero(kept)
     history = tuple(problem.measured[j] for j in chosen)
     few = replace(problem, history=history, weights=tuple(problem.whitening[j] for j in chosen))
-    own = Shapes(shapes.x[chosen], shapes.lam[chosen], shapes.deviation[chosen])
     # The other poses have pulled these far away: restart them at a soft balance.
     softness = [soft for soft in SOFTNESS[1:] if soft >= relaxation.softness]
-    led = relaxed(few, Values(values.theta, own, [places[j] for j in chosen]), softness, fixed)
-    x, lam, deviation = shapes.x.copy(), shapes.lam.copy(), shapes.deviation.copy()
-    x[chosen], lam[chosen], deviation[chosen] = led.shapes.x, led.shapes.lam, led.shapes.deviation
+    own = Values(values.theta, shapes.subset(chosen), [places[j] for j in chosen])
+    led = relaxed(few, own, softness, fixed)
     for j, place in zip(chosen, led.projections, strict=True):
         places[j] = place
-    return Values(led.theta, Shapes(x, lam, deviation), places)
+    return Values(led.theta, shapes.replaced(chosen, led.shapes), places)
 
 
 def _from_ends_and_lines(problem: Problem, values: Values, among: BoolArray) -> list[Values]:

@@ -57,6 +57,12 @@ class Shapes:
         """Shapes of some of the poses."""
         return Shapes(self.x[index], self.lam[index], self.deviation[index])
 
+    def replaced(self, index: Any, other: Shapes) -> Shapes:
+        """Shapes with those of some of the poses from `other`, which has these poses alone."""
+        x, lam, deviation = self.x.copy(), self.lam.copy(), self.deviation.copy()
+        x[index], lam[index], deviation[index] = other.x, other.lam, other.deviation
+        return Shapes(x, lam, deviation)
+
 
 def _by_name(rows: FloatArray, names: Sequence[str], others: Sequence[str]) -> FloatArray:
     """Columns (m, k) of some names, in the order of others; zeros for new ones."""
