@@ -171,10 +171,9 @@ def cross_validate(fit: Fit) -> CrossValidation:
         known if k in at_folds or not np.isfinite(x) else x
         for k, (x, known) in enumerate(zip(densities, linear, strict=True))
     ]
-    items = [problem.measured[j] for j in problem.used]
     errors = [
         None if seen is None else (item.distances(seen.curve), item.misread(seen, fit.noise))
-        for item, seen in zip(items, predicted.values(), strict=True)
+        for item, seen in zip(problem.fit_poses, predicted.values(), strict=True)
     ]
     for k in at_folds:
         errors[k] = np.zeros(0), np.zeros(0)
@@ -189,7 +188,7 @@ def _as_far_by_chance(
 
     `seen`: predicted at `theta`, to which `covariance` belongs.
     """
-    item, curve = fit.problem.measured[fit.problem.used[k]], seen.curve
+    item, curve = fit.problem.fit_poses[k], seen.curve
     s, (lower, upper) = item.nearest(curve), fit.problem.unknowns.bounds
     error = float(np.sqrt((item.distances(curve) ** 2).mean()))
     generator, ways = np.random.default_rng(0), root_of(covariance)
@@ -247,7 +246,7 @@ def _density_of(fit: Fit, k: int, seen: Observed | None, covariance: FloatArray)
     """`_density` of the k-th pose, seen as in `_at_own_deviations`; -inf without an equilibrium."""
     if seen is None:
         return -np.inf
-    item = fit.problem.measured[fit.problem.used[k]]
+    item = fit.problem.fit_poses[k]
     off = fit.problem.whitening[k] @ item.residual(
         seen, item.located(seen, fit.point.projections[k])
     )
@@ -314,7 +313,9 @@ def _predicted(
         p[j] = unknowns.p(thetas[k])
         by_theta = fit.linearization.shapes.rest[j][:, : unknowns.size]
         rest[j] += by_theta @ (thetas[k] - fit.point.theta)
-    start = _declared(fit) if start is None else start
+    if start is None:
+        shapes = fit.point.shapes
+        start = replace(shapes, deviation=np.zeros_like(shapes.deviation))
     # Without its random moment a pose is far off. Any other pose that Newton's method loses is at
     # the edge of stability: a descent would end in another equilibrium, an error of any model.
     random = fit.problem.random_std.any()
@@ -325,17 +326,10 @@ def _predicted(
     return {k: seen[j] if converged[j] else None for k, j in at.items()}
 
 
-def _declared(fit: Fit) -> Shapes:
-    """The fitted shapes with their ends as declared, used as start of a solve."""
-    shapes = fit.point.shapes
-    return replace(shapes, deviation=np.zeros_like(shapes.deviation))
-
-
 def _stretches(fit: Fit) -> CrossValidation:
     """Cross-validation along the arc of a single pose."""
     problem, lin = fit.problem, fit.linearization
-    j = problem.used[0]
-    item = problem.measured[j]
+    (item,) = problem.fit_poses
     points = np.argsort(fit.point.projections[0], kind="stable")  # a stretch of all photographs
     size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
     prior = np.zeros((size + n_dev, size + n_dev))

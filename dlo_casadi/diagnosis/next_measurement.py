@@ -27,7 +27,6 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.runtime.executors import InProcess
-from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.thresholds import APART
 
 # Trial weights over the cable's own, in this order, until one does not fit.
@@ -108,7 +107,7 @@ def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
     """Direction [rad] of the clamp at which two fits differ most, and that difference [m], RMS."""
     if fit.model.in_space or fit.model.start != "clamped":
         return None, None
-    base = fit.problem.measured[fit.problem.used[0]].pose
+    base = fit.problem.fit_poses[0].pose
     places = np.linspace(0.0, fit.model.cable.length, 51)
     headings, differences = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False), []
     for heading in headings:
@@ -236,7 +235,11 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     difference, pose, one, other = best
     end = np.array(pose.end)
     place = tuple(round(float(x), 4) for x in end)
-    s, item = _nearest_line(first, end)
+    # Seen like the fit pose whose end is nearest, at the arc lengths of its points.
+    measured = first.problem.fit_poses
+    away = np.array([item.pose.end for item in measured]) - end
+    k = int((away**2).sum(axis=1).argmin())
+    s, item = first.point.projections[k], measured[k]
     moved, again = _displaced(first, pose, one, s)
     open_too, _ = _displaced(second, pose, other, s)
     gap = one.curve.at(s) - other.curve.at(s)
@@ -263,14 +266,6 @@ def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
         times = int(np.ceil(std**2 / left)) if left > 0 else None
         found.append(NextReading(name, difference, difference / float(np.hypot(std, bias)), times))
     return max(found, key=lambda item: item.separation)
-
-
-def _nearest_line(fit: Fit, end: FloatArray) -> tuple[FloatArray, MeasuredPose]:
-    """Arc lengths (K,) [m] of the points of the fit pose whose end is nearest, and that pose."""
-    problem = fit.problem
-    ends = np.array([problem.measured[j].pose.end for j in problem.used])
-    k = int(((ends - end) ** 2).sum(axis=1).argmin())
-    return fit.point.projections[k], problem.measured[problem.used[k]]
 
 
 def _displaced(

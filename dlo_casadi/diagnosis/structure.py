@@ -104,10 +104,9 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     problem, lin, normal = fit.problem, fit.linearization, fit.normal
     model = fit.model
     coefficients, own, arms = [], [], []
-    for k, (j, s) in enumerate(zip(problem.used, fit.point.projections, strict=True)):
+    for k, (item, s) in enumerate(zip(problem.fit_poses, fit.point.projections, strict=True)):
         modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
-        seen = problem.measured[j].slow_rows(modes)
-        basis, _ = np.linalg.qr(problem.whitening[k] @ seen)
+        basis, _ = np.linalg.qr(problem.whitening[k] @ item.slow_rows(modes))
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         block, cross, _ = normal.inner[k]
         solved = np.linalg.solve(block, np.column_stack([b.T, cross]))
@@ -124,7 +123,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     p_value = survival(statistic, max(dof, 1), noise_dof)
     shares = zip(coefficients, own, strict=True)
     energies = np.array([float((c**2).sum()) / max(float(np.trace(v)), 0.1) for c, v in shares])
-    items = [problem.measured[j] for j in problem.used]
+    items = problem.fit_poses
     pairs = zip(items, lin.residuals, strict=True)
     series = [one for item, e in pairs for one in item.along(e)]
     names, spans = [x.pose.name for x in items], np.array([x.pose.span for x in items])

@@ -86,7 +86,7 @@ def estimate_unknown_force(base: Fit, executor: Executor) -> UnknownForce | None
     position = best.value(name)
     half = NORMAL_95 * max(best.std(name), 1e-4 * length)
     interval = (float(max(0.0, position - half)), float(min(length, position + half)))
-    names = tuple(best.problem.measured[j].pose.name for j in best.problem.used)
+    names = tuple(item.pose.name for item in best.problem.fit_poses)
     return UnknownForce(forces, position, interval, best, names)
 
 

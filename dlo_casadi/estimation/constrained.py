@@ -79,14 +79,12 @@ def threshold(fit: Fit, name: str = BENDING_STIFFNESS, *, systematic: bool = Fal
     k = fit.problem.unknowns.names.index(name)
     more = fit.marginal_covariance[k, k] / fit.covariance[k, k]
     square = 0.0
-    for j, white in zip(fit.problem.used, fit.problem.whitening, strict=True):
-        if not systematic or fit.noise.source != "declared":
-            break
-        item = fit.problem.measured[j]
-        constant = np.zeros(item.n_residuals)
-        constant[item.on_points] = item.relative_std[item.point_of]
-        constant *= SYSTEMATIC_SHARE * fit.noise.std
-        square += float(((white @ constant) ** 2).sum())
+    if systematic and fit.noise.source == "declared":
+        for item, white in zip(fit.problem.fit_poses, fit.problem.whitening, strict=True):
+            constant = np.zeros(item.n_residuals)
+            constant[item.on_points] = item.relative_std[item.point_of]
+            constant *= SYSTEMATIC_SHARE * fit.noise.std
+            square += float(((white @ constant) ** 2).sum())
     return float((student_95(fit, name) + np.sqrt(square)) ** 2 * more)
 
 

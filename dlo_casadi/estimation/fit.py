@@ -184,13 +184,10 @@ def fit_to_misfit(near: Fit) -> Fit:
 # ---- meshes ------------------------------------------------------------------------------------
 
 
-def refine_mesh(fit: Fit, n: int, modes: int = SMOOTH_MODES) -> Fit:
-    """Fit the same model on another mesh, from a fit's minimum.
-
-    `modes`: number of slow displacements kept out of the noise estimate, if noise is estimated.
-    """
+def refine_mesh(fit: Fit, n: int) -> Fit:
+    """Fit the same model on another mesh, from a fit's minimum."""
     moved = _moved(fit, n)
-    return _anew(fit, n) if moved is None else refine(moved, rounds=2, modes=modes)
+    return _anew(fit, n) if moved is None else refine(moved, rounds=2)
 
 
 def _moved(fit: Fit, n: int) -> Fit | None:
@@ -309,7 +306,7 @@ def resting_height(problem: Problem) -> float | None:
     lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
     ends = heights[:, :1] if model.end == "free" else heights[:, [0, -1]]
     highest = ends.min(axis=1)
-    for k, item in enumerate(problem.measured[j] for j in problem.used):
+    for k, item in enumerate(problem.fit_poses):
         known = height_of(item.traced.points, model.gravity) if item.has_line else heights[k]
         highest[k] = max(lowest[k], known.min(initial=highest[k]))
     least, most = (share * length for share in RESTING_APART)

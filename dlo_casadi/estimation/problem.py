@@ -183,7 +183,7 @@ class Problem:
 
         In the plane one per point and two per marker; one per component of a wrench measurement.
         """
-        return sum(self.measured[j].n_residuals for j in self.used)
+        return sum(item.n_residuals for item in self.fit_poses)
 
     # ---- weights -----------------------------------------------------------------------------
 
@@ -202,8 +202,8 @@ class Problem:
         linear.
         """
         weights = [
-            self.measured[j].whitening(self.noise, s)
-            for j, s in zip(self.used, values.projections, strict=True)
+            item.whitening(self.noise, s)
+            for item, s in zip(self.fit_poses, values.projections, strict=True)
         ]
         random = self.own_errors(values) if self.priors.pose_scatter.rest_std else []
         for k, way in enumerate(random):
@@ -242,7 +242,7 @@ class Problem:
         """`moved_by` for one standard deviation of each; (R_j, 0) if the cable repeats."""
         scatter = self.priors.pose_scatter
         if scatter.std == 0:
-            return [np.zeros((self.measured[j].n_residuals, 0)) for j in self.used]
+            return [np.zeros((item.n_residuals, 0)) for item in self.fit_poses]
         (moved,) = self.moved_by(values, scatter)
         return [way * scatter.sizes(way.shape[1]) for way in moved]
 
@@ -279,16 +279,15 @@ class Problem:
             white @ self.measured[j].residual(seen[j], s)
             for white, j, s in zip(self.whitening, self.used, moved, strict=True)
         ]
-        objective, data = self.objective(values, residuals)
-        return Point(values.theta, values.shapes, moved, objective, data, residuals)
-
-    def objective(self, values: Values, residuals: list[FloatArray]) -> tuple[float, float]:
-        """Half the sum of squares with priors; full sum of squares of whitened residuals alone."""
         data = float(sum(white @ white for white in residuals))
-        gap = values.theta - self.mean
-        used = values.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
-        prior = float(gap @ self.precision @ gap + ((used / self.deviation_std) ** 2).sum())
-        return (data + prior) / 2, data
+        gap, own = values.theta - self.mean, self.own_deviations(values)
+        prior = float(gap @ self.precision @ gap + ((own / self.deviation_std) ** 2).sum())
+        return Point(values.theta, values.shapes, moved, (data + prior) / 2, data, residuals)
+
+    def own_deviations(self, values: Values) -> FloatArray:
+        """Deviations (fitted poses, n_deviations) of each fitted pose's own."""
+        used = np.ix_(self.used, self.equilibria.used_deviations)
+        return np.asarray(values.shapes.deviation[used])
 
     def balanced(self, values: Values, **options: Any) -> Point | None:
         """Objective at equilibria of all poses near some values; None if a pose has none there.
@@ -362,9 +361,8 @@ class Problem:
 
     def normal_equations(self, point: Values, lin: Linearization) -> Normal:
         """Gauss-Newton normal equations of theta, each pose's deviations eliminated."""
-        each = lin.residuals, lin.by_theta, lin.by_deviation
-        own = point.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
-        return self._eliminated(point, zip(*each, own[:, None], strict=True))
+        each = lin.residuals, lin.by_theta, lin.by_deviation, self.own_deviations(point)[:, None]
+        return self._eliminated(point, zip(*each, strict=True))
 
     def step_equations(self, point: Values, lin: Linearization) -> Normal:
         """Normal equations of a descent: with a state, a deviation also moves all later poses.
@@ -374,8 +372,7 @@ class Problem:
         if not lin.by_all:
             return self.normal_equations(point, lin)
         e, a, b = (np.concatenate(x) for x in (lin.residuals, lin.by_theta, lin.by_all))
-        own = point.shapes.deviation[np.ix_(self.used, self.equilibria.used_deviations)]
-        return self._eliminated(point, [(e, a, b, own)])
+        return self._eliminated(point, [(e, a, b, self.own_deviations(point))])
 
     def _eliminated(self, point: Values, groups: Iterable[tuple[FloatArray, ...]]) -> Normal:
         """Normal equations of groups of poses: residuals, derivatives by theta and by deviations.

@@ -203,9 +203,7 @@ class Fit:
     @property
     def own_deviations(self) -> FloatArray:
         """Deviations (fitted poses, n_deviations) of each fitted pose's own."""
-        problem = self.problem
-        used = np.ix_(problem.used, problem.equilibria.used_deviations)
-        return np.asarray(self.point.shapes.deviation[used])
+        return self.problem.own_deviations(self.point)
 
     @property
     def _taken(self) -> list[FloatArray]:
@@ -277,7 +275,7 @@ class Fit:
     @property
     def compared_std(self) -> float:
         """Standard deviation [m] of the compared data: of points, or of means of several points."""
-        noise, items = self.noise, [self.problem.measured[j] for j in self.problem.used]
+        noise, items = self.noise, self.problem.fit_poses
         white = float(np.median(np.concatenate([item.relative_white for item in items])))
         return noise.std * float(np.sqrt((1 - noise.share) * white**2 + noise.share))
 
@@ -315,7 +313,7 @@ class Fit:
 
     @property
     def _on_points(self) -> list[BoolArray]:
-        return [self.problem.measured[j].on_points for j in self.problem.used]
+        return [item.on_points for item in self.problem.fit_poses]
 
     @property
     def failed(self) -> bool:
@@ -335,7 +333,7 @@ class Fit:
 
     @property
     def _n_points(self) -> int:
-        return sum(len(self.problem.measured[j].points) for j in self.problem.used)
+        return sum(len(item.points) for item in self.problem.fit_poses)
 
     @cached_property
     def expected_error(self) -> float:
@@ -358,14 +356,14 @@ class Fit:
         problem, size = self.problem, self.problem.unknowns.size
         square, count = problem.n_residuals * self.noise.std**2, self._n_points
         directions = (by[:, :size] for by in self.linearization.raw_directions)
-        own = (problem.used, self._by_fixtures, self._by_rest, self._on_points)
+        own = (problem.fit_poses, self._by_fixtures, self._by_rest)
         rows = zip(covariances, directions, *own, strict=True)
-        for covariance, by, j, fixtures, rest, on_points in rows:
+        for covariance, by, item, fixtures, rest in rows:
             variance = self.inflation**2 * ((by @ covariance) * by).sum(axis=1)
             variance += fixtures + rest
-            units = self.noise.units(problem.measured[j].kinds)
+            units = self.noise.units(item.kinds)
             square += float((units**2 * variance).sum())
-            count += int((~on_points).sum())
+            count += int((~item.on_points).sum())
         return float(np.sqrt(square / count))
 
     @property

@@ -47,7 +47,6 @@ class Unknowns:
 
     @cached_property
     def _parameters(self) -> list[Parameter]:
-        """The free parameters."""
         return [self.model.parameters[i] for i in self._used]
 
     @property

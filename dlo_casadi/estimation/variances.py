@@ -176,7 +176,7 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
     MacKay, Neural Computation 4 (1992).
     """
     own, guess = fit.noise.readings, first_reading_noise(fit.model)
-    kinds = np.concatenate([fit.problem.measured[j].kinds for j in fit.problem.used])
+    kinds = np.concatenate([item.kinds for item in fit.problem.fit_poses])
     if (kinds == "point").all():
         return own
     free = 1 - np.concatenate(fit.leverages)
@@ -246,7 +246,7 @@ def _scatters_of(
 def _white_noise(fit: Fit) -> NoiseModel:
     """White noise: size of the residuals over their degrees of freedom."""
     problem = fit.problem
-    items = [problem.measured[j] for j in problem.used]
+    items = problem.fit_poses
     on_points = np.concatenate([item.on_points for item in items])
     free = 1 - np.concatenate(fit.leverages)
     spare = problem.n_residuals - fit.determined_unknowns - float(free[~on_points].sum())
@@ -273,15 +273,15 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     bases, left_over = [], []
     scatter = problem.priors.pose_scatter
     rest = problem.moved_by(point, scatter)[0] if scatter.rest_std > 0 else None
-    kept = [problem.measured[j].on_points for j in problem.used]
+    kept = [item.on_points for item in problem.fit_poses]
     raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
     ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]
     scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in ways], axis=0)
-    for k, (j, s) in enumerate(zip(problem.used, point.projections, strict=True)):
+    for k, (item, s) in enumerate(zip(problem.fit_poses, point.projections, strict=True)):
         directions = ways[k]
         own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
         sines = smooth_modes(s, length, modes, model.end == "free")
-        slow = problem.measured[j].slow_rows(sines)[kept[k]]
+        slow = item.slow_rows(sines)[kept[k]]
         if rest is not None:
             way = rest[k][kept[k]]
             slow = np.concatenate([slow, way / np.abs(way).max()], axis=1)
@@ -293,11 +293,11 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     # A direction already among the poses' own ones takes no further degree of freedom.
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
     blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in raws])[:-1])
-    rows = zip(problem.used, raws, point.projections, bases, blocks, strict=True)
+    rows = zip(problem.fit_poses, raws, point.projections, bases, blocks, strict=True)
     return [
         NoiseSample(e[at], s[on], x.weight, own[at], block[at], x.correlation_length, x.count)
-        for j, e, s, own, block in rows
-        for x, on, at in problem.measured[j].slices
+        for item, e, s, own, block in rows
+        for x, on, at in item.slices
     ]
 
 
@@ -331,7 +331,7 @@ def scatter_of(fit: Fit) -> FloatArray:
         return problem.priors.scatter
     covariance = np.linalg.pinv(normal.hessian, hermitian=True)
     variance = [np.diag(full) for full in normal.own_covariances(covariance)]
-    square = (fit.point.shapes.deviation[np.ix_(problem.used, columns)] ** 2).sum(axis=0)
+    square = (fit.own_deviations**2).sum(axis=0)
     determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
     scatter = problem.priors.scatter.copy()
     node = problem.unknowns.model.node

@@ -431,7 +431,6 @@ def _runs_away(history: list[float]) -> bool:
 def _message(
     status: Algorithm1Status, history: list[float], seconds: float, failed: int, n_poses: int
 ) -> str:
-    """Say in words how the loop ended."""
     text = (
         f"After {counted(len(history) - 1, 'iteration')} ({seconds:.1f} s) {status.value}; "
         f"k_theta went from {history[0]:.3g} to {history[-1]:.3g} N m/rad."
