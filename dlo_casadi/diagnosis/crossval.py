@@ -32,8 +32,8 @@ from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import explains
-from dlo_casadi.estimation.point import NO_INFORMATION, Values
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.unknowns import NO_INFORMATION, Values
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.thresholds import EVIDENCE_APART
 

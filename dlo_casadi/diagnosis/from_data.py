@@ -20,11 +20,11 @@ from dlo_casadi.diagnosis.candidates import Candidate, Listing
 from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
 from dlo_casadi.estimation.fit import FIRST_STD
 from dlo_casadi.estimation.measured_shapes import measured_shapes
-from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import (
+    SearchSettings,
     begin,
     fit_from,
     loosely_relaxed,
@@ -32,7 +32,7 @@ from dlo_casadi.estimation.start import (
     retry_outlying_poses,
     with_springs_in_place,
 )
-from dlo_casadi.estimation.unknowns import SearchSettings
+from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.noise import NoiseModel

@@ -8,11 +8,11 @@ from dlo_casadi.diagnosis.selection import Found, likelier_by
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import explains, fine_enough, refine_mesh
-from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import fit_from, relaxed
+from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.estimation.variances import pose_scatter_of, refine
 from dlo_casadi.model.pose_scatter import PoseScatter, sources_in
 from dlo_casadi.thresholds import DIFFERENT, EVIDENCE_APART

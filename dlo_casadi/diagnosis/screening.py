@@ -29,11 +29,11 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import StateEffect
 from dlo_casadi.estimation.descent import carried_shapes
-from dlo_casadi.estimation.point import NO_INFORMATION, Linearization, Point, Values
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.relaxation import Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import with_springs_in_place
+from dlo_casadi.estimation.unknowns import NO_INFORMATION, Linearization, Point, Values
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess

@@ -12,12 +12,11 @@ from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.effects import PointLoad, UnknownPull
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
-from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, fit_from, relaxed
-from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
+from dlo_casadi.estimation.start import SearchSettings, begin, fit_from, relaxed
+from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.thresholds import NORMAL_95

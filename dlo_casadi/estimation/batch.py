@@ -26,8 +26,8 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.by_ipopt import run_ipopt
 from dlo_casadi.equilibrium.curve import ObservedChange
 from dlo_casadi.errors import EstimationError, counted
-from dlo_casadi.estimation.point import Point, Values
 from dlo_casadi.estimation.problem import Problem
+from dlo_casadi.estimation.unknowns import Point, Values
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, readings, rest_after

@@ -22,10 +22,9 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import energy_slope
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import NEARLY, descend
-from dlo_casadi.estimation.point import Point
 from dlo_casadi.estimation.prediction import Prediction, measured_elsewhere, predict_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.unknowns import Point, Unknowns
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES, CableModel
 from dlo_casadi.thresholds import EVIDENCE_APART, IDENTIFIABLE, SYSTEMATIC_SHARE

@@ -16,8 +16,8 @@ from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.repeats import different_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import begin, fit_from, weighed
-from dlo_casadi.estimation.unknowns import SearchSettings, Unknowns
+from dlo_casadi.estimation.start import SearchSettings, begin, fit_from, weighed
+from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.estimation.variances import (
     SCATTER_FLOOR,
     SMOOTH_MODES,

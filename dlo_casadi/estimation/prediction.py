@@ -20,10 +20,10 @@ from dlo_casadi.equilibrium.solve import (
 )
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.repeats import different_poses, repeat_std
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose

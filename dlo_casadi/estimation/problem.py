@@ -26,8 +26,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.point import Linearization, Normal, Point, Values
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.unknowns import Linearization, Normal, Point, Unknowns, Values
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.pose_scatter import PoseScatter

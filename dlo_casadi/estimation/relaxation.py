@@ -27,8 +27,8 @@ from scipy.optimize import lsq_linear
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.curve import Observed
-from dlo_casadi.estimation.point import NO_INFORMATION, Normal, Values
 from dlo_casadi.estimation.problem import Problem
+from dlo_casadi.estimation.unknowns import NO_INFORMATION, Normal, Values
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.model.contact import gap_per_force

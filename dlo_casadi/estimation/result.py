@@ -12,9 +12,15 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
-from dlo_casadi.estimation.point import NO_INFORMATION, Linearization, Normal, Point
 from dlo_casadi.estimation.problem import FIRST_ROUGHNESS, Priors, Problem
-from dlo_casadi.estimation.unknowns import REST_TURNS_STD, Unknowns
+from dlo_casadi.estimation.unknowns import (
+    NO_INFORMATION,
+    REST_TURNS_STD,
+    Linearization,
+    Normal,
+    Point,
+    Unknowns,
+)
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import LEAST_NOISE_DEGREES

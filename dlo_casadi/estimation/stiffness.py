@@ -12,7 +12,7 @@ from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, stacked
-from dlo_casadi.estimation.unknowns import SearchSettings
+from dlo_casadi.estimation.start import SearchSettings
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of

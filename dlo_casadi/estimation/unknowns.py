@@ -1,8 +1,12 @@
-"""Unknowns of a fit with their Gaussian prior, and the settings of the search for them."""
+"""Unknowns of a fit with their Gaussian prior, and what a batch problem gives at their values.
+
+That is the objective and residuals, their Jacobians, and the normal equations of one Gauss-Newton
+step.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -11,6 +15,7 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.effects import Load
 from dlo_casadi.effects.cable import Parameter
+from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import STIFFNESS_RATIO_STD, STIFFNESSES, CableModel
 
 # Units of parameters that are the size of a load; others are places and directions.
@@ -23,6 +28,8 @@ LARGEST_REST = 20.0
 # Largest change of a logarithm in one step: a factor of 20. Without it, where shapes hardly
 # determine a stiffness, a step led to bounds at which rounding loses equilibria: 40 steps, not 7.
 FARTHEST = 3.0
+# Precision in scaled units below which a direction counts as undetermined.
+NO_INFORMATION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -224,51 +231,107 @@ class Unknowns:
 
 
 @dataclass(frozen=True)
-class SearchSettings:
-    """Settings of the search for the unknowns, in the plane or in space.
+class Values:
+    """Unknowns and shapes, whether in equilibrium or not.
 
     Parameters
     ----------
-    mesh : int
-        Number of elements; in space an element takes 17 times the operations.
-    std : float
-        Standard deviation of points over the length; 0 leaves it unchanged.
-    misfit : float
-        RMS distance over length above which the model lacks something.
-    other_minima : float
-        RMS distance over length above which the search may have found another minimum,
-        because every repeat has a rest curvature of its own.
-    decades : int
-        Range to both sides of the prior in the search for the stiffness alone.
-    predicts : bool
-        Whether poses lost on the way are predicted again, from their ends.
-    converged_first : bool
-        Whether noise is first estimated only at minima that have converged.
+    theta : (size,)
+    projections : list of (K_j,) [m]
+        Arc lengths at which the fitted poses' points are compared.
     """
 
-    mesh: int
-    std: float
-    misfit: float
-    other_minima: float
-    decades: int
-    predicts: bool
-    converged_first: bool
-
-    @classmethod
-    def of(cls, model: CableModel) -> SearchSettings:
-        """Settings for a model; with obstacles a prediction takes seconds per pose."""
-        found = IN_SPACE if model.in_space else IN_PLANE
-        return replace(found, decades=1, predicts=False) if model.surfaces else found
+    theta: FloatArray
+    shapes: Shapes
+    projections: list[FloatArray]
 
 
-# misfit: of 37 hidden sets two searches left 0.012 (a taper) and 0.06 (softening and a weight);
-# scores are useless there, and an estimated noise may absorb the effect. Real wires and bench
-# sessions left less than 0.0052.
-# other_minima: 16 of 26 sessions in the plane left less; a second search changed none of these.
-IN_PLANE = SearchSettings(20, 0.0, 0.01, 0.001, 3, predicts=True, converged_first=False)
-# std, a judgement: of three sessions in which an effect is missing, one (space_flat) also found its
-# minimum with the noise itself; at 3 mm two did, and one with a drift at neither.
-# misfit: searches left 0.0025 to 0.0083 in four sessions in which an effect is missing, 0.0008 to
-# 0.0013 in three with little or nothing missing. Either stiffness of such a fit may be far off (a
-# taper's torsion 0.0005 of 0.005 N m^2): the missing effect is searched from the measured shapes.
-IN_SPACE = SearchSettings(10, 0.004, 0.002, np.inf, 1, predicts=False, converged_first=True)
+@dataclass(frozen=True)
+class Point(Values):
+    """Unknowns and shapes with the objective and the residuals there.
+
+    Parameters
+    ----------
+    objective : float
+        Half the sum of squares, priors included.
+    data : float
+        Sum of squares of the whitened residuals alone.
+    residuals : list of (R_j,)
+        Whitened residuals of the fitted poses.
+    """
+
+    objective: float
+    data: float
+    residuals: list[FloatArray]
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Residuals and Jacobians of the data at a point.
+
+    Parameters
+    ----------
+    residuals : list of (R_j,)
+        Whitened residuals of the sensors, measured minus model.
+    by_theta : list of (R_j, size)
+        Derivative of the residuals.
+    by_deviation : list of (R_j, n_deviations)
+        Derivative by the pose's own deviations.
+    by_all : list of (R_j, fitted poses x n_deviations)
+        Derivative by the deviations of all fitted poses, if poses carry a state; else empty.
+    raw : list of (R_j,)
+        Residuals, not whitened.
+    raw_directions : list of (R_j, size + n_deviations)
+        Derivatives of the raw residuals.
+    shapes : Tangents
+        Derivatives of the equilibria, see `BatchEquilibrium.directions`.
+    """
+
+    residuals: list[FloatArray]
+    by_theta: list[FloatArray]
+    by_deviation: list[FloatArray]
+    by_all: list[FloatArray]
+    raw: list[FloatArray]
+    raw_directions: list[FloatArray]
+    shapes: Tangents
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations with the deviations eliminated: hessian @ step = -gradient.
+
+    `inner`: for each fitted pose the block of its own deviations, its coupling to theta, and its
+    gradient; of size zero if the model has no deviations.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    inner: list[tuple[FloatArray, FloatArray, FloatArray]]
+
+    def own_covariances(self, covariance: FloatArray) -> list[FloatArray]:
+        """Covariance of each fitted pose's own deviations, given that of theta (size, size)."""
+        out: list[FloatArray] = []
+        for block, cross, _ in self.inner:
+            inverse = np.linalg.inv(block)
+            arm = inverse @ cross
+            out.append(inverse + arm @ covariance @ arm.T)
+        return out
+
+    def promised(self, damping: float = 0.0) -> float:
+        """Decrease of the objective predicted for a damped step, deviations included."""
+        step = np.linalg.solve(self.damped(damping), self.gradient)
+        held = damping * self.scale @ step**2
+        own = (slope @ np.linalg.solve(block, slope) for block, _, slope in self.inner)
+        return float(self.gradient @ step + held) / 2 + float(sum(own)) / 2
+
+    @property
+    def scale(self) -> FloatArray:
+        """Diagonal of the Hessian, positive."""
+        return np.maximum(np.diag(self.hessian), 1e-12)
+
+    def damped(self, damping: float) -> FloatArray:
+        """Hessian for damped steps.
+
+        A direction without information, such as the place of a mass of zero, does not move.
+        """
+        return self.hessian + np.diag(damping * self.scale + NO_INFORMATION)

@@ -17,7 +17,7 @@ from dlo_casadi.estimation.scatter_likelihood import (
     ScatterSample,
     estimate_pose_scatter,
 )
-from dlo_casadi.estimation.unknowns import SearchSettings
+from dlo_casadi.estimation.start import SearchSettings
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, smooth_modes

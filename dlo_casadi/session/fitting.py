@@ -29,10 +29,10 @@ from dlo_casadi.estimation.fit import (
     fit_to_misfit,
     refine_mesh,
 )
-from dlo_casadi.estimation.point import Point
 from dlo_casadi.estimation.prediction import predicted_shapes
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
+from dlo_casadi.estimation.unknowns import Point
 from dlo_casadi.estimation.variances import first_reading_noise, refine
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel, Tolerances
 from dlo_casadi.paper.algorithm1 import Algorithm1Result, applies, run_algorithm1

@@ -21,11 +21,10 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances

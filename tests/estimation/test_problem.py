@@ -30,11 +30,10 @@ from dlo_casadi.estimation import fit as fit_module
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model, fit_to_misfit
-from dlo_casadi.estimation.point import Normal, Point, Values
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.unknowns import Normal, Point, Unknowns, Values
 from dlo_casadi.estimation.variances import scatter_of
 from dlo_casadi.model.assembly import Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances

@@ -13,12 +13,11 @@ from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.effects.effect import Load, SpringAt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.measured_shapes import measured_shapes
-from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.start import begin, relaxed, with_springs_in_place
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel

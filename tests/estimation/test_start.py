@@ -10,7 +10,6 @@ from test_relaxation import HELD, NOISE, ROLL, problem_of
 from dlo_casadi.effects import BendingAnisotropy, CableData, PointForce
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.measured_shapes import _along, measured_shapes
-from dlo_casadi.estimation.point import Values
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
@@ -21,7 +20,7 @@ from dlo_casadi.estimation.start import (
     relaxed,
     retry_outlying_poses,
 )
-from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel

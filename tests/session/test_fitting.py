@@ -12,9 +12,9 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import explains
-from dlo_casadi.estimation.point import Point
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.unknowns import Point
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import run_session
