@@ -269,5 +269,4 @@ class Search:
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         """The effects found, and whether they explain the data."""
         fit = fit if added or fit.noise.known else settle(fit)
-        used, significance = len(self.declared.problem.used), self.trials.significance
-        return Found.of(fit, added, ranked, used, significance)
+        return Found.of(fit, added, ranked, self.trials.significance)

@@ -158,14 +158,13 @@ class Found:
         fit: Fit,
         added: Sequence[AddedEffect],
         ranked: tuple[Ranked, ...],
-        poses: int,
         significance: float,
     ) -> Self:
-        """A fit with effects, and whether it explains what was measured in that number of poses."""
+        """A fit with effects, and whether it explains what was measured."""
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
         limit = UNSEEN * max(fit.expected_error, validation.expected)
         # One pose alone does not predict another one to first order of the covariance.
-        told = bool(added) or poses > 2
+        told = bool(added) or len(fit.problem.used) > 2
         unpredicted = told and validation.error_of_most > limit
         unexplained = structure.p_noise < significance or unpredicted
         unexplained |= fit.noise.source == "misfit"

@@ -126,7 +126,7 @@ def test_no_force_is_asked_for_where_shapes_lead_to_an_explanation(
     asked = []
     monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: asked.append(1))
     monkeypatch.setattr(module, "explains", lambda _: not from_shapes)
-    explained = Found.of(found.after, found.added, found.ranked, 12, 0.005)
+    explained = Found.of(found.after, found.added, found.ranked, 0.005)
     monkeypatch.setattr(Search, "run", lambda *_: explained)
     monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
     lost = replace(cross_validate(fit), squares=np.full(12, np.inf))
@@ -270,7 +270,7 @@ def test_ipopt_and_gauss_newton_reach_the_same_minimum(session):
 
 @pytest.mark.parametrize("scatter", [0.0, 0.3])
 def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, monkeypatch, scatter):
-    ended = Found.of(found.after, found.added, found.ranked, 12, 0.005)
+    ended = Found.of(found.after, found.added, found.ranked, 0.005)
     priors = replace(fit.problem.priors, pose_scatter=PoseScatter(scatter))
     own = replace(ended.fit, problem=replace(ended.fit.problem, priors=priors))
     searched = []
@@ -288,7 +288,7 @@ def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, mon
 
 def test_shapes_near_which_nothing_is_found_do_not_end_the_search(found, fit, monkeypatch):
     """A drift and a stretch left 1.64 times the noise; from the shapes none was significant."""
-    ended = Found.of(found.after, found.added, found.ranked, 12, 0.005)
+    ended = Found.of(found.after, found.added, found.ranked, 0.005)
     searched = []
 
     def run(search):

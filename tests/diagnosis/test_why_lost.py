@@ -150,6 +150,7 @@ def test_what_explains_the_data(error, p_noise, source, added, unexplained, monk
     monkeypatch.setattr(selection, "cross_validate", lambda _: told)
     monkeypatch.setattr(selection, "structure_of", lambda *_: SimpleNamespace(p_noise=p_noise))
     monkeypatch.setattr(selection, "noise_degrees", lambda _: np.inf)
-    fit = SimpleNamespace(expected_error=5e-4, noise=SimpleNamespace(source=source))
+    noise, problem = SimpleNamespace(source=source), SimpleNamespace(used=[0, 1])
+    fit = SimpleNamespace(expected_error=5e-4, noise=noise, problem=problem)
     effects = ["one"] * added
-    assert Found.of(fit, effects, (), poses=2, significance=0.005).unexplained is unexplained
+    assert Found.of(fit, effects, (), significance=0.005).unexplained is unexplained
