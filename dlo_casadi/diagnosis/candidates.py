@@ -106,8 +106,7 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
         prefix = f"{effect.label}."
         frees = tuple(prefix + q.name for q in effect.parameters(model.cable))
         if any(other.label == effect.label for other in model.effects):
-            held = all(name in model.priors for name in frees)
-            if held:
+            if all(name in model.priors for name in frees):
                 found.append(Candidate(effect, frees, frees, ({},), nuisance=True))
             continue
         scans = tuple(

@@ -132,16 +132,14 @@ def cross_validate(fit: Fit) -> CrossValidation:
     if len(fit.problem.used) == 1:
         return _stretches(fit)
     problem, lin = fit.problem, fit.linearization
-    thetas, covariances = [], []
-    total = fit.normal
+    steps, total = [], fit.normal
     for k, (block, cross, slope) in enumerate(total.inner):
         a, e = lin.by_theta[k], lin.residuals[k]
         solved = np.linalg.solve(block, np.column_stack([cross, slope]))
         h_j = a.T @ a - cross.T @ solved[:, :-1]
         g_j = a.T @ e - cross.T @ solved[:, -1]
-        theta, covariance = _without(fit, total.hessian - h_j, total.gradient - g_j)
-        thetas.append(theta)
-        covariances.append(covariance)
+        steps.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
+    thetas, covariances = zip(*steps, strict=True)
     predicted = _predicted(fit, dict(enumerate(thetas)))
     near = _at_own_deviations(fit, dict(enumerate(thetas)), predicted)
     linear = [
@@ -154,8 +152,7 @@ def cross_validate(fit: Fit) -> CrossValidation:
         # Such a fit misses most poses, and fits without each of them would take minutes.
         densities = [linear[k] if k in missed else x for k, x in enumerate(densities)]
         missed = []
-    anew = {k: _fitted_without(fit, k) for k in missed}
-    refitted = {k: theta for k, theta in anew.items() if theta is not None}
+    refitted = {k: z for k in missed if (z := _fitted_without(fit, k)) is not None}
     again = _predicted(fit, refitted)
     predicted |= again
     for k, seen in _at_own_deviations(fit, refitted, again).items():

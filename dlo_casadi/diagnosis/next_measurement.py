@@ -219,20 +219,18 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
         if 0.03 < reach / first.model.cable.length < 0.97:
             tried.append(replace(nearest, end=tuple(map(float, end)), name="next"))
     rivals = [predict_each(fit.model, fit.p, fit.rest_now, tried) for fit in (first, second)]
-    best: tuple[float, HeldPose, Prediction, Prediction] | None = None
+    clear: list[tuple[float, HeldPose, Prediction, Prediction]] = []
     for pose, one, other in zip(tried, *rivals, strict=True):
         if one is None or other is None:
             continue
         gap = one.curve.at(places) - other.curve.at(places)
         difference = float(np.sqrt((gap**2).sum(axis=1).mean()))
         # Above a tenth of the length the rivals are on different branches: not a clear test.
-        if difference > 0.1 * first.model.cable.length:
-            continue
-        if best is None or difference > best[0]:
-            best = (difference, pose, one, other)
-    if best is None:
+        if difference <= 0.1 * first.model.cable.length:
+            clear.append((difference, pose, one, other))
+    if not clear:
         return None
-    difference, pose, one, other = best
+    difference, pose, one, other = max(clear, key=lambda found: found[0])
     end = np.array(pose.end)
     place = tuple(round(float(x), 4) for x in end)
     # Seen like the fit pose whose end is nearest, at the arc lengths of its points.

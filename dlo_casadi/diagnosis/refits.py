@@ -259,11 +259,8 @@ def refit_with(base: Fit, screened: Screened, ceiling: float = np.inf) -> Fit | 
             best = fit
         gain = 2 * (base.point.objective - best.point.objective)
         hopeless += fit.point.objective > ceiling
-        if (
-            same
-            or hopeless == 2
-            or (gain > 0 and (best.converged or gain > PROMISED * screened.score))
-        ):
+        kept = gain > 0 and (best.converged or gain > PROMISED * screened.score)
+        if same or hopeless == 2 or kept:
             break
     return best
 

@@ -110,11 +110,9 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         block, cross, _ = normal.inner[k]
         solved = np.linalg.solve(block, np.column_stack([b.T, cross]))
-        covariance = np.eye(basis.shape[1]) - b @ solved[:, : len(b)]
-        a = a - b @ solved[:, len(b) :]
         coefficients.append(basis.T @ lin.residuals[k])
-        own.append(covariance)
-        arms.append(a)
+        own.append(np.eye(basis.shape[1]) - b @ solved[:, : len(b)])
+        arms.append(a - b @ solved[:, len(b) :])
     arm = np.concatenate(arms)
     covariance = block_diag(*own) - arm @ fit.covariance @ arm.T
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)

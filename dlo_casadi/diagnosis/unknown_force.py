@@ -1,6 +1,7 @@
 """A missing load without an assumed cause: where and how the cable is pulled, and by what load."""
 
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -72,11 +73,9 @@ def estimate_unknown_force(base: Fit, executor: Executor) -> UnknownForce | None
     length, name = model.cable.length, search.position
     best: Fit | None = None
     for fit in search.run(executor):
-        try:
+        with suppress(EstimationError):
             best = refit(fit, model, steps=MOST_STEPS)
             break
-        except EstimationError:
-            continue
     if best is None:
         return None
     columns = _columns(model)

@@ -325,8 +325,7 @@ def best_parameters(
         by_stiffness = -slopes.ravel() / (x[0] ** 2 * k_theta)
         return np.column_stack([by_stiffness, -np.tile(np.eye(joints), (m, 1))])
 
-    start, lower = np.concatenate([[1.0], theta_0]), np.full(joints + 1, -np.inf)
-    lower[0] = 1e-9
+    start, lower = np.append(1.0, theta_0), np.append(1e-9, np.full(joints, -np.inf))
     found = least_squares(residual, start, jac=jacobian, bounds=(lower, np.inf), method="trf")
     return float(found.x[0] * k_theta), found.x[1:]
 
