@@ -6,7 +6,7 @@ that others have made superfluous, or replaces them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -107,9 +107,8 @@ class Trials:
             near = self.relaxed if current is self.declared else from_data(current)
             return near_data(current, near, self.executor, self.listed, pairs=pairs)
         screened = self.first if current is self.declared else self.screened(current)
-        p_values = p_values_of(screened)
         known = self.refitted if current is self.declared else {}
-        return Tried(screened, p_values, self.leading(current, screened, p_values, known))
+        return Tried(screened, p_values_of(screened), self.leading(current, screened, known))
 
     def tried_as_causes(self, force: UnknownForce) -> Tried:
         """Refits of all loads at one place that explain the forces, whatever their scores.
@@ -135,7 +134,6 @@ class Trials:
         self,
         current: Fit,
         screened: Sequence[Screened],
-        p_values: Mapping[str, float],
         known: dict[str, Confirmed | None],
         beside: Fit | None = None,
     ) -> list[Confirmed]:
@@ -143,6 +141,7 @@ class Trials:
 
         `beside`: see `confirm`.
         """
+        p_values = p_values_of(screened)
         # A scatter from pose to pose may hide the effect: test the refit with what is left.
         significant = [
             x
@@ -213,17 +212,16 @@ def judged_again(
     before, name, label = cross_validate(smaller), effect.name, effect.candidate.effect.label
     rivals_only = {name, *(rival.name for rival in effect.rival_candidates)}
     screened = trials.screened(smaller, rivals_only if misfits(smaller) else None)
-    p_values = p_values_of(screened)
     own = [item for item in screened if item.candidate.effect.label == label]
     known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}
-    tried = trials.leading(smaller, screened, p_values, known, fit)
+    tried = trials.leading(smaller, screened, known, fit)
     chosen, _ = choose(tried, smaller, before, trials.doubt)
     others = tuple(item for item in chosen if item.name != name)
     if len(others) < len(chosen):
         effect = replace(effect, rivals=others)
     if not chosen or (chosen[0].name == name and own):
         return fit, effect
-    if found := _winner_added(trials, smaller, before, chosen, p_values, fit.log_evidence):
+    if found := _winner_added(trials, smaller, before, chosen, screened, fit.log_evidence):
         return found
     rivals = {item.name: item for item in (*effect.rivals, chosen[0]) if item.name != name}
     return fit, replace(effect, rivals=tuple(rivals.values()))
@@ -236,11 +234,10 @@ def in_its_place(
     label = effect.candidate.effect.label
     screened = [] if misfits(smaller) else trials.screened(smaller)  # in a misfit no score counts
     screened = [item for item in screened if item.candidate.effect.label != label]
-    p_values = p_values_of(screened)
-    tried = trials.leading(smaller, screened, p_values, {})
+    tried = trials.leading(smaller, screened, {})
     before = cross_validate(smaller)
     chosen, _ = choose(tried, smaller, before, trials.doubt)
-    found = _winner_added(trials, smaller, before, chosen, p_values, smaller.log_evidence)
+    found = _winner_added(trials, smaller, before, chosen, screened, smaller.log_evidence)
     return (found[0], [found[1]]) if found else (smaller, [])
 
 
@@ -249,14 +246,15 @@ def _winner_added(
     base: Fit,
     before: CrossValidation,
     chosen: Sequence[Confirmed],
-    p_values: Mapping[str, float],
+    screened: Sequence[Screened],
     least: float,
 ) -> tuple[Fit, AddedEffect] | None:
     """The best of the chosen refits, if it is significant and its log evidence above the least."""
     if not chosen:
         return None
     winner, *rivals = chosen
-    fit, p_value = with_new_noise(winner, base, p_values, trials.starts_at_shapes(base))
+    from_shapes = trials.starts_at_shapes(base)
+    fit, p_value = with_new_noise(winner, base, p_values_of(screened), from_shapes)
     with suppress(EstimationError):
         if fit.log_evidence > least and p_value <= trials.significance:
             (effect,) = added_by(winner, rivals, p_value, before, cross_validate(fit))

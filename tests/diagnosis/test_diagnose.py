@@ -313,14 +313,14 @@ def test_only_rivals_of_the_same_search_tell_which_refit_is_given_up(monkeypatch
     monkeypatch.setattr(refits, "loads_from_best", lambda *_: [])
 
     def scored(name):
-        return SimpleNamespace(candidate=SimpleNamespace(name=name), score=100.0)
+        return SimpleNamespace(candidate=SimpleNamespace(name=name), score=100.0, p_value=0.0)
 
     screened = [scored("known"), scored("new")]
     among = SimpleNamespace(executor=InProcess(), significance=0.01)
     fit = SimpleNamespace(point=SimpleNamespace(objective=300.0), scatters=False)
-    confirmed, p_values = SimpleNamespace(fit=fit), {"known": 0.0, "new": 0.0}
-    Trials.leading(among, fit, screened, p_values, {"known": confirmed})
-    Trials.leading(among, fit, screened[1:], p_values, {"excluded": confirmed})
+    confirmed = SimpleNamespace(fit=fit)
+    Trials.leading(among, fit, screened, {"known": confirmed})
+    Trials.leading(among, fit, screened[1:], {"excluded": confirmed})
     assert ceilings == [600.0, np.inf]
 
 
