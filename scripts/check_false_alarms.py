@@ -340,7 +340,7 @@ def run_one(index: int, seed: int, scatter: bool) -> dict:
     fit = fit_declared(config, declared_model(config), measured)
     fitted = time.perf_counter()
     diagnosis = diagnose(fit, finest=SEARCH_MESH)
-    interval = profile_intervals(diagnosis.after)["bending_stiffness"]
+    interval = profile_intervals(diagnosis.fit)["bending_stiffness"]
     return {
         "right": not diagnosis.added and diagnosis.verdict != "unexplained",
         "session": config.cable.name,
@@ -348,7 +348,7 @@ def run_one(index: int, seed: int, scatter: bool) -> dict:
         "added": [item.candidate.name for item in diagnosis.added],
         "n": fit.model.n,
         "inside": within((interval.low, interval.high), stiffness),
-        "in_band": in_band(diagnosis.after, measured),
+        "in_band": in_band(diagnosis.fit, measured),
         "fit_seconds": fitted - begin,
         "diagnosis_seconds": time.perf_counter() - fitted,
     }

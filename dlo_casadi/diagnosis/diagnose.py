@@ -135,15 +135,10 @@ class Search:
             for x in found.added
         )
         return Diagnosis(
+            **vars(replace(found, added=tuple(added))),
             before=fit,
-            after=found.fit,
             validation_before=trials.validation,
-            validation_after=found.validation,
             structure_before=structure_of(fit, screening_degrees(fit)),
-            structure_after=found.structure,
-            added=tuple(added),
-            ranked=found.ranked,
-            unexplained=found.unexplained,
             unknown_force=force if found.unexplained else None,
             weight=None if found.unexplained else hidden_weight(found.fit, trials.exclude),
         )

@@ -102,48 +102,18 @@ class HiddenWeight:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
-    """Result of a search for missing effects.
+class Found:
+    """Result of one search.
 
     Parameters
     ----------
-    before, after : Fit
-        The declared model, and the model with the effects that were added.
-    validation_before, validation_after : CrossValidation
-    structure_before, structure_after : Structure
+    fit : Fit
+        The model with the effects that were added.
     ranked : tuple of Ranked
         All candidates of the first step: the refitted ones by `support`, then the others by score.
     unexplained : bool
         Whether structure is left, or most left-out poses are not predicted.
-    unknown_force : UnknownForce or None
-        If unexplained: the load that assumes no cause; None if no load fits.
-    weight : HiddenWeight or None
-        Hidden weight that the fit would not notice.
     """
-
-    before: Fit
-    after: Fit
-    validation_before: CrossValidation
-    validation_after: CrossValidation
-    structure_before: Structure
-    structure_after: Structure
-    added: tuple[AddedEffect, ...] = ()
-    ranked: tuple[Ranked, ...] = ()
-    unexplained: bool = False
-    unknown_force: UnknownForce | None = None
-    weight: HiddenWeight | None = None
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the model is complete, an effect was found, or neither explains the data."""
-        if self.unexplained:
-            return "unexplained"
-        return "effect_found" if self.added else "complete"
-
-
-@dataclass(frozen=True)
-class Found:
-    """Result of one search."""
 
     fit: Fit
     added: tuple[AddedEffect, ...]
@@ -152,14 +122,10 @@ class Found:
     structure: Structure
     unexplained: bool
 
-    @classmethod
+    @staticmethod
     def of(
-        cls,
-        fit: Fit,
-        added: Sequence[AddedEffect],
-        ranked: tuple[Ranked, ...],
-        significance: float,
-    ) -> Self:
+        fit: Fit, added: Sequence[AddedEffect], ranked: tuple[Ranked, ...], significance: float
+    ) -> "Found":
         """A fit with effects, and whether it explains what was measured."""
         validation, structure = cross_validate(fit), structure_of(fit, noise_degrees(fit))
         limit = UNSEEN * max(fit.expected_error, validation.expected)
@@ -168,7 +134,7 @@ class Found:
         unpredicted = told and validation.error_of_most > limit
         unexplained = structure.p_noise < significance or unpredicted
         unexplained |= fit.noise.source == "misfit"
-        return cls(fit, tuple(added), ranked, validation, structure, unexplained)
+        return Found(fit, tuple(added), ranked, validation, structure, unexplained)
 
     def or_better(self, other: Self | None, margin: float = 0.0) -> Self:
         """The other search's result if only that explains the data, or better; else this one.
@@ -212,6 +178,36 @@ class Found:
     def _sets(self, candidates: int) -> float:
         """Log of the number of sets of this many effects, all taken as equally likely."""
         return log(comb(candidates, min(len(self.added), candidates)))
+
+
+@dataclass(frozen=True)
+class Diagnosis(Found):
+    """Result of a search for missing effects, and the declared model before it.
+
+    Parameters
+    ----------
+    before : Fit
+        The declared model.
+    validation_before : CrossValidation
+    structure_before : Structure
+    unknown_force : UnknownForce or None
+        If unexplained: the load that assumes no cause; None if no load fits.
+    weight : HiddenWeight or None
+        Hidden weight that the fit would not notice.
+    """
+
+    before: Fit
+    validation_before: CrossValidation
+    structure_before: Structure
+    unknown_force: UnknownForce | None
+    weight: HiddenWeight | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the model is complete, an effect was found, or neither explains the data."""
+        if self.unexplained:
+            return "unexplained"
+        return "effect_found" if self.added else "complete"
 
 
 def likelier_by(fit: Fit, other: Fit) -> float:

@@ -298,8 +298,8 @@ def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
         FoundEffect(
             name=item.candidate.name,
             label=item.candidate.effect.label,
-            of=_support(diagnosis.after, item.candidate.effect),
-            parameters=effect_parameters(diagnosis.after, item.candidate.effect),
+            of=_support(diagnosis.fit, item.candidate.effect),
+            parameters=effect_parameters(diagnosis.fit, item.candidate.effect),
             p_value=item.p_value,
             rmse_cross_validated_before=item.before.rmse if item.before.complete else None,
             rmse_cross_validated_after=item.after.rmse,

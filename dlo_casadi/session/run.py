@@ -192,12 +192,12 @@ class _Run:
             finest=None if kept_mesh else SEARCH_MESH,
         )
         unknown = diagnosis.unexplained and not diagnosis.added
-        fit = nearest if unknown and nearest is not declared else diagnosis.after
+        fit = nearest if unknown and nearest is not declared else diagnosis.fit
         fit = self.meshed(fit, SETTLED_MODES)
         confirming = (
             begin(self.executor, fitting.minimum_by_ipopt, fit) if diagnosis.added else None
         )
-        next_pose = separating_pose(diagnosis.after, diagnosis.added)
+        next_pose = separating_pose(diagnosis.fit, diagnosis.added)
         if diagnosis.unexplained or (nearest.noise.source == "misfit" and diagnosis.added):
             stages[-1] = _marked(stages[-1], explains=False)
         elif diagnosis.added:
@@ -216,8 +216,8 @@ class _Run:
                 own = fit_stage("closed", best, measured, profile_intervals(best), names)
             fit = best
             stages.append(own)
-        diagnosis = replace(diagnosis, after=fit)
-        validated = diagnosis.validation_after
+        diagnosis = replace(diagnosis, fit=fit)
+        validated = diagnosis.validation
         told = validated.complete and not diagnosis.added
         self.seconds["diagnosis"] = time.perf_counter() - began
         found = {
@@ -226,7 +226,7 @@ class _Run:
             "candidates": diagnosis.ranked,
             "unexplained": diagnosis.unknown_force,
             "next_pose": next_pose,
-            "structure": (diagnosis.structure_before, diagnosis.structure_after),
+            "structure": (diagnosis.structure_before, diagnosis.structure),
             "cross_validated": validated.rmse if told else None,
             "hidden_weight": diagnosis.weight,
         }

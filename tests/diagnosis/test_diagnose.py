@@ -82,7 +82,7 @@ def test_held_out_poses_are_not_looked_at(session, found):
     assert found.added
     assert [a.candidate.name for a in found.added] == [a.candidate.name for a in again.added]
     assert found.ranked == again.ranked
-    assert found.after.p == pytest.approx(again.after.p, rel=1e-12)
+    assert found.fit.p == pytest.approx(again.fit.p, rel=1e-12)
 
 
 @pytest.mark.long
@@ -93,7 +93,7 @@ def test_without_the_cause_nothing_false_is_claimed(fit):
     # What is left is smaller with a force in each pose, all at one place.
     assert found.unknown_force is not None
     assert 0 < found.unknown_force.position < fit.model.cable.length
-    assert found.unknown_force.fit.chi2_per_dof < found.after.chi2_per_dof
+    assert found.unknown_force.fit.chi2_per_dof < found.fit.chi2_per_dof
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_no_force_is_asked_for_where_shapes_lead_to_an_explanation(
     asked = []
     monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: asked.append(1))
     monkeypatch.setattr(module, "explains", lambda _: not from_shapes)
-    explained = Found.of(found.after, found.added, found.ranked, 0.005)
+    explained = Found.of(found.fit, found.added, found.ranked, 0.005)
     monkeypatch.setattr(Search, "run", lambda *_: explained)
     monkeypatch.setattr(Search, "of_simpler_effects", lambda *_: None)
     lost = replace(cross_validate(fit), squares=np.full(12, np.inf))
@@ -251,7 +251,7 @@ def test_a_clean_cable_with_a_pose_at_a_fold_is_complete():
 
 def test_structure_is_seen_before_and_not_after(fit, found):
     assert structure_of(fit, screening_degrees(fit)).p_value < 1e-6
-    assert found.structure_after.p_value > 0.005
+    assert found.structure.p_value > 0.005
 
 
 def test_ipopt_and_gauss_newton_reach_the_same_minimum(session):
@@ -270,7 +270,7 @@ def test_ipopt_and_gauss_newton_reach_the_same_minimum(session):
 
 @pytest.mark.parametrize("scatter", [0.0, 0.3])
 def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, monkeypatch, scatter):
-    ended = Found.of(found.after, found.added, found.ranked, 0.005)
+    ended = Found.of(found.fit, found.added, found.ranked, 0.005)
     priors = replace(fit.problem.priors, pose_scatter=PoseScatter(scatter))
     own = replace(ended.fit, problem=replace(ended.fit.problem, priors=priors))
     searched = []
@@ -288,7 +288,7 @@ def test_what_a_scatter_explains_is_searched_from_the_shapes_too(found, fit, mon
 
 def test_shapes_near_which_nothing_is_found_do_not_end_the_search(found, fit, monkeypatch):
     """A drift and a stretch left 1.64 times the noise; from the shapes none was significant."""
-    ended = Found.of(found.after, found.added, found.ranked, 0.005)
+    ended = Found.of(found.fit, found.added, found.ranked, 0.005)
     searched = []
 
     def run(search):

@@ -69,8 +69,8 @@ def test_a_plastic_set_is_found_beside_a_drift():
     assert found.verdict == "effect_found"
     assert named(found) == {"plastic_set"}
     # A cell of 80 mm has one mean bend, on one side of the yield: 14 %; with half of it 6 %.
-    assert found.after.value("plastic_set.yield_curvature") == pytest.approx(3.0, rel=0.2)
-    assert found.after.value("plastic_set.share") == pytest.approx(0.3, rel=0.2)
+    assert found.fit.value("plastic_set.yield_curvature") == pytest.approx(3.0, rel=0.2)
+    assert found.fit.value("plastic_set.share") == pytest.approx(0.3, rel=0.2)
 
 
 @pytest.mark.long
@@ -90,7 +90,7 @@ def test_a_tether_is_found_and_is_no_point_force():
     assert named(found) == {"tether"}
     for name, true in zip(("stiffness", "position", "anchor_x", "anchor_y"), TETHER, strict=True):
         key = f"tether.{name}"
-        assert abs(found.after.value(key) - true) < 3 * found.after.std(key)
+        assert abs(found.fit.value(key) - true) < 3 * found.fit.std(key)
 
 
 def test_wrong_causes_beside_an_unexplained_residual_are_withdrawn(monkeypatch):
@@ -100,8 +100,8 @@ def test_wrong_causes_beside_an_unexplained_residual_are_withdrawn(monkeypatch):
     found = diagnose(fit, exclude=rivals_of("point_force", "stiff_section"))
     assert found.verdict == "unexplained"
     assert found.added == ()
-    assert found.validation_after.rmse == pytest.approx(found.validation_before.rmse)
-    assert found.structure_after.p_value < 0.005
+    assert found.validation.rmse == pytest.approx(found.validation_before.rmse)
+    assert found.structure.p_value < 0.005
     assert {row.name for row in found.ranked} == {"point_force", "stiff_section"}
     assert all(row.rmse_cross_validated for row in found.ranked)  # all were refitted
 

@@ -53,8 +53,8 @@ def test_a_wrong_standoff_is_found_and_not_taken_for_a_scale(config, cameras):
     found = diagnose(fit, exclude=OTHERS)
     assert [item.candidate.name for item in found.added] == ["standoff_error"]
     name = "standoff_error.distance"
-    assert abs(found.after.value(name) - DISTANCE) < 3 * found.after.std(name)
-    assert found.after.std(name) < 0.2 * DISTANCE  # it would not be found otherwise
+    assert abs(found.fit.value(name) - DISTANCE) < 3 * found.fit.std(name)
+    assert found.fit.std(name) < 0.2 * DISTANCE  # it would not be found otherwise
     assert "image_scale" not in found.added[0].rivals
     assert found.verdict == "effect_found"
 
