@@ -141,8 +141,7 @@ class _BatchNlp:
     def _assemble(self) -> None:
         """NLP, gradient, Jacobian and Hessian from the poses' blocks."""
         problem, m = self.problem, self.m
-        unknowns, model = problem.unknowns, problem.equilibria.model
-        size, n_z, n_rows = unknowns.size, self.n_z, self.n_rows
+        size, n_z, n_rows = problem.unknowns.size, self.n_z, self.n_rows
         x = ca.MX.sym("x", size + self.stride * m)
         factor = ca.MX.sym("factor", n_rows, n_z * len(problem.used))
         target = ca.MX.sym("target", n_rows, len(problem.used))
@@ -175,21 +174,16 @@ class _BatchNlp:
             whitened = block @ jacobian
             squares[c] = whitened.T @ whitened
             squares[c] += ca.diag(ca.vertcat(pick, ca.DM.zeros(size)))
-        constraints, rows = [ca.vec(balance)], [self._blocks(slopes[0])]
-        if model.has_state:
-            carried, row = self._carry(theta, own, after, slopes[2])
-            constraints.append(carried)
-            rows.append(row)
-        g = ca.vertcat(*constraints)
+        carried, by_carried = self._carry(theta, own, after, slopes[2])
+        g = ca.vertcat(ca.vec(balance), carried)
+        jac_g = ca.vertcat(self._blocks(slopes[0]), by_carried)
 
         lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", g.numel())
         n_balance = self.n_x + self.n_lam
         of_balance = ca.reshape(lam_g[: n_balance * m], n_balance, m)
-        of_after = ca.MX.zeros(self.n_rest, m)
-        if model.has_state:
-            # Row block j + 1 of the carried constraints subtracts what pose j leaves behind.
-            later = ca.reshape(lam_g[n_balance * m :], self.n_rest, m)[:, 1:]
-            of_after = ca.horzcat(-later, ca.MX.zeros(self.n_rest, 1))
+        # Row block j + 1 of the carried constraints subtracts what pose j leaves behind.
+        later = ca.reshape(lam_g[n_balance * m :], self.n_rest, m)[:, 1:]
+        of_after = ca.horzcat(-later, ca.MX.zeros(self.n_rest, 1))
         bends = self.bend.map(m)(
             own, thetas, fixed, of_balance, lam_f * ca.horzcat(*pulls), of_after
         )
@@ -211,7 +205,7 @@ class _BatchNlp:
                 "no_nlp_grad": True,
                 "calc_lam_p": False,
                 "grad_f": ca.Function("grad_f", [x, p], [objective, ca.vertcat(by_theta, *by_own)]),
-                "jac_g": ca.Function("jac_g", [x, p], [g, ca.vertcat(*rows)]),
+                "jac_g": ca.Function("jac_g", [x, p], [g, jac_g]),
                 "hess_lag": ca.Function("hess_lag", [x, p, lam_f, lam_g], [ca.triu(hessian)]),
                 "ipopt.print_level": 0,
                 "ipopt.sb": "yes",
@@ -234,10 +228,13 @@ class _BatchNlp:
         return ca.horzcat(thetas, owns)
 
     def _carry(self, theta: ca.MX, own: ca.MX, after: ca.MX, slopes: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Rest curvature that each pose finds minus that left by the pose before; its Jacobian."""
+        """Rest curvature that each pose finds minus that left by the pose before; its Jacobian.
+
+        Both have no rows if the model carries no state.
+        """
         m, unknowns = self.m, self.problem.unknowns
         scale = unknowns.model.cable.curvature_scale
-        first = ca.DM(unknowns.rest_slopes) / scale
+        first = ca.DM(unknowns.rest_slopes)[: self.n_rest, :] / scale
         begins = own[self.stride - self.n_rest :, :] / scale
         gap = ca.vec(begins - ca.horzcat(first @ theta, after[:, :-1]))
         select = ca.DM.zeros(self.n_rest, self.stride)
