@@ -17,12 +17,7 @@ from dlo_casadi.equilibrium.spread import Repeats
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import student_95
 from dlo_casadi.estimation.descent import refit
-from dlo_casadi.estimation.prediction import (
-    Prediction,
-    predict_each,
-    predict_poses,
-    uncertainty_of,
-)
+from dlo_casadi.estimation.prediction import Prediction, predict_each, predict_poses, uncertainty_of
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.rod.ends import reaction_rows

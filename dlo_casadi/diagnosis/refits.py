@@ -29,12 +29,7 @@ from dlo_casadi.diagnosis.from_data import (
     left_without,
     priors_without_scatter,
 )
-from dlo_casadi.diagnosis.screening import (
-    Screen,
-    Screened,
-    in_order,
-    survival,
-)
+from dlo_casadi.diagnosis.screening import Screen, Screened, in_order, survival
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, places_in, start_from
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
