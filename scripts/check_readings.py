@@ -139,7 +139,7 @@ def clean(generator) -> dict:
     measured, stiffness = drawn(config, generator)
     fit = fit_declared(config, declared_model(config), measured)
     diagnosis = diagnose(fit)
-    after, _ = fine_enough(diagnosis.fit, diagnosis.fit.model.n)
+    after = fine_enough(diagnosis.fit, diagnosis.fit.model.n)
     interval = profile_intervals(after)["bending_stiffness"]
     return {
         "added": [item.candidate.name for item in diagnosis.added],

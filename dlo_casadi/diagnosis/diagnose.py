@@ -16,7 +16,6 @@ from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     at_random_instead,
     bends_at_random,
-    enough_poses,
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
@@ -36,6 +35,7 @@ from dlo_casadi.diagnosis.trials import Trials, pruned
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import explains
+from dlo_casadi.estimation.repeats import enough_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.runtime.executors import InProcess
@@ -114,7 +114,8 @@ class Search:
         """Result of the search, without effects that explain too little."""
         trials, force = self.trials, None
         fit = trials.declared
-        misfit = fit.noise.source == "misfit" and enough_poses(fit)
+        many = enough_poses(fit.problem.history, fit.model)
+        misfit = fit.noise.source == "misfit" and many
         near = with_loose_poses(fit, trials.relaxed[0], trials.finest) if misfit else None
         if near is not None:
             return self.beginning_with(declared=near).diagnosis()

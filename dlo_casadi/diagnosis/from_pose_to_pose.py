@@ -9,23 +9,17 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import explains, fine_enough, refine_mesh
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
-from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import fit_from, relaxed
 from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.estimation.variances import pose_scatter_of, refine
 from dlo_casadi.model.pose_scatter import PoseScatter, sources_in
-from dlo_casadi.thresholds import DIFFERENT, EVIDENCE_APART
+from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Standard deviations of what is loose in each pose: of a place or a length, as a share of the
 # length; of a clamp's turns [rad]; of the curvature by a pin's moment, in 1 / length. A judgement:
 # a setup in which they differ more is a broken one.
 LOOSE_PLACE, LOOSE_TURN, LOOSE_BEND = 0.02, 0.1, 1.0
-
-
-def enough_poses(fit: Fit) -> bool:
-    """Whether there are enough different poses to show what differs between them."""
-    return different_poses(fit.problem.history, fit.model) >= DIFFERENT
 
 
 def as_repeating(fit: Fit) -> Fit:
@@ -84,7 +78,7 @@ def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit |
         found = None if fit is None else at_random(fit)
         if found is not None:
             n = misfit.model.n
-            found = fine_enough(found, found.model.n, finest=finest)[0] if finest else found
+            found = fine_enough(found, found.model.n, finest=finest) if finest else found
             found = found if finest or found.model.n == n else refine_mesh(found, n)
             if found.problem.random_std.any() and explains(found):
                 return found
@@ -119,6 +113,6 @@ def at_random_instead(misfit: Fit, found: Found, finest: int | None = None) -> F
         return None
     if finest:
         n = max(near.model.n, min(found.fit.model.n, finest))
-        near = fine_enough(near, n, finest=finest)[0]
+        near = fine_enough(near, n, finest=finest)
     likelier = found.unexplained or likelier_by(found.fit, near) > -EVIDENCE_APART
     return near if likelier and explains(near) else None

@@ -11,13 +11,12 @@ from scipy.special import ndtri
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.screening import sidak, survival
 from dlo_casadi.estimation.prediction import noise_distance
-from dlo_casadi.estimation.repeats import different_poses, repeatability
+from dlo_casadi.estimation.repeats import enough_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import pose_scatter_of
 from dlo_casadi.sensing.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.thresholds import (
     ALIKE,
-    DIFFERENT,
     KEPT_INFORMATION,
     KEPT_VARIANCE,
     LEAST_NOISE_DEGREES,
@@ -205,7 +204,7 @@ def _ranks(x: FloatArray) -> FloatArray:
 
 def limiting_spread(fit: Fit) -> float | None:
     """Difference between repeats [m] if it is what limits a prediction, else None."""
-    if different_poses(fit.problem.history, fit.model) >= DIFFERENT:
+    if enough_poses(fit.problem.history, fit.model):
         return None
     spread = repeatability(fit.problem.history, fit.model)
     if spread is None or fit.noise.source == "repeats":

@@ -163,7 +163,7 @@ class Trials:
         """A fit with effects on a sufficiently fine mesh, if the mesh may be refined."""
         if self.finest is None:
             return fit
-        return fine_enough(fit, fit.model.n, SETTLED_MODES, finest or self.finest)[0]
+        return fine_enough(fit, fit.model.n, SETTLED_MODES, finest or self.finest)
 
 
 def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:

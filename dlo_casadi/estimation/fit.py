@@ -14,7 +14,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import MISFIT_GAIN, descend, on_other_mesh, refit
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem
-from dlo_casadi.estimation.repeats import different_poses, with_repeats
+from dlo_casadi.estimation.repeats import enough_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import SearchSettings, begin, fit_from, weighed
 from dlo_casadi.estimation.unknowns import Unknowns
@@ -30,7 +30,7 @@ from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
-from dlo_casadi.thresholds import DIFFERENT, LACKING_SHARE, MESH_SHARE, RESTING_APART, RESTING_NOISE
+from dlo_casadi.thresholds import LACKING_SHARE, MESH_SHARE, RESTING_APART, RESTING_NOISE
 
 # Std of points over length used as weight in a fit whose model cannot meet them any better.
 MISFIT_STD = 0.01
@@ -108,9 +108,8 @@ def fit_model(
     if not refined:
         return fit
     fit = fit_to_misfit(fit) if misfits(fit) else refine(fit, first=True)
-    different = different_poses(measured, model)
     doubtful = fit.residual_rms > SearchSettings.of(model).other_minima * model.cable.length
-    if different >= DIFFERENT and fit.beyond_noise and doubtful:
+    if enough_poses(measured, model) and fit.beyond_noise and doubtful:
         # A fit that trusts each line to its noise distorts rest shape and stiffness to fit whatever
         # is left: search again with a rest curvature of its own for each repeat.
         scatter = PoseScatter(FIRST_REST_TURNS * model.cable.curvature_scale)
@@ -241,10 +240,8 @@ def mesh_error(fit: Fit) -> float:
     return 4 / 3 * worst
 
 
-def fine_enough(
-    fit: Fit, n: int, modes: int = SMOOTH_MODES, finest: int = FINEST_MESH
-) -> tuple[Fit, float]:
-    """Refine a fit's mesh, from n elements on, until its error [m] is far below the noise.
+def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES, finest: int = FINEST_MESH) -> Fit:
+    """Refine a fit's mesh, from n elements on, until its error is far below the noise.
 
     The noise is estimated again once a mesh is fine enough. If an effect is missing, the mesh error
     need only be small against the misfit.
@@ -269,7 +266,7 @@ def fine_enough(
             finer = n * np.clip((error / allowed) ** (1 / order), 1.2, 2.0)
             n = min(2 * int(np.ceil(finer / 2)), largest)
         elif fit is known:
-            return fit, error
+            return fit
         else:
             try:
                 fit = known = refine(fit, rounds=2, modes=modes)
@@ -278,7 +275,7 @@ def fine_enough(
     if fit is not known:
         with suppress(EstimationError):
             known = refine(fit, rounds=2, modes=modes)
-    return known, mesh_error(known)
+    return known
 
 
 def allowed_mesh_error(fit: Fit) -> float:

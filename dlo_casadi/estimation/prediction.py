@@ -21,13 +21,12 @@ from dlo_casadi.equilibrium.solve import (
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.problem import Problem
-from dlo_casadi.estimation.repeats import different_poses, repeat_std
+from dlo_casadi.estimation.repeats import enough_poses, repeat_std
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.thresholds import DIFFERENT
 
 # Further values of `turns` that may choose the equilibrium in which a pose was measured.
 WHOLE_TURNS = (1.0, -1.0)
@@ -358,6 +357,6 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     own = fit.model.deviations  # random ones of the problem's poses follow these
     scatter = dict(zip(own, map(float, fit.problem.fixture_std[: len(own)]), strict=True))
     history, apart = fit.problem.history, 0.0
-    if different_poses(history, fit.model) < DIFFERENT:
+    if not enough_poses(history, fit.model):
         apart = repeat_std(history, fit.model, fit.noise.of_points.beside_repeats)
     return Uncertainty(names, covariance, scatter, fit.problem.priors.pose_scatter, apart)

@@ -92,6 +92,11 @@ def different_poses(measured: Sequence[MeasuredPose], model: CableModel) -> int:
     return len(_held_alike(measured, model))
 
 
+def enough_poses(measured: Sequence[MeasuredPose], model: CableModel) -> bool:
+    """Whether there are enough different poses to show what differs between them."""
+    return different_poses(measured, model) >= DIFFERENT
+
+
 def with_repeats(
     noise: NoiseModel, measured: Sequence[MeasuredPose], model: CableModel
 ) -> NoiseModel:
@@ -108,7 +113,7 @@ def with_repeats(
     ----------
     Draper and Smith, Applied Regression Analysis, section 2.1.
     """
-    if different_poses(measured, model) >= DIFFERENT:
+    if enough_poses(measured, model):
         return noise  # differences between repeats are then modelled by `pose_scatter`
     spread = repeatability(measured, model)
     if spread is None or spread <= REPEATS_ARE_NOISE * noise.std:

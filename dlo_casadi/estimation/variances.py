@@ -8,7 +8,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EstimationError, counted
 from dlo_casadi.estimation.descent import NEARLY, descend
-from dlo_casadi.estimation.repeats import different_poses, with_repeats
+from dlo_casadi.estimation.repeats import enough_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.scatter_likelihood import (
     MOST_POSES,
@@ -22,7 +22,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, smooth_modes
 from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
-from dlo_casadi.thresholds import DIFFERENT, SCATTER_APART, SCATTERED, SCATTERED_DEGREES
+from dlo_casadi.thresholds import SCATTER_APART, SCATTERED, SCATTERED_DEGREES
 
 # Number of slow displacements per pose kept out of the noise estimate: many while an effect may be
 # missing, few once the model is taken as complete, because noise is also slow.
@@ -193,7 +193,7 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
 
 def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
     """Likeliest random quantity of each repeat and its size; see `estimate_pose_scatter`."""
-    if different_poses(fit.problem.history, fit.model) < DIFFERENT:
+    if not enough_poses(fit.problem.history, fit.model):
         return ScatterEstimate(PoseScatter(), 1.0, 1.0, 0.0)
     (found,) = _scatters_of(fit, noise, [PoseScatter()])
     if found.scatter.std == 0 and not (fit.beyond_noise or _beyond_tolerances(fit)):

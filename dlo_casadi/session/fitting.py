@@ -177,7 +177,7 @@ def fit_declared(config: Config, declared: Declared, measured: Sequence[Measured
         values=declared.start,
         readings=first_reading_noise(model, measurement.force_std, measurement.moment_std),
     )
-    return refine_mesh(fit, finest) if finest else fine_enough(fit, first)[0]
+    return refine_mesh(fit, finest) if finest else fine_enough(fit, first)
 
 
 def first_mesh(model: CableModel) -> int:

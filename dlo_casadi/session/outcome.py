@@ -19,13 +19,12 @@ from dlo_casadi.diagnosis.selection import Diagnosis, HiddenWeight, Ranked, Verd
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.effects import Effect
-from dlo_casadi.estimation.repeats import different_poses, repeatability
+from dlo_casadi.estimation.repeats import enough_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.rod.obstacles import Obstacle
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
-from dlo_casadi.thresholds import DIFFERENT
 
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
 # Name of the cable's mass among a stage's parameters.
@@ -392,7 +391,7 @@ class Outcome:
     def repeatability(self) -> Repeatability:
         """How well the cable returns to the same shape."""
         history, model = self.fit.problem.history, self.fit.model
-        if different_poses(history, model) >= DIFFERENT:
+        if enough_poses(history, model):
             return Repeatability(float(np.sqrt(2) * self.fit.repeat_error), "poses")
         spread = repeatability(history, model)
         return Repeatability(spread or 0.0, None if spread is None else "repeats")

@@ -11,12 +11,13 @@ import numpy as np
 from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.from_data import from_data
-from dlo_casadi.diagnosis.from_pose_to_pose import at_random, enough_poses, with_loose_poses
+from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_loose_poses
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
 from dlo_casadi.estimation.fit import SEARCH_MESH, fine_enough, mesh_error, refine_mesh
 from dlo_casadi.estimation.prediction import noise_distance
+from dlo_casadi.estimation.repeats import enough_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, SMOOTH_MODES
 from dlo_casadi.model.cable_model import CableModel
@@ -132,7 +133,7 @@ class _Run:
         own = own if best.point is fit.point else staged(best)
         fit = fitting.not_worse(best, [*stages, own])
         if not diagnosed:
-            if fit.noise.source == "misfit" and enough_poses(fit):
+            if fit.noise.source == "misfit" and enough_poses(fit.problem.history, fit.model):
                 near = with_loose_poses(fit, from_data(fit)[0]) or at_random(fit)
                 fit = fit if near is None else self.meshed(near)
             fit = as_measured(fit)
@@ -234,7 +235,7 @@ class _Run:
 
     def meshed(self, fit: Fit, modes: int = SMOOTH_MODES) -> Fit:
         """The fit on a fine enough mesh, or as it is on the declared one."""
-        return fit if self.config.model.n else fine_enough(fit, fit.model.n, modes)[0]
+        return fit if self.config.model.n else fine_enough(fit, fit.model.n, modes)
 
     def confirmed(self, fit: Fit, confirming: Callable[[], fitting.Minimum]) -> Fit:
         """Compare a fit with the minimum that IPOPT has found in the meantime."""

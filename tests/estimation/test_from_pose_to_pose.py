@@ -15,7 +15,6 @@ from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     bends_at_random,
-    enough_poses,
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.refits import confirm
@@ -28,6 +27,7 @@ from dlo_casadi.equilibrium.spread import Repeats, Uncertainty
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.constrained import EnergyGap, profile_interval
 from dlo_casadi.estimation.descent import descend
+from dlo_casadi.estimation.repeats import enough_poses
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, effect_of, sources_in
@@ -204,8 +204,8 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
     interval = profile_interval(near)
     assert interval.low < found.values["bending_stiffness"] < interval.high
     few = replace(near.problem, history=near.problem.history[: DIFFERENT - 1])
-    assert enough_poses(fit)
-    assert not enough_poses(SimpleNamespace(problem=few, model=near.model))
+    assert enough_poses(fit.problem.history, fit.model)
+    assert not enough_poses(few.history, near.model)
 
 
 @pytest.fixture(scope="module")

@@ -89,6 +89,5 @@ def test_noise_is_estimated_on_the_last_mesh(lost, found, monkeypatch):
     monkeypatch.setattr(fitting, "refine", refine)
     monkeypatch.setattr(fitting, "mesh_error", lambda near: 1 / near.model.n**2)
     monkeypatch.setattr(fitting, "allowed_mesh_error", lambda near: 1 / 36**2)
-    near, error = fitting.fine_enough(fit(10, True), 10)
+    near = fitting.fine_enough(fit(10, True), 10)
     assert (near.model.n, near.known) == found
-    assert error == 1 / near.model.n**2
