@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -339,8 +339,7 @@ def _effect_row(effect: Effect) -> dict[str, Any]:
     """Name and label of an effect, and its other arguments."""
     if known_effect(effect.name) is not type(effect):
         raise DloError(f"the effect {effect.name!r} cannot be written to parameters.yaml")
-    options = (item.name for item in fields(effect) if item.name != "label")
-    return fields_of(effect, "name", "label", *options)
+    return {"name": effect.name, **asdict(effect)}
 
 
 def shared_fixtures(config: Config) -> dict[str, Any]:
