@@ -434,16 +434,7 @@ def parameters_hash(document: Mapping[str, Any]) -> str:
     content = {key: document.get(key) for key in _MODEL_KEYS}
     content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
     content["coefficients"] = document["rest_curvature"]["coefficients"]
-    text = json.dumps(_as_floats(content), sort_keys=True, separators=(",", ":"))
+    # 1 and 1.0 are the same model; keys that are not read may hold what JSON lacks, such as dates.
+    plain = json.dumps(content, default=str, skipkeys=True)
+    text = json.dumps(json.loads(plain, parse_int=float), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _as_floats(data: Any) -> Any:
-    """Convert every number to a float: 1 and 1.0 are the same model."""
-    if isinstance(data, Mapping):
-        return {str(key): _as_floats(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_as_floats(value) for value in data]
-    if isinstance(data, int) and not isinstance(data, bool):
-        return float(data)
-    return data

@@ -203,6 +203,15 @@ def test_a_file_changed_by_hand_is_noticed(file, tmp_path):
     assert load(edited).metadata.edited
 
 
+def test_an_unread_key_may_hold_what_only_yaml_can(file, tmp_path):
+    noted = tmp_path / "parameters.yaml"
+    text = file.read_text()
+    assert "rest_shape: " in text
+    noted.write_text(text.replace("rest_shape: ", "bought: !!timestamp 2024-01-31, rest_shape: "))
+
+    assert load(noted).metadata.edited
+
+
 def test_coefficients_changed_by_hand_are_used_without_the_state(file, tmp_path):
     def double(document):
         rows = document["rest_curvature"]["coefficients"]
