@@ -10,6 +10,7 @@ import json
 import math
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
@@ -90,6 +91,8 @@ def _alike(value: Any, default: Any) -> bool:
     """Whether a value has a default's form; if the default is empty, any list of whole numbers."""
     if default == ():
         return isinstance(value, list) and all(type(item) is int for item in value)
+    if type(default) is int:
+        return type(value) is int
     return bool(_form(value) == _form(default))
 
 
@@ -98,7 +101,7 @@ def _form(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_form(item) for item in value]
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    return "number" if number and math.isfinite(value) else type(value)
+    return "number" if number and abs(value) <= sys.float_info.max else type(value)
 
 
 class _Cable(OpenSection):

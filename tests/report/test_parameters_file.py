@@ -367,6 +367,14 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
             lambda d: d["effects"][0].update(label=[1]),
             "effects[0].label: something like '' belongs",
         ),
+        (
+            lambda d: d["effects"][0].update(label=10**400),
+            "effects[0].label: something like '' belongs",
+        ),
+        (
+            lambda d: d["effects"].append({"name": "clip_offset", "clip": 0.5}),
+            "effects[1].clip: something like 0 belongs here, found 0.5",
+        ),
     ],
 )
 def test_a_value_that_cannot_be_computed_with_is_named_with_its_line(
