@@ -22,7 +22,7 @@ from test_holds import (
     turned,
 )
 
-from dlo_casadi.codegen import QUANTITIES, STATUSES, Capsule, Plane
+from dlo_casadi.codegen import QUANTITIES, STATUSES, Capsule, CompiledShape, Plane
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
@@ -178,7 +178,15 @@ def test_limits_that_cannot_be_checked():
     # What Python refuses beforehand C refuses, too.
     out, tightest = np.ones((5, solver._records.usage.itemsize // 8)), np.ones(1, np.intc)
     for wrong, status in ((-1.0, "bad_argument"), (np.nan, "not_finite"), (np.inf, "not_finite")):
-        given = (solver._record_of(shape), np.full(5, wrong), None, 0, None, out, tightest)
+        given = (
+            solver._record_of(CompiledShape, shape),
+            np.full(5, wrong),
+            None,
+            0,
+            None,
+            out,
+            tightest,
+        )
         assert STATUSES[solver._call("dlo_limits", *given)] == status
         assert not out.any()
         assert not tightest.any()

@@ -373,7 +373,7 @@ def test_a_damaged_file_is_named_with_its_key(file, tmp_path, change, message):
         ),
         (
             lambda d: d["effects"].append({"name": "clip_offset", "clip": 0.5}),
-            "effects[1].clip: something like 0 belongs here, found 0.5",
+            "effects[3].clip: something like 0 belongs here, found 0.5",
         ),
     ],
 )
