@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip, clamped_nodes, node_places
 
@@ -67,7 +67,7 @@ def random_pose(
     if not isinstance(hung, Equilibrium):
         return None
     given = Inputs.of(free.nominal, rest, pose.vector[None])
-    curve = NodeCurve.of(1.0, assembly_of(free).curve(hung.shapes, given)[0])
+    curve = NodeCurve.of(1.0, Assembly(free, hung.shapes, given).curve()[0])
     count = rng.integers(1, 5)
     at = (np.arange(1, count + 1) + rng.uniform(-0.25, 0.25, count)) / (count + 1)
     places = curve.at(at) + MOVED * rng.uniform(-1, 1, (count, d))
@@ -175,7 +175,7 @@ def check_bvp() -> None:
         pose = HeldPose((0.0, 0.0), end, clips=(HeldClip("pinned", place, at),))
         (eq,) = solve_equilibria(model, model.nominal, np.zeros(n), [pose])
         given = Inputs.of(model.nominal, np.zeros(n), pose.vector[None])
-        curve = NodeCurve.of(1.0, assembly_of(model).curve(eq.shapes, given)[0])
+        curve = NodeCurve.of(1.0, Assembly(model, eq.shapes, given).curve()[0])
         u, nodes = np.linspace(0, 1, 201), node_places(model.chain, pose.clips)
         guess = []
         for s in (at * u, at + (1 - at) * u):

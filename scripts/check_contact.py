@@ -24,7 +24,7 @@ from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.equilibrium.spans import first_guesses
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.obstacles import Capsule, Obstacle, Plane
 
@@ -122,7 +122,7 @@ def curve_of(model: CableModel, found: Equilibrium) -> np.ndarray:
     """Rows of places and slopes of the pose of `check_cylinder`."""
     pose = HeldPose((-0.2, -0.25), (0.22, -0.15))
     given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), pose.vector[None])
-    return assembly_of(model).curve(found.shapes, given)[0]
+    return Assembly(model, found.shapes, given).curve()[0]
 
 
 def random_cable(

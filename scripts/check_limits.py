@@ -35,7 +35,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.equilibrium.symbolic import CasadiCable
-from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipKind, HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter, modes_in
@@ -222,9 +222,9 @@ def solved(case: Case, count: int, seed: int) -> tuple[list[Equilibrium], NDArra
             now, right = some.solve(replace(now, deviation=there[2]), *there[:2], reach=0.5)
             kept &= right & some.stable(now, *there[:2])
         shapes.x[lost], shapes.lam[lost], stable[lost] = now.x, now.lam, kept
-    given = batch.given(shapes, p, rest)
+    found = Assembly(case.cable.model, shapes, batch.at(shapes, p, rest).given)
     none = np.zeros(count, dtype=int)
-    return equilibria_of(case.cable.model, shapes, given, stable=stable, iterations=none), stable
+    return equilibria_of(found, stable=stable, iterations=none), stable
 
 
 def values_of(eq: Equilibrium) -> dict[str, float]:

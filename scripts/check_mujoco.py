@@ -24,7 +24,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.obstacles import Plane
 
@@ -113,7 +113,7 @@ def ours(case: Case, height: float) -> tuple[CableModel, Equilibrium, NodeCurve]
     rest = np.zeros(model.chain.n_rests)
     found = solve_equilibrium(model, model.nominal, rest, pose)
     given = Inputs.of(model.nominal, rest, pose.vector[None])
-    curve = NodeCurve.of(CABLE.length, assembly_of(model).curve(found.shapes, given)[0])
+    curve = NodeCurve.of(CABLE.length, Assembly(model, found.shapes, given).curve()[0])
     return model, found, curve
 
 

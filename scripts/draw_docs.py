@@ -14,7 +14,7 @@ from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.session.measure import draw_steps
@@ -63,7 +63,7 @@ def draw_clips() -> None:
     pose = HeldPose((0.0, 0.0), (0.8, 0.05), clips=clips)
     eq = solve_equilibrium(model, model.nominal, np.zeros(40), pose)
     given = Inputs.of(model.nominal, np.zeros(40), pose.vector[None])
-    curve = NodeCurve.of(1.0, assembly_of(model).curve(eq.shapes, given)[0])
+    curve = NodeCurve.of(1.0, Assembly(model, eq.shapes, given).curve()[0])
     held = zip(clips, eq.clips, strict=True)
     drawing = draw_shape(
         curve.at(np.linspace(0.0, 1.0, 201)),

@@ -5,33 +5,35 @@ from dataclasses import replace
 
 import numpy as np
 
-from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
+from dlo_casadi.model.assembly import Assembly, Shapes, Tangents
+from dlo_casadi.model.cable_model import CableModel
 
 FloatArray = np.ndarray
 
 
-def any_shapes(a: Assembly, m: int = 1, scale: float = 0.4) -> Shapes:
+def any_shapes(model: CableModel, m: int = 1, scale: float = 0.4) -> Shapes:
     """Nodes, multipliers and deviations of m poses without any symmetry."""
     rng = np.random.default_rng(0)
-    x = a.node.moved(np.array(a.node.identity), rng.normal(scale=scale, size=(m, a.n, a.b)))
-    lam = rng.normal(size=(m, a.k))
-    deviation = rng.normal(scale=0.01, size=(m, len(a.model.deviation_names)))
+    node, n = model.node, model.chain.n_nodes
+    x = node.moved(np.array(node.identity), rng.normal(scale=scale, size=(m, n, node.increment)))
+    lam = rng.normal(size=(m, model.n_border))
+    deviation = rng.normal(scale=0.01, size=(m, len(model.deviation_names)))
     return Shapes(x, lam, deviation)
 
 
-def any_rest(a: Assembly, m: int = 1) -> FloatArray:
+def any_rest(model: CableModel, m: int = 1) -> FloatArray:
     """Rest curvatures (m, n_rests) [1/m]."""
-    return np.random.default_rng(1).normal(size=(m, a.chain.n_rests))
+    return np.random.default_rng(1).normal(size=(m, model.chain.n_rests))
 
 
-def directions(a: Assembly, m: int, *names: str) -> Tangents:
+def directions(model: CableModel, m: int, *names: str) -> Tangents:
     """One column for each number of the named parts of `Tangents`, the same in all poses."""
     rows = {
-        "x": a.n * a.b,
-        "lam": a.k,
-        "p": len(a.model.parameters),
-        "rest": a.chain.n_rests,
-        "deviation": len(a.model.deviation_names),
+        "x": model.chain.n_nodes * model.node.increment,
+        "lam": model.n_border,
+        "p": len(model.parameters),
+        "rest": model.chain.n_rests,
+        "deviation": len(model.deviation_names),
     }
     q = sum(rows[name] for name in names)
     parts, used = {}, 0
@@ -41,32 +43,30 @@ def directions(a: Assembly, m: int, *names: str) -> Tangents:
             block[:, np.arange(count), used + np.arange(count)] = 1.0
             used += count
         parts[name] = block
-    parts["x"] = parts["x"].reshape((m, a.n, a.b, q))
+    parts["x"] = parts["x"].reshape((m, model.chain.n_nodes, -1, q))
     return Tangents(**parts)
 
 
 def central(
-    a: Assembly,
-    function: Callable[[Shapes, Inputs], FloatArray],
-    shapes: Shapes,
-    given: Inputs,
+    here: Assembly,
+    function: Callable[[Assembly], FloatArray],
     along: Tangents,
     step: FloatArray | float = 1e-6,
 ) -> FloatArray:
-    """Derivatives (..., q) of what a function of the shapes says, by steps (q,)."""
-    q = along.lam.shape[2]
+    """Derivatives (..., q) of what a function of the assembly says, by steps (q,)."""
+    shapes, given, q = here.shapes, here.given, along.lam.shape[2]
     columns = []
     for i, d in enumerate(np.broadcast_to(step, (q,))):
         values = []
         for h in (d, -d):
             there = Shapes(
-                a.node.moved(shapes.x, h * along.x[..., i]),
+                here.model.node.moved(shapes.x, h * along.x[..., i]),
                 shapes.lam + h * along.lam[..., i],
                 shapes.deviation + h * along.deviation[..., i],
             )
             others = replace(
                 given, p=given.p + h * along.p[..., i], rest=given.rest + h * along.rest[..., i]
             )
-            values.append(np.asarray(function(there, others)))
+            values.append(np.asarray(function(replace(here, shapes=there, given=others))))
         columns.append((values[0] - values[1]) / (2 * d))
     return np.stack(columns, axis=-1)

@@ -2,6 +2,7 @@
 
 import pickle
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import ELEMENTS
@@ -53,9 +54,7 @@ OWN_LENGTH = LengthError(label="length of a pose")
 RANDOM_OF = {"pinned": (random_effects()["pin_moment"](label="moment of a pose"), OWN_LENGTH)}
 
 
-def posed(
-    element: str, boundary: tuple, effects=MOST, n=4, varied=True
-) -> tuple[Assembly, Shapes, Inputs]:
+def posed(element: str, boundary: tuple, effects=MOST, n=4, varied=True) -> Assembly:
     """Three poses of a model with most effects, at nothing special."""
     effects = (*effects, *HOLDERS[boundary[1]])
     random = RANDOM_OF.get(boundary[1], (OWN_LENGTH,)) if varied else ()
@@ -64,17 +63,17 @@ def posed(
     p = model.nominal + [
         0.3 * q.scale * (not q.log) * rng.uniform(0.2, 1) for q in model.parameters
     ]
-    a = assembly_of(model)
-    return a, any_shapes(a, M), Inputs.of(p, any_rest(a, M), np.pad(ENDS, ((0, 0), (0, 3))))
+    given = Inputs.of(p, any_rest(model, M), np.pad(ENDS, ((0, 0), (0, 3))))
+    return Assembly(model, any_shapes(model, M), given)
 
 
-def steps(a: Assembly, *names: str) -> np.ndarray:
+def steps(model: CableModel, *names: str) -> np.ndarray:
     """Steps of central differences: 1e-5 of a parameter's scale, 1e-6 of all else."""
-    count = directions(a, 1, *names).lam.shape[2]
+    count = directions(model, 1, *names).lam.shape[2]
     out = np.full(count, 1e-6)
     if "p" in names:
-        at = directions(a, 1, *names).p[0].argmax(axis=1)
-        out[at] = [1e-5 * (q.nominal if q.log else q.scale) for q in a.model.parameters]
+        at = directions(model, 1, *names).p[0].argmax(axis=1)
+        out[at] = [1e-5 * (q.nominal if q.log else q.scale) for q in model.parameters]
     return out
 
 
@@ -91,13 +90,13 @@ def assert_close(exact: np.ndarray, approximate: np.ndarray, d: np.ndarray, size
 @ALL
 @BOUNDARIES
 def test_gradient_and_hessian_of_the_lagrangian(element, boundary):
-    a, shapes, given = posed(element, boundary)
+    a = posed(element, boundary)
     names = ("x", "lam")
-    along, d = directions(a, M, *names), steps(a, *names)
-    total, slope, matrix = a.balance(shapes, given)
-    by_value = central(a, lambda s, g: a.balance(s, g)[0], shapes, given, along, d)
+    along, d = directions(a.model, M, *names), steps(a.model, *names)
+    total, slope, matrix = a.balance()
+    by_value = central(a, lambda b: b.balance()[0], along, d)
     assert_close(slope.rows[..., 0], by_value, d, np.abs(total).max())
-    by_slope = central(a, lambda s, g: a.balance(s, g)[1].rows[..., 0], shapes, given, along, d)
+    by_slope = central(a, lambda b: b.balance()[1].rows[..., 0], along, d)
     dense = matrix.dense()
     assert_close(dense, by_slope, d, np.abs(slope.rows).max())
     np.testing.assert_allclose(dense, np.swapaxes(dense, 1, 2), atol=1e-13)
@@ -107,49 +106,49 @@ def test_gradient_and_hessian_of_the_lagrangian(element, boundary):
 @BOUNDARIES
 def test_gradient_by_what_the_equilibrium_depends_on(element, boundary):
     """By parameters, rest curvature and deviations."""
-    a, shapes, given = posed(element, boundary)
+    a = posed(element, boundary)
     names = ("p", "rest", "deviation")
-    along, d = directions(a, M, *names), steps(a, *names)
-    exact = a.balance_along(shapes, given, along).rows
-    slope = central(a, lambda s, g: a.balance(s, g)[1].rows[..., 0], shapes, given, along, d)
+    along, d = directions(a.model, M, *names), steps(a.model, *names)
+    exact = a.balance_along(along).rows
+    slope = central(a, lambda b: b.balance()[1].rows[..., 0], along, d)
     assert_close(exact, slope, d, 10.0)
 
 
 @ALL
 @BOUNDARIES
 def test_measured_curve_by_all_it_depends_on(element, boundary):
-    a, shapes, given = posed(element, boundary)
+    a = posed(element, boundary)
     names = ("x", "lam", "p", "rest", "deviation")
-    along, d = directions(a, M, *names), steps(a, *names)
-    curves, change = a.curve_along(shapes, given, along)
-    np.testing.assert_allclose(curves, a.curve(shapes, given), atol=1e-14)  # rounding
-    assert curves.shape == (M, a.chain.n + 1, 4 if a.chain.kind.smooth else 2)
-    assert_close(change, central(a, a.curve, shapes, given, along, d), d, 10.0)
+    along, d = directions(a.model, M, *names), steps(a.model, *names)
+    curves, change = a.curve_along(along)
+    np.testing.assert_allclose(curves, a.curve(), atol=1e-14)  # rounding
+    assert curves.shape == (M, a.model.chain.n + 1, 4 if a.model.chain.kind.smooth else 2)
+    assert_close(change, central(a, lambda b: b.curve(), along, d), d, 10.0)
 
 
 @ALL
 @BOUNDARIES
 def test_state_by_all_it_depends_on(element, boundary):
-    a, shapes, given = posed(element, boundary)
+    a = posed(element, boundary)
     names = ("x", "p", "rest", "deviation")
-    along, d = directions(a, M, *names), steps(a, *names)
-    after = a.state_after(shapes, given)
+    along, d = directions(a.model, M, *names), steps(a.model, *names)
+    after = a.state_after()
     exact = a.state_along(after, along)
-    approximate = central(a, lambda s, g: a.state_after(s, g)[0], shapes, given, along, d)
+    approximate = central(a, lambda b: b.state_after()[0], along, d)
     assert_close(exact, approximate, d, 10.0)
 
 
 @ALL
 def test_energy_is_the_lagrangian_less_the_work_of_its_multipliers(element):
     """Where nothing inside moves with them it does not depend on the multipliers."""
-    a, shapes, given = posed(element, ("clamped", "clamped"), LOADS)
-    total, slope, _ = a.balance(shapes, given)
-    energy = a.energy(shapes, given)
-    work = (shapes.lam * slope.y[..., 0]).sum(axis=1)
+    a = posed(element, ("clamped", "clamped"), LOADS)
+    total, slope, _ = a.balance()
+    energy = a.energy()
+    work = (a.shapes.lam * slope.y[..., 0]).sum(axis=1)
     np.testing.assert_allclose(energy + work, total, rtol=1e-12)
     if not a.model.n_inner:
-        others = Shapes(shapes.x, 3 * shapes.lam - 1, shapes.deviation)
-        np.testing.assert_allclose(a.energy(others, given), energy, rtol=1e-12)
+        others = replace(a, shapes=replace(a.shapes, lam=3 * a.shapes.lam - 1))
+        np.testing.assert_allclose(others.energy(), energy, rtol=1e-12)
 
 
 # ---- shape -------------------------------------------------------------------------------------
@@ -158,15 +157,15 @@ def test_energy_is_the_lagrangian_less_the_work_of_its_multipliers(element):
 @ALL
 def test_the_curve_without_measurement_effects_is_the_cable(element):
     """Places of the nodes; for smooth elements the direction there, as long as the stretch."""
-    a, shapes, given = posed(element, ("pinned", "pinned"), (LengthError(),), varied=False)
-    z = a.curve(shapes, given)
-    np.testing.assert_allclose(z[..., :2], a.nodes(shapes, given), atol=1e-14)
+    a = posed(element, ("pinned", "pinned"), (LengthError(),), varied=False)
+    z = a.curve()
+    np.testing.assert_allclose(z[..., :2], a.nodes(), atol=1e-14)
     np.testing.assert_array_equal(z[:, 0, :2], ENDS[:, :2])
-    if a.chain.kind.smooth:
+    if a.model.chain.kind.smooth:
         stretch = (
-            float(lagrangian_of(a.model).true_ends_and_length(given.p[0], 0, 0)[1]) / CABLE.length
+            float(lagrangian_of(a.model).true_ends_and_length(a.given.p[0], 0, 0)[1]) / CABLE.length
         )
-        x = shapes.x[..., 0]
+        x = a.shapes.x[..., 0]
         exact = stretch * np.stack([np.cos(x), np.sin(x)], axis=-1)
         np.testing.assert_allclose(z[..., 2:], exact, atol=1e-14)
 
@@ -174,34 +173,34 @@ def test_the_curve_without_measurement_effects_is_the_cable(element):
 @ALL
 def test_the_end_is_held_where_the_multipliers_say(element):
     """Gradient by the first two multipliers: where the cable ends, less where it should."""
-    a, shapes, given = posed(element, ("clamped", "pinned"))
-    gap = a.balance(shapes, given)[1].y[:, :2, 0]
+    a = posed(element, ("clamped", "pinned"))
+    gap = a.balance()[1].y[:, :2, 0]
     held = [
         np.array(lagrangian_of(a.model).true_ends_and_length(p, ends, own)[0]).ravel()[2:4]
-        for p, ends, own in zip(given.p, ENDS, shapes.deviation, strict=True)
+        for p, ends, own in zip(a.given.p, ENDS, a.shapes.deviation, strict=True)
     ]
-    exact = a.nodes(shapes, given)[:, -1] - held
+    exact = a.nodes()[:, -1] - held
     np.testing.assert_allclose(gap, exact, atol=1e-13)  # rounding of a dozen sums
 
 
 @ALL
 def test_poses_do_not_touch_each_other(element):
     """All poses at once are each pose alone."""
-    a, shapes, given = posed(element, ("clamped", "clamped"))
-    together = a.balance(shapes, given)
+    a = posed(element, ("clamped", "clamped"))
+    together = a.balance()
     for j in range(M):
-        alone = a.balance(shapes.subset([j]), given.subset([j]))
+        alone = a.subset([j]).balance()
         assert alone[0][0] == together[0][j]
         np.testing.assert_array_equal(alone[1].rows[0], together[1].rows[j])
         np.testing.assert_array_equal(alone[2].dense()[0], together[2].dense()[j])
-        one = a.curve(shapes.subset([j]), given.subset([j]))
-        np.testing.assert_array_equal(one[0], a.curve(shapes, given)[j])
+        one = a.subset([j]).curve()
+        np.testing.assert_array_equal(one[0], a.curve()[j])
 
 
 def test_another_process_gets_the_same_numbers():
-    a, shapes, given = posed("quadratic", ("pinned", "pinned"))
+    a = posed("quadratic", ("pinned", "pinned"))
     again = pickle.loads(pickle.dumps(a))
-    np.testing.assert_array_equal(again.balance(shapes, given)[0], a.balance(shapes, given)[0])
+    np.testing.assert_array_equal(again.balance()[0], a.balance()[0])
 
 
 # ---- size --------------------------------------------------------------------------------------

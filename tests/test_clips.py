@@ -27,7 +27,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import Span, _sides, first_guesses
 from dlo_casadi.equilibrium.spread import tolerances_of
 from dlo_casadi.errors import ConfigError, EquilibriumError
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import Clipped, HeldClip, clamped_nodes
 from dlo_casadi.model.whole_pose import potential
@@ -70,7 +70,7 @@ def test_the_sharpest_bend_over_a_support_is_measured_there():
     for n in (20, 40, 80):
         model, pose, eq = solved(supports, None, n, cable=stiff, end="free")
         given = Inputs.of(model.nominal, np.zeros(n), pose.vector[None])
-        sizes = sizes_of(model, eq.shapes, given, "curvature")[0]
+        sizes = sizes_of(Assembly(model, eq.shapes, given), "curvature")[0]
         places, _ = places_of(model, pose, eq, given, "curvature")
         assert places[sizes.argmax()] == pytest.approx(eq.clips[0].at, abs=1e-12)
         assert 1 / sizes.max() == pytest.approx(eq.min_bend_radius, rel=1e-12)
@@ -88,7 +88,7 @@ def test_the_bend_at_a_clip_is_smooth_in_its_arc_length(at):
         model, pose, eq = solved([HeldClip("pinned", (0.4, 0.0), s)], (0.75, 0.0), 20)
         given = Inputs.of(model.nominal, np.zeros(20), pose.vector[None])
         assert places_of(model, pose, eq, given, "curvature")[0][21] == s
-        return sizes_of(model, eq.shapes, given, "curvature")[0, 21]
+        return sizes_of(Assembly(model, eq.shapes, given), "curvature")[0, 21]
 
     step = 1e-5
     before, here, after = (bend(at + k * step) for k in (-1, 0, 1))
@@ -240,9 +240,8 @@ def test_the_tangent_is_the_derivative_of_the_balance():
         IN_SPACE, (0.7, 0.2, 0.1), 10, LOOM, gravity=(0.0, 0.0, -9.81), start="clamped",
         start_orientation=turned(0, 0.2, 0.1),
     )  # fmt: skip
-    assembly = assembly_of(model)
     given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), pose.vector[None])
-    dense = assembly.balance(eq.shapes, given)[2].dense()[0]
+    dense = Assembly(model, eq.shapes, given).balance()[2].dense()[0]
     b, step = model.node.increment, 1e-6
     for column in (3, 3 * 4, 3 * 5 + 1, b * model.chain.n_nodes + 1, len(dense) - 1):
         rows = []
@@ -253,7 +252,7 @@ def test_the_tangent_is_the_derivative_of_the_balance():
             x = model.node.moved(eq.x[None], nodes)
             lam = eq.multipliers[None] + delta[b * model.chain.n_nodes :]
             moved = replace(eq.shapes, x=x, lam=lam)
-            rows.append(assembly.imbalance(moved, given).rows[0, :, 0])
+            rows.append(Assembly(model, moved, given).imbalance().rows[0, :, 0])
         assert dense[:, column] == pytest.approx((rows[0] - rows[1]) / (2 * step), abs=1e-5)
 
 
@@ -351,7 +350,7 @@ def test_a_clearance_beside_a_saddle_between_even_places():
         saddle = HeldClip("clamped", (0.4, -0.15), at, heading=-0.8)
         model, pose, eq = solved([saddle], (0.7, 0.0), n, **held)
         given = Inputs.of(model.nominal, np.zeros((1, model.chain.n_rests)), pose.vector[None])
-        heights.append(sizes_of(model, eq.shapes, given, "clearance")[0])
+        heights.append(sizes_of(Assembly(model, eq.shapes, given), "clearance")[0])
     np.testing.assert_allclose(heights[0], heights[1][::4], atol=2.5e-4)
 
 
@@ -483,7 +482,7 @@ def test_a_drift_of_zero_leaves_the_rest_curvature_at_a_saddle_between_nodes():
     pose, rest = HeldPose((0.0, 0.0), (0.75, 0.1), clips=(SADDLE,)), model.rest_basis @ BENT
     eq = solve_equilibrium(model, model.nominal, rest, pose)
     given = Inputs.of(model.nominal, rest, pose.vector[None])
-    assert assembly_of(model).state_after(eq.shapes, given)[0][0] == pytest.approx(rest, abs=1e-15)
+    assert Assembly(model, eq.shapes, given).state_after()[0][0] == pytest.approx(rest, abs=1e-15)
 
 
 def test_derivatives_of_what_a_pose_leaves_behind_at_a_saddle():

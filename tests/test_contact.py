@@ -11,7 +11,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.diagnosis.candidates import candidates_of
 from dlo_casadi.diagnosis.refits import scored_by_refit
 from dlo_casadi.effects import CableData, ContactPlane, ObstacleOffset
-from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.batch import SOFT_DEPTH, BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import beside_bars
@@ -20,7 +20,7 @@ from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import begin
-from dlo_casadi.model.assembly import Assembly, Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.contact import Touching, forces_on_other_mesh
 from dlo_casadi.rod.obstacles import Capsule, Plane
@@ -55,7 +55,7 @@ def loom():
 
 
 def test_what_touches_is_found_once_for_the_same_shapes(loom, monkeypatch):
-    """Also for some of the poses; shapes changed in place are others."""
+    """Also for some of the poses; a batch sees when its shapes have been changed in place."""
     model, found = loom
     shapes = found.shapes.subset([0, 0, 0])
     poses = np.tile(HELD_IN_SPACE.vector, (3, 1))
@@ -63,20 +63,20 @@ def test_what_touches_is_found_once_for_the_same_shapes(loom, monkeypatch):
     shapes.lam[:, :3] += [[0.0], [0.3], [0.6]]  # which turn the normals of the bar
     calls, of = [], Touching.of
     monkeypatch.setattr(Touching, "of", lambda *args: calls.append(args) or of(*args))
-    assembly, fresh = Assembly(model), Assembly(model)
-    all_poses = assembly.touching(shapes, given)
-    two = assembly.touching(shapes.subset([2, 0]), given.subset([2, 0]))
+    batch = BatchEquilibrium(model, [HELD_IN_SPACE] * 3)
+    inputs = shapes, model.nominal, np.zeros(model.chain.n_rests)
+    all_poses = batch.at(*inputs).touching
+    two = batch.at(*inputs).subset([2, 0]).touching
     assert len(calls) == 1
     np.testing.assert_array_equal(two.normal, all_poses.normal[[2, 0]])
     assert not np.array_equal(*two.normal)
-    none = np.zeros(0, dtype=int)
-    assert assembly.touching(shapes.subset(none), given.subset(none)).gap.shape[0] == 0
+    assert batch.at(*inputs).subset(np.zeros(0, dtype=int)).touching.gap.shape[0] == 0
     shapes.lam[0, 0] += 0.3
-    again = assembly.touching(shapes, given)
+    again = batch.at(*inputs).touching
     assert len(calls) == 2
+    fresh = Assembly(model, shapes, given, SOFT_DEPTH).touching
     for name in ("border", "gap", "normal", "active"):
-        own = getattr(again, name)
-        np.testing.assert_array_equal(own, getattr(fresh.touching(shapes, given), name))
+        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
 
 
 def test_a_heavy_beam_laid_on_a_table_lifts_off_where_beam_theory_says():
@@ -141,9 +141,9 @@ def test_forces_balance_and_no_node_is_inside(loom):
 
 def test_the_tangent_is_the_derivative_of_the_balance(loom):
     model, found = loom
-    assembly, shapes = assembly_of(model), found.shapes
+    shapes = found.shapes
     given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), HELD_IN_SPACE.vector[None])
-    dense = assembly.balance(shapes, given)[2].dense()[0]
+    dense = Assembly(model, shapes, given).balance()[2].dense()[0]
     nodes, step = 3 * model.chain.n_nodes, 1e-6
     touching = nodes + model.n_lam + np.flatnonzero(found.multipliers[model.n_lam :] > 0)
     for column in (3 * 3 + 1, 3 * 8 + 2, nodes + 1, touching[0], touching[-1]):
@@ -152,7 +152,7 @@ def test_the_tangent_is_the_derivative_of_the_balance(loom):
             delta = h * np.eye(len(dense))[column]
             x = model.node.moved(shapes.x, delta[:nodes].reshape((*shapes.x.shape[:2], 3)))
             moved = replace(shapes, x=x, lam=shapes.lam + delta[nodes:])
-            rows.append(assembly.imbalance(moved, given).rows[0, :, 0])
+            rows.append(Assembly(model, moved, given).imbalance().rows[0, :, 0])
         assert dense[:, column] == pytest.approx((rows[0] - rows[1]) / (2 * step), abs=2e-4)
 
 

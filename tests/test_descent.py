@@ -6,7 +6,7 @@ import pytest
 from dlo_casadi.effects import CableData, Tether
 from dlo_casadi.equilibrium.minima import _convex, descend
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix
 
@@ -41,8 +41,8 @@ def test_a_soft_cable_on_a_strong_tether_is_brought_to_rest(element, stiffness):
         p, np.zeros(10), np.repeat(HeldPose((0.0, 0.0), (0.4, 0.1)).vector[None], 12, 0)
     )
 
-    found = descend(assembly_of(model), shapes, given)
+    found = descend(Assembly(model, shapes, given))
 
-    force = assembly_of(model).imbalance(found.shapes, given)
+    force = Assembly(model, found.shapes, given).imbalance()
     assert np.abs(force.x[found.balanced]).max() < 1e-8
     assert found.converged.sum() >= 11

@@ -40,7 +40,7 @@ from dlo_casadi.effects.effect import Fitted
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
@@ -121,34 +121,34 @@ def own_parameters(model: CableModel, values: str) -> np.ndarray:
     return p
 
 
-def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> tuple[Shapes, Inputs]:
+def posed(model: CableModel, p: np.ndarray, headings: str = "random") -> Assembly:
     """One pose, straight and unloaded or without any symmetry."""
     pose = POSE_IN_SPACE if model.in_space else POSE
     if model.clips:
         clip = CLIPS["space" if model.in_space else "plane"]
         pose = np.concatenate([pose, clip.vector(model.node)])
-    a, scale = assembly_of(model), 0.0 if headings == "straight" else 1.0
-    shapes = any_shapes(a, scale=1.5 * scale)
-    given = Inputs.of(p, scale * any_rest(a)[0], pose[None])
+    scale = 0.0 if headings == "straight" else 1.0
+    shapes = any_shapes(model, scale=1.5 * scale)
+    given = Inputs.of(p, scale * any_rest(model)[0], pose[None])
     # Springs rest at the origin: their unknowns are those of no other model.
-    lam = scale * shapes.lam * (np.arange(a.k) < len(model.condition_names))
-    shapes = Shapes.declared(shapes.x, lam, len(model.clips))
+    lam = scale * shapes.lam * (np.arange(model.n_border) < len(model.condition_names))
+    a = Assembly(model, Shapes.declared(shapes.x, lam, len(model.clips)), given)
     # The node at a saddle is in its frame, as in all shapes.
-    return replace(shapes, x=a.clipped(shapes, given).in_frames(shapes.x)), given
+    return replace(a, shapes=replace(a.shapes, x=a.clipped.in_frames(shapes.x)))
 
 
 def outputs(model: CableModel, p: np.ndarray, headings: str = "random") -> dict[str, np.ndarray]:
     """All that the other stages ask for, derivatives by all but the effect's own parameters."""
-    a, (shapes, given) = assembly_of(model), posed(model, p, headings)
-    total, slope, matrix = a.balance(shapes, given)
-    along = directions(a, 1, "x", "lam", "p", "rest", "deviation")
+    a = posed(model, p, headings)
+    total, slope, matrix = a.balance()
+    along = directions(model, 1, "x", "lam", "p", "rest", "deviation")
     kept = ~along.p[0, own_indices(model)].any(axis=0)
-    (curve, change), after = a.curve_along(shapes, given, along), a.state_after(shapes, given)
+    (curve, change), after = a.curve_along(along), a.state_after()
     return {
         "Lagrangian": total,
         "gradient": slope.rows,
         "Hessian": matrix.dense(),
-        "gradient by all": a.balance_along(shapes, given, along).rows[..., kept],
+        "gradient by all": a.balance_along(along).rows[..., kept],
         "curve": curve,
         "curve by all": change[..., kept],
         "rest after": after[0],
@@ -211,11 +211,10 @@ def test_gradients_and_hessians_are_finite(case, headings, values):
     """No sqrt(0), atan2(0, 0) or 0/0 in the Lagrangian, its Hessian, or the derivatives by p."""
     model = with_effect(*case)
     p = own_parameters(model, values)
-    shapes, given = posed(model, p, headings)
+    a, own = posed(model, p, headings), directions(model, 1, "p")
     blocks = outputs(model, p, headings)
-    own = directions(assembly_of(model), 1, "p")
-    blocks["gradient by p"] = assembly_of(model).balance_along(shapes, given, own).rows
-    blocks["curve by p"] = assembly_of(model).curve_along(shapes, given, own)[1]
+    blocks["gradient by p"] = a.balance_along(own).rows
+    blocks["curve by p"] = a.curve_along(own)[1]
     for what, block in blocks.items():
         assert np.all(np.isfinite(block)), what
 
@@ -245,24 +244,23 @@ def test_every_effect_does_something(case):
 def test_derivatives_by_parameters_against_finite_differences(case):
     """Of the balance, the measured curve and the state."""
     model = with_effect(*case)
-    a, (shapes, given) = assembly_of(model), posed(model, own_parameters(model, "off"))
-    along = directions(a, 1, "p")
+    a, along = posed(model, own_parameters(model, "off")), directions(model, 1, "p")
     d = np.array([1e-5 * (q.nominal if q.log else q.scale) for q in model.parameters])
-    after = a.state_after(shapes, given)
+    after = a.state_after()
     for what, exact, function in (
         (
             "balance",
-            a.balance_along(shapes, given, along).rows,
-            lambda s, g: a.balance(s, g)[1].rows[..., 0],
+            a.balance_along(along).rows,
+            lambda b: b.balance()[1].rows[..., 0],
         ),
-        ("curve", a.curve_along(shapes, given, along)[1], a.curve),
+        ("curve", a.curve_along(along)[1], lambda b: b.curve()),
         (
             "state",
             a.state_along(after, along),
-            lambda s, g: a.state_after(s, g)[0],
+            lambda b: b.state_after()[0],
         ),
     ):
-        found = central(a, function, shapes, given, along, d)
+        found = central(a, function, along, d)
         size = np.maximum(np.abs(exact).max(axis=tuple(range(exact.ndim - 1))), 1.0)
         # Central differences of 1e-5 scales: 1e-10 of the third derivative, and the
         # rounding of values of order ten over 2 d, d > 1e-8.
@@ -289,7 +287,8 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, where, element):
     gravity = tuple(float(g) for g in turn @ np.array(model.gravity))
     turned = replace(model, gravity=gravity)
     p = own_parameters(model, "off")
-    shapes, given = posed(model, p)
+    a = posed(model, p)
+    shapes, given = a.shapes, a.given
     start, end, frames, viewpoint = np.split(given.poses[0], [d, 2 * d, 2 * (d + c)])
     pose = np.concatenate(
         [turn @ start + shift, turn @ end + shift, turned_nodes(frames), viewpoint]
@@ -297,15 +296,14 @@ def test_elastic_effects_do_not_feel_rigid_motion(name, where, element):
     lam = shapes.lam.copy()  # multipliers of clamps are about the frames' own axes
     lam[:, :d] = lam[:, :d] @ turn.T
     there = Shapes.declared(turned_nodes(shapes.x), lam, len(model.clips))
-    moved = replace(given, poses=pose[None])
-    a, b = assembly_of(model), assembly_of(turned)
+    b = Assembly(turned, there, replace(given, poses=pose[None]))
     fall = -CABLE.mass * np.array(gravity) @ shift  # the weight has been moved, too
     # Rounding of a few dozen terms of order one.
-    energy = b.energy(there, moved) - fall
-    np.testing.assert_allclose(energy, a.energy(shapes, given), atol=1e-11)
-    nodes = a.nodes(shapes, given) @ turn.T + shift
-    np.testing.assert_allclose(b.nodes(there, moved), nodes, atol=1e-11)
-    balance, new_balance = a.balance(shapes, given)[1], b.balance(there, moved)[1]
+    energy = b.energy() - fall
+    np.testing.assert_allclose(energy, a.energy(), atol=1e-11)
+    nodes = a.nodes() @ turn.T + shift
+    np.testing.assert_allclose(b.nodes(), nodes, atol=1e-11)
+    balance, new_balance = a.balance()[1], b.balance()[1]
     np.testing.assert_allclose(new_balance.x, balance.x, atol=1e-11)
 
 
@@ -316,7 +314,7 @@ def energies(effects: tuple[Effect, ...], p: list[float], gravity=(0.0, -9.81), 
     """Energy [J] and nodes of a random shape that hangs on these loads alone."""
     model = CableModel(CABLE, n=5, element=element, effects=effects, gravity=gravity)
     where = posed(model, np.array([CABLE.bending_stiffness, *p]))
-    return assembly_of(model).energy(*where)[0], assembly_of(model).nodes(*where)[0]
+    return where.energy()[0], where.nodes()[0]
 
 
 # At given headings loads move the bubbles of quadratic elements: not for those.
@@ -421,9 +419,9 @@ def test_nothing_hangs_beyond_the_end(name, cable):
 def test_an_unknown_pull_is_another_force_in_every_pose(element):
     """The mean over the poses and the pose's own deviation, together a point force."""
     model = CableModel(CABLE, n=5, element=element, effects=(UnknownPull(),))
-    shapes, given = posed(model, np.array([0.05, 0.3, 0.1, 0.48]))
-    shapes.deviation[0, 4:] = [0.1, -0.8]
-    found = assembly_of(model).energy(shapes, given)[0]
+    a = posed(model, np.array([0.05, 0.3, 0.1, 0.48]))
+    a.shapes.deviation[0, 4:] = [0.1, -0.8]
+    found = a.energy()[0]
     direct, _ = energies((PointForce(),), [0.4, -0.7, 0.48], element=element)
     assert found == pytest.approx(direct, abs=1e-12)
 
@@ -525,14 +523,14 @@ def test_a_clamp_that_gives_way_is_one_turned_by_the_moment_on_it(element):
 def test_moments_of_pins_turn_the_ends_counter_clockwise():
     """V = -EI (start phi(0) + end phi(L)) with the numbers of the pose."""
     model = CableModel(CABLE, 5, "arc", random=(random_effects()["pin_moment"](),))
-    shapes, given = posed(model, model.nominal)
+    a = posed(model, model.nominal)
     own = np.zeros((1, len(model.deviation_names)))
     names = ["pin_moment.start", "pin_moment.end"]
     own[0, [model.deviation_names.index(name) for name in names]] = [0.7, -0.4]
     energies = [
-        assembly_of(model).energy(replace(shapes, deviation=x), given)[0] for x in (own, 0 * own)
+        replace(a, shapes=replace(a.shapes, deviation=x)).energy()[0] for x in (own, 0 * own)
     ]
-    work = CABLE.bending_stiffness * shapes.x[0, [0, -1], 0] @ [0.7, -0.4]
+    work = CABLE.bending_stiffness * a.shapes.x[0, [0, -1], 0] @ [0.7, -0.4]
     assert energies[0] - energies[1] == pytest.approx(-work, abs=1e-13)
 
 
@@ -608,7 +606,7 @@ def test_a_scaled_line_is_scaled_between_its_nodes_too():
     bare = CableModel(CABLE, 5)
     model = bare.with_effect(ImageScale())
     seen, true = (
-        assembly_of(m).curve(*posed(m, p))[0]
+        posed(m, p).curve()[0]
         for m, p in ((model, np.append(bare.nominal, 1.1)), (bare, bare.nominal))
     )
     start = true[0, :2]

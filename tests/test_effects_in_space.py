@@ -26,7 +26,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.obstacles import Plane
@@ -135,8 +135,8 @@ def test_a_cable_that_stays_in_its_plane_is_the_planar_one(name):
         Inputs.of(*of) for of in zip(ps, rests, (pose.vector[None], same.vector[None]), strict=True)
     ]
     planar, spatial = (
-        (a.energy(s, g), a.curve(s, g), a.state_after(s, g)[0], a.balance(s, g)[1].rows)
-        for a, s, g in zip((assembly_of(m) for m in models), shapes, given, strict=True)
+        (a.energy(), a.curve(), a.state_after()[0], a.balance()[1].rows)
+        for a in map(Assembly, models, shapes, given)
     )
     n = models[0].chain.n_cells
     # Rounding of a few dozen terms; forces and moments as far as the planar shape balances.

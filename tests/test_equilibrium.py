@@ -29,7 +29,7 @@ from dlo_casadi.equilibrium.guesses import arc_half_angle, guesses
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import coarse_rest, continued, solve_equilibria, solve_equilibrium
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 
 DATA = Path(__file__).parent / "data"
@@ -499,8 +499,7 @@ def test_among_many_poses_no_joint_is_bent_beyond_its_bound(bend, stable):
     rest = bend / np.diff(model.chain.cells, axis=1).ravel()
     shapes = Shapes.declared(x[None], np.zeros((1, model.n_border)))
     batch = BatchEquilibrium(model, [pose])
-    given = batch.given(shapes, model.nominal, rest)
-    assert np.abs(batch.assembly.imbalance(shapes, given).rows).max() < 1e-14
+    assert np.abs(batch.at(shapes, model.nominal, rest).imbalance().rows).max() < 1e-14
     assert batch.stable(shapes, model.nominal, rest).tolist() == [stable]
 
 
@@ -530,7 +529,7 @@ def test_a_joint_at_its_bound_beside_others_that_bow(end, headings):
     moments = held.bound_multipliers
     assert moments.any()
     given = Inputs.of(model.nominal, np.zeros(20), pose.vector[None])
-    force = assembly_of(model).balance(held.shapes, given)[1].x.ravel()
+    force = Assembly(model, held.shapes, given).balance()[1].x.ravel()
     turned = np.concatenate([[0.0], moments]) - np.concatenate([moments, [0.0]])
     np.testing.assert_allclose(force + turned, 0.0, atol=1e-10)
 

@@ -21,7 +21,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.whole_pose import potential
@@ -105,10 +105,9 @@ def test_section_laws_multiply(element):
     def bending(effects, own) -> np.ndarray:
         """Second derivative of the weightless energy by headings and rest curvature."""
         model = CableModel(CABLE, 6, element, gravity=(0.0, 0.0), effects=effects)
-        a = assembly_of(model)
-        shapes = replace(any_shapes(a), lam=np.zeros((1, a.k)))
-        where = given(model, np.array([0.02, *own]), any_rest(a)[0])
-        return a.balance_along(shapes, where, directions(a, 1, "rest")).x
+        shapes = replace(any_shapes(model), lam=np.zeros((1, model.n_border)))
+        where = given(model, np.array([0.02, *own]), any_rest(model)[0])
+        return Assembly(model, shapes, where).balance_along(directions(model, 1, "rest")).x
 
     plain = bending((), [])
     first, second = bending(laws[:1], values[0]), bending(laws[1:], values[1])
@@ -136,15 +135,15 @@ def test_dead_load_is_all_that_hangs_on_the_cable(element):
 def test_weight_hangs_on_the_centre_of_gravity(element):
     """V = -m g . (1/L) int r ds, with r(s) from headings by fine sums; arcs bend no other way."""
     heavy, light = (CableModel(CABLE, 5, element, gravity=g) for g in ((2.0, -9.0), (0.0, 0.0)))
-    a = assembly_of(heavy)
-    shapes, where = any_shapes(a), given(heavy, heavy.nominal, np.zeros(a.chain.n_cells))
-    energy = [assembly_of(m).energy(shapes, where)[0] for m in (heavy, light)]
+    chain = heavy.chain
+    shapes, where = any_shapes(heavy), given(heavy, heavy.nominal, np.zeros(chain.n_cells))
+    energy = [Assembly(m, shapes, where).energy()[0] for m in (heavy, light)]
     s = (np.arange(20000) + 0.5) * CABLE.length / 20000
     phi = shapes.x[0, :, 0]
     if element == "arc":
-        heading = np.interp(s, a.chain.places, phi)
+        heading = np.interp(s, chain.places, phi)
     else:
-        heading = phi[(s / a.chain.h).astype(int)]
+        heading = phi[(s / chain.h).astype(int)]
     step = CABLE.length / 20000 * np.stack([np.cos(heading), np.sin(heading)], axis=1)
     center = (np.cumsum(step, axis=0) - step / 2).mean(axis=0)
     exact = -CABLE.mass * np.array([2.0, -9.0]) @ center
@@ -164,10 +163,10 @@ def test_condensed_stretch_equals_the_minimisation_over_axial_strains(element):
     pose = HeldPose((0.0, 0.0), (1.1, -0.2))
     found = solve_equilibrium(model, p, rest, pose)
     assert found.stable
-    a, where = assembly_of(model), Inputs.of(p, rest, pose.vector[None])
+    where = Inputs.of(p, rest, pose.vector[None])
     shapes = Shapes.declared(found.x[None], found.multipliers[None])
     # Newton's last step leaves the rounding of terms of order one.
-    assert np.abs(a.balance(shapes, where)[1].rows).max() < 1e-11
+    assert np.abs(Assembly(model, shapes, where).balance()[1].rows).max() < 1e-11
 
     problem = potential(model)
     solver = ca.nlpsol(
@@ -181,7 +180,7 @@ def test_condensed_stretch_equals_the_minimisation_over_axial_strains(element):
         },
         {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-11},
     )
-    x0 = np.concatenate([found.phi + 0.05, np.zeros(model.n_inner * a.chain.n_segments)])
+    x0 = np.concatenate([found.phi + 0.05, np.zeros(model.n_inner * model.chain.n_segments)])
     values = np.concatenate([p, rest, pose.vector, STILL])
     direct = solver(x0=x0, p=values, lbg=0, ubg=0)
     assert solver.stats()["success"]

@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.minima import descend
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -169,11 +169,11 @@ def test_the_twist_at_which_a_ring_leaves_its_plane():
         # The exact ring is an equilibrium, stable or not: Newton's method stays there.
         shapes = Shapes.declared(x[None], lam)
         for _ in range(6):
-            _, force, matrix = assembly_of(m).balance(shapes, given)
+            _, force, matrix = Assembly(m, shapes, given).balance()
             step = matrix.factor().solve(type(force)(-force.x, -force.y))
             moved = m.node.moved(shapes.x, step.x[..., 0])
             shapes = Shapes(moved, shapes.lam + step.y[..., 0], shapes.deviation)
-        _, force, matrix = assembly_of(m).balance(shapes, given)
+        _, force, matrix = Assembly(m, shapes, given).balance()
         assert np.abs(force.x).max() < 1e-9
         return least_second_variation(m, matrix)
 
@@ -196,11 +196,11 @@ def test_the_twist_at_which_a_straight_cable_between_clamps_buckles():
         place = HeldPose((0.0, 0.0, 0.0), (LENGTH, 0.0, 0.0), None, None, tuple(x[0]), tuple(x[-1]))
         given = Inputs.of(m.nominal, np.zeros(m.chain.n_rests), place.vector[None])
         free = Shapes.declared(x[None], np.zeros((1, m.n_border)))
-        _, force, matrix = assembly_of(m).balance(free, given)
+        _, force, matrix = Assembly(m, free, given).balance()
         # Of the axial force, which the straight cable leaves open, least squares takes none.
         rows = matrix.dense()[0][: force.x.size]
         lam = np.linalg.lstsq(rows[:, force.x.size :], -force.x.ravel(), rcond=None)[0]
-        _, force, matrix = assembly_of(m).balance(Shapes.declared(x[None], lam[None]), given)
+        _, force, matrix = Assembly(m, Shapes.declared(x[None], lam[None]), given).balance()
         assert np.abs(force.x).max() < 1e-12
         return least_second_variation(m, matrix)
 
@@ -245,20 +245,20 @@ def test_derivatives_by_increments():
     x = same_sign(Rotation.from_rotvec(0.4 * rng.normal(size=(5, 3)).cumsum(axis=0)).as_quat())
     given = Inputs.of(m.nominal, curved(m), OUT_OF_PLANE.vector[None])
     shapes = Shapes.declared(x[None], rng.normal(size=(1, m.n_border)))
-    _, force, matrix = assembly_of(m).balance(shapes, given)
+    _, force, matrix = Assembly(m, shapes, given).balance()
     d = 1e-5
 
     def moved(node, axis, sign):
         step = np.zeros((1, 5, 3))
         step[0, node, axis] = sign * d
         there = Shapes(m.node.moved(shapes.x, step), shapes.lam, shapes.deviation)
-        return assembly_of(m).balance(there, given)[0][0]
+        return Assembly(m, there, given).balance()[0][0]
 
     for node in range(5):
         for axis in range(3):
             slope = (moved(node, axis, 1) - moved(node, axis, -1)) / (2 * d)
             assert slope == pytest.approx(force.x[0, node, axis, 0], abs=1e-7)
-    np.testing.assert_allclose(assembly_of(m).imbalance(shapes, given).rows, force.rows, atol=1e-12)
+    np.testing.assert_allclose(Assembly(m, shapes, given).imbalance().rows, force.rows, atol=1e-12)
     dense = matrix.dense()[0]
     np.testing.assert_allclose(dense, dense.T, atol=1e-10)
 
@@ -289,9 +289,9 @@ def test_descents_from_far_away_are_minima():
     given = Inputs.of(
         m.nominal, np.zeros(m.chain.n_rests), np.repeat(OUT_OF_PLANE.vector[None], 4, axis=0)
     )
-    found = descend(assembly_of(m), Shapes.declared(x, np.zeros((4, m.n_border))), given)
+    found = descend(Assembly(m, Shapes.declared(x, np.zeros((4, m.n_border))), given))
     assert found.converged.any()
-    _, force, matrix = assembly_of(m).balance(found.shapes, given)
+    _, force, matrix = Assembly(m, found.shapes, given).balance()
     assert np.abs(force.x[found.converged]).max() < 1e-9
     assert np.all(matrix.negative()[found.converged] == m.n_multipliers)
 

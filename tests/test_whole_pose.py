@@ -15,7 +15,7 @@ from dlo_casadi.effects import (
     LumpedMass,
     RestCurvatureDrift,
 )
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, curve, potential, rest_after
 from dlo_casadi.rod.chain import ELEMENTS
@@ -41,19 +41,14 @@ def model_of(element: str, boundary: tuple[str, str]) -> tuple[CableModel, np.nd
 @BOUNDARIES
 def test_expressions_are_what_the_assembly_says(element, boundary):
     model, p = model_of(element, boundary)
-    a, s = assembly_of(model), PoseSymbols.of(model)
-    shapes, rest = any_shapes(a), any_rest(a)[0]
-    given = Inputs.of(p, rest, ENDS[None])
+    s, shapes, rest = PoseSymbols.of(model), any_shapes(model), any_rest(model)[0]
+    a = Assembly(model, shapes, Inputs.of(p, rest, ENDS[None]))
     arguments = [s.x, s.lam, s.p, s.rest, s.pose, s.deviation]
     expressions = [balance(model, s), curve(model, s), rest_after(model, s)]
     numbers = ca.Function("pose", arguments, expressions)(
         shapes.x.ravel(), shapes.lam[0], p, rest, ENDS, shapes.deviation[0]
     )
-    exact = [
-        a.balance(shapes, given)[1].rows,
-        a.curve(shapes, given),
-        a.state_after(shapes, given)[0],
-    ]
+    exact = [a.balance()[1].rows, a.curve(), a.state_after()[0]]
     for found, expected in zip(numbers, exact, strict=True):
         # The same few dozen terms of order ten, added in another order.
         np.testing.assert_allclose(np.array(found).ravel(), expected.ravel(), atol=1e-13)
@@ -75,11 +70,11 @@ def test_minimum_over_what_is_inside_is_the_lagrangian(element, effect, own, hel
     a time: the Lagrangian leaves out their product.
     """
     model = CableModel(CABLE, 4, element, held, held, effects=(effect,))
-    a, problem, p = assembly_of(model), potential(model), np.array([0.02, *own])
-    shapes, rest = any_shapes(a, scale=0.05), any_rest(a)[0]
+    problem, p = potential(model), np.array([0.02, *own])
+    shapes, rest = any_shapes(model, scale=0.05), any_rest(model)[0]
     shapes.lam[0, :2] = [-9.0, 0.0]  # N; the cable pulls its end back
     total = problem.energy + ca.dot(ca.DM(shapes.lam[0]), problem.conditions)
-    inner = problem.coordinates[a.n :]
+    inner = problem.coordinates[model.chain.n_nodes :]
     derivatives = ca.Function(
         "derivatives",
         [problem.coordinates, problem.parameters],
@@ -90,5 +85,5 @@ def test_minimum_over_what_is_inside_is_the_lagrangian(element, effect, own, hel
     value, slope, bend = (np.array(block) for block in derivatives(x, values))
     assert np.all(np.linalg.eigvalsh(bend) > 0)
     least = value - slope.T @ np.linalg.solve(bend, slope) / 2
-    exact = a.balance(shapes, Inputs.of(p, rest, ENDS[None]))[0][0]
+    exact = Assembly(model, shapes, Inputs.of(p, rest, ENDS[None])).balance()[0][0]
     assert least.item() == pytest.approx(exact, rel=1e-12)

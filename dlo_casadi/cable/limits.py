@@ -23,7 +23,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Uncertainty, cause_of, tolerances_of, with_tolerances
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, counted
-from dlo_casadi.model.assembly import Inputs
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.show.text import STRAIGHT, millimetres
@@ -277,7 +277,7 @@ class Resolved:
 
     def sizes(self, mesh: CableModel, shape: Equilibrium, quantity: str) -> FloatArray:
         """Sizes (K,) of a quantity on a mesh, see `sizes_of`."""
-        return sizes_of(mesh, shape.shapes, self._given(mesh), _size(quantity))[0]
+        return sizes_of(Assembly(mesh, shape.shapes, self._given(mesh)), _size(quantity))[0]
 
     def _given(self, mesh: CableModel) -> Inputs:
         return Inputs.of(self.cable.p, self.rest_on(mesh), self.pose.vector[None])

@@ -19,11 +19,12 @@ from dlo_casadi.equilibrium.minima import (
     TOLERANCE,
     damped,
     descend_to_contact,
+    size_of,
     stepped,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
-from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import BandMatrix, Vector
 
@@ -60,11 +61,10 @@ class BatchEquilibrium:
         self.model, self.wrenches = model, wrenches
         self.poses = tuple(poses)
         self.m = len(self.poses)
-        self.assembly = assembly_of(model).softened(SOFT_DEPTH)
-        self.node = self.assembly.node
+        self.node = model.node
         self._ends = np.array([pose.vector for pose in self.poses])
         self.used_deviations = [model.deviation_names.index(name) for name in model.deviations]
-        self._last_rests: tuple[tuple[FloatArray, ...], FloatArray] = (), np.zeros(0)
+        self._last: tuple[tuple[FloatArray, ...], Assembly] | None = None
 
     def start_shapes(self, x: FloatArray) -> Shapes:
         """Shapes with these nodes (m, n_nodes, coordinates), without forces and deviations."""
@@ -72,34 +72,41 @@ class BatchEquilibrium:
         still = np.zeros((self.m, len(self.model.deviation_names)))
         return Shapes(x, np.array(border).reshape((self.m, -1)), still)
 
+    def at(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Assembly:
+        """The model at shapes; `rest` (n_rests,) before the first pose, or (m, n_rests) each's."""
+        inputs = shapes.x, shapes.lam, shapes.deviation, p, rest
+        # The same shapes are evaluated, observed and linearised. Replaced as a whole: threads may
+        # share a batch.
+        last = self._last
+        if last is None or not all(map(np.array_equal, last[0], inputs)):
+            known = tuple(part.copy() for part in inputs)
+            shapes, (p, rest) = Shapes(*known[:3]), known[3:]
+            given = Inputs.of(p, self._rests(shapes, p, rest), self._ends)
+            self._last = last = known, Assembly(self.model, shapes, given, SOFT_DEPTH)
+        return last[1]
+
     # ---- state -----------------------------------------------------------------------------------
 
     def rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Rest curvature (m, n_rests) before each pose, from that before the first one.
 
-        If `rest` is already given for each pose, (m, n_rests), it is returned unchanged.
+        If `rest` is already given for each pose, (m, n_rests), these are the same.
         """
+        return self.at(shapes, p, rest).given.rest.copy()
+
+    def _rests(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
+        """As `rests`, computed from pose to pose."""
         if rest.ndim == 2:
             return rest
-        if not self.model.has_state:
-            return np.repeat(rest[None], self.m, axis=0)
-        # The same shapes are evaluated, observed and linearised. No state depends on forces.
-        inputs = shapes.x, shapes.deviation, p, rest
-        known, out = self._last_rests
-        if not (known and all(map(np.array_equal, known, inputs))):
-            out = self._carried(shapes, p, rest)
-            self._last_rests = tuple(part.copy() for part in inputs), out
-        return out.copy()
-
-    def _carried(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
-        """As `rests`, computed from pose to pose."""
         out = np.repeat(rest[None], self.m, axis=0)
+        if not self.model.has_state:
+            return out
         # Newton's method for all poses at once: if a law is linear in the rest curvature, one step;
         # of any law each step makes at least one more pose exact.
         strains = len(self.node.strains)
         for _ in range(self.m):
-            found = self.assembly.state_after(shapes, Inputs.of(p, out, self._ends))
-            after, _, by_rest, *_ = found
+            here = Assembly(self.model, shapes, Inputs.of(p, out, self._ends), SOFT_DEPTH)
+            after, _, by_rest, *_ = here.state_after()
             change, slopes = after[:-1] - out[1:], by_rest.reshape((self.m, strains, -1, strains))
             for j in range(1, self.m - 1):
                 before = change[j - 1].reshape((strains, -1))
@@ -112,23 +119,19 @@ class BatchEquilibrium:
 
     def rest_after_last(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Rest curvature (n_rests,) after the last pose."""
-        return self.assembly.state_after(shapes, self.given(shapes, p, rest))[0][-1]
+        return self.at(shapes, p, rest).state_after()[0][-1]
 
     def bends(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Size (m, n_cells) [1/m] of the curvature minus the rest curvature before each pose."""
-        given = self.given(shapes, p, rest)
-        bends = self.assembly.strain(shapes, given) - given.rest
-        return np.asarray(np.linalg.norm(self.assembly.chain.curvatures(bends), axis=1))
-
-    def given(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Inputs:
-        """Inputs of the equilibria, with the rest curvature before each pose."""
-        return Inputs.of(p, self.rests(shapes, p, rest), self._ends)
+        here = self.at(shapes, p, rest)
+        bends = self.model.chain.curvatures(here.strain() - here.given.rest)
+        return np.asarray(np.linalg.norm(bends, axis=1))
 
     # ---- equilibria ------------------------------------------------------------------------------
 
     def balance(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> tuple[Vector, BandMatrix]:
         """Imbalance and tangent matrices; `rest` is that before the first pose, or each pose's."""
-        return self.assembly.balance(shapes, self.given(shapes, p, rest))[1:]
+        return self.at(shapes, p, rest).balance()[1:]
 
     def moved(self, shapes: Shapes, step: Vector) -> Shapes:
         """Shapes after a step of one column."""
@@ -176,20 +179,19 @@ class BatchEquilibrium:
         active, last = np.arange(self.m), np.full(self.m, np.inf)
         stale, matrix = np.ones(self.m, dtype=bool), None
         for _ in range(max_iterations):
-            given = self.given(now, p, rest).subset(active)
-            here = now.subset(active)
+            here = self.at(now, p, rest).subset(active)
             fresh = stale[active] | coupled
-            force, matrix = self._linearized(here, given, active, fresh, matrix)
+            force, matrix = self._linearized(here, active, fresh, matrix)
             try:
                 step = self._newton(force, matrix, active)
-                step = self._handed_on(here, given, matrix, step) if coupled else step
+                step = self._handed_on(here, matrix, step) if coupled else step
             except np.linalg.LinAlgError:
                 break
-            size = self.assembly.size(step)
+            size = size_of(self.model, step)
             if coupled:
                 size[:] = size.max()
-            step, taken = damped(self.assembly, step, size, last[active])
-            now.x[active], now.lam[active] = stepped(self.assembly, here, step, taken)
+            there = stepped(here, *damped(self.model, step, size, last[active])).shapes
+            now.x[active], now.lam[active] = there.x, there.lam
             done = _settled(size, last[active], tolerance, fresh)
             stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
             # A contact that starts or ends changes the matrix.
@@ -218,31 +220,26 @@ class BatchEquilibrium:
         lost = np.flatnonzero(~converged)
         if not len(lost) or self._coupled(rest):
             return now, converged
-        given = self.given(shapes, p, rest).subset(lost)
-        some = shapes.subset(lost)
-        found = descend_to_contact(self.assembly, some, given, KEEPING_SIDE, DOWNHILL)
+        start = self.at(shapes, p, rest).subset(lost)
+        found = descend_to_contact(start, KEEPING_SIDE, DOWNHILL)
         kept = lost[found.converged]
         now.x[kept] = found.shapes.x[found.converged]
         now.lam[kept] = found.shapes.lam[found.converged]
         converged[kept] = True
         return now, converged
 
+    @staticmethod
     def _linearized(
-        self,
-        here: Shapes,
-        given: Inputs,
-        active: IntArray,
-        fresh: BoolArray,
-        matrix: BandMatrix | None,
+        here: Assembly, active: IntArray, fresh: BoolArray, matrix: BandMatrix | None
     ) -> tuple[Vector, BandMatrix]:
         """Imbalance of the active poses, and matrices of all poses, evaluated again for some."""
         if matrix is not None and not fresh.any():
-            return self.assembly.imbalance(here, given), matrix
+            return here.imbalance(), matrix
         if fresh.all():
-            _, force, new = self.assembly.balance(here, given)
+            _, force, new = here.balance()
         else:
-            force = self.assembly.imbalance(here, given)
-            _, _, new = self.assembly.balance(here.subset(fresh), given.subset(fresh))
+            force = here.imbalance()
+            _, _, new = here.subset(fresh).balance()
         return force, new if matrix is None else matrix.replaced(active[fresh], new)
 
     @staticmethod
@@ -255,13 +252,13 @@ class BatchEquilibrium:
         step.x[finite], step.y[finite] = found.x, found.y
         return step
 
-    def _handed_on(self, here: Shapes, given: Inputs, matrix: BandMatrix, step: Vector) -> Vector:
+    def _handed_on(self, here: Assembly, matrix: BandMatrix, step: Vector) -> Vector:
         """Newton step including the change of the rest curvature by the poses before."""
-        after = self.assembly.state_after(here, given)
+        after = here.state_after()
         if not after[1].any():
             return step
-        still = self._still(given, np.zeros((given.rest.shape[1], 1)))
-        ways = self._in_order(here, given, matrix, replace(still, x=step.x, lam=step.y), after)
+        still = self._still(np.zeros((self.model.chain.n_rests, 1)))
+        ways = self._in_order(here, matrix, replace(still, x=step.x, lam=step.y), after)
         return Vector(ways.x, ways.lam)
 
     # ---- derivatives -----------------------------------------------------------------------------
@@ -293,28 +290,28 @@ class BatchEquilibrium:
             Columns: the unknowns, then, with `deviations`, the model's deviations; if poses leave a
             state behind, those of the first pose, of the second, ...
         """
-        given = self.given(shapes, p, rest)
+        here = self.at(shapes, p, rest)
         used = self.used_deviations if deviations else []
         size, own = slopes.shape[1], len(used)
         deviation = np.zeros((len(self.model.deviation_names), size + own))
         deviation[used, size + np.arange(own)] = 1.0
         by_p, by_rest = (np.pad(part, [(0, 0), (0, own)]) for part in (slopes, rest_slopes))
-        still = self._still(given, by_rest, by_p, deviation)
+        still = self._still(by_rest, by_p, deviation)
         if not self.model.has_state:
-            return self._solved(shapes, given, still)
-        after = self.assembly.state_after(shapes, given)
-        if after[1].any() or not self.assembly.rest_stays(after):
+            return self._solved(here, still)
+        after = here.state_after()
+        if after[1].any() or not here.rest_stays(after):
             more = [(0, 0), (0, (self.m - 1) * own)]
-            still = self._still(given, *(np.pad(part, more) for part in (by_rest, by_p, deviation)))
+            still = self._still(*(np.pad(part, more) for part in (by_rest, by_p, deviation)))
             for j in range(1, self.m):
                 still.deviation[j] = np.roll(still.deviation[j], own * j, axis=1)
-            _, _, matrix = self.assembly.balance(shapes, given)
-            found = self._in_order(shapes, given, matrix, still, after)
+            _, _, matrix = here.balance()
+            found = self._in_order(here, matrix, still, after)
             return replace(found, tangent=matrix)
         # A state effect that is still zero leaves the rest unchanged, but its parameters change it.
         left = after[3] @ still.p
         still.rest[1:] += left[:-1].cumsum(axis=0)
-        return self._solved(shapes, given, still)
+        return self._solved(here, still)
 
     def by_rest(
         self,
@@ -329,43 +326,38 @@ class BatchEquilibrium:
 
         A mode may also change the parameters (n_parameters, q) and deviations (n_deviations, q).
         """
-        given = self.given(shapes, p, rest)
-        return self._solved(shapes, given, self._still(given, modes, by_p, by_deviation))
+        here = self.at(shapes, p, rest)
+        return self._solved(here, self._still(modes, by_p, by_deviation))
 
     def _still(
         self,
-        given: Inputs,
         by_rest: FloatArray,
         by_p: FloatArray | None = None,
         by_deviation: FloatArray | None = None,
     ) -> Tangents:
         """Directions (rows, q) at fixed nodes and multipliers, the same for all poses."""
-        a, q = self.assembly, by_rest.shape[1]
-        counts = (given.p.shape[1], len(by_rest), len(self.model.deviation_names))
+        model, q = self.model, by_rest.shape[1]
+        counts = (len(model.parameters), len(by_rest), len(model.deviation_names))
         p, rest, deviation = (
             np.repeat((np.zeros((count, q)) if part is None else part)[None], self.m, axis=0)
             for count, part in zip(counts, (by_p, by_rest, by_deviation), strict=True)
         )
-        x, lam = np.zeros((self.m, a.n, a.b, q)), np.zeros((self.m, a.k, q))
-        return Tangents(x, lam, p, rest, deviation)
+        x = np.zeros((self.m, model.chain.n_nodes, model.node.increment, q))
+        return Tangents(x, np.zeros((self.m, model.n_border, q)), p, rest, deviation)
 
-    def _solved(self, shapes: Shapes, given: Inputs, still: Tangents) -> Tangents:
+    @staticmethod
+    def _solved(here: Assembly, still: Tangents) -> Tangents:
         """Directions, completed by the resulting change of nodes and multipliers."""
-        _, _, matrix = self.assembly.balance(shapes, given)
-        found = matrix.factor().solve(self.assembly.balance_along(shapes, given, still))
+        _, _, matrix = here.balance()
+        found = matrix.factor().solve(here.balance_along(still))
         return replace(still, x=still.x - found.x, lam=still.lam - found.y, tangent=matrix)
 
     def _in_order(
-        self,
-        shapes: Shapes,
-        given: Inputs,
-        matrix: BandMatrix,
-        along: Tangents,
-        after: tuple[FloatArray, ...],
+        self, here: Assembly, matrix: BandMatrix, along: Tangents, after: tuple[FloatArray, ...]
     ) -> Tangents:
         """As `_solved`; the rest curvature of each pose is computed from the pose before."""
         x, lam, rest = along.x.copy(), along.lam.copy(), along.rest.copy()
-        factor, by_inputs = matrix.factor(), self.assembly.balance_slopes(shapes, given)
+        factor, by_inputs = matrix.factor(), here.balance_slopes()
         for j in range(self.m):
             one = np.array([j])
             parts = (x[one], lam[one], along.p[one], rest[one], along.deviation[one])
@@ -373,26 +365,26 @@ class BatchEquilibrium:
             moving = np.any([part.any(axis=tuple(range(part.ndim - 1))) for part in parts], axis=0)
             now = Tangents(*(part[..., moving] for part in parts))
             if now.p.any() or now.rest.any() or now.deviation.any():
-                here, own = (shapes.subset(one), given.subset(one)), [y[one] for y in by_inputs]
-                found = factor.subset(one).solve(self.assembly.balance_along(*here, now, own))
+                own = [y[one] for y in by_inputs]
+                change = here.subset(one).balance_along(now, own)
+                found = factor.subset(one).solve(change)
                 now = replace(now, x=now.x - found.x, lam=now.lam - found.y)
             x[j][..., moving], lam[j][..., moving] = now.x[0], now.lam[0]
             if j + 1 < self.m:
                 slopes = tuple(part[one] for part in after)
-                rest[j + 1][..., moving] = self.assembly.state_along(slopes, now)[0]
+                rest[j + 1][..., moving] = here.state_along(slopes, now)[0]
         return replace(along, x=x, lam=lam, rest=rest)
 
     def observe(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, along: Tangents
     ) -> list[tuple[Observed, ObservedChange]]:
         """Predicted measurements of each pose, and their derivatives along directions."""
-        given, length = self.given(shapes, p, rest), self.model.cable.length
-        curves, moved = self.assembly.curve_along(shapes, given, along)
+        here, length = self.at(shapes, p, rest), self.model.cable.length
+        curves, moved = here.curve_along(along)
         felt: FloatArray = np.zeros((self.m, 0))
         changes: FloatArray = np.zeros((self.m, 0, along.x.shape[3]))
         if self.wrenches:
-            felt = self.assembly.readings(shapes, given)
-            changes = self.assembly.readings_along(shapes, given, along)
+            felt, changes = here.readings(), here.readings_along(along)
         each = zip(curves, felt, moved, changes, strict=True)
         return [
             (Observed(NodeCurve.of(length, z), readings), ObservedChange(change, reading_change))
@@ -401,14 +393,14 @@ class BatchEquilibrium:
 
     def seen(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> list[Observed]:
         """Predicted measurements of each pose."""
-        given, length = self.given(shapes, p, rest), self.model.cable.length
-        felt = self.assembly.readings(shapes, given) if self.wrenches else np.zeros((self.m, 0))
-        both = zip(self.assembly.curve(shapes, given), felt, strict=True)
+        here, length = self.at(shapes, p, rest), self.model.cable.length
+        felt = here.readings() if self.wrenches else np.zeros((self.m, 0))
+        both = zip(here.curve(), felt, strict=True)
         return [Observed(NodeCurve.of(length, z), readings) for z, readings in both]
 
     def readings(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> FloatArray:
         """Wrench measurements (m, n_reactions) [N, N m] that each pose would give."""
-        return self.assembly.readings(shapes, self.given(shapes, p, rest))
+        return self.at(shapes, p, rest).readings()
 
     def stable(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> BoolArray:
         """Whether each pose is a strict minimum of the energy under its end conditions.

@@ -23,7 +23,7 @@ from dlo_casadi.equilibrium.equilibrium import (
 from dlo_casadi.equilibrium.minima import descend
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes
 from dlo_casadi.model.contact import outwards
@@ -109,7 +109,7 @@ def by_ipopt(
     upper = np.concatenate([held, bent, most])
     numbers, given = (p, rest, pose.vector), Inputs.of(p, rest, pose.vector[None])
     first = Shapes(phi[None, :, None], np.zeros((1, model.n_border)), deviation[None])
-    clipped, x0 = assembly_of(model).clipped(first, given), np.zeros(solver.size1_in("x0"))
+    clipped, x0 = Assembly(model, first, given).clipped, np.zeros(solver.size1_in("x0"))
     x0[:count], x0[count : count + len(others)] = clipped.in_frames(first.x)[0, :, 0], others
     room = np.where(np.isin(np.arange(len(x0)), clipped.clamped[0]), 0.0, np.inf)
     bounds = {"lbx": x0 - room, "ubx": x0 + room, "lbg": lower, "ubg": upper}
@@ -119,14 +119,15 @@ def by_ipopt(
     bounded, pressed = np.split(multipliers[conditions:], [count - 1])
     border[model.are_multipliers] = np.concatenate([multipliers[:conditions], -pressed])
     border[~model.are_multipliers] = coordinates[count:][: np.sum(~model.are_multipliers)]
-    start = Shapes(coordinates[None, :count, None], border[None], deviation[None])
+    shapes = Shapes(coordinates[None, :count, None], border[None], deviation[None])
+    start = Assembly(model, shapes, given)
     if model.surfaces:
-        start = descend(assembly_of(model), start, given).shapes
-    return _balanced(model, start, bounded, given, stats["iter_count"])
+        start = replace(start, shapes=descend(start).shapes)
+    return _balanced(start, bounded, stats["iter_count"])
 
 
 def _balanced(
-    model: CableModel, start: Shapes, bound_multipliers: FloatArray, given: Inputs, iterations: int
+    start: Assembly, bound_multipliers: FloatArray, iterations: int
 ) -> Equilibrium | None:
     """Newton's method from IPOPT's minimum, on a Lagrangian that keeps compressed bubbles stiff.
 
@@ -134,24 +135,24 @@ def _balanced(
     status of IPOPT is ignored, because on fine meshes of stiff cables its tolerance lies below
     rounding. Only the balance of the shape counts: the result is None if it does not balance.
     """
-    assembly, node = assembly_of(model), model.node
+    model, node = start.model, start.model.node
 
     def bends(shapes: Shapes) -> FloatArray:
         """Angles (n_nodes - 1,) [rad] between neighbouring nodes."""
         return node.difference(shapes.x[0, :-1], shapes.x[0, 1:])[:, 0]
 
-    def linearized(shapes: Shapes, moments: FloatArray) -> tuple[Vector, BandMatrix]:
+    def linearized(here: Assembly, moments: FloatArray) -> tuple[Vector, BandMatrix]:
         """Imbalance and tangent with the active joints as further conditions."""
-        _, force, matrix = assembly.balance(shapes, given)
+        _, force, matrix = here.balance()
         arms = np.zeros((1, model.chain.n_nodes, 1, len(active)))
         arms[0, active, 0, np.arange(len(active))] = -1.0
         arms[0, active + 1, 0, np.arange(len(active))] = 1.0
-        arms[0, assembly.clipped(shapes, given).clamped[0]] = 0.0
-        gap = (bends(shapes)[active] - bound)[None, :, None]
+        arms[0, here.clipped.clamped[0]] = 0.0
+        gap = (bends(here.shapes)[active] - bound)[None, :, None]
         conditions = np.concatenate([force.y, gap], axis=1)
         return Vector(force.x + (arms @ moments)[..., None], conditions), matrix.with_border(arms)
 
-    bent = bends(start)
+    bent = bends(start.shapes)
     active = np.flatnonzero(np.abs(bent) > JOINT_BOUND - AT_BOUND)
     while True:
         bound, moments = np.copysign(JOINT_BOUND, bent[active]), bound_multipliers[active]
@@ -165,8 +166,9 @@ def _balanced(
             size = float(np.abs(step.x).max())
             if not size < NEARBY:
                 break
-            lam = now.lam + step.y[:, : model.n_border, 0]
-            now = replace(now, x=node.moved(now.x, step.x[..., 0]), lam=lam)
+            lam = now.shapes.lam + step.y[:, : model.n_border, 0]
+            x = node.moved(now.shapes.x, step.x[..., 0])
+            now = replace(now, shapes=replace(now.shapes, x=x, lam=lam))
             moments = moments + step.y[0, model.n_border :, 0]
             if size < 1e-12:
                 break
@@ -176,14 +178,14 @@ def _balanced(
     force, matrix = linearized(now, moments)
     residual = float(np.abs(force.y).max(initial=0.0))
     imbalance = float(np.abs(force.x).max())
-    inside = bool(np.abs(bends(now)).max() < JOINT_BOUND + AT_BOUND)
+    inside = bool(np.abs(bends(now.shapes)).max() < JOINT_BOUND + AT_BOUND)
     balanced = imbalance <= BALANCE * float(matrix.scale[0]) < np.inf
-    inside = inside and bool(assembly.clipped(now, given).in_order[0])
+    inside = inside and bool(now.clipped.in_order[0])
     if not (inside and balanced and residual <= END_TOLERANCE):
         return None
     stable = int(matrix.negative()[0]) == model.n_multipliers + len(active)
     numbers = {"stable": np.array([stable]), "iterations": np.array([iterations])}
-    (found,) = equilibria_of(model, now, given, **numbers)
+    (found,) = equilibria_of(now, **numbers)
     bound_lam = np.zeros(len(bent))
     bound_lam[active] = moments
     return replace(found, bound_multipliers=bound_lam)

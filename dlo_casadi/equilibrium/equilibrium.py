@@ -6,8 +6,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.pose import SIGNS, Branch
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.clips import ClipLoad, Clipped
 from dlo_casadi.model.contact import Contact
 from dlo_casadi.rod.ends import reaction_rows
@@ -161,27 +160,19 @@ def continued(clipped: Clipped) -> tuple[IntArray, FloatArray]:
     return index, inside + beyond
 
 
-def equilibria_of(
-    model: CableModel,
-    shapes: Shapes,
-    given: Inputs,
-    *,
-    stable: BoolArray,
-    iterations: IntArray,
-) -> list[Equilibrium]:
+def equilibria_of(found: Assembly, *, stable: BoolArray, iterations: IntArray) -> list[Equilibrium]:
     """Equilibria of m shapes, whose joints bend freely; `stable` and `iterations` (m,)."""
-    assembly, chain, node = assembly_of(model), model.chain, model.node
-    total, force, _ = assembly.balance(shapes, given)
-    energies = total - assembly.work(shapes, force)
-    if touching := assembly.touching(shapes, given):
-        energies += touching.given_way
+    shapes, chain, node = found.shapes, found.model.chain, found.model.node
+    total, force, _ = found.balance()
+    energies = total - found.work(force)
+    if found.touching:
+        energies += found.touching.given_way
     residuals = np.abs(force.y[..., 0]).max(axis=1, initial=0.0)
-    strains = assembly.strain(shapes, given)
-    on_fixtures, rows = assembly.reactions(shapes, given), reaction_rows(node)
-    points = assembly.nodes(shapes, given)
+    strains, points = found.strain(), found.nodes()
+    on_fixtures, rows = found.reactions(), reaction_rows(node)
     curvatures = chain.curvatures(strains)
-    sizes = curvatures_along(curvatures, assembly.clipped(shapes, given)).max(axis=1)
-    on_clips, contacts = assembly.clip_loads(shapes, given), assembly.contacts(shapes, given)
+    sizes = curvatures_along(curvatures, found.clipped).max(axis=1)
+    on_clips, contacts = found.clip_loads(), found.contacts()
     out = []
     for j in range(len(shapes.x)):
         moments = [on_fixtures[j, rows[f"{side}_moment"]] for side in ("start", "end")]

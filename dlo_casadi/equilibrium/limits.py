@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium, curvatures_along, pl
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Repeats
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, tangents
 from dlo_casadi.model.contact import outwards
@@ -66,34 +66,34 @@ def places_of(
         held = fixtures_of(model, pose, found)
         own = [item for item in held if quantity == "force" or item.takes_moment]
         return np.array([item.at for item in own]), [item.name for item in own]
+    there = Assembly(model, found.shapes, given)
     if quantity == "clearance":
-        names, deep = _depths(model, found.shapes, given)
+        names, deep = _depths(there)
         along = np.linspace(0.0, model.cable.length, deep.shape[2])
         return along, [names[k] for k in deep[:, 0].argmax(axis=0)]
-    clipped = assembly_of(model).clipped(found.shapes, given)
     bends = quantity == "curvature"
-    places = places_along(clipped)[0] if bends else clipped.cells[0].mean(axis=1)
+    places = places_along(there.clipped)[0] if bends else there.clipped.cells[0].mean(axis=1)
     return places, [""] * len(places)
 
 
-def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) -> FloatArray:
+def sizes_of(found: Assembly, quantity: str) -> FloatArray:
     """Sizes (m, K) of a quantity at `places_of`, in repeats of a pose.
 
     Curvature, twist [1/m]; force [N] and moment [N m] on fixtures; minus the clearance [m].
     """
     if quantity == "clearance":
-        _, deep = _depths(model, shapes, given)
+        _, deep = _depths(found)
         return np.asarray(deep.max(axis=0))
-    assembly, chain, rows = assembly_of(model), model.chain, reaction_rows(model.node)
+    model, chain, rows = found.model, found.model.chain, reaction_rows(found.model.node)
     if quantity in ("curvature", "twist"):
-        strain = assembly.strain(shapes, given)
+        strain = found.strain()
         if quantity == "twist":
             return np.abs(strain[:, : chain.n_cells])  # the first strain in space
-        return curvatures_along(chain.curvatures(strain), assembly.clipped(shapes, given))
-    found, loads = assembly.reactions(shapes, given), assembly.clip_loads(shapes, given)
+        return curvatures_along(chain.curvatures(strain), found.clipped)
+    reactions, loads = found.reactions(), found.clip_loads()
     held = tuple(side for side in ("start", "end") if getattr(model, side) != "free")
     ends = held if quantity == "force" else functions_of(model).moment_ends
-    each = [found[:, rows[f"{side}_{quantity}"]] for side in ends]
+    each = [reactions[:, rows[f"{side}_{quantity}"]] for side in ends]
     each += [
         np.array([np.atleast_1d(getattr(load[k], quantity)) for load in loads])
         for k, kind in enumerate(model.clips)
@@ -102,20 +102,20 @@ def sizes_of(model: CableModel, shapes: Shapes, given: Inputs, quantity: str) ->
     return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
 
 
-def _depths(model: CableModel, shapes: Shapes, given: Inputs) -> tuple[list[str], FloatArray]:
+def _depths(found: Assembly) -> tuple[list[str], FloatArray]:
     """Obstacles to be avoided, and the depth (n, m, K) [m] of cables in each; outside negative."""
-    along, offsets = _along(model, shapes, given), given.p @ outwards(model).T
+    model, along = found.model, _along(found)
+    offsets = found.given.p @ outwards(model).T
     known = [(k, one) for k, one in enumerate(model.obstacles) if not one.touch]
     deep = [offsets[:, [k]] - one.near(along).distance for k, one in known]
     return [one.name for _, one in known], np.array(deep) + model.cable.diameter / 2
 
 
-def _along(model: CableModel, shapes: Shapes, given: Inputs) -> FloatArray:
+def _along(found: Assembly) -> FloatArray:
     """Places (m, K, d) [m] along cables, four per element, interpolated from their nodes."""
-    assembly, even, x = assembly_of(model), model.chain.places, shapes.x
-    points = assembly.nodes(shapes, given)
+    model, points, x = found.model, found.nodes(), found.shapes.x
     if model.clamped_between:  # nodes of clamped clips are moved to these, `points` are even
-        moved = assembly.clipped(shapes, given).places
+        even, moved = model.chain.places, found.clipped.places
         x = np.array([model.node.interpolated(even, *each) for each in zip(moved, x, strict=True)])
     slopes = model.chain.h * tangents(model.node, x)
     u = np.arange(4)[:, None] / 4
@@ -224,8 +224,8 @@ class Varied(Repeats):
         """Sizes (K,) and their derivatives (K, q) by the ways in which a repeat may differ."""
         count = len(self.uncertainty.causes_in(self.model))
         z = _STEP * np.vstack([np.eye(count), -np.eye(count), np.zeros((1, count))])
-        near, given = self._near(z), self._given(z)
-        found = {name: sizes_of(self.larger, near, given, name) for name in names}
+        near = Assembly(self.larger, self._near(z), self._given(z))
+        found = {name: sizes_of(near, name) for name in names}
         slopes = {name: x[:count] - x[count : 2 * count] for name, x in found.items()}
         sizes = {name: x[-1] for name, x in found.items()}
         return sizes, {name: np.asarray(x.T / (2 * _STEP)) for name, x in slopes.items()}
@@ -266,8 +266,9 @@ class Varied(Repeats):
             way = np.abs(self.model.node.difference(start.x, shapes.x)).max(axis=(1, 2))
             near = converged & (way <= REACH)
             lost.append(~(near & batch.stable(shapes, own.p, own.rest)))
+            solved = Assembly(self.larger, shapes, own)
             for name in names:
-                parts[name].append(sizes_of(self.larger, shapes, own, name))
+                parts[name].append(sizes_of(solved, name))
         return {name: np.concatenate(x) for name, x in parts.items()}, np.concatenate(lost)
 
 

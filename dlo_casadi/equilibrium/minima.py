@@ -20,11 +20,14 @@ from typing import NamedTuple
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
-from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
+from dlo_casadi.model.assembly import Assembly, Shapes
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import DEPTH, gap_per_force
 from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
 from dlo_casadi.rod.obstacles import bars_of
 
+# Turn [rad] that counts as much as a slip of the whole length through an eyelet.
+_TURN = 10.0
 # Longest step of a node [rad].
 LONGEST_STEP = 0.5
 # Longest step at convergence [rad].
@@ -74,20 +77,33 @@ class Minima(NamedTuple):
     iterations: IntArray
 
 
-def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: int = 80) -> Minima:
+def turn_per_slip(model: CableModel) -> FloatArray:
+    """Turn [rad/m] equivalent to a change of an eyelet's arc length; zero for others (k,)."""
+    slide = np.isin(np.arange(model.n_border), list(model.sliding.values()))
+    return slide * (_TURN / model.chain.length)
+
+
+def size_of(model: CableModel, step: Vector) -> FloatArray:
+    """Largest turn (m,) [rad] in a step of one column."""
+    nodes = np.abs(step.x).max(axis=(1, 2, 3))
+    slips = (np.abs(step.y[..., 0]) * turn_per_slip(model)).max(axis=1, initial=0.0)
+    return np.maximum(nodes, slips)
+
+
+def descend(start: Assembly, max_iterations: int = 80) -> Minima:
     """Minimise the energy of each of m shapes under its end conditions.
 
-    `shapes`: first guesses; their deviations are kept. `given`: inputs of each of them.
+    `start`: first guesses and the inputs of each of them; their deviations are kept.
     """
-    m = len(shapes.x)
-    wanted = assembly.model.n_multipliers
+    model, shapes = start.model, start.shapes
+    m, wanted, turns = len(shapes.x), model.n_multipliers, turn_per_slip(model)
     now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
     balanced, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
     shift, first, last = np.zeros(m), np.full(m, np.inf), np.full(m, np.inf)
     active = np.arange(m)
+    here = start.subset(active)
     for iteration in range(max_iterations):
-        here = now.subset(active)
-        _, force, matrix = assembly.balance(here, given.subset(active))
+        _, force, matrix = here.balance()
         if not iteration:
             first = RUNAWAY * matrix.scale
         bounded = np.flatnonzero(matrix.scale <= first[active])
@@ -97,78 +113,67 @@ def descend(assembly: Assembly, shapes: Shapes, given: Inputs, max_iterations: i
             matrix = matrix.subset(bounded)
         if not len(active):
             break
-        factor, shift[active] = _convex(matrix, wanted, shift[active], assembly.turn_per_slip)
+        factor, shift[active] = _convex(matrix, wanted, shift[active], turns)
         step = factor.solve(Vector(-force.x, -force.y))
-        size = assembly.size(step)
-        taken, length = damped(assembly, step, size, last[active])
+        size = size_of(model, step)
+        taken, length = damped(model, step, size, last[active])
         last[active] = size
-        own = here, taken, length, given.subset(active)
-        now.x[active], now.lam[active] = _on_their_sides(assembly, *own)
+        here = _on_their_sides(here, taken, length)
+        now.x[active], now.lam[active] = here.shapes.x, here.shapes.lam
         # A shift makes steps small even if forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True
         iterations[active[done]] = iteration + 1
-        active = active[~done & np.isfinite(size)]
+        left = np.flatnonzero(~done & np.isfinite(size))
+        active, here = active[left], here.subset(left)
         if not len(active):
             break
-    total, force, matrix = assembly.balance(now, given)
+    end = replace(start, shapes=now)
+    total, force, matrix = end.balance()
     with np.errstate(invalid="ignore"):
-        energy = total - assembly.work(now, force)
+        energy = total - end.work(force)
     there = np.flatnonzero(balanced)
     converged = np.zeros(m, dtype=bool)
     converged[there] = matrix.subset(there).negative() == wanted
-    possible = assembly.clipped(now, given).in_order
-    pressed = now.lam[:, assembly.model.n_lam :].max(axis=1, initial=0.0)
-    possible &= pressed * gap_per_force(assembly.model, DEPTH) < NO_ROOM * assembly.chain.length
+    pressed = now.lam[:, model.n_lam :].max(axis=1, initial=0.0)
+    possible = end.clipped.in_order
+    possible &= pressed * gap_per_force(model, DEPTH) < NO_ROOM * model.chain.length
     balanced, converged = balanced & possible, converged & possible
     return Minima(now, balanced, converged, energy, iterations)
 
 
 def descend_to_contact(
-    assembly: Assembly,
-    shapes: Shapes,
-    given: Inputs,
-    skipped: int | IntArray,
-    max_iterations: int = 80,
+    start: Assembly, skipped: int | IntArray, max_iterations: int = 80
 ) -> Minima:
     """As `descend`; each shape skips the first `skipped` (m,) of the depths SOFT."""
-    if not assembly.model.surfaces:
-        return descend(assembly, shapes, given, max_iterations)
-    shapes = shapes.subset(np.arange(len(shapes.x)))  # a copy
-    depths = [depth for depth in SOFT if depth > assembly.depth]
+    if not start.model.surfaces:
+        return descend(start, max_iterations)
+    shapes = start.shapes.subset(np.arange(len(start.shapes.x)))  # a copy
+    depths = [depth for depth in SOFT if depth > start.depth]
     for k, depth in enumerate(depths):
         rows = np.flatnonzero(np.broadcast_to(skipped, len(shapes.x)) <= k)
         if len(rows):
-            some = shapes.subset(rows), given.subset(rows)
-            softer = descend(assembly.softened(depth), *some, STEPS_WHILE_SOFT).shapes
+            soft = replace(start, shapes=shapes, depth=depth).subset(rows)
+            softer = descend(soft, STEPS_WHILE_SOFT).shapes
             shapes.x[rows], shapes.lam[rows] = softer.x, softer.lam
-    return _hardened(assembly, depths[-1], shapes, given, max_iterations, HALVINGS)
+    return _hardened(replace(start, shapes=shapes), depths[-1], max_iterations, HALVINGS)
 
 
-def _hardened(
-    assembly: Assembly,
-    softer: float,
-    shapes: Shapes,
-    given: Inputs,
-    max_iterations: int,
-    halvings: int,
-) -> Minima:
+def _hardened(start: Assembly, softer: float, max_iterations: int, halvings: int) -> Minima:
     """Minima from shapes that balanced in obstacles of a larger depth, `softer`.
 
     If this finds none because contacts change too much, the change of log depth is halved: an
     intermediate depth is solved first.
     """
-    found = descend(assembly, shapes, given, max_iterations)
+    found = descend(start, max_iterations)
     lost = np.flatnonzero(~found.balanced)
     if not len(lost) or not halvings:
         return found
-    between, few = float(np.sqrt(softer * assembly.depth)), (STEPS_WHILE_SOFT, halvings - 1)
-    half = _hardened(
-        assembly.softened(between), softer, shapes.subset(lost), given.subset(lost), *few
-    )
+    between, few = float(np.sqrt(softer * start.depth)), (STEPS_WHILE_SOFT, halvings - 1)
+    half = _hardened(replace(start.subset(lost), depth=between), softer, *few)
     lost, near = lost[half.balanced], half.shapes.subset(half.balanced)
     if len(lost):
-        other = _hardened(assembly, between, near, given.subset(lost), *few)
+        other = _hardened(replace(start.subset(lost), shapes=near), between, *few)
         parts = ((one.shapes.x, one.shapes.lam, *one[1:]) for one in (found, other))
         for mine, theirs in zip(*parts, strict=True):
             mine[lost] = theirs
@@ -180,7 +185,7 @@ def _convex(
 ) -> tuple[BandFactor, FloatArray]:
     """Factors of the matrices, shifted until their inertia is that of a minimum, and the shifts.
 
-    `turns` (k,): see `Assembly.turn_per_slip`. The largest shift makes the nodes' part positive
+    `turns` (k,): see `turn_per_slip`. The largest shift makes the nodes' part positive
     definite: if the inertia is wrong even then, the conditions are the cause.
     """
     scale, most = matrix.scale, matrix.row_sum
@@ -209,48 +214,46 @@ def _convex(
 
 
 def damped(
-    assembly: Assembly, step: Vector, size: FloatArray, last: FloatArray
+    model: CableModel, step: Vector, size: FloatArray, last: FloatArray
 ) -> tuple[Vector, FloatArray]:
     """Steps of one column and their sizes (m,), shortened if contacts alternate."""
-    if not assembly.model.surfaces:
+    if not model.surfaces:
         return step, size
     share = np.where(size > SAME_SIZE * last, SHORTER, 1.0)
     return Vector(step.x * share[:, None, None, None], step.y * share[:, None, None]), size * share
 
 
-def stepped(
-    assembly: Assembly, shapes: Shapes, step: Vector, size: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Nodes and border of shapes after a step of one column, limited to LONGEST_STEP.
+def stepped(here: Assembly, step: Vector, size: FloatArray) -> Assembly:
+    """Shapes after a step of one column, limited to LONGEST_STEP.
 
-    `size` (m,) [rad] is the longest step of each shape, see `Assembly.size`. Eyelets stay within
-    the cable.
+    `size` (m,) [rad] is the longest step of each shape, see `size_of`. Eyelets stay within the
+    cable.
     """
+    model, shapes = here.model, here.shapes
     share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
-    x = assembly.node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
+    x = model.node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
     lam = shapes.lam + share[:, None] * step.y[..., 0]
-    for row in assembly.model.sliding.values():
-        lam[:, row] = lam[:, row].clip(0.0, assembly.chain.length)
-    return x, lam
+    for row in model.sliding.values():
+        lam[:, row] = lam[:, row].clip(0.0, model.chain.length)
+    return replace(here, shapes=replace(shapes, x=x, lam=lam))
 
 
-def _on_their_sides(
-    assembly: Assembly, shapes: Shapes, step: Vector, size: FloatArray, given: Inputs
-) -> tuple[FloatArray, FloatArray]:
+def _on_their_sides(here: Assembly, step: Vector, size: FloatArray) -> Assembly:
     """As `stepped`, but a step that carries a cable through a bar is halved.
 
     Bars so soft that the cable sinks in by more than their radius under its weight are ignored.
     """
-    depth, size = assembly.depth * assembly.chain.length, np.maximum(size, LONGEST_STEP)
-    bars = bars_of(assembly.model.surfaces, assembly.model.gravity)
+    model, size = here.model, np.maximum(size, LONGEST_STEP)
+    depth = here.depth * model.chain.length
+    bars = bars_of(model.surfaces, model.gravity)
     bars = [(bar, up) for bar, up in bars if depth < bar.radius]
-    before = assembly.nodes(shapes, given) if bars else shapes.x
+    before = here.nodes() if bars else here.shapes.x
     for _ in range(SHORTENED):
-        x, lam = stepped(assembly, shapes, step, size)
-        after = assembly.nodes(replace(shapes, x=x, lam=lam), given) if bars else x
+        there = stepped(here, step, size)
+        after = there.nodes() if bars else there.shapes.x
         sides = [np.array([bar.passed(up, y) for y in (before, after)]) for bar, up in bars]
         through = np.any([(x != y).all(axis=0) for x, y in sides], axis=0)
         if not through.any():
             break
         size = np.where(through, 2 * size, size)
-    return x, lam
+    return there

@@ -32,7 +32,7 @@ from dlo_casadi.equilibrium.spans import (
     out_of_reach,
 )
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import clamped_nodes, node_places
 from dlo_casadi.rod.node import Frame
@@ -279,14 +279,15 @@ class _PoseSearch:
 
     def _descend(
         self, poses: Sequence[HeldPose], guesses: Guesses, near: BoolArray
-    ) -> tuple[IntArray, Inputs, Minima]:
-        """Pose of each guess, its inputs, and the minima reached; `near` as in `_descended`."""
+    ) -> tuple[IntArray, Assembly, Minima]:
+        """Pose of each guess, and the minima reached; `near` as in `_descended`."""
         of, x, border = (np.array(part) for part in zip(*guesses, strict=True))
         shapes = Shapes.declared(x, border, len(self.model.clips))
         given = Inputs.of(self.p, self.rest, np.array([poses[j].vector for j in of]))
         sided = np.array([bool(named_sides(self.model, poses[j])) for j in of])
         skipped = (KEEPING_SIDE + sided) * near[of]
-        return of, given, descend_to_contact(assembly_of(self.model), shapes, given, skipped)
+        minima = descend_to_contact(Assembly(self.model, shapes, given), skipped)
+        return of, Assembly(self.model, minima.shapes, given), minima
 
     def _descended(
         self, poses: Sequence[HeldPose], guesses: Guesses, near: BoolArray
@@ -295,18 +296,13 @@ class _PoseSearch:
 
         `near` (poses,): whether they are to stay on their side of obstacles.
         """
-        _, given, minima = self._descend(poses, guesses, near)
+        _, found, minima = self._descend(poses, guesses, near)
         kept = minima.balanced
         if not self.model.in_space:
-            bends = np.abs(np.diff(minima.shapes.x[..., 0], axis=1))
+            bends = np.abs(np.diff(found.shapes.x[..., 0], axis=1))
             kept = minima.converged & (bends.max(axis=1) < JOINT_BOUND)
-        equilibria = equilibria_of(
-            self.model,
-            minima.shapes.subset(kept),
-            given.subset(kept),
-            stable=minima.converged[kept],
-            iterations=minima.iterations[kept],
-        )
+        stable, iterations = minima.converged[kept], minima.iterations[kept]
+        equilibria = equilibria_of(found.subset(kept), stable=stable, iterations=iterations)
         out: list[list[Equilibrium]] = [[] for _ in poses]
         untold = self.model.end == "free" and bool(self.model.surfaces)  # not in IPOPT's problem
         for k, (j, x, _) in enumerate(guesses):
@@ -323,16 +319,14 @@ class _PoseSearch:
         search = _PoseSearch(coarse, self.p, coarse_rest(model, coarse, self.rest))
         touching = bool(model.surfaces)
         guesses = search._beside(poses) if touching else search._first(poses, [None] * len(poses))
-        of, given, found = search._descend(poses, guesses, np.full(len(poses), touching))
-        strains = assembly_of(coarse).strain(found.shapes, given)
-        twist = strains[:, : coarse.chain.n_cells]
+        of, found, minima = search._descend(poses, guesses, np.full(len(poses), touching))
+        twist, points = found.strain()[:, : coarse.chain.n_cells], found.nodes()
         x, kept = found.shapes.x, []
-        points = assembly_of(coarse).nodes(found.shapes, given)
         for j, pose in enumerate(poses):
-            rows = np.flatnonzero((of == j) & found.converged)
+            rows = np.flatnonzero((of == j) & minima.converged)
             rows = rows[_holds(pose, _twists(coarse, pose, twist[rows]))]
             rows = rows[on_named_sides(coarse, pose, points[rows])]
-            rows = rows[np.argsort(found.energy[rows], kind="stable")]
+            rows = rows[np.argsort(minima.energy[rows], kind="stable")]
             mine = [int(rows[k]) for k in _distinct(model, x[rows])[:FEW]]
             if mine:
                 there = rows[on_other_side(model, pose, x[mine[0]], x[rows])]

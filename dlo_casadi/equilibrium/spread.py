@@ -18,7 +18,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import ways_of
-from dlo_casadi.model.assembly import Inputs, Shapes, Tangents, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.thresholds import EITHER
@@ -343,7 +343,7 @@ def energy_slope(
     for moved in by_deviation:
         shapes = replace(shapes, deviation=moved)
     inputs = Inputs.of(given[0] + by_p, given[1] + by_rest, np.tile(pose.vector, (m, 1)))
-    total = assembly_of(model).balance(shapes, inputs)[0]
+    total = Assembly(model, shapes, inputs).balance()[0]
     return np.asarray((total[:q] - total[q:]) / (2 * step))
 
 

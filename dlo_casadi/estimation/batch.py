@@ -83,7 +83,7 @@ class _BatchNlp:
         self.problem = problem
         unknowns, model = problem.unknowns, problem.equilibria.model
         self.m = problem.equilibria.m
-        self.n_x, self.n_lam = problem.equilibria.assembly.n, model.n_border
+        self.n_x, self.n_lam = model.chain.n_nodes, model.n_border
         self.columns = problem.equilibria.used_deviations
         self.n_rest = model.chain.n_rests if model.has_state else 0
         first = self.n_x + self.n_lam

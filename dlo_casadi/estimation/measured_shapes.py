@@ -141,12 +141,16 @@ def _kinematics(
 
 def _each_node(equilibria: BatchEquilibrium) -> Tangents:
     """Directions: each increment of each node."""
-    a, m = equilibria.assembly, equilibria.m
-    q = a.n * a.b
-    x = np.broadcast_to(np.eye(q).reshape((a.n, a.b, q)), (m, a.n, a.b, q))
-    model = equilibria.model
-    counts = (a.k, len(model.parameters), model.chain.n_rests, len(model.deviation_names))
-    lam, p, rest, deviation = (np.zeros((m, count, q)) for count in counts)
+    model, m = equilibria.model, equilibria.m
+    n, b = model.chain.n_nodes, model.node.increment
+    x = np.broadcast_to(np.eye(n * b).reshape((n, b, n * b)), (m, n, b, n * b))
+    counts = (
+        model.n_border,
+        len(model.parameters),
+        model.chain.n_rests,
+        len(model.deviation_names),
+    )
+    lam, p, rest, deviation = (np.zeros((m, count, n * b)) for count in counts)
     return Tangents(x, lam, p, rest, deviation)
 
 

@@ -24,7 +24,7 @@ from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.repeats import enough_poses, repeat_std
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Values
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
@@ -138,7 +138,7 @@ def predict_poses(
         last = pose, found.equilibrium.x
         if model.has_state:
             inputs = Inputs.of(p, rest, pose.vector[None])
-            rest = assembly_of(model).state_after(found.equilibrium.shapes, inputs)[0][0]
+            rest = Assembly(model, found.equilibrium.shapes, inputs).state_after()[0][0]
     return out
 
 
@@ -152,13 +152,11 @@ def _seen(
     """Equilibria of poses as camera and sensors would see them."""
     if not poses:
         return []
-    shapes = stacked(equilibria)
     given = Inputs.of(p, rest, np.array([pose.vector for pose in poses]))
-    length, assembly = model.cable.length, assembly_of(model)
-    curves, readings = assembly.curve(shapes, given), assembly.readings(shapes, given)
+    found, length = Assembly(model, stacked(equilibria), given), model.cable.length
     return [
         Prediction(eq, Observed(NodeCurve.of(length, z), shown), rest)
-        for eq, z, shown in zip(equilibria, curves, readings, strict=True)
+        for eq, z, shown in zip(equilibria, found.curve(), found.readings(), strict=True)
     ]
 
 

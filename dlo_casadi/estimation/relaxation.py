@@ -29,7 +29,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.unknowns import NO_INFORMATION, Normal, Values
-from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
+from dlo_casadi.model.assembly import Assembly, Shapes, Tangents
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.model.contact import gap_per_force
 from dlo_casadi.model.functions import functions_of
@@ -102,12 +102,12 @@ class Relaxation:
     @cached_property
     def _counts(self) -> tuple[int, int, int, int, int]:
         """Number of a pose's increments; plus multipliers; plus deviations; plus state; and all."""
-        equilibria = self.problem.equilibria
-        a, model = equilibria.assembly, self.problem.unknowns.model
-        nodes = a.n * a.b
-        own = nodes + a.k + len(equilibria.used_deviations)
+        model = self.problem.unknowns.model
+        nodes = model.chain.n_nodes * model.node.increment
+        border = nodes + model.n_border
+        own = border + len(self.problem.equilibria.used_deviations)
         known = own + (model.chain.n_rests if model.has_state else 0)
-        return nodes, nodes + a.k, own, known, known + self.problem.unknowns.size
+        return nodes, border, own, known, known + self.problem.unknowns.size
 
     def _stiffness(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log stiffnesses (n b,) that scale the nodes' rows, and their derivatives by p.
@@ -135,10 +135,9 @@ class Relaxation:
 
     # ---- contact -----------------------------------------------------------------------------
 
-    @cached_property
-    def _assembly(self) -> Assembly:
-        """Assembly in which forces of obstacles act whatever the gaps."""
-        return self.problem.equilibria.assembly.felt_everywhere()
+    def _at(self, values: Values) -> Assembly:
+        """The model at these values; forces of obstacles act whatever the gaps."""
+        return self.problem.equilibria.at(*self.problem.state(values)).felt_everywhere
 
     @cached_property
     def _contacts(self) -> slice:
@@ -177,8 +176,7 @@ class Relaxation:
         """
         problem = self.problem
         shapes = values.shapes
-        given = problem.equilibria.given(*problem.state(values))
-        left = self._assembly.imbalance(shapes, given).rows[:, :, 0]
+        left = self._at(values).imbalance().rows[:, :, 0]
         left[:, self._contacts] = self._complementarity(left, shapes)[0]
         left *= self._weights(values.theta)
         own = shapes.deviation[:, problem.equilibria.used_deviations] / problem.deviation_std
@@ -200,11 +198,10 @@ class Relaxation:
         rows = self._reduced(self._linearized(values), 0.0).shared
         return Normal(rows[:, :-1].T @ rows[:, :-1], -rows[:, :-1].T @ rows[:, -1], [])
 
-    def _along(self, values: Values, given: Inputs) -> Tangents:
+    def _along(self, values: Values) -> Tangents:
         """Directions: each own unknown of a pose, then of its state, then of theta."""
-        problem = self.problem
-        unknowns, equilibria, model = problem.unknowns, problem.equilibria, problem.unknowns.model
-        a, m = equilibria.assembly, equilibria.m
+        unknowns, equilibria = self.problem.unknowns, self.problem.equilibria
+        model, m = unknowns.model, equilibria.m
         nodes, border, own, known, q = self._counts
         unit = np.broadcast_to(np.eye(own, q), (m, own, q))
         deviation = np.zeros((m, values.shapes.deviation.shape[1], q))
@@ -218,7 +215,7 @@ class Relaxation:
             rest[:, :, own:known] = np.eye(known - own)
         else:
             rest[:, :, known:] = unknowns.rest_slopes
-        x = unit[:, :nodes].reshape((m, a.n, a.b, q))
+        x = unit[:, :nodes].reshape((m, model.chain.n_nodes, -1, q))
         forces = values.shapes.lam * model.are_multipliers  # these scale with the stiffness
         lam = unit[:, nodes:border] + forces[:, :, None] * self._growth(values)
         return Tangents(x, lam, p, rest, deviation)
@@ -246,16 +243,14 @@ class Relaxation:
         log, by_p = functions_of(unknowns.model).bent_stiffness(unknowns.p(theta))
         return float(log), np.array(by_p).ravel()
 
-    def _states(self, values: Values, given: Inputs, along: Tangents) -> list[FloatArray]:
+    def _states(self, here: Assembly, along: Tangents) -> list[FloatArray]:
         """Change of each pose's state by the unknowns of the pose before, see `_Linearized`."""
         problem = self.problem
         own, known, q = self._counts[2:]
         states = np.zeros((problem.equilibria.m, known - own, q + 1))
         if problem.unknowns.model.has_state:
-            assembly = problem.equilibria.assembly
-            after = assembly.state_after(values.shapes, given)
             states[0, :, known:-1] = problem.unknowns.rest_slopes
-            states[1:, :, :-1] = assembly.state_along(after, along)[:-1]
+            states[1:, :, :-1] = here.state_along(here.state_after(), along)[:-1]
         return list(states)
 
     def _linearized(self, values: Values) -> _Linearized:
@@ -263,12 +258,10 @@ class Relaxation:
         problem = self.problem
         equilibria = problem.equilibria
         nodes, _, _, known, _ = self._counts
-        state = problem.state(values)
-        given = equilibria.given(*state)
-        along = self._along(values, given)
-        _, force, matrix = self._assembly.balance(values.shapes, given)
+        here, along = self._at(values), self._along(values)
+        _, force, matrix = here.balance()
         still = replace(along, x=np.zeros_like(along.x), lam=np.zeros_like(along.lam))
-        rows = self._assembly.balance_along(values.shapes, given, still).rows
+        rows = here.balance_along(still).rows
         tangent = matrix.dense()
         rows[:, :, :nodes] += tangent[:, :, :nodes]
         rows += tangent[:, :, nodes:] @ along.lam
@@ -291,7 +284,7 @@ class Relaxation:
             parts += [data[j]] if j in data else []
             stacked.append(np.concatenate([np.column_stack([a, -e]) for a, e in parts]))
         root, gap = self._prior, values.theta - problem.mean
-        states = self._states(values, given, along)
+        states = self._states(here, along)
         return _Linearized(stacked, states, np.column_stack([root, -root @ gap]))
 
     def _reduced(

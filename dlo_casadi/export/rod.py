@@ -30,7 +30,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.export.common import printable
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.element import Cell
@@ -73,20 +73,20 @@ class SolvedCable(CasadiCable):
         """The cable in its predicted shape."""
         return cls(model, p, rest, pose, solve_equilibrium(model, p, rest, pose))
 
-    @property
-    def _given(self) -> Inputs:
-        return Inputs.of(self.p, self.rest, self.pose.vector[None])
+    @cached_property
+    def _found(self) -> Assembly:
+        given = Inputs.of(self.p, self.rest, self.pose.vector[None])
+        return Assembly(self.model, self.equilibrium.shapes, given)
 
     @cached_property
     def curve(self) -> NodeCurve:
         """The curve by declared arc length; the true one if the model has no camera's effects."""
-        table = assembly_of(self.model).curve(self.equilibrium.shapes, self._given)[0]
-        return NodeCurve.of(self.model.cable.length, table)
+        return NodeCurve.of(self.model.cable.length, self._found.curve()[0])
 
     @property
     def places(self) -> FloatArray:
         """Arc lengths (n_nodes,) [m] of the model's nodes; those of saddles are moved to these."""
-        return assembly_of(self.model).clipped(self.equilibrium.shapes, self._given).places[0]
+        return self._found.clipped.places[0]
 
 
 @dataclass(frozen=True)

@@ -214,14 +214,21 @@ class Touching:
         outwards = np.repeat(self.offsets[poses], _count(self.model), axis=1)
         return found._replace(distance=found.distance - outwards - self.model.cable.diameter / 2)
 
+    @property
+    def _pull(self) -> list[int]:
+        """Rows of a force at the end of the cable, in derivatives of a segment."""
+        return [2 * self.model.node.increment + row for row in self.model.end_pull]
+
     def added(
-        self, total: FloatArray, force: Vector, advances: FloatArray
+        self, total: FloatArray, force: Vector, gradient: FloatArray
     ) -> tuple[FloatArray, Vector]:
         """The Lagrangian (m,) [J] and its gradient, contacts included.
 
-        The gradient ends with the contacts' conditions [m]: -g - lam / c for active ones; those of
-        the others drive their forces to zero.
+        `gradient` (m, n, 2b + k, 1): that of the segments. The result ends with the contacts'
+        conditions [m]: -g - lam / c for active ones; those of the others drive their forces to
+        zero.
         """
+        advances = gradient[:, :, self._pull, 0]
         all_poses = np.arange(len(advances))
         gaps = np.where(self.active, self._near(all_poses, advances).distance, 0.0)
         y = np.concatenate([force.y, (-gaps - self.sizes * self.softness)[..., None]], axis=1)
@@ -307,7 +314,7 @@ class Touching:
         Also by each other (m, a, a), taken as forces.
         """
         b, pull = self.model.node.increment, self.model.end_pull
-        by_pull = bend[..., 2 * b + np.array(pull)]
+        by_pull = bend[..., self._pull]
         on_segments = by_pull @ np.moveaxis(vectors, 1, -1)
         first, last, border = np.split(on_segments, [b, 2 * b], axis=2)
         nodes = np.zeros((len(first), first.shape[1] + 1, *first.shape[2:]))
@@ -316,12 +323,13 @@ class Touching:
         mutual = np.einsum("mcsd,msda->mca", vectors, border[:, :, pull])
         return nodes, border.sum(axis=1), mutual
 
-    def along(self, change: Vector, moved: FloatArray, offsets: FloatArray) -> Vector:
+    def along(self, change: Vector, segments: FloatArray, p: FloatArray) -> Vector:
         """Add contacts to the gradient's change at fixed nodes and multipliers.
 
-        `moved` (m, n, d, q): change of the advances; `offsets` (m, surfaces, q) [m]: change of the
-        surfaces. It is neglected that these changes turn the normals of round obstacles.
+        `segments` (m, n, 2b + k, q): changes of the segments' gradients; `p` (m, n_parameters, q):
+        those of the parameters. It is neglected that they turn the normals of round obstacles.
         """
+        moved, offsets = segments[:, :, self._pull], outwards(self.model) @ p
         rows = np.repeat(offsets, _count(self.model), axis=1) * self.active[..., None]
         rows[:, self._used] -= np.einsum("masd,msdq->maq", self._normals, moved)
         y = np.concatenate([change.y, rows], axis=1)

@@ -24,7 +24,7 @@ from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses, limited
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel, EndKind, StartKind
 
 FloatArray = NDArray[np.floating]
@@ -155,7 +155,7 @@ def _is_minimum(
     model = problem.model
     given = Inputs.of(problem.p, problem.rest, problem.poses[i].vector[None])
     shapes = Shapes.declared(frames[None], lam[None])
-    _, slope, matrix = assembly_of(model).balance(shapes, given)
+    _, slope, matrix = Assembly(model, shapes, given).balance()
     scale = float(matrix.scale[0])
     balanced = np.abs(slope.x).max() < 1e-7 * scale
     stable = (np.linalg.eigvalsh(matrix.dense()[0] / scale) < 0).sum() == model.n_multipliers
@@ -307,7 +307,7 @@ def check(problem: Problem, shape: NDArray[np.void], end: FloatArray) -> tuple[b
     pose = HeldPose((0.0, 0.0), (float(end[0]), float(end[1])))
     given = Inputs.of(model.nominal, problem.rest, pose.vector[None])
     shapes = Shapes.declared(phi[None, :, None], shape["end_force"][None])
-    _, slope, matrix = assembly_of(model).balance(shapes, given)
+    _, slope, matrix = Assembly(model, shapes, given).balance()
     force = slope.x[0, :, 0, 0]
     active = np.flatnonzero(np.abs(np.diff(phi)) > JOINT_BOUND - 1e-7)
     error = float(np.hypot(*slope.y[0, :2, 0]))

@@ -29,7 +29,7 @@ from benchmarks.peers import COURANT, missing_elastica, missing_mujoco, relax, r
 from benchmarks.space_speed import CABLE, FINE, Timed, problem, reference
 from dlo_casadi.equilibrium.guesses import guessed_frames
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.model.assembly import assembly_of
+from dlo_casadi.model.assembly import Assembly
 
 FloatArray = NDArray[np.floating]
 RADIUS = CABLE.diameter / 2
@@ -109,7 +109,7 @@ def ipopt(n: int, element: str) -> Method:
         results = []
         for found in solver.solve(own.model.nominal, own.rest, pose):
             shapes = Shapes.declared(found.frames[None], found.multipliers[None])
-            nodes = assembly_of(own.model).nodes(shapes, given)[0]
+            nodes = Assembly(own.model, shapes, given).nodes()[0]
             results.append((nodes, found.seconds))
         least = min(float(distances(nodes, fine).max()) for nodes, _ in results)
         there = [r for r in results if distances(r[0], fine).max() < 1.1 * least + 1e-6]

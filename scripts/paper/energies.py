@@ -12,7 +12,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND, Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.ends import deviation_names
@@ -54,7 +54,7 @@ def chain() -> CableModel:
 def energy_of(model: CableModel, found: Equilibrium, rest: FloatArray, pose: HeldPose) -> float:
     """Energy [J] of a shape for another rest curvature."""
     given = Inputs.of(model.nominal, rest, pose.vector[None])
-    return float(assembly_of(model).energy(found.shapes, given)[0])
+    return float(Assembly(model, found.shapes, given).energy()[0])
 
 
 def rows_of_table_4(roundings: int = ROUNDINGS) -> list[Row]:

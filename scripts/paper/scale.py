@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.show.style import BLUE, GREEN, ORANGE
@@ -62,7 +62,7 @@ def simulated(poses: int) -> list[MeasuredPose]:
             continue
         shapes = Shapes.declared(shape.x[None], shape.end_force[None])
         given = Inputs.of(model.nominal, rest, pose.vector[None])
-        z = assembly_of(model).curve(shapes, given)[0]
+        z = Assembly(model, shapes, given).curve()[0]
         s = np.linspace(0.01, 0.99, POINTS) * published.LENGTH
         points = NodeCurve.of(published.LENGTH, z).at(s) + STD * rng.standard_normal((POINTS, 2))
         out.append(MeasuredPose.of_points(pose, points))

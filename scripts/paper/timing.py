@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.show.style import BLACK, GREY, VERMILLION
 from paper import published
@@ -119,7 +119,7 @@ def _seen(
     """Curve of given headings."""
     given = Inputs.of(model.nominal, rest, pose.vector[None])
     shapes = Shapes.declared(x.reshape(1, -1, 1), lam[None])
-    return NodeCurve.of(published.LENGTH, assembly_of(model).curve(shapes, given)[0])
+    return NodeCurve.of(published.LENGTH, Assembly(model, shapes, given).curve()[0])
 
 
 def by_ipopt(element: Method, n: int) -> float:

@@ -11,7 +11,7 @@ from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import load_config, read_yaml
 from dlo_casadi.effects import EFFECTS, ClampAngle
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.session.fitting import declared_model
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
@@ -78,5 +78,5 @@ def test_session(name):
         assert shape.min_bend_radius == pytest.approx(expected.min_bend_radius, rel=1e-6)
         if model.has_state:  # a drift enters with its latest state: compile anew
             given = Inputs.of(p, rest, pose.vector[None])
-            rest = assembly_of(model).state_after(expected.shapes, given)[0][0]
+            rest = Assembly(model, expected.shapes, given).state_after()[0][0]
             solver = CompiledSolver(model, p, rest, flags=QUICK)

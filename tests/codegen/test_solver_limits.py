@@ -26,7 +26,7 @@ from dlo_casadi.codegen import QUANTITIES, STATUSES, Capsule, CompiledShape, Pla
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
-from dlo_casadi.model.assembly import Inputs
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.clips import HeldClip
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
@@ -78,7 +78,7 @@ def test_values_and_places_are_those_of_python(case):
         if name == "twist" and not model.in_space:
             assert own.value == 0.0
             continue
-        sizes = sizes_of(model, found.shapes, given, size)[0]
+        sizes = sizes_of(Assembly(model, found.shapes, given), size)[0]
         places, holders = places_of(model, pose, found, given, size)
         tight = int(sizes.argmax())
         expected = 1 / sizes[tight] if name == "bend_radius" else sizes[tight]

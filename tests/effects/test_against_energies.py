@@ -27,7 +27,7 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.model.assembly import Inputs, Shapes, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import REACTIONS
 
@@ -454,7 +454,7 @@ def test_what_is_measured_of_a_curve(name, where):
     values, image = IMAGES[name]
     model, p, rest, known = modelled(name, where, values)
     shapes, rod = bent(model, where)
-    found = assembly_of(model).curve(shapes, Inputs.of(p, rest, POSES[where].vector[None]))[0]
+    found = Assembly(model, shapes, Inputs.of(p, rest, POSES[where].vector[None])).curve()[0]
     d = model.node.dimension
     # Three Gauss points: elements turn by d = 0.5, d^6 / 2e6.
     np.testing.assert_allclose(found[:, :d], image(rod, known)[:, :d], atol=1e-7)
@@ -469,8 +469,8 @@ def test_a_sensors_bias_is_added_to_what_it_reads(where):
     model, p, rest, _ = modelled("sensor_bias", where, values)
     shapes, _ = bent(model, where)
     given = Inputs.of(p, rest, POSES[where].vector[None])
-    a = assembly_of(model)
-    added = (a.readings(shapes, given) - a.reactions(shapes, given))[0]
+    a = Assembly(model, shapes, given)
+    added = (a.readings() - a.reactions())[0]
     np.testing.assert_allclose(added, [values[name] for name in names], atol=1e-12)
 
 
@@ -493,7 +493,7 @@ def test_the_rest_shape_that_a_pose_leaves_behind(name, where):
     values, moved, tolerance = STATES[name]
     model, p, rest, known = modelled(name, where, values)
     shapes, rod = bent(model, where)
-    after = assembly_of(model).state_after(shapes, Inputs.of(p, rest, POSES[where].vector[None]))[0]
+    after = Assembly(model, shapes, Inputs.of(p, rest, POSES[where].vector[None])).state_after()[0]
     expected = REST[where] + moved(rod.strains - REST[where], known)
     used = expected.T[-len(model.node.strains) :].ravel()
     np.testing.assert_allclose(after[0], used, atol=tolerance)

@@ -243,8 +243,7 @@ def test_without_moments_of_its_own_each_pose_is_in_another_equilibrium(rubbed):
     assert problem.equilibria.model == fit.model
     assert point.shapes.deviation.shape[1] == fit.point.shapes.deviation.shape[1] - 2
     assert np.abs(point.shapes.x - fit.point.shapes.x).max() > 0.01
-    given = problem.equilibria.given(*problem.state(point))
-    force = problem.equilibria.assembly.imbalance(point.shapes, given)
+    force = problem.equilibria.at(*problem.state(point)).imbalance()
     assert np.abs(force.rows).max() < 1e-6 * fit.model.force_scale
     back, again = fit.problem.taken_over(point, problem)
     assert not again.shapes.deviation[:, -2:].any()

@@ -15,7 +15,7 @@ from dlo_casadi.errors import ConfigError, MeasurementError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.variances import reading_noise_of
-from dlo_casadi.model.assembly import Inputs, Tangents, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs, Tangents
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import REACTIONS, reaction_rows
@@ -42,7 +42,7 @@ def reactions(model: CableModel, pose: HeldPose) -> tuple[dict[str, np.ndarray],
     rest = np.full(model.chain.n_rests, 0.5)
     eq = solve_equilibrium(model, model.nominal, rest, pose)
     given = Inputs.of(model.nominal, rest, pose.vector[None])
-    found = assembly_of(model).reactions(eq.shapes, given)[0]
+    found = Assembly(model, eq.shapes, given).reactions()[0]
     return {name: found[at] for name, at in reaction_rows(model.node).items()}, eq.energy, eq.points
 
 
@@ -107,12 +107,13 @@ def test_a_spring_at_a_pin_holds_a_moment():
     p[[model.names.index(f"start_spring.{name}") for name in ("stiffness", "heading")]] = 0.05, 0.4
     rest, pose = np.zeros(model.chain.n_rests), HeldPose((0.0, 0.0), (0.6, 0.0))
     eq = solve_equilibrium(model, p, rest, pose)
-    found = assembly_of(model).reactions(eq.shapes, Inputs.of(p, rest, pose.vector[None]))[0]
+    found = Assembly(model, eq.shapes, Inputs.of(p, rest, pose.vector[None])).reactions()[0]
     expected = np.array([0.05 * (eq.phi[0] - 0.4), 0.0])
     np.testing.assert_allclose(found[[2, 5]], expected, atol=1e-12)
     np.testing.assert_allclose(eq.moments, expected, atol=1e-12)
     assert [x.name for x in fixtures_of(model, pose, eq) if x.takes_moment] == ["start"]
-    sizes = sizes_of(model, eq.shapes, Inputs.of(p, rest, pose.vector[None]), "moment")
+    found = Assembly(model, eq.shapes, Inputs.of(p, rest, pose.vector[None]))
+    sizes = sizes_of(found, "moment")
     np.testing.assert_allclose(sizes, [np.abs(expected[:1])], atol=1e-12)
 
 
@@ -133,15 +134,17 @@ def test_derivatives_of_readings(space, held):
     names = tuple(reaction_rows(model.node, len(model.clips)))
     setup = Setup(model.cable, gravity=model.gravity, readings=names, clips=model.clips)
     model = model.with_effect(SensorBias.made_for(setup))
-    rest, assembly = np.full(model.chain.n_rests, 0.5), assembly_of(model)
+    rest = np.full(model.chain.n_rests, 0.5)
     shapes = solve_equilibrium(model, model.nominal, rest, pose).shapes
     given = Inputs.of(model.nominal, rest, pose.vector[None])
     rng = np.random.default_rng(0)
-    sizes = [(assembly.n, assembly.b), (model.n_border,), (len(model.names),), (len(rest),)]
+    nodes = (model.chain.n_nodes, model.node.increment)
+    sizes = [nodes, (model.n_border,), (len(model.names),), (len(rest),)]
     sizes.append((len(model.deviation_names),))
     x, lam, p, r, deviation = (rng.normal(size=(1, *size, 1)) for size in sizes)
     p[:, 0] *= model.nominal[0]
-    slope = assembly.readings_along(shapes, given, Tangents(x, lam, p, r, deviation))[0, :, 0]
+    along = Tangents(x, lam, p, r, deviation)
+    slope = Assembly(model, shapes, given).readings_along(along)[0, :, 0]
 
     def at(s: float) -> np.ndarray:
         there = replace(
@@ -150,7 +153,8 @@ def test_derivatives_of_readings(space, held):
             lam=shapes.lam + s * lam[..., 0],
             deviation=shapes.deviation + s * deviation[..., 0],
         )
-        return assembly.readings(there, replace(given, p=given.p + s * p[..., 0]))[0]
+        others = replace(given, p=given.p + s * p[..., 0])
+        return Assembly(model, there, others).readings()[0]
 
     # Central differences of numbers of order one: 1e-10 of curvature, 1e-16 / 1e-5 of rounding.
     np.testing.assert_allclose(slope, (at(1e-5) - at(-1e-5)) / 2e-5, atol=1e-8)
@@ -161,9 +165,9 @@ def test_readings_of_clips_are_the_forces_on_them(space):
     model, pose = clipped(space)
     rest = np.full(model.chain.n_rests, 0.5)
     eq = solve_equilibrium(model, model.nominal, rest, pose)
-    found = assembly_of(model).reactions(
-        eq.shapes, Inputs.of(model.nominal, rest, pose.vector[None])
-    )
+    found = Assembly(
+        model, eq.shapes, Inputs.of(model.nominal, rest, pose.vector[None])
+    ).reactions()
     rows = reaction_rows(model.node, 2)
     for k, load in enumerate(eq.clips, start=1):
         np.testing.assert_array_equal(found[0, rows[f"clip_{k}_force"]], load.force)

@@ -19,7 +19,7 @@ from dlo_casadi.errors import ConfigError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.assembly import Inputs, assembly_of
+from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.report.documents import fit_dict, parameters_text
 from dlo_casadi.session.fitting import declared_model, minimum_by_ipopt
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -175,7 +175,7 @@ def test_the_next_pose_finds_the_cable_as_the_last_one_left_it(outcome, tmp_path
     shapes = fit.point.shapes
     for j, item in enumerate(measured):
         given = Inputs.of(fit.p, expected, item.pose.vector[None])
-        kappa = assembly_of(fit.model).strain(shapes.subset([j]), given)[0]
+        kappa = Assembly(fit.model, shapes.subset([j]), given).strain()[0]
         expected = expected + rate * (kappa - expected)
     assert rate > 0.005
     assert np.abs(expected - fit.rest).max() > 0.01
