@@ -144,12 +144,7 @@ def _each_node(equilibria: BatchEquilibrium) -> Tangents:
     model, m = equilibria.model, equilibria.m
     n, b = model.chain.n_nodes, model.node.increment
     x = np.broadcast_to(np.eye(n * b).reshape((n, b, n * b)), (m, n, b, n * b))
-    counts = (
-        model.n_border,
-        len(model.parameters),
-        model.chain.n_rests,
-        len(model.deviation_names),
-    )
+    counts = model.n_border, len(model.names), model.chain.n_rests, len(model.deviation_names)
     lam, p, rest, deviation = (np.zeros((m, count, n * b)) for count in counts)
     return Tangents(x, lam, p, rest, deviation)
 
