@@ -33,8 +33,7 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium, equilibria_of
 from dlo_casadi.equilibrium.limits import resolved
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
-from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.equilibrium.spread import SolvedCable, Uncertainty
 from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import ClipKind, HeldClip
@@ -83,24 +82,18 @@ POINTS, ERRORS = 0.02, 4.0
 class Case:
     """A pose of a cable, its shape and what is uncertain."""
 
-    cable: CasadiCable
-    pose: HeldPose
-    found: Equilibrium
+    held: SolvedCable
     known: Uncertainty
 
     @property
     def resolved(self) -> "Case":
         """The same on the mesh on which bends are checked."""
-        p = self.cable.p
-        model, found = resolved(self.cable.model, p, np.zeros(0), self.pose, self.found)[-1]
-        cable = CasadiCable(model, p, np.zeros(model.chain.n_rests))
-        return replace(self, cable=cable, found=found)
+        return replace(self, held=resolved(self.held, np.zeros(0))[-1])
 
     def checked(self, limits: dict[str, float]) -> tuple[LimitCheck, ...]:
         """What is checked here."""
-        none = np.zeros(self.cable.model.n_coefficients)
-        shape = Resolved(self.cable, none, self.pose, self.found, Limits(**limits))
-        return shape.checks(self.known)
+        none = np.zeros(self.held.model.n_coefficients)
+        return Resolved(self.held, none, Limits(**limits)).checks(self.known)
 
 
 def uncertainty_of(model: CableModel) -> Uncertainty:
@@ -151,7 +144,7 @@ def cases(kind: str, rng: np.random.Generator) -> Iterator[Case]:
         (found,) = solve_equilibria(model, model.nominal, rest, [pose])
         if isinstance(found, Equilibrium) and found.stable:
             count -= 1
-            yield Case(CasadiCable(model, model.nominal, rest), pose, found, known)
+            yield Case(SolvedCable(model, model.nominal, rest, pose, found), known)
 
 
 def roomy(model: CableModel, pose: HeldPose) -> bool:
@@ -189,8 +182,8 @@ def unit(rng: np.random.Generator, size: int) -> FloatArray:
 
 def drawn(case: Case, share: float, seed: int, count: int) -> tuple[FloatArray, ...]:
     """Parameters, rest strains and deviations (count, ...) of repeats, at a share of their way."""
-    model, known, rng = case.cable.model, case.known, np.random.default_rng(seed)
-    p = np.tile(case.cable.p, (count, 1))
+    model, known, rng = case.held.model, case.known, np.random.default_rng(seed)
+    p = np.tile(case.held.p, (count, 1))
     fitted = rng.multivariate_normal(np.zeros(len(known.names)), known.covariance, count)
     added = rng.normal(0.0, [*known.added.values()], (count, len(known.added)))
     steps = np.hstack([fitted, added])
@@ -203,26 +196,27 @@ def drawn(case: Case, share: float, seed: int, count: int) -> tuple[FloatArray, 
     deviation = np.zeros((count, len(model.deviation_names)))
     for name, std in known.scatter.items():
         deviation[:, model.deviation_names.index(name)] = rng.normal(0.0, std, count)
-    return p, case.cable.rest + share * rest @ modes.T, share * deviation
+    return p, case.held.rest + share * rest @ modes.T, share * deviation
 
 
 def solved(case: Case, count: int, seed: int) -> tuple[list[Equilibrium], NDArray[np.bool_]]:
     """Shapes of repeats, and which of them are stable; those that are not are followed anew."""
     p, rest, deviation = drawn(case, 1.0, seed, count)
-    batch, near = BatchEquilibrium(case.cable.model, [case.pose] * count), case.found.shapes
+    near = case.held.equilibrium.shapes
+    batch = BatchEquilibrium(case.held.model, [case.held.pose] * count)
     x, lam = (np.repeat(part, count, axis=0) for part in (near.x, near.lam))
     shapes, right = batch.solve(Shapes(x, lam, deviation), p, rest, tolerance=TOLERANCE)
     stable = right & batch.stable(shapes, p, rest)
     lost = np.flatnonzero(~stable)
     if len(lost):
-        some = BatchEquilibrium(case.cable.model, [case.pose] * len(lost))
+        some = BatchEquilibrium(case.held.model, [case.held.pose] * len(lost))
         now, kept = Shapes(x, lam, deviation).subset(lost), np.ones(len(lost), dtype=bool)
         for k in range(1, STEPS + 1):
             there = [part[lost] for part in drawn(case, k / STEPS, seed, count)]
             now, right = some.solve(replace(now, deviation=there[2]), *there[:2], reach=0.5)
             kept &= right & some.stable(now, *there[:2])
         shapes.x[lost], shapes.lam[lost], stable[lost] = now.x, now.lam, kept
-    found = Assembly(case.cable.model, shapes, batch.at(shapes, p, rest).given)
+    found = Assembly(case.held.model, shapes, batch.at(shapes, p, rest).given)
     none = np.zeros(count, dtype=int)
     return equilibria_of(found, stable=stable, iterations=none), stable
 
@@ -241,8 +235,8 @@ def values_of(eq: Equilibrium) -> dict[str, float]:
 
 def compared(case: Case, rng: np.random.Generator, draws: int) -> tuple[int, int]:
     """Print a row for each limit of a pose; how many there are, and how many are off."""
-    model, fine = case.cable.model, case.resolved
-    own, parts = values_of(fine.found), draws // CHUNK
+    model, fine = case.held.model, case.resolved
+    own, parts = values_of(fine.held.equilibrium), draws // CHUNK
     asked = {"bend_radius", "force"} | ({"twist"} if model.in_space else set())
     if "clamped" in (model.start, model.end, *model.clips):
         asked |= {"moment"}

@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import Span, _sides, first_guesses
-from dlo_casadi.equilibrium.spread import tolerances_of
+from dlo_casadi.equilibrium.spread import SolvedCable, tolerances_of
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
@@ -69,9 +69,9 @@ def test_the_sharpest_bend_over_a_support_is_measured_there():
     errors = []
     for n in (20, 40, 80):
         model, pose, eq = solved(supports, None, n, cable=stiff, end="free")
-        given = Inputs.of(model.nominal, np.zeros(n), pose.vector[None])
-        sizes = sizes_of(Assembly(model, eq.shapes, given), "curvature")[0]
-        places, _ = places_of(model, pose, eq, given, "curvature")
+        held = SolvedCable(model, model.nominal, np.zeros(n), pose, eq)
+        sizes = sizes_of(held.assembly, "curvature")[0]
+        places, _ = places_of(held, "curvature")
         assert places[sizes.argmax()] == pytest.approx(eq.clips[0].at, abs=1e-12)
         assert 1 / sizes.max() == pytest.approx(eq.min_bend_radius, rel=1e-12)
         errors.append(abs(eq.min_bend_radius / radius - 1))
@@ -86,9 +86,9 @@ def test_the_bend_at_a_clip_is_smooth_in_its_arc_length(at):
 
     def bend(s):
         model, pose, eq = solved([HeldClip("pinned", (0.4, 0.0), s)], (0.75, 0.0), 20)
-        given = Inputs.of(model.nominal, np.zeros(20), pose.vector[None])
-        assert places_of(model, pose, eq, given, "curvature")[0][21] == s
-        return sizes_of(Assembly(model, eq.shapes, given), "curvature")[0, 21]
+        held = SolvedCable(model, model.nominal, np.zeros(20), pose, eq)
+        assert places_of(held, "curvature")[0][21] == s
+        return sizes_of(held.assembly, "curvature")[0, 21]
 
     step = 1e-5
     before, here, after = (bend(at + k * step) for k in (-1, 0, 1))

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.export.mujoco import principal
-from dlo_casadi.export.rod import Rod, SolvedCable
+from dlo_casadi.export.rod import Rod
 from dlo_casadi.export.targets import TARGETS, losses, samples_of, target_of, write_rods
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip

@@ -20,8 +20,7 @@ from dlo_casadi.effects import CableData, ClipSlip, ObstacleOffset
 from dlo_casadi.equilibrium.limits import Exceedance, _counted, _crossing
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import Uncertainty, cause_of
-from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.equilibrium.spread import SolvedCable, Uncertainty, cause_of
 from dlo_casadi.errors import ConfigError, DloError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.model.cable_model import CableModel
@@ -37,10 +36,8 @@ DOWN, UP = -np.pi / 2, np.pi / 2
 
 def check(model, pose, uncertainty, **limits) -> dict[str, LimitCheck]:
     rest = np.zeros(model.chain.n_rests)
-    found = solve_equilibrium(model, model.nominal, rest, pose)
-    cable = CasadiCable(model, model.nominal, rest)
-    none = np.zeros(model.n_coefficients)
-    checks = Resolved(cable, none, pose, found, Limits(**limits)).checks(uncertainty)
+    shape, none = SolvedCable.of(model, model.nominal, rest, pose), np.zeros(model.n_coefficients)
+    checks = Resolved(shape, none, Limits(**limits)).checks(uncertainty)
     return {item.quantity: item for item in checks}
 
 
@@ -131,8 +128,9 @@ def test_repeats_that_snap_to_the_other_side_violate_any_limit():
     assert fold > upright + 0.1
     pose, found = at(fold - 0.05, eq.x)
     known = Uncertainty((), np.zeros((0, 0)), {"start_heading": 0.05}, PoseScatter())
-    cable, none = CasadiCable(model, model.nominal, rest), np.zeros(model.n_coefficients)
-    (item,) = Resolved(cable, none, pose, found, Limits(force=100 * weight)).checks(known)
+    shape = SolvedCable(model, model.nominal, rest, pose, found)
+    none = np.zeros(model.n_coefficients)
+    (item,) = Resolved(shape, none, Limits(force=100 * weight)).checks(known)
     # Three standard errors of 2,000 draws, and the step of the search.
     assert item.probability == pytest.approx(norm.sf(1.0), abs=0.03)
     assert (item.lost / item.draws, item.verdict) == (item.probability, "risk")

@@ -12,7 +12,7 @@ from dlo_casadi.cable.placing import ROOM, _Search, placed
 from dlo_casadi.config import Limits
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 
@@ -36,8 +36,8 @@ def used(known: EstimatedCable, clips: list[dict], limits: dict, poses=POSES):
     asked = {"turns": 0.0, "branch": None, "clips": clips}
     for pose in poses:
         own = held_pose(held.model, {}, asked | pose)
-        eq = solve_equilibrium(held.model, held.p, held.rest, own)
-        yield from Resolved(held, KNOWN.coefficients, own, eq, Limits(**limits)).uses
+        shape = SolvedCable.of(held.model, held.p, held.rest, own)
+        yield from Resolved(shape, KNOWN.coefficients, Limits(**limits)).uses
 
 
 def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():

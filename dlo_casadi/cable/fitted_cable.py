@@ -21,10 +21,15 @@ from dlo_casadi.config import Clip, Obstacle
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import EDGE, Repeats, Tipping, sides_of, spread_across
+from dlo_casadi.equilibrium.spread import (
+    EDGE,
+    Repeats,
+    SolvedCable,
+    Tipping,
+    sides_of,
+    spread_across,
+)
 from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.export.targets import check_counts, samples_of, target_of, write_rods
 from dlo_casadi.model.clips import ClipLoad, clip_rows
 from dlo_casadi.model.contact import Contact, surfaces_at
@@ -122,7 +127,7 @@ class FittedCable(EstimatedCable):
 
     def _solved(self, pose: HeldPose) -> "Shape":
         try:
-            eq = solve_equilibrium(self.model, self.p, self.rest, pose)
+            found = SolvedCable.of(self.model, self.p, self.rest, pose)
         except EquilibriumError as error:
             happened, _, advice = error.message.partition("\n  Try: ")
             # A call has no configuration whose keys could be changed.
@@ -133,10 +138,10 @@ class FittedCable(EstimatedCable):
                 advice += f" Headings in degrees? {turn:g} degrees are {np.radians(turn):.4g} rad."
             advice = advice.replace("(model.n)", f"(`with_mesh({2 * self.model.n})`)")
             raise EquilibriumError(f"{happened}\n  Try: {advice}", p_des=error.p_des) from None
-        beyond, known = eq.other_side, self.metadata.uncertainty
-        if beyond is None:
+        eq = found.equilibrium
+        if (beyond := eq.other_side) is None:
             return self.shape_in(pose, eq)
-        near = Repeats(self.model, self.p, self.rest, pose, eq, known).tipping(beyond)
+        near = Repeats(found, self.metadata.uncertainty).tipping(beyond)
         if not near.either:
             return self.shape_in(pose, eq)
         own, others = sides_of(self.model, pose, eq, beyond)
@@ -249,7 +254,13 @@ class Shape:
     def held(self) -> SolvedCable:
         """The state from which an export is made, without effects of the camera."""
         model, p = self.cable.model.without_kind(MeasurementEffect, self.cable.p)
-        return SolvedCable(model, p, self.cable.rest, self.pose, self.equilibrium)
+        return replace(self._measured, model=model, p=p)
+
+    @property
+    def _measured(self) -> SolvedCable:
+        """The state with the effects of the camera."""
+        cable = self.cable
+        return SolvedCable(cable.model, cable.p, cable.rest, self.pose, self.equilibrium)
 
     @cached_property
     def curve(self) -> CableCurve:
@@ -259,8 +270,7 @@ class Shape:
     @cached_property
     def seen(self) -> CableCurve:
         """The same curve as measured by the session's camera."""
-        measured = replace(self.held, model=self.cable.model, p=self.cable.p)
-        return CableCurve.of(self.cable.length, measured.curve.numbers)
+        return CableCurve.of(self.cable.length, self._measured.curve.numbers)
 
     @property
     def s(self) -> FloatArray:
@@ -332,9 +342,8 @@ class Shape:
 
         To first order in parameter errors, scatter of fixtures and scatter of repeats.
         """
-        cable, s = self.cable, self.s
-        own = self.pose, self.equilibrium, cable.metadata.uncertainty
-        curve, moved = Repeats(cable.model, cable.p, cable.rest, *own).displacements(s)
+        repeats, s = Repeats(self._measured, self.cable.metadata.uncertainty), self.s
+        curve, moved = repeats.displacements(s)
         return np.asarray(EDGE * np.linalg.norm(spread_across(curve, s, moved), axis=1))
 
     def check(self, limits: Asked = None, *, tolerances: Asked = None) -> tuple[LimitCheck, ...]:

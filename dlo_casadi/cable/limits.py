@@ -1,7 +1,7 @@
 """Check a shape against limits: value, probability, tightest place, main cause of uncertainty."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
@@ -17,13 +17,17 @@ from dlo_casadi.equilibrium.limits import (
     Varied,
     places_of,
     resolved,
-    sizes_of,
+    sizes_in,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spread import Uncertainty, cause_of, tolerances_of, with_tolerances
-from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.equilibrium.spread import (
+    SolvedCable,
+    Uncertainty,
+    cause_of,
+    tolerances_of,
+    with_tolerances,
+)
 from dlo_casadi.errors import DloError, counted
-from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.show.text import STRAIGHT, millimetres
@@ -217,9 +221,9 @@ def check_limits(
         raise DloError(f"{text}.\n  Try: metres, such as {stds[large[0]] / 1e3:g}")
     model = with_tolerances(cable.model, stds)
     added = model.nominal[len(cable.p) :]
-    cable = replace(cable, model=model, p=np.concatenate([cable.p, added]))
+    shape = SolvedCable(model, np.concatenate([cable.p, added]), cable.rest, pose, found)
     uncertainty = known.uncertainty.installed(model, stds)
-    return Resolved(cable, known.coefficients, pose, found, asked).checks(uncertainty)
+    return Resolved(shape, known.coefficients, asked).checks(uncertainty)
 
 
 def _given(kind: type[Kind], given: Asked, example: str) -> Kind | None:
@@ -252,53 +256,38 @@ class Resolved:
     meaningful for this cable, see `Limits.problems`.
     """
 
-    cable: CasadiCable
+    held: SolvedCable
     coefficients: FloatArray
-    pose: HeldPose
-    found: Equilibrium
     limits: Limits
 
     @cached_property
-    def meshes(self) -> list[tuple[CableModel, Equilibrium]]:
-        """Each mesh with the shape there."""
-        model, curved = self.cable.model, self.limits.given.keys() & {"bend_radius", "twist"}
-        if model.has_state or not curved:
-            return [(model, self.found)]
-        return resolved(model, self.cable.p, self.coefficients, self.pose, self.found)
+    def meshes(self) -> list[SolvedCable]:
+        """The shape on each mesh."""
+        curved = self.limits.given.keys() & {"bend_radius", "twist"}
+        if self.held.model.has_state or not curved:
+            return [self.held]
+        return resolved(self.held, self.coefficients)
 
-    def rest_on(self, mesh: CableModel) -> FloatArray:
-        """Rest curvature (n_rests,) [1/m] on one of the meshes."""
-        known = self.cable
-        return known.rest if mesh is known.model else mesh.rest_basis @ self.coefficients
-
-    def on(self, quantity: str) -> tuple[CableModel, Equilibrium]:
-        """The mesh on which a quantity is measured, and the shape there."""
+    def on(self, quantity: str) -> SolvedCable:
+        """The shape on the mesh on which a quantity is measured."""
         return self.meshes[-1 if quantity in ("bend_radius", "twist") else 0]
-
-    def sizes(self, mesh: CableModel, shape: Equilibrium, quantity: str) -> FloatArray:
-        """Sizes (K,) of a quantity on a mesh, see `sizes_of`."""
-        return sizes_of(Assembly(mesh, shape.shapes, self._given(mesh)), _size(quantity))[0]
-
-    def _given(self, mesh: CableModel) -> Inputs:
-        return Inputs.of(self.cable.p, self.rest_on(mesh), self.pose.vector[None])
 
     @property
     def uses(self) -> tuple[LimitUse, ...]:
         """Use of each limit by the shape, in their order."""
         out, bounds = [], bounds_of(self.limits)
         for quantity, limit in self.limits.given.items():
-            mesh, shape = self.on(quantity)
-            here = self.sizes(mesh, shape, quantity)
-            places, holders = places_of(mesh, self.pose, shape, self._given(mesh), _size(quantity))
+            shape, name = self.on(quantity), _size(quantity)
+            here, (places, holders) = sizes_in(shape, name), places_of(shape, name)
             tight = int(here.argmax())
-            value, used = here[tight], here / bounds[_size(quantity)]
+            value, used = here[tight], here / bounds[name]
             if quantity == "bend_radius":
                 value = 1 / max(value, 1e-300)
             elif quantity == "clearance":
                 value, used = -value, 2 - used
             where, along = (float(places[tight]), holders[tight]), places.argsort(kind="stable")
             both = places[along], used[along]
-            out.append(LimitUse(self.pose.name, quantity, limit, float(value), *where, *both))
+            out.append(LimitUse(shape.pose.name, quantity, limit, float(value), *where, *both))
         return tuple(out)
 
     def checks(self, uncertainty: Uncertainty) -> tuple[LimitCheck, ...]:
@@ -307,23 +296,22 @@ class Resolved:
         Bend and twist are measured on a mesh that resolves the bend. Draws are solved there, too:
         how places compete for the sharpest bend depends on the mesh.
         """
-        drawn, near = self.meshes[-1]
+        drawn = self.meshes[-1]
         # Ratio of a size on the mesh of the draws to its resolved value.
         ratio = {
-            _size(x): self.sizes(drawn, near, x).max() / size if size else 1.0
+            _size(x): sizes_in(drawn, _size(x)).max() / size if size else 1.0
             for x in self.limits.given
             if x != "clearance"  # a clearance hardly depends on the mesh
-            for size in [self.sizes(*self.on(x), x).max()]
+            for size in [sizes_in(self.on(x), _size(x)).max()]
         } | {"clearance": 1.0}
-        varied = Varied(drawn, self.cable.p, self.rest_on(drawn), self.pose, near, uncertainty)
         bounds = {name: ratio[name] * bound for name, bound in bounds_of(self.limits).items()}
-        likely, out = varied.exceedances(bounds), []
+        likely, out = Varied(drawn, uncertainty).exceedances(bounds), []
         for use in self.uses:
             name = _size(use.quantity)
             chance, std = likely[name], float(likely[name].std / ratio[name])
             if use.quantity == "bend_radius":
                 std = std * use.value * use.value  # infinite, or 0, of a straight cable
-            cause = _main_cause(self.cable.model, uncertainty, chance)
+            cause = _main_cause(self.held.model, uncertainty, chance)
             known = vars(use) | vars(chance) | {"std": std}
             out.append(LimitCheck(**known, decided_by=cause))
         return tuple(out)

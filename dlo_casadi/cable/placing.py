@@ -28,12 +28,11 @@ from dlo_casadi.cable.held import HELD, held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
-from dlo_casadi.equilibrium.limits import Varied, fixtures_of
+from dlo_casadi.equilibrium.limits import Varied, fixtures_of, sizes_in
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
-from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.equilibrium.spread import SolvedCable, Uncertainty
 from dlo_casadi.errors import DloError, EquilibriumError, counted
-from dlo_casadi.export.rod import SolvedCable
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.show.text import vector
@@ -249,9 +248,10 @@ class _Search:
         for pose, eq in zip(poses, found, strict=True):
             if isinstance(eq, EquilibriumError):
                 raise eq
-            shapes.append(Resolved(known, known.metadata.coefficients, pose, eq, self.limits))
+            shape = SolvedCable(known.model, known.p, known.rest, pose, eq)
+            shapes.append(Resolved(shape, known.metadata.coefficients, self.limits))
         names = (*self.bounded, "force")
-        sizes = tuple({x: one.sizes(known.model, one.found, x) for x in names} for one in shapes)
+        sizes = tuple({x: sizes_in(one.held, x) for x in names} for one in shapes)
         return _Trial(z, tuple(shapes), sizes, *self._split(sizes, scales))
 
     @cached_property
@@ -275,10 +275,9 @@ class _Search:
 
     def slopes(self, now: _Trial, scales: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (R, size of z), (S, size of z) of `aims` and `others`."""
-        known, names, sizes = self.slipping, (*self.bounded, "force"), []
+        names, sizes = (*self.bounded, "force"), []
         for one in now.shapes:
-            varied = Varied(known.model, known.p, known.rest, one.pose, one.found, self.clip_moves)
-            by_moves = varied.linear(tuple(dict.fromkeys(names)))[1]
+            by_moves = Varied(one.held, self.clip_moves).linear(tuple(dict.fromkeys(names)))[1]
             sizes.append({k: self.length * x[:, self.columns] for k, x in by_moves.items()})
         return self._split(sizes, scales)
 
@@ -420,10 +419,10 @@ class _Search:
 
     def _placing_of(self, now: _Trial, uses: Sequence[LimitUse]) -> Placing:
         """Convert a result to a placing in a configuration's terms."""
-        model, worst = self.slipping.model, []
+        worst = []
         for one, sizes in zip(now.shapes, now.sizes, strict=True):
-            named = zip(sizes["force"], fixtures_of(model, one.pose, one.found), strict=True)
-            worst += [(float(x), f"{holder.name} in {one.pose.name}") for x, holder in named]
-        held = now.shapes[0].pose.clips
+            named = zip(sizes["force"], fixtures_of(one.held), strict=True)
+            worst += [(float(x), f"{holder.name} in {one.held.pose.name}") for x, holder in named]
+        held = now.shapes[0].held.pose.clips
         clips = (Clip(name=x.name, kind="pinned", at=x.at, place=x.place) for x in held)
         return Placing(tuple(clips), tuple(uses), *max(worst))

@@ -214,27 +214,27 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
         if 0.03 < reach / first.model.cable.length < 0.97:
             tried.append(replace(nearest, end=tuple(map(float, end)), name="next"))
     rivals = [predict_each(fit.model, fit.p, fit.rest_now, tried) for fit in (first, second)]
-    clear: list[tuple[float, HeldPose, Prediction, Prediction]] = []
-    for pose, one, other in zip(tried, *rivals, strict=True):
+    clear: list[tuple[float, Prediction, Prediction]] = []
+    for one, other in zip(*rivals, strict=True):
         if one is None or other is None:
             continue
         gap = one.curve.at(places) - other.curve.at(places)
         difference = float(np.sqrt((gap**2).sum(axis=1).mean()))
         # Above a tenth of the length the rivals are on different branches: not a clear test.
         if difference <= 0.1 * first.model.cable.length:
-            clear.append((difference, pose, one, other))
+            clear.append((difference, one, other))
     if not clear:
         return None
-    difference, pose, one, other = max(clear, key=lambda found: found[0])
-    end = np.array(pose.end)
+    difference, one, other = max(clear, key=lambda found: found[0])
+    end = np.array(one.pose.end)
     place = tuple(round(float(x), 4) for x in end)
     # Seen like the fit pose whose end is nearest, at the arc lengths of its points.
     measured = first.problem.fit_poses
     away = np.array([item.pose.end for item in measured]) - end
     k = int((away**2).sum(axis=1).argmin())
     s, item = first.point.projections[k], measured[k]
-    moved, again = _displaced(first, pose, one, s)
-    open_too, _ = _displaced(second, pose, other, s)
+    moved, again = _displaced(first, one, s)
+    open_too, _ = _displaced(second, other, s)
     gap = one.curve.at(s) - other.curve.at(s)
     seen = item.whitening(first.noise, s) @ item.components(
         one.curve, s, np.concatenate([gap[..., None], again, moved, open_too], axis=2)
@@ -261,13 +261,10 @@ def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
     return max(found, key=lambda item: item.separation)
 
 
-def _displaced(
-    fit: Fit, pose: HeldPose, found: Prediction, s: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _displaced(fit: Fit, found: Prediction, s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """`displacements` (K, d, q) [m] by the fit's parameters, and those that each repeat draws."""
     known = uncertainty_of(fit)
-    repeats = Repeats(fit.model, fit.p, fit.rest_now, pose, found.equilibrium, known)
-    _, moved = repeats.displacements(s)
+    _, moved = Repeats(found, known).displacements(s)
     causes = known.causes_in(fit.model)
     kept = np.zeros(moved.shape[2], bool)
     kept[: len(causes)] = [cause == "parameters" for cause in causes]

@@ -13,12 +13,10 @@ from scipy.special import ndtr
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.batch import REACH, BatchEquilibrium
-from dlo_casadi.equilibrium.equilibrium import Equilibrium, curvatures_along, places_along
-from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.equilibrium import curvatures_along, places_along
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import Repeats
+from dlo_casadi.equilibrium.spread import Repeats, SolvedCable
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
-from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS, tangents
 from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.functions import functions_of
@@ -46,30 +44,28 @@ class Fixture(NamedTuple):
     takes_moment: bool
 
 
-def fixtures_of(model: CableModel, pose: HeldPose, found: Equilibrium) -> list[Fixture]:
+def fixtures_of(held: SolvedCable) -> list[Fixture]:
     """All that holds a cable in a pose: the held ends, then the clips."""
+    model = held.model
     ends = (("start", 0.0, model.start), ("end", model.cable.length, model.end))
     turned = functions_of(model).moment_ends
-    held = [Fixture(name, at, name in turned) for name, at, kind in ends if kind != "free"]
-    clips = zip(pose.clips, found.clips, strict=True)
-    return [*held, *(Fixture(x.name, load.at, x.kind in CLAMPS) for x, load in clips)]
+    on_ends = [Fixture(name, at, name in turned) for name, at, kind in ends if kind != "free"]
+    clips = zip(held.pose.clips, held.equilibrium.clips, strict=True)
+    return [*on_ends, *(Fixture(x.name, load.at, x.kind in CLAMPS) for x, load in clips)]
 
 
-def places_of(
-    model: CableModel, pose: HeldPose, found: Equilibrium, given: Inputs, quantity: str
-) -> tuple[FloatArray, list[str]]:
+def places_of(held: SolvedCable, quantity: str) -> tuple[FloatArray, list[str]]:
     """Arc lengths (K,) [m] at which a quantity has values, and the names of what is there.
 
     The names are those of fixtures; for a clearance, those of the nearest obstacles.
     """
     if quantity in ("force", "moment"):
-        held = fixtures_of(model, pose, found)
-        own = [item for item in held if quantity == "force" or item.takes_moment]
+        own = [item for item in fixtures_of(held) if quantity == "force" or item.takes_moment]
         return np.array([item.at for item in own]), [item.name for item in own]
-    there = Assembly(model, found.shapes, given)
+    there = held.assembly
     if quantity == "clearance":
         names, deep = _depths(there)
-        along = np.linspace(0.0, model.cable.length, deep.shape[2])
+        along = np.linspace(0.0, held.model.cable.length, deep.shape[2])
         return along, [names[k] for k in deep[:, 0].argmax(axis=0)]
     bends = quantity == "curvature"
     places = places_along(there.clipped)[0] if bends else there.clipped.cells[0].mean(axis=1)
@@ -100,6 +96,11 @@ def sizes_of(found: Assembly, quantity: str) -> FloatArray:
         if quantity == "force" or kind in CLAMPS
     ]
     return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
+
+
+def sizes_in(held: SolvedCable, quantity: str) -> FloatArray:
+    """Sizes (K,) of a quantity in one shape, see `sizes_of`."""
+    return sizes_of(held.assembly, quantity)[0]
 
 
 def _depths(found: Assembly) -> tuple[list[str], FloatArray]:
@@ -180,7 +181,7 @@ class Varied(Repeats):
         Glasserman, Monte Carlo Methods in Financial Engineering, 2003, 4.1: control variates.
         """
         names = tuple(bounds)
-        causes = self.uncertainty.causes_in(self.model)
+        causes = self.uncertainty.causes_in(self.held.model)
         sizes, slopes = self.linear(names)
         if not any(map(np.any, self.ways)):
             sure = {x: float((sizes[x] > bounds[x]).any()) for x in names}
@@ -189,7 +190,7 @@ class Varied(Repeats):
         solved, lost = self._solved(z[:PAIRED], names)
         likely = {x: _crossing(sizes[x], slopes[x], bounds[x], z) for x in names}
         softer: dict[str, FloatArray] = dict.fromkeys(names, np.zeros(1))
-        if self.model.surfaces:
+        if self.held.model.surfaces:
             # Draws use softer obstacles: allow for how far the predicted shape then sinks in.
             (same, _) = self._solved(0 * z[:1], names)
             softer = {x: same[x] - sizes[x] for x in names}
@@ -222,7 +223,7 @@ class Varied(Repeats):
 
     def linear(self, names: tuple[str, ...]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
         """Sizes (K,) and their derivatives (K, q) by the ways in which a repeat may differ."""
-        count = len(self.uncertainty.causes_in(self.model))
+        count = len(self.uncertainty.causes_in(self.held.model))
         z = _STEP * np.vstack([np.eye(count), -np.eye(count), np.zeros((1, count))])
         near = Assembly(self.larger, self._near(z), self._given(z))
         found = {name: sizes_of(near, name) for name in names}
@@ -232,22 +233,22 @@ class Varied(Repeats):
 
     def _given(self, z: FloatArray) -> Inputs:
         """Inputs of repeats z (m, q); stiffnesses are log-normal, all values within bounds."""
-        by_p, by_rest, _ = self.ways
-        known, steps = self.model.parameters, z @ by_p.T
-        log = np.array([q.log for q in known])
-        p = self.p + np.where(log, 0.0, steps)
-        p[:, log] = self.p[log] * np.exp(steps[:, log] / self.p[log])
+        (by_p, by_rest, _), held = self.ways, self.held
+        own, parameters, steps = held.p, held.model.parameters, z @ by_p.T
+        log = np.array([q.log for q in parameters])
+        p = own + np.where(log, 0.0, steps)
+        p[:, log] = own[log] * np.exp(steps[:, log] / own[log])
         # A declared value may be outside of the bounds of an estimation.
-        lower = np.minimum(self.p, [q.lower for q in known])
-        p = np.clip(p, lower, np.maximum(self.p, [q.upper for q in known]))
-        poses = np.broadcast_to(self.pose.vector, (len(z), self.model.n_pose))
-        return Inputs.of(p, self.rest + z @ by_rest.T, poses)
+        lower = np.minimum(own, [q.lower for q in parameters])
+        p = np.clip(p, lower, np.maximum(own, [q.upper for q in parameters]))
+        poses = np.broadcast_to(held.pose.vector, (len(z), held.model.n_pose))
+        return Inputs.of(p, held.rest + z @ by_rest.T, poses)
 
     def _near(self, z: FloatArray) -> Shapes:
         """Shapes of repeats z (m, q) to first order."""
-        shapes, along = self.found.shapes, self.along
+        shapes, along = self.held.equilibrium.shapes, self.along
         start = np.repeat(shapes.x, len(z), axis=0)
-        x = self.model.node.moved(start, np.einsum("nbq,mq->mnb", along.x[0], z))
+        x = self.held.model.node.moved(start, np.einsum("nbq,mq->mnb", along.x[0], z))
         return Shapes(x, shapes.lam + z @ along.lam[0].T, z @ along.deviation[0].T)
 
     def _solved(
@@ -260,10 +261,10 @@ class Varied(Repeats):
         for begin in range(0, len(z), CHUNK):
             some = slice(begin, begin + CHUNK)
             own, start = given.subset(some), guesses.subset(some)
-            batch = BatchEquilibrium(self.larger, [self.pose] * len(start.x))
+            batch = BatchEquilibrium(self.larger, [self.held.pose] * len(start.x))
             shapes, converged = batch.solve_or_descend(start, own.p, own.rest, tolerance=_TOLERANCE)
             # A descent may end in a shape far away, to which the cable snaps.
-            way = np.abs(self.model.node.difference(start.x, shapes.x)).max(axis=(1, 2))
+            way = np.abs(self.held.model.node.difference(start.x, shapes.x)).max(axis=(1, 2))
             near = converged & (way <= REACH)
             lost.append(~(near & batch.stable(shapes, own.p, own.rest)))
             solved = Assembly(self.larger, shapes, own)
@@ -314,22 +315,21 @@ def _counted(anew: BoolArray, linear: BoolArray, expected: float) -> tuple[float
     return min(max(chance, 0.0), 1.0), float(np.linalg.norm(a - b * c) / len(a))
 
 
-def resolved(
-    model: CableModel, p: FloatArray, coefficients: FloatArray, pose: HeldPose, found: Equilibrium
-) -> list[tuple[CableModel, Equilibrium]]:
+def resolved(held: SolvedCable, coefficients: FloatArray) -> list[SolvedCable]:
     """The same shape on finer meshes; the last mesh resolves its sharpest bend.
 
     Elements are halved until the least bend radius changes by less than `thresholds.RESOLVED`. On a
     coarse mesh the radius of the segments, like that of the curve, is too large: beside a clamp of
     a soft cable by tens of percent. `coefficients` (n_coefficients,) [1/m]: of the rest curvature.
     """
-    meshes, settled = [(model, found)], False
+    model, found = held.model, held.equilibrium
+    meshes, settled = [held], False
     while not settled and 2 * model.n <= FINEST:
         finer = model.with_mesh(2 * model.n)
         start = model.node.interpolated(finer.chain.places, model.chain.places, found.x)
         rest = finer.rest_basis @ coefficients
-        better = solve_equilibrium(finer, p, rest, pose, x_init=start)
+        better = solve_equilibrium(finer, held.p, rest, held.pose, x_init=start)
         settled = abs(better.min_bend_radius / found.min_bend_radius - 1) < RESOLVED
         model, found = finer, better
-        meshes.append((model, found))
+        meshes.append(SolvedCable(model, held.p, rest, held.pose, found))
     return meshes

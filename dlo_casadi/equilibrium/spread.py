@@ -1,4 +1,4 @@
-"""Uncertainty of a prediction: the spread of new repeats of a pose, and the side it takes."""
+"""A predicted shape and its uncertainty: the spread of new repeats, and the side they take."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import ways_of
+from dlo_casadi.equilibrium.solve import solve_equilibrium, ways_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
@@ -30,6 +30,45 @@ EDGE = -float(ndtri((1 - COVERED) / 2))
 _ROUNDING = 1e-9
 # Step of finite differences of energies, as a share of a standard deviation.
 _SHARE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedCable:
+    """A cable in an equilibrium of one pose.
+
+    Parameters
+    ----------
+    model, p, rest, pose
+        As in `solve_equilibrium`.
+    equilibrium : Equilibrium
+    """
+
+    model: CableModel
+    p: FloatArray
+    rest: FloatArray
+    pose: HeldPose
+    equilibrium: Equilibrium
+
+    @classmethod
+    def of(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> Self:
+        """The cable in its predicted shape."""
+        return cls(model, p, rest, pose, solve_equilibrium(model, p, rest, pose))
+
+    @cached_property
+    def assembly(self) -> Assembly:
+        """The assembly of this pose alone."""
+        given = Inputs.of(self.p, self.rest, self.pose.vector[None])
+        return Assembly(self.model, self.equilibrium.shapes, given)
+
+    @cached_property
+    def curve(self) -> NodeCurve:
+        """The curve by declared arc length; the true one if the model has no camera's effects."""
+        return NodeCurve.of(self.model.cable.length, self.assembly.curve()[0])
+
+    @property
+    def places(self) -> FloatArray:
+        """Arc lengths (n_nodes,) [m] of the model's nodes; those of saddles are moved to these."""
+        return self.assembly.clipped.places[0]
 
 
 @dataclass(frozen=True)
@@ -192,43 +231,37 @@ class Repeats:
 
     Parameters
     ----------
-    model, p, rest, pose
-        As in `solve_equilibrium`.
-    found : Equilibrium
+    held : SolvedCable
         The predicted shape.
     uncertainty : Uncertainty
     """
 
-    model: CableModel
-    p: FloatArray
-    rest: FloatArray
-    pose: HeldPose
-    found: Equilibrium
+    held: SolvedCable
     uncertainty: Uncertainty
 
     @cached_property
     def ways(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Uncertainty.ways_in`."""
-        return self.uncertainty.ways_in(self.model)
+        return self.uncertainty.ways_in(self.held.model)
 
     @cached_property
     def larger(self) -> CableModel:
         """The model with the deviations that each repeat has of its own."""
-        return self.uncertainty.pose_scatter.within(self.model)
+        return self.uncertainty.pose_scatter.within(self.held.model)
 
     @cached_property
     def _batch(self) -> BatchEquilibrium:
-        return BatchEquilibrium(self.larger, [self.pose])
+        return BatchEquilibrium(self.larger, [self.held.pose])
 
     @property
     def _shapes(self) -> Shapes:
-        return replace(self.found.shapes, deviation=np.zeros((1, len(self.ways[2]))))
+        return replace(self.held.equilibrium.shapes, deviation=np.zeros((1, len(self.ways[2]))))
 
     @cached_property
     def along(self) -> Tangents:
         """Derivatives of the shape along the `ways`."""
-        by_p, by_rest, by_deviation = self.ways
-        return self._batch.by_rest(self._shapes, self.p, self.rest, by_rest, by_p, by_deviation)
+        (by_p, by_rest, by_deviation), held = self.ways, self.held
+        return self._batch.by_rest(self._shapes, held.p, held.rest, by_rest, by_p, by_deviation)
 
     def displacements(self, s: FloatArray) -> tuple[NodeCurve, FloatArray]:
         """Curve of the pose, and displacements (K, d, q) [m] of its places s [m] in a new repeat.
@@ -238,7 +271,8 @@ class Repeats:
         propagated through the equilibrium. The measured difference of repeats is added, equal at
         all places.
         """
-        ((seen, change),) = self._batch.observe(self._shapes, self.p, self.rest, self.along)
+        given = self._shapes, self.held.p, self.held.rest
+        ((seen, change),) = self._batch.observe(*given, self.along)
         curve, d = seen.curve, seen.curve.d
         alike = np.broadcast_to(self.uncertainty.repeat_std * np.eye(d), (len(s), d, d))
         return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
@@ -249,9 +283,8 @@ class Repeats:
         It is of first order in all uncertainties of a prediction: the derivative of an
         equilibrium's energy by any input is that of the Lagrangian at fixed nodes and multipliers.
         """
-        std = float(np.linalg.norm(self._gap_slopes(other)))
-        lever = _lever(self.model, self.found, other)
-        return Tipping(tipping(self.model, self.found, other), std / lever)
+        std, pair = float(np.linalg.norm(self._gap_slopes(other))), (self.held.equilibrium, other)
+        return Tipping(tipping(self.held.model, *pair), std / _lever(self.held.model, *pair))
 
     def gap_std(self, other: Equilibrium) -> float:
         """Standard deviation [J] between repeats of the energy difference to another equilibrium.
@@ -263,12 +296,9 @@ class Repeats:
 
     def _gap_slopes(self, other: Equilibrium) -> FloatArray:
         """Changes (q,) [J] of the difference in energy along the `ways`."""
-        given = self.p, self.rest
-        own, beyond = (
-            energy_slope(self.larger, self.pose, eq, given, self.ways, _SHARE)
-            for eq in (self.found, other)
-        )
-        return np.asarray(beyond - own)
+        held = replace(self.held, model=self.larger)
+        beyond = energy_slope(replace(held, equilibrium=other), self.ways, _SHARE)
+        return np.asarray(beyond - energy_slope(held, self.ways, _SHARE))
 
 
 def spread_across(curve: NodeCurve, s: FloatArray, moved: FloatArray) -> FloatArray:
@@ -316,34 +346,26 @@ class Tipping:
         return self.angle < max(EITHER * self.std, _ROUNDING)
 
 
-def energy_slope(
-    model: CableModel,
-    pose: HeldPose,
-    eq: Equilibrium,
-    given: tuple[FloatArray, FloatArray],
-    along: Sequence[FloatArray],
-    step: float,
-) -> FloatArray:
+def energy_slope(held: SolvedCable, along: Sequence[FloatArray], step: float) -> FloatArray:
     """Derivative (q,) [J] of an equilibrium's energy along q directions.
 
     It is that of the Lagrangian at a fixed shape, by central differences.
 
     Parameters
     ----------
-    given : ((n_parameters,), (n_rests,))
-        Parameters and rest strains.
     along : sequence of (n_parameters, q), (n_rests, q) and, optionally, (n_deviations, q)
-        Directions of these, and of the pose's deviations.
+        Directions of the parameters, the rest strains, and the pose's deviations.
     step : float
         Step to both sides, as a share of a direction.
     """
     by_p, by_rest, *by_deviation = (step * np.hstack([by, -by]).T for by in along)
     m, q = len(by_p), len(by_p) // 2
-    shapes = eq.shapes.subset(np.zeros(m, dtype=np.intp))
+    shapes = held.equilibrium.shapes.subset(np.zeros(m, dtype=np.intp))
     for moved in by_deviation:
         shapes = replace(shapes, deviation=moved)
-    inputs = Inputs.of(given[0] + by_p, given[1] + by_rest, np.tile(pose.vector, (m, 1)))
-    total = Assembly(model, shapes, inputs).balance()[0]
+    poses = np.tile(held.pose.vector, (m, 1))
+    inputs = Inputs.of(held.p + by_p, held.rest + by_rest, poses)
+    total = Assembly(held.model, shapes, inputs).balance()[0]
     return np.asarray((total[:q] - total[q:]) / (2 * step))
 
 

@@ -18,15 +18,14 @@ from scipy.special import stdtrit
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.spread import energy_slope
+from dlo_casadi.equilibrium.spread import SolvedCable, energy_slope
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.prediction import Prediction, measured_elsewhere, predict_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Point, Unknowns
 from dlo_casadi.estimation.variances import settle
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES, CableModel
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, STIFFNESSES
 from dlo_casadi.thresholds import EVIDENCE_APART, IDENTIFIABLE, SYSTEMATIC_SHARE
 
 # Probability below the upper end of a 95 % interval.
@@ -262,28 +261,24 @@ class EnergyGap:
     @classmethod
     def between(
         cls,
-        model: CableModel,
-        pose: HeldPose,
-        pair: tuple[Equilibrium, Equilibrium],
-        given: tuple[FloatArray, FloatArray],
+        held: SolvedCable,
+        other: Equilibrium,
         along: tuple[FloatArray, FloatArray],
         covariance: FloatArray,
     ) -> EnergyGap:
-        """Energy of the first of two equilibria minus that of the second.
+        """Energy of another equilibrium in the pose of a solved cable, minus that of its own.
 
         Parameters
         ----------
-        given : (n_parameters,), (n_rests,)
-            Parameters and rest curvature at which they are equilibria.
         along : (n_parameters, q), (n_rests, q)
-            Directions of both.
+            Directions of the parameters and the rest curvature.
         covariance : (q, q)
             Covariance along these directions.
         """
-        value = pair[0].energy - pair[1].energy
-        first, second = (energy_slope(model, pose, eq, given, along, _STEP) for eq in pair)
-        whole = first - second
-        slope = whole - value * along[0][0] / given[0][0]
+        value = other.energy - held.equilibrium.energy
+        beyond = energy_slope(replace(held, equilibrium=other), along, _STEP)
+        whole = beyond - energy_slope(held, along, _STEP)
+        slope = whole - value * along[0][0] / held.p[0]
         variances = [max(float(way @ covariance @ way), 0.0) for way in (whole, slope)]
         return cls(value, slope, float(np.sqrt(min(variances))))
 
@@ -312,19 +307,16 @@ def as_measured(fit: Fit) -> Fit:
 
 def _gaps(fit: Fit) -> list[EnergyGap]:
     """Energy of each fitted pose as measured, minus that of its prediction, along the unknowns."""
-    problem, model, unknowns = fit.problem, fit.model, fit.problem.unknowns
+    problem, unknowns = fit.problem, fit.problem.unknowns
     own = _predicted_next(fit)
     nodes = {x.pose.name: fit.point.shapes.x[j] for j, x in enumerate(problem.measured)}
-    others = measured_elsewhere(model, fit.p, fit.rest, problem.measured, own, nodes)
+    others = measured_elsewhere(fit.model, fit.p, fit.rest, problem.measured, own, nodes)
     along = unknowns.slopes(fit.point.theta), unknowns.rest_slopes
     gaps = []
     for j in problem.used:
         there, known = others[j], own[j]
         if there is not None and known is not None:
-            pair = there.equilibrium, known.equilibrium
-            pose = problem.measured[j].pose
-            given = fit.p, known.rest
-            gaps.append(EnergyGap.between(model, pose, pair, given, along, fit.covariance))
+            gaps.append(EnergyGap.between(known, there.equilibrium, along, fit.covariance))
     return gaps
 
 

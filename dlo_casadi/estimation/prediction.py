@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import groupby
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from dlo_casadi.equilibrium.solve import (
     ways_of,
     ways_round,
 )
-from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.equilibrium.spread import SolvedCable, Uncertainty
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.repeats import enough_poses, repeat_std
@@ -32,23 +34,19 @@ from dlo_casadi.sensing.measured_pose import MeasuredPose
 WHOLE_TURNS = (1.0, -1.0)
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """One pose predicted without its measurement.
+@dataclass(frozen=True, eq=False)
+class Prediction(SolvedCable):
+    """One pose predicted without its measurement; `rest` is the rest curvature before the pose.
 
     Parameters
     ----------
     seen : Observed
         Predicted measurements of the camera and the sensors.
-    rest : (n_rests,) [1/m]
-        Rest curvature before the pose.
     """
 
-    equilibrium: Equilibrium
     seen: Observed
-    rest: FloatArray
 
-    @property
+    @cached_property
     def curve(self) -> NodeCurve:
         """As the camera would see it."""
         return self.seen.curve
@@ -137,8 +135,7 @@ def predict_poses(
             continue
         last = pose, found.equilibrium.x
         if model.has_state:
-            inputs = Inputs.of(p, rest, pose.vector[None])
-            rest = Assembly(model, found.equilibrium.shapes, inputs).state_after()[0][0]
+            rest = found.assembly.state_after()[0][0]
     return out
 
 
@@ -155,8 +152,10 @@ def _seen(
     given = Inputs.of(p, rest, np.array([pose.vector for pose in poses]))
     found, length = Assembly(model, stacked(equilibria), given), model.cable.length
     return [
-        Prediction(eq, Observed(NodeCurve.of(length, z), shown), rest)
-        for eq, z, shown in zip(equilibria, found.curve(), found.readings(), strict=True)
+        Prediction(model, p, rest, pose, eq, Observed(NodeCurve.of(length, z), shown))
+        for pose, eq, z, shown in zip(
+            poses, equilibria, found.curve(), found.readings(), strict=True
+        )
     ]
 
 
@@ -175,17 +174,16 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     shapes, p, rest = problem.state(values)
     model, history = problem.unknowns.model, [item.pose for item in problem.history]
     predictions = predict_poses(model, p, rest, history)
-    poses = [history[index] for index in problem.indices]
     known = [predictions[index] for index in problem.indices]
     elsewhere = [
         replace(one, equilibrium=replace(one.equilibrium, x=x))
         if one is not None
-        and _tells_no_side(model, pose)
+        and _tells_no_side(one)
         and not model.node.same(one.equilibrium.x, x, NEARBY)
         else None
-        for one, pose, x in zip(known, poses, shapes.x, strict=True)
+        for one, x in zip(known, shapes.x, strict=True)
     ]
-    told = _named_ways(model, p, poses, elsewhere)
+    told = _named_ways(elsewhere)
     x, lam = shapes.x.copy(), shapes.lam.copy()
     for j, (one, way) in enumerate(zip(known, told, strict=True)):
         if one is not None and way is None:
@@ -193,17 +191,17 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     return Shapes(x, lam, np.zeros_like(shapes.deviation))
 
 
-def _tells_no_side(model: CableModel, pose: HeldPose) -> bool:
+def _tells_no_side(found: Prediction) -> bool:
     """Whether a cable has two sides, see `CableModel.tipped_by`, and the pose names none."""
-    return model.tipped_by is not None and not pose.branch and not pose.turns
+    return found.model.tipped_by is not None and not (found.pose.branch or found.pose.turns)
 
 
-def predict_other_side(
-    model: CableModel, p: FloatArray, pose: HeldPose, known: Prediction
-) -> Prediction | None:
+def predict_other_side(known: Prediction) -> Prediction | None:
     """Prediction on the other side, see `Equilibrium`; None where there is none."""
     other = known.equilibrium.other_side
-    return None if other is None else _seen(model, p, known.rest, [pose], [other])[0]
+    if other is None:
+        return None
+    return _seen(known.model, known.p, known.rest, [known.pose], [other])[0]
 
 
 def measured_elsewhere(
@@ -266,7 +264,7 @@ def measured_branches(
 ) -> list[MeasuredBranch | None]:
     """`measured_elsewhere`, with the branch that a pose has to name for that equilibrium."""
     others = measured_elsewhere(model, p, rest, measured, predictions, fitted)
-    told = _named_ways(model, p, [item.pose for item in measured], others)
+    told = _named_ways(others)
     out: list[MeasuredBranch | None] = []
     last: tuple[HeldPose, FloatArray] | None = None
     for item, known, found, way in zip(measured, predictions, others, told, strict=True):
@@ -274,7 +272,7 @@ def measured_branches(
         if found is not None:
             branch = MeasuredBranch(found, None)
             if way is not None:
-                named, side = None if way.turns else way.branch, _tells_no_side(model, item.pose)
+                named, side = None if way.turns else way.branch, _tells_no_side(found)
                 branch = MeasuredBranch(found, named, way.turns or None, side)
             elif last is not None:
                 with suppress(EquilibriumError):
@@ -292,26 +290,26 @@ def _square(prediction: Prediction, item: MeasuredPose) -> float:
     return float((item.distances(prediction.curve) ** 2).mean())
 
 
-def _named_ways(
-    model: CableModel, p: FloatArray, poses: Sequence[HeldPose], others: Sequence[Prediction | None]
-) -> list[HeldPose | None]:
-    """Poses with the branch or turns for which the other equilibrium is predicted, if any."""
-    ways = [
-        []
-        if found is None or pose.turns
-        else [*ways_of(model, pose), *ways_round(model, pose, WHOLE_TURNS)]
-        for pose, found in zip(poses, others, strict=True)
+def _named_ways(others: Sequence[Prediction | None]) -> list[HeldPose | None]:
+    """Poses with the branch or turns for which these equilibria are predicted, if any."""
+    asked = [
+        (j, found, way)
+        for j, found in enumerate(others)
+        if found is not None and not found.pose.turns
+        for way in (
+            *ways_of(found.model, found.pose),
+            *ways_round(found.model, found.pose, WHOLE_TURNS),
+        )
     ]
-    out: list[HeldPose | None] = [None] * len(poses)
-    asked = [j for j, own in enumerate(ways) if own]
-    for group in [[j] for j in asked] if model.has_state else [asked]:
-        of = [(j, way) for j in group for way in ways[j]]
-        rest = next((found.rest for j in group if (found := others[j])), np.zeros(0))
-        solved = solve_equilibria(model, p, rest, [way for _, way in of])
-        for (j, way), eq in zip(of, solved, strict=True):
-            there = others[j]
-            if out[j] is None and there is not None and isinstance(eq, Equilibrium):
-                same = model.node.same(eq.x, there.equilibrium.x, NEARBY)
+    out: list[HeldPose | None] = [None] * len(others)
+    # All at once, except where a state gives each pose its own rest curvature.
+    for _, group in groupby(asked, key=lambda one: one[1].model.has_state and one[0]):
+        of = list(group)
+        known = of[0][1]
+        solved = solve_equilibria(known.model, known.p, known.rest, [way for *_, way in of])
+        for (j, found, way), eq in zip(of, solved, strict=True):
+            if out[j] is None and isinstance(eq, Equilibrium):
+                same = found.model.node.same(eq.x, found.equilibrium.x, NEARBY)
                 out[j] = way if same else None
     return out
 

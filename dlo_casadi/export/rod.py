@@ -7,7 +7,6 @@ with second order in h.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal, Self
 
 import casadi as ca
@@ -25,12 +24,9 @@ from dlo_casadi.effects import (
     StateEffect,
 )
 from dlo_casadi.equilibrium.curve import NodeCurve
-from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.symbolic import CasadiCable
+from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.export.common import printable
-from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.element import Cell
@@ -59,34 +55,6 @@ ROUND = 1 / 1.3
 TURN, SEGMENTS = 0.1, (40, 200)
 # Maximum number of steps in which the segments are turned until they reach the end.
 _CLOSING = 200
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedCable(CasadiCable):
-    """A cable in an equilibrium of one pose, from which a `Rod` is cut."""
-
-    pose: HeldPose
-    equilibrium: Equilibrium
-
-    @classmethod
-    def of(cls, model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) -> Self:
-        """The cable in its predicted shape."""
-        return cls(model, p, rest, pose, solve_equilibrium(model, p, rest, pose))
-
-    @cached_property
-    def _found(self) -> Assembly:
-        given = Inputs.of(self.p, self.rest, self.pose.vector[None])
-        return Assembly(self.model, self.equilibrium.shapes, given)
-
-    @cached_property
-    def curve(self) -> NodeCurve:
-        """The curve by declared arc length; the true one if the model has no camera's effects."""
-        return NodeCurve.of(self.model.cable.length, self._found.curve()[0])
-
-    @property
-    def places(self) -> FloatArray:
-        """Arc lengths (n_nodes,) [m] of the model's nodes; those of saddles are moved to these."""
-        return self._found.clipped.places[0]
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, root_of
 from dlo_casadi.effects import ContactEffect
+from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import DloError, EquilibriumError, OutputError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
 from dlo_casadi.export.common import Relaxed, printable
-from dlo_casadi.export.rod import Feature, Rod, SolvedCable
+from dlo_casadi.export.rod import Feature, Rod
 from dlo_casadi.io.files import is_marked, write_file
 
 # Text that identifies a written file.

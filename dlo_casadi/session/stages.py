@@ -12,10 +12,10 @@ from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck, Resolved
 from dlo_casadi.config import Limits
 from dlo_casadi.effects.mass_error import MASS_FACTOR
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import on_other_side
 from dlo_casadi.equilibrium.spread import Repeats, Uncertainty, sides_of, spread_across
-from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.estimation.constrained import EnergyGap, Interval
 from dlo_casadi.estimation.prediction import (
     MeasuredBranch,
@@ -176,8 +176,7 @@ class _Model:
         if self.uncertainty is None:
             return shape
         places = np.linspace(0.0, known.curve.length, _CURVE_POINTS)
-        own = known.rest, item.pose, known.equilibrium, self.uncertainty
-        repeats = Repeats(self.model, self.p, *own)
+        repeats = Repeats(known, self.uncertainty)
         curve, moved = repeats.displacements(np.concatenate([places, shape.s]))
         expected: FloatArray = np.zeros(0)
         missed = expected
@@ -194,7 +193,7 @@ class _Model:
         return replace(
             shape,
             either_side=self._either_side(item, known, other, repeats),
-            undecided=other is not None and self._undecided(item, known, other),
+            undecided=other is not None and _undecided(repeats, other.prediction.equilibrium),
             spread=spread_across(curve, places, moved[: len(places)]).squeeze(),
             expected=expected,
             missed=missed,
@@ -213,7 +212,7 @@ class _Model:
         if measured is not None and measured.other_side:
             other: Prediction | None = measured.prediction
         else:
-            other = predict_other_side(self.model, self.p, item.pose, known)
+            other = predict_other_side(known)
         if other is None:
             return None
         pair = known.equilibrium, other.equilibrium
@@ -236,22 +235,15 @@ class _Model:
         tipping = repeats.tipping(other.equilibrium)
         return EitherSide(shapes[0], shapes[1], tipping if tipping.angle < np.pi else None)
 
-    def _undecided(self, item: MeasuredPose, known: Prediction, other: MeasuredBranch) -> bool:
-        """Whether parameters, fixtures and scatter leave the equilibrium of a pose undecided."""
-        pair, uncertain = (other.prediction.equilibrium, known.equilibrium), self.uncertainty
-        assert uncertain is not None
-        std = np.sqrt(np.maximum(np.diag(uncertain.covariance), 1e-300))
-        by_p, by_rest = uncertain.unknowns_in(self.model)
-        gap = EnergyGap.between(
-            self.model,
-            item.pose,
-            pair,
-            (self.p, known.rest),
-            (by_p * std, by_rest * std),
-            uncertain.covariance / np.outer(std, std),
-        )
-        repeats = Repeats(self.model, self.p, known.rest, item.pose, pair[0], uncertain)
-        return bool(gap.value < UNSEEN * np.hypot(gap.std, repeats.gap_std(pair[1])))
+
+def _undecided(repeats: Repeats, other: Equilibrium) -> bool:
+    """Whether parameters, fixtures and scatter leave the equilibrium of a pose undecided."""
+    held, uncertain = repeats.held, repeats.uncertainty
+    std = np.sqrt(np.maximum(np.diag(uncertain.covariance), 1e-300))
+    by_p, by_rest = uncertain.unknowns_in(held.model)
+    along, correlation = (by_p * std, by_rest * std), uncertain.covariance / np.outer(std, std)
+    gap = EnergyGap.between(held, other, along, correlation)
+    return bool(gap.value < UNSEEN * np.hypot(gap.std, repeats.gap_std(other)))
 
 
 def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple[LimitCheck, ...]:
@@ -261,15 +253,9 @@ def checked_limits(limits: Limits, fit: Fit, poses: Sequence[HeldPose]) -> tuple
     found, known = predict_poses(fit.model, fit.p, fit.rest, poses), uncertainty_of(fit)
     return tuple(
         check
-        for pose, one in zip(poses, found, strict=True)
+        for one in found
         if one is not None
-        for check in Resolved(
-            CasadiCable(fit.model, fit.p, one.rest),
-            fit.coefficients,
-            pose,
-            one.equilibrium,
-            limits,
-        ).checks(known)
+        for check in Resolved(one, fit.coefficients, limits).checks(known)
     )
 
 

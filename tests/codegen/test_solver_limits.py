@@ -25,6 +25,7 @@ from test_holds import (
 from dlo_casadi.codegen import QUANTITIES, STATUSES, Capsule, CompiledShape, Plane
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.clips import HeldClip
@@ -79,7 +80,7 @@ def test_values_and_places_are_those_of_python(case):
             assert own.value == 0.0
             continue
         sizes = sizes_of(Assembly(model, found.shapes, given), size)[0]
-        places, holders = places_of(model, pose, found, given, size)
+        places, holders = places_of(SolvedCable(model, p, rest, pose, found), size)
         tight = int(sizes.argmax())
         expected = 1 / sizes[tight] if name == "bend_radius" else sizes[tight]
         assert own.value == pytest.approx(expected, rel=1e-9), name

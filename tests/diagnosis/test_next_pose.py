@@ -64,7 +64,7 @@ def test_only_parameters_are_the_same_in_all_repeats():
     ]
     fit = fit_model(model, measured, Tolerances(end=1e-3), STD)
     (found,) = predict_poses(fit.model, fit.p, fit.rest, poses[:1])
-    kept, again = _displaced(fit, poses[0], found, np.array([0.0, LENGTH]))
+    kept, again = _displaced(fit, found, np.array([0.0, LENGTH]))
     assert kept.shape == (2, 2, len(fit.named_covariance[0]))
     assert kept[1] == pytest.approx(0.0, abs=1e-9)  # no parameter moves the end
     # The end's x and y, the rest curvature of each repeat, which is none here, and repeats as such.

@@ -23,7 +23,7 @@ from dlo_casadi.diagnosis.trials import Trials, judged_again
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.equilibrium.spread import Repeats, Uncertainty
+from dlo_casadi.equilibrium.spread import Repeats, SolvedCable, Uncertainty
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.constrained import EnergyGap, profile_interval
 from dlo_casadi.estimation.descent import descend
@@ -76,11 +76,12 @@ def changed(model, scatter, k, x):
 def test_displacements_are_those_of_shapes_solved_anew(case):
     model, pose = MODELS[case]
     rest, s = np.zeros(model.chain.n_rests), model.chain.places
-    eq = solve_equilibrium(model, model.nominal, rest, pose)
+    held = SolvedCable.of(model, model.nominal, rest, pose)
+    eq = held.equilibrium
     for source in (REST_CURVATURE, *sources_in(model)):
         scatter = PoseScatter(1e-5, source=source)
         uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
-        found = Repeats(model, model.nominal, rest, pose, eq, uncertainty).displacements(s)[1]
+        found = Repeats(held, uncertainty).displacements(s)[1]
         found = found[:, :, len(model.deviations) :]
         sizes = scatter.sizes(found.shape[2] - len(pose.start))
         for k, size in enumerate(sizes):
@@ -439,7 +440,7 @@ def test_gap_of_two_equilibria_moves_with_each_repeat_as_energies_solved_anew():
             (a, b), (c, d) = energies
             moved.append(size * (a - b - c + d) / 2e-3)
         uncertainty = Uncertainty((), np.zeros((0, 0)), {}, scatter)
-        repeats = Repeats(model, model.nominal, rest, pose, pair[0], uncertainty)
+        repeats = Repeats(SolvedCable(model, model.nominal, rest, pose, pair[0]), uncertainty)
         assert repeats.gap_std(pair[1]) == pytest.approx(np.linalg.norm(moved), rel=1e-4)
 
 
@@ -464,7 +465,8 @@ def test_gap_of_two_equilibria_is_as_uncertain_as_energies_solved_anew(bend):
         whole.append((gaps[0] - gaps[1]) / 2e-4)
         without.append((stiff[0] - stiff[1]) / 2e-4)
     covariance = np.diag([1.0, 0.1, 0.1]) ** 2
-    found = EnergyGap.between(model, pose, tuple(pair), (p, rest), (by_p, by_rest), covariance)
+    held = SolvedCable(model, p, rest, pose, pair[1])
+    found = EnergyGap.between(held, pair[0], (by_p, by_rest), covariance)
     assert found.value == pytest.approx(pair[0].energy - pair[1].energy)
     scale = np.abs(whole).max()
     np.testing.assert_allclose(found.slope, without, rtol=0, atol=1e-4 * scale)

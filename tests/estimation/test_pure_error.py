@@ -186,10 +186,8 @@ def test_a_wire_that_does_not_repeat_gets_no_rest_shape_that_snaps(left_out):
     # The band is as wide as the fitted repeats differ across the cable.
     uncertainty = uncertainty_of(fit)
     assert uncertainty.repeat_std == pytest.approx(repeatability(measured, fit.model), rel=0.02)
-    (found,) = (item.equilibrium for item in predictions[left_out : left_out + 1])
     at = np.array([0.4, 0.7])
-    known = (fit.model, fit.p, fit.rest, poses[left_out], found, uncertainty)
-    curve, moved = Repeats(*known).displacements(at)
+    curve, moved = Repeats(predictions[left_out], uncertainty).displacements(at)
     assert np.all(spread_across(curve, at, moved) > uncertainty.repeat_std)
     assert fit_dict(fit)["scatter"]["hanging"] == uncertainty.repeat_std
     # Noise that repeats tell is no declared one.

@@ -11,6 +11,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.limits import fixtures_of, sizes_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import ConfigError, MeasurementError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -111,9 +112,9 @@ def test_a_spring_at_a_pin_holds_a_moment():
     expected = np.array([0.05 * (eq.phi[0] - 0.4), 0.0])
     np.testing.assert_allclose(found[[2, 5]], expected, atol=1e-12)
     np.testing.assert_allclose(eq.moments, expected, atol=1e-12)
-    assert [x.name for x in fixtures_of(model, pose, eq) if x.takes_moment] == ["start"]
-    found = Assembly(model, eq.shapes, Inputs.of(p, rest, pose.vector[None]))
-    sizes = sizes_of(found, "moment")
+    held = SolvedCable(model, p, rest, pose, eq)
+    assert [x.name for x in fixtures_of(held) if x.takes_moment] == ["start"]
+    sizes = sizes_of(held.assembly, "moment")
     np.testing.assert_allclose(sizes, [np.abs(expected[:1])], atol=1e-12)
 
 

@@ -75,8 +75,7 @@ def test_an_unknown_place_widens_no_band(fitted):
     s = np.linspace(0.0, LENGTH, 11)
 
     def band(uncertainty):
-        known = (shape.rest, pose, shape.equilibrium, uncertainty)
-        curve, moved = Repeats(fit.model, fit.p, *known).displacements(s)
+        curve, moved = Repeats(shape, uncertainty).displacements(s)
         return spread_across(curve, s, moved)
 
     whole = uncertainty_of(fit)

@@ -12,7 +12,7 @@ from dlo_casadi.config import dump_yaml
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria, solve_equilibrium
-from dlo_casadi.equilibrium.spread import Repeats, Uncertainty, tipping
+from dlo_casadi.equilibrium.spread import Repeats, SolvedCable, Uncertainty, tipping
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
@@ -187,7 +187,7 @@ def test_how_well_the_angle_is_known_follows_from_what_is_uncertain(even):
         names = tuple(variances or {})
         covariance = np.diag([(variances or {})[name] for name in names])
         uncertainty = Uncertainty(names, covariance, scatter or {}, PoseScatter())
-        return Repeats(MODEL, P, REST, pose, pair[0], uncertainty).tipping(pair[1])
+        return Repeats(SolvedCable(MODEL, P, REST, pose, pair[0]), uncertainty).tipping(pair[1])
 
     rolled = near({"end_roll": 0.03**2}, {"end_rotation_x": 0.04})
     assert rolled.std == pytest.approx(0.05, rel=1e-6)

@@ -11,7 +11,7 @@ from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium import solve as solve_module
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import MOST_MOVED, continued, solve_equilibrium
-from dlo_casadi.equilibrium.spread import Repeats, Uncertainty, tipping
+from dlo_casadi.equilibrium.spread import Repeats, SolvedCable, Uncertainty, tipping
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
@@ -158,7 +158,7 @@ def test_a_cable_that_does_not_repeat_may_fall_to_either_side():
 
     def near(std):
         known = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter(std))
-        repeats = Repeats(MODEL, MODEL.nominal, STRAIGHT, pose, eq, known)
+        repeats = Repeats(SolvedCable(MODEL, MODEL.nominal, STRAIGHT, pose, eq), known)
         return repeats.tipping(eq.other_side)
 
     assert near(0.3).std == pytest.approx(10 * near(0.03).std, rel=1e-6)

@@ -162,11 +162,8 @@ def test_scatter_alone_may_leave_an_equilibrium_undecided(scatter, undecided, mo
     monkeypatch.setattr(stages_module.EnergyGap, "between", lambda *_: gap)
     monkeypatch.setattr(stages_module.Repeats, "gap_std", lambda *_: scatter)
     uncertainty = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter(0.3))
-    own = SimpleNamespace(model=MODEL, p=MODEL.nominal, uncertainty=uncertainty)
-    known = SimpleNamespace(equilibrium=None, rest=None)
-    other = SimpleNamespace(prediction=known)
-    item = SimpleNamespace(pose=None)
-    assert stages_module._Model._undecided(own, item, known, other) is undecided
+    repeats = stages_module.Repeats(SimpleNamespace(model=MODEL), uncertainty)
+    assert stages_module._undecided(repeats, None) is undecided
 
 
 @pytest.mark.parametrize(("nearer", "doubted"), [(0.5, True), (2.0, False)])
