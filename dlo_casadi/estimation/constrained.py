@@ -306,7 +306,10 @@ def as_measured(fit: Fit) -> Fit:
 
 
 def _gaps(fit: Fit) -> list[EnergyGap]:
-    """Energy of each fitted pose as measured, minus that of its prediction, along the unknowns."""
+    """Energy of each fitted pose as measured, minus that of its prediction, along the unknowns.
+
+    A gap that no unknown changes is left out: without weight all energies grow with EI alone.
+    """
     problem, unknowns = fit.problem, fit.problem.unknowns
     own = _predicted_next(fit)
     nodes = {x.pose.name: fit.point.shapes.x[j] for j, x in enumerate(problem.measured)}
@@ -317,7 +320,7 @@ def _gaps(fit: Fit) -> list[EnergyGap]:
         there, known = others[j], own[j]
         if there is not None and known is not None:
             gaps.append(EnergyGap.between(known, there.equilibrium, along, fit.covariance))
-    return gaps
+    return [gap for gap in gaps if gap.std > 0]
 
 
 def _predicted_next(fit: Fit) -> list[Prediction | None]:

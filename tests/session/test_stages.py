@@ -11,6 +11,7 @@ from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.effects import CableData, ContactPlane
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Uncertainty
+from dlo_casadi.estimation.constrained import as_measured
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import (
     measured_branches,
@@ -256,6 +257,12 @@ def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():
     shape = pose_shape(predicted, item, found).measured_branch
     assert shape.chosen_by == f"turns: {turns}"
     assert shape.rmse < 1e-4
+
+
+def test_a_gap_that_no_unknown_changes_is_not_refitted():
+    """With the weight known and all at rest straight, EI is all there is to fit."""
+    fit = fit_model(MODEL, measured("cw", "cw", "cw"), Tolerances(), NOISE)
+    assert as_measured(fit) is fit
 
 
 def test_a_whole_turn_of_twist_is_named_before_a_pose_is_to_be_taken_again():
