@@ -166,7 +166,7 @@ def test_evidence_of_scatter_and_of_effects_is_compared_on_one_mesh(monkeypatch)
     coarse, fine = scattering(3065.6, 10), scattering(3072.0, 15)
     monkeypatch.setattr(from_pose_to_pose, "at_random", lambda _: coarse)
     refined = {10: coarse, 15: fine}
-    monkeypatch.setattr(from_pose_to_pose, "fine_enough", lambda _, n, finest: (refined[n], 0.0))
+    monkeypatch.setattr(from_pose_to_pose, "fine_enough", lambda _, n, finest: refined[n])
     misfit = scattering(0.0, 10, "misfit")
     found = SimpleNamespace(fit=scattering(3072.3, 15), unexplained=False)
     assert at_random_instead(misfit, found, 80) is fine
