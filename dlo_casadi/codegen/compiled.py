@@ -78,7 +78,9 @@ def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",
         raise DloError(f"flags is a sequence of words, found {flags!r}\n  Try: {flags.split()}")
     solver.write(folder)
     library = folder / f"{solver.prefix}_solver.so"
+    prefix = solver.prefix.upper()
     command = [compiler, *words[1:], "-std=c99", *flags, "-fPIC", "-shared"]
+    command += [f"-D{prefix}_SHARED", f"-D{prefix}_BUILDING"]
     command += [f"{solver.prefix}_solver.c", "-o", library.name, "-lm"]
     run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if run.returncode:

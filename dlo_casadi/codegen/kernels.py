@@ -86,7 +86,7 @@ class Kernel:
         return f"""\
 /* Segments {first} to {last - 1}. */
 {head}const double *x, const double *lam, const double *row,
-{" " * len(head)}const double *table, double *restrict out)
+{" " * len(head)}const double *table, double *RESTRICT out)
 {{
 {_statements(self.function, ("x", "lam", "row", "table"), targets)}
     (void)x, (void)lam, (void)row, (void)table;

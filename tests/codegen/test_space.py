@@ -437,48 +437,6 @@ def test_clang_compiles_without_a_warning(tmp_path, ends, element):
     assert "bend radius" in build_and_run(tmp_path, "clang", "harness_solver.c")
 
 
-CALLER = """
-#include "harness_solver.hpp"
-
-int main()
-{
-    harness::Solver solver;
-    harness_pose pose = {};
-    pose.end[0] = 0.7 * HARNESS_LENGTH;
-    pose.start_orientation[3] = pose.end_orientation[3] = 1.0;
-    const harness_shape shape = solver.solve(pose);
-    std::size_t jump = 0;
-    if (solver.path({pose, pose}, jump).size() != 2 || jump != 2)
-        return 1;
-    if (solver.step(pose, shape, 4).energy > shape.energy + 1e-9)
-        return 2;
-    (void)solver.sensitivity(pose, shape);
-    try {
-        pose.end[0] = 2.0 * HARNESS_LENGTH;
-        (void)solver.solve(pose);
-    } catch (const harness::Error &error) {
-        return error.status == HARNESS_UNREACHABLE ? 0 : 3;
-    }
-    return 4;
-}
-"""
-
-
-def test_c_plus_plus_throws_what_fails(tmp_path):
-    if shutil.which("c++") is None:
-        pytest.skip("no C++ compiler (c++)")
-    generate(*problem("arc", 6), "harness").write(tmp_path)
-    (tmp_path / "caller.cpp").write_text(CALLER)
-    for command in (
-        ["cc", "-O0", "-c", "harness_solver.c"],
-        ["c++", "-std=c++11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-c", "caller.cpp"],
-        ["c++", "caller.o", "harness_solver.o", "-lm", "-o", "caller"],
-        ["./caller"],
-    ):
-        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-        assert run.returncode == 0, run.stderr
-
-
 @pytest.mark.parametrize("end", ["clamped", "free"])
 def test_sanitizers_and_threads_with_a_workspace_each_are_silent(tmp_path, end):
     """scripts/benchmark.py --only memory runs more, under valgrind, too."""
@@ -505,28 +463,3 @@ def test_the_coarse_mesh_is_never_finer_than_the_fine_one():
         case_of(*problem(n=n), True, Obstacles()).coarse_elements for n in (2, 4, 12, 30, 1000)
     ]
     assert found == [2, 4, 6, 15, 500]
-
-
-def test_an_installed_solver_is_found_by_cmake(tmp_path):
-    if shutil.which("cmake") is None:
-        pytest.skip("cmake is not installed")
-    generate(*problem("arc", 6), "harness").write(tmp_path / "solver")
-    (tmp_path / "user").mkdir()
-    shutil.copy(tmp_path / "solver" / "example.c", tmp_path / "user")
-    (tmp_path / "user" / "CMakeLists.txt").write_text(
-        "cmake_minimum_required(VERSION 3.13)\nproject(user C)\n"
-        "find_package(harness_solver 0 REQUIRED CONFIG)\n"
-        "add_executable(user example.c)\n"
-        "target_link_libraries(user PRIVATE harness::harness_solver)\n"
-    )
-    there = f"-DCMAKE_INSTALL_PREFIX={tmp_path / 'there'}"
-    for command in (
-        ["cmake", "-S", "solver", "-B", "solver/build", there, "-DBUILD_EXAMPLE=OFF"],
-        ["cmake", "--build", "solver/build", "--target", "install"],
-        ["cmake", "-S", "user", "-B", "user/build", f"-DCMAKE_PREFIX_PATH={tmp_path / 'there'}"],
-        ["cmake", "--build", "user/build"],
-        ["user/build/user"],
-    ):
-        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-        assert run.returncode == 0, run.stdout + run.stderr
-    assert "bend radius" in run.stdout
