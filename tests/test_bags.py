@@ -1,7 +1,6 @@
 """Bags whose frames, forces and clouds are given in other ways than the rendered takes do it."""
 
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import make_dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.recordings import CloudView, Wishes, make_session, read_recording
-from dlo_casadi.recordings.bags import _markers
 from dlo_casadi.recordings.fixtures import find_gripper
+from dlo_casadi.recordings.messages import items_of
 from dlo_casadi.recordings.stills import align_clocks, find_stills
 
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
@@ -211,16 +210,13 @@ def test_what_is_deleted_or_a_line_is_no_marker(tmp_path):
 
 def test_markers_without_a_name_keep_their_number_when_one_is_lost():
     """As mocap4r2_msgs has them: only those that are seen are in a message."""
+    one = make_dataclass("Marker", ["id_type", "marker_index", "marker_name", "translation"])
+    array = make_dataclass("Markers", ["markers"])
     names = []
     for seen in ((0, 1, 2), (0, 2)):
-        items = [
-            SimpleNamespace(
-                id_type=1, marker_index=k, marker_name="", translation=MSG["Point"](0.1 * k, 0, 0)
-            )
-            for k in seen
-        ]
-        found = _markers(SimpleNamespace(markers=items), "Markers", "mocap")
-        names.append([(name, place[0]) for name, _, place in found])
+        items = [one(1, k, "", MSG["Point"](0.1 * k, 0.0, 0.0)) for k in seen]
+        found = items_of(array(items), "Markers", "mocap")
+        names.append([(item.name, item.row[0]) for item in found])
     assert names[1] == [names[0][0], names[0][2]]
 
 

@@ -323,7 +323,7 @@ def test_exchanged_labels_name_their_pose(take):
     there, markers = in_pose(take, 2), {name: x.copy() for name, x in take.markers.items()}
     for one, other in (("m02", "m07"), ("m07", "m02")):
         markers[one][there] = take.markers[other][there]
-    with pytest.raises(MeasurementError, match="are labels exchanged in pose 3"):
+    with pytest.raises(MeasurementError, match="labels of m02 and m07 are exchanged in pose 3 "):
         make_session("loom", recording_of(replace(take, markers=markers)), Wishes())
 
 

@@ -36,7 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
 }
 FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
-MAY_IMPORT["recordings"] = {"config", "vision"}
+MAY_IMPORT["recordings"] = {"config", "vision", "io"}
 MAY_IMPORT["session"] = {*FITTING, "cable", "paper", "config", "io", "vision", "runtime"}
 MAY_IMPORT["session"] |= {"export"}
 # A report reads results and solves nothing.

@@ -356,15 +356,16 @@ def test_limits_that_no_pose_is_checked_against_are_no_success(fitted, tmp_path,
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "no poses"),
+        ("", "a header end_x_m,end_y_m and poses belong here"),
+        ("end_x_m,end_y_m\n", "no poses"),
         ("x,y\n1,2\n", "unknown columns"),
         ("end_x_m,end_y_m,end_x_m\n0.3,0.1,0.5\n", "two columns are called end_x_m"),
-        ("end_x_m\n0.3\n", "numbers belong here"),
-        ("end_x_m,end_y_m\n0.3,high\n", "pose 1: finite numbers"),
-        ("end_x_m,end_y_m\n0.3,0\n0.3,nan\n", "pose 2: finite numbers"),
-        ("end_x_m,end_y_m\n0,3,-0,1\n", "pose 1: more cells"),
-        ("end_x_m,end_y_m\n0.3,-0.1\n0.3,-0,1\n", "pose 2: more cells"),
-        ("name,end_x_m,end_y_m\na,0.3,0\na,0.2,0\n", "pose 2: an earlier pose is called 'a'"),
+        ("end_x_m\n0.3\n", "line 1: the column end_y_m is missing"),
+        ("end_x_m,end_y_m\n0.3,high\n", "line 2: 'high' is not a number of end_y_m"),
+        ("end_x_m,end_y_m\n0.3,0\n0.3,nan\n", "line 3: 'nan' is not a finite number"),
+        ("end_x_m,end_y_m\n0,3,-0,1\n", "line 2: two numbers end_x,end_y belong here, found 4"),
+        ("end_x_m,end_y_m\n0.3,-0.1\n0.3,-0,1\n", "line 3: two numbers end_x,end_y belong"),
+        ("name,end_x_m,end_y_m\na,0.3,0\na,0.2,0\n", "line 3: an earlier pose is called 'a'"),
     ],
 )
 def test_a_list_that_cannot_be_read_is_named(fitted, tmp_path, capsys, text, said):

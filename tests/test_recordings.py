@@ -267,15 +267,15 @@ def test_columns_that_are_absent(program, take, tmp_path):
     lines = cable.read_text().splitlines()
     lines[2] = ",".join(lines[2].split(",")[:5])
     cable.write_text(VICON if program == "vicon" else "\n".join(lines))
-    with pytest.raises(MeasurementError, match=r"cable\.csv: cannot be read .*\n  Try: ") as told:
+    said = "hand has no rotation" if program == "vicon" else "line 3 has 5 of 38 cells"
+    with pytest.raises(MeasurementError, match=rf"^cable\.csv: {said}.*\n  Try: "):
         read_recording([cable])
-    assert isinstance(told.value.__cause__, IndexError)
 
 
 def test_a_mistake_in_a_reader_stays_recognisable(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_text("")
-    monkeypatch.setitem(FORMATS, ".csv", lambda path: {}["nothing"])
-    with pytest.raises(MeasurementError, match="KeyError: 'nothing'") as told:
+    monkeypatch.setitem(FORMATS, ".csv", lambda path, unit: {}["nothing"])
+    with pytest.raises(MeasurementError, match="it is damaged, cut short, or of an unk") as told:
         read_recording([tmp_path / "a.csv"])
     assert isinstance(told.value.__cause__, KeyError)
 

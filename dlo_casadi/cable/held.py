@@ -1,6 +1,5 @@
 """End conditions of a fitted cable, from what a caller gives and what a session shares."""
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,6 +16,7 @@ from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.errors import DloError
+from dlo_casadi.io.tables import read_table
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import CLAMPS
 from dlo_casadi.model.contact import outwards
@@ -167,60 +167,48 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
 
 
 def listed_poses(model: CableModel, path: Path) -> dict[str, dict[str, Any]]:
-    """Arguments of `FittedCable.solve` for each line of a CSV, by the pose's name.
+    """Arguments of `FittedCable.solve` for each line of a table, by the pose's name.
 
     Columns are end_x_m, end_y_m and, where they differ from pose to pose, start_x_m, start_y_m,
     start_heading_rad, end_heading_rad; in space also end_z_m, start_z_m, start_qx to start_qw,
     end_qx to end_qw and turns; and name, by default the line's number. Raises DloError if the file
-    is missing, has other columns or one twice, cells that are not numbers, or a name twice.
+    is missing, has other columns or one twice, cells that are not numbers, or a name twice; see
+    `read_table` for what it may look like.
     """
     node, sides = model.node, ("start", "end")
     keys = {side: [f"{side}_{axis}_m" for axis in node.axes] for side in sides}
     keys |= {f"{side}_{node.direction}": [f"{side}_{x}" for x in node.columns] for side in sides}
     keys |= {"turns": ["turns"]} if node.twists else {}
     known = ["name", *(column for group in keys.values() for column in group)]
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            rows, header = list(reader), list(reader.fieldnames or ())
-    except (OSError, UnicodeError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise DloError(
-            f"{path} cannot be read: {reason}.\n  Try: a CSV with the columns {', '.join(known)}"
-        ) from None
-    wrong = "" if rows else "no poses"
-    if strange := [x for x in header if x and x not in known]:
-        wrong = wrong or f"unknown columns {strange}"
-    if twice := [x for x in header if x and header.count(x) > 1]:
-        wrong = wrong or f"two columns are called {twice[0]}"
-    if wrong:
-        raise DloError(f"{path}: {wrong}.\n  Try: {', '.join(known)}; the first line names them")
+    advice = f".\n  Try: {', '.join(known)}; the first line names them"
+
+    def chosen(names: tuple[str, ...]) -> list[str]:
+        """All columns but that of the names."""
+        if strange := [name for name in names if name and name not in known]:
+            raise ValueError(f"unknown columns {strange}", advice)
+        if twice := [name for name in names if name and names.count(name) > 1]:
+            raise ValueError(f"two columns are called {twice[0]}", advice)
+        groups = [group for group in keys.values() if {*group} & {*names}]
+        if absent := [name for group in groups for name in group if name not in names]:
+            raise ValueError(f"the column {absent[0]} is missing", advice)
+        return [name for group in groups for name in group]
+
+    table = read_table(path, chosen, f"a header {','.join(keys['end'])} and poses")
+    if not table.lines:
+        raise DloError(f"{path}: no poses{advice}")
+    texts = table.texts("name") if "name" in table.names else [""] * len(table.lines)
     out: dict[str, dict[str, Any]] = {}
-    for k, row in enumerate(rows, start=1):
-        name = row.get("name") or f"pose_{k:02d}"
-        if None in row:
-            raise DloError(
-                f"{path}, pose {k}: more cells than the first line has columns.\n"
-                "  Try: numbers with a decimal point, 0.3 and not 0,3"
-            )
+    for k, (text, line) in enumerate(zip(texts, table.lines, strict=True)):
+        name = text or f"pose_{k + 1:02d}"
         if name in out:
             raise DloError(
-                f"{path}, pose {k}: an earlier pose is called {name!r}, too.\n"
+                f"{path}, line {line}: an earlier pose is called {name!r}, too.\n"
                 "  Try: a name for each pose, or no column `name`"
             )
-        given: dict[str, Any] = {}
-        for key, columns in keys.items():
-            if set(columns) & row.keys():
-                try:
-                    numbers = [float(row[column]) for column in columns]
-                except (KeyError, TypeError, ValueError):
-                    numbers = []
-                if not numbers or not np.isfinite(numbers).all():
-                    cells = ", ".join(f"{x}={row.get(x)!r}" for x in columns)
-                    raise DloError(
-                        f"{path}, pose {k}: finite numbers belong here, found {cells}.\n"
-                        "  Try: one number in each cell"
-                    )
-                given[key] = numbers if len(columns) > 1 else numbers[0]
+        given = {}
+        for key, group in keys.items():
+            if group[0] in table.columns:
+                numbers = [float(table[column][k]) for column in group]
+                given[key] = numbers if len(group) > 1 else numbers[0]
         out[name] = given
     return out

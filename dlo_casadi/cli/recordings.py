@@ -2,7 +2,8 @@
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from dlo_casadi.recordings import (
     FREE,
     CloudView,
     Imported,
+    Recording,
     Wishes,
     make_session,
     read_recording,
@@ -60,7 +62,7 @@ def _vector(name: str, axes: str, text: str) -> Option:
     _vector("--camera", "X Y Z", "m, place of the camera that saw the clouds"),
     _vector("--color", "R G B", "of the cable in clouds, 0 to 255"),
     _vector("--box", "X Y Z X Y Z", "m, two corners between which the cable is in clouds"),
-    option("--units", choices=("m", "mm"), default="m", help="of bags and clouds; %(default)s"),
+    option("--units", choices=("m", "cm", "mm"), help="of files that do not name theirs"),
     option("--hold", type=float, default=0.5, metavar="S", help="shortest pose; %(default)s s"),
     option("--held-out", type=int, default=4, metavar="N", help="one in N; default %(default)s"),
     *(
@@ -91,8 +93,9 @@ def import_(chosen: argparse.Namespace) -> None:
         watch.step("read", 0, 3)
         recording = read_recording(chosen.file, chosen.up, view)
         watch.step("find poses", 1, 3)
-        session = make_session(chosen.output.name, recording, wishes)
-        with FolderDraft(chosen.output) as draft:
+        with _assuming(recording):
+            session = make_session(chosen.output.name, recording, wishes)
+        with _assuming(recording), FolderDraft(chosen.output) as draft:
             _write(session, draft.folder)
             watch.step("compare with a cable", 2, 3)
             mistakes, doubts = _mistakes(session, draft.folder)
@@ -120,6 +123,17 @@ def import_(chosen: argparse.Namespace) -> None:
     page.say(f"{target}: {filled}\nthen: {follow}")
 
 
+@contextmanager
+def _assuming(recording: Recording) -> Iterator[None]:
+    """Tell what was assumed in reading with what it leads to: it may be wrong."""
+    try:
+        yield
+    except MeasurementError as error:
+        assumed = [text for text in recording.assumptions if text not in error.message]
+        told = "\n".join([error.message, *[f"  Assumed: {text}." for text in assumed]])
+        raise MeasurementError(told) from error
+
+
 def _write(session: Imported, folder: Path) -> None:
     for name, (points, s) in session.points.items():
         write_points(folder / name, points, s)
@@ -145,7 +159,7 @@ def _mistakes(session: Imported, folder: Path) -> tuple[list[str], list[str]]:
         config = load_config(stand_in)
         inputs = measure.read_inputs(config)
     except ConfigError as error:  # it cites a file that will not exist
-        raise DloError(f"nothing is written: {error.problem}") from None
+        raise MeasurementError(f"nothing is written: {error.problem}") from None
     else:
         found = find_suspicions(config, inputs)
         return contradictions(found, inputs), [item.message for item in found]

@@ -1,6 +1,5 @@
 """Lines and markers as CSV files: points along a cable in metres, from its start to its end."""
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,23 +9,21 @@ import numpy as np
 import numpy.typing as npt
 
 from dlo_casadi.arrays import FloatArray, chord_lengths, length_of
-from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.files import write_file
+from dlo_casadi.io.tables import Columns, read_table
 
 COLUMNS = ["x_m", "y_m", "z_m"]
 PLACE = "s_m"
+TIME = "t_s"
+# Units other than metres in names of columns, and how many make a metre.
+_UNITS = {"mm": 1000, "cm": 100, "um": 1_000_000}
 
 _LONGEST = 100.0
 """Length of a centre-line [m] from which on it is not in metres."""
 
-_LARGEST = 20_000_000
-"""Bytes of a file: half a million points, measured to take two seconds."""
-
 _SAME_POINT = 1e-9
 """Distance [m] below which two points in a row are one."""
-
-_COUNTS = {2: "two", 3: "three", 4: "four"}
 
 
 @dataclass(frozen=True)
@@ -120,9 +117,9 @@ def read_points(
     Parameters
     ----------
     path : str or Path
-        CSV file, one point a line [m]. The header `x_m,y_m` (in space `x_m,y_m,z_m`) means a line
-        in order along the cable; `s_m,x_m,y_m` (`s_m,x_m,y_m,z_m`) means markers at the arc lengths
-        s_m from the start.
+        Table as `read_table` takes it, one point a line [m]. The columns `x_m,y_m` (in space
+        `x_m,y_m,z_m`) mean a line in order along the cable; with `s_m` they are markers at these
+        arc lengths from the start. Other columns are not read.
     start : (d,) [m]
         Fixture of the cable's start, d = 2 or 3.
     end : (d,) [m], optional
@@ -143,13 +140,12 @@ def read_points(
         If the file is not such a measurement; the message names the file and the line.
     """
     source = Path(path)
-    header, table = _parse(source, len(start))
-    if len(table) == 0:
+    axes = COLUMNS[: len(start)]
+    table = read_table(source, _columns(len(axes)), f"a header {','.join(axes)} and points")
+    if not table.lines:
         raise MeasurementError("has a header but no points", pose=source.name)
-    if header[0] == PLACE:
-        found = MeasuredPoints(table[:, 1:], table[:, 0])
-    else:
-        found = MeasuredPoints(table)
+    points = np.column_stack([table[axis] for axis in axes])
+    found = MeasuredPoints(points, table[PLACE] if PLACE in table.columns else None)
     return found.in_order(start, end, length, source.name, PLACE)
 
 
@@ -203,64 +199,37 @@ def write_table(path: Path, header: Sequence[str], rows: FloatArray) -> None:
     write_file(path, "\n".join(lines) + "\n")
 
 
-def _parse(source: Path, dimension: int) -> tuple[list[str], FloatArray]:
-    """Read header and numbers (K, columns), K >= 0."""
-    try:
-        with source.open("rb") as file:
-            content = file.read(_LARGEST + 1)
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise MeasurementError("is not a text file", pose=source.name) from None
-    except OSError as error:
-        raise MeasurementError(f"cannot be read: {error.strerror}", pose=source.name) from None
-    if len(content) > _LARGEST:
-        raise MeasurementError(
-            f"is larger than {_LARGEST} bytes; keep every tenth point, a few hundred suffice",
-            pose=source.name,
-        )
+def _columns(dimension: int) -> Columns:
+    """Which columns of a file are coordinates, of points with `dimension` axes."""
     axes = COLUMNS[:dimension]
     line, markers = ",".join(axes), ",".join([PLACE, *axes])
-    header: list[str] = []
-    table: list[list[float]] = []
-    for number, text in enumerate(lines, start=1):
-        try:
-            cells = [cell.strip() for cell in next(csv.reader([text]), [])]
-            if not any(cells) and len(cells) <= 1:
-                continue
-            if header:
-                table.append(_numbers(cells, header))
-            elif cells in (axes, [PLACE, *axes]):
-                header = cells
-            else:
-                raise ValueError(
-                    f"the header must be {line} (metres), or {markers} of markers at known arc "
-                    f"lengths, found {show(text)}"
-                )
-        except csv.Error as error:
-            wrong = f"line {number}: {error}; one point a line belongs here"
-            raise MeasurementError(wrong, pose=source.name) from None
-        except ValueError as error:
-            raise MeasurementError(f"line {number}: {error}", pose=source.name) from None
-    if not header:
-        raise MeasurementError(f"is empty; a header {line} and points belong here", source.name)
-    return header, np.array(table).reshape(-1, len(header))
 
-
-def _numbers(cells: list[str], header: list[str]) -> list[float]:
-    """Numbers of a line, or a ValueError that says what is wrong with it."""
-    if len(cells) != len(header):
-        names = ",".join(name.removesuffix("_m") for name in header)
-        belongs = f"{_COUNTS[len(header)]} numbers {names} belong here"
-        raise ValueError(f"{belongs}, found {len(cells)}: {show(','.join(cells))}")
-    values = []
-    for cell in cells:
-        try:
-            values.append(float(cell))
-        except ValueError:
-            raise ValueError(f"{show(cell)} is not a number") from None
-        if not math.isfinite(values[-1]):
+    def chosen(names: tuple[str, ...]) -> list[str]:
+        wanted = [PLACE, *axes] if PLACE in names else axes
+        told = [name for name in names if name in (PLACE, TIME, *COLUMNS)]
+        if twice := [name for name in told if told.count(name) > 1]:
+            raise ValueError(f"two columns are called {twice[0]}: leave one of them")
+        if sorted(told) != sorted(wanted):
             raise ValueError(
-                f"{show(cell)} is not a finite number; leave out the points that were not "
-                "measured, gaps are allowed"
+                f"the header must be {line} (metres), or {markers} of markers at known arc lengths",
+                _meant(names, wanted),
             )
-    return values
+        return wanted
+
+    return chosen
+
+
+def _meant(names: Sequence[str], wanted: Sequence[str]) -> str:
+    """What columns of other names may have been meant to be."""
+    if TIME in names:
+        return f"; a pose is one instant: keep the rows of one and leave out {TIME}"
+    given = set(names) & set(COLUMNS)
+    if given >= {*COLUMNS[:2]} and given != {*wanted} - {PLACE}:
+        return "; two coordinates belong to a cable in a plane, three to one in space"
+    for name in names:
+        stem, _, unit = name.partition("_")
+        if f"{stem}_m" in wanted and unit in _UNITS:
+            return f"; divide {name} by {_UNITS[unit]} and call it {stem}_m"
+        if f"{name}_m" in wanted:
+            return f"; if {name} is in metres, call it {name}_m"
+    return "; write it above the numbers"

@@ -13,7 +13,7 @@ from dlo_casadi.recordings.recording import FREE, METRES, Cloud, Recording, Stre
 from dlo_casadi.recordings.session import Imported, make_session
 
 Record = TypeVar("Record", Stream, Cloud)
-WHOLE = CloudView()  # all points of clouds, in metres
+WHOLE = CloudView()  # all points of clouds
 
 # File extension -> reader.
 FORMATS: dict[str, Callable[..., Recording]] = {
@@ -50,25 +50,19 @@ def read_recording(
         exception that no reader expects is its `__cause__`.
     """
     names = [path.absolute().name for path in paths]
+    labels = [
+        name if names.count(name) == 1 else str(path)
+        for path, name in zip(paths, names, strict=True)
+    ]
+    read = [_read(path, label, view.units) for path, label in zip(paths, labels, strict=True)]
     found = []
-    for path, name in zip(paths, names, strict=True):
-        label = name if names.count(name) == 1 else str(path)
+    for recording, label in zip(_in_units(read, labels, view.units), labels, strict=True):
         try:
-            read = _read(path, METRES[view.units])
-            streams = tuple(_of_file(stream, label) for stream in read.streams)
-            clouds = tuple(_of_file(cloud, label) for cloud in view.of_all(read.clouds))
-            found.append(replace(read, streams=streams, clouds=clouds).with_z_up(up))
+            streams = tuple(_of_file(stream, label) for stream in recording.streams)
+            clouds = tuple(_of_file(cloud, label) for cloud in view.of_all(recording.clouds))
         except MeasurementError as error:
             raise MeasurementError(error.message, pose=label) from error
-        except DloError:  # a library that is not installed
-            raise
-        except Exception as error:  # what readers of damaged files raise is not documented
-            again = "export it again, whole" + "; `ros2 bag reindex`" * (_reader(path) is read_bag)
-            raise MeasurementError(
-                f"cannot be read as a {path.suffix or 'bag'} recording: {type(error).__name__}: "
-                f"{str(error).rstrip('.')}.\n  Try: {again}.",
-                pose=label,
-            ) from error
+        found.append(replace(recording, streams=streams, clouds=clouds).with_z_up(up))
     recording = together(found)
     asked = " and ".join(f"--{key}" for key in ("camera", "color", "box") if getattr(view, key))
     if asked and not recording.clouds:
@@ -76,19 +70,55 @@ def read_recording(
     return recording
 
 
+def _in_units(
+    read: Sequence[Recording], labels: Sequence[str], asked: str | None
+) -> list[Recording]:
+    """The recordings in the unit that their user has asked for, where that is for them.
+
+    It is for files that name none, which are in it already. If there are none, it overrules what
+    the files name, since nobody asks for nothing; this is told.
+    """
+    if asked is None:
+        return list(read)
+    found = []
+    for recording, label in zip(read, labels, strict=True):
+        scale = METRES[asked] / METRES[recording.unit or asked]
+        told = f"{label} is in {recording.unit}, as it names it: --units is for the other files"
+        if scale != 1.0 and all(item.unit for item in read):
+            recording = recording.scaled(scale)
+            told = f"{label} is taken to be in {asked} (--units), though it names {recording.unit}"
+        assumptions = (*recording.assumptions, *[told] * (scale != 1.0))
+        found.append(replace(recording, assumptions=assumptions))
+    return found
+
+
 def _reader(path: Path) -> Callable[..., Recording] | None:
     return FORMATS.get("" if path.is_dir() else path.suffix.lower())
 
 
-def _read(path: Path, scale: float) -> Recording:
-    """What the reader of a file's format finds in it; `scale` is that of files without a unit."""
+def _read(path: Path, label: str, unit: str | None) -> Recording:
+    """What the reader of a file's format finds in it; errors begin with its `label`."""
     reader = _reader(path)
     if reader is None:
         kinds = ", ".join(filter(None, FORMATS))
-        raise MeasurementError(f"files of this kind are not read.\n  Try: {kinds}")
+        told = f"files of this kind are not read.\n  Try: {kinds}"
+        raise MeasurementError(told, pose=label)
     if not path.exists():
-        raise MeasurementError(f"there is no {path}.\n  Try: another name or folder.")
-    return reader(path, scale) if reader in (read_bag, read_cloud) else reader(path)
+        raise MeasurementError(f"there is no {path}.\n  Try: another name or folder.", pose=label)
+    try:
+        return reader(path, unit)
+    except MeasurementError as error:
+        raise MeasurementError(error.message, pose=label) from error
+    except DloError:  # a library that is not installed
+        raise
+    except Exception as error:  # what readers of damaged files raise is not documented
+        # Their own words are for those who program with them; they are the cause of this one.
+        again = "export it again, whole" + "; `ros2 bag reindex`" * (reader is read_bag)
+        raise MeasurementError(
+            f"cannot be read as a {path.suffix or 'bag'} recording: it is damaged, cut short, or "
+            f"of an unknown version.\n  Try: {again}.",
+            pose=label,
+        ) from error
 
 
 def _of_file(record: Record, file: str) -> Record:

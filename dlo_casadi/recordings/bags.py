@@ -1,7 +1,7 @@
 """ROS bags (rosbag2 with SQLite or MCAP, and rosbag1), read by rosbags."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,108 +11,265 @@ from scipy.spatial.transform import Rotation, Slerp
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, library
 from dlo_casadi.recordings.clouds import cloud_of
-from dlo_casadi.recordings.recording import Cloud, Kind, Recording, Stream, checked_times
+from dlo_casadi.recordings.messages import carries_places, is_cloud, items_of, transform_of
+from dlo_casadi.recordings.recording import METRES, Cloud, Kind, Recording, Stream, checked_times
 
 _NANO = 1e-9
 # NumPy types of a message's fields, by their numbers in sensor_msgs/PointField.
 _FIELDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _WANTED = (
     "marker arrays (visualization_msgs/MarkerArray, geometry_msgs/PoseArray, or any message with "
-    "`markers`), PoseStamped, TransformStamped, Odometry or TF, WrenchStamped, PointCloud2"
+    "`markers`), PointStamped, PoseStamped, TransformStamped, Odometry, lists of named poses or "
+    "TF, WrenchStamped, PointCloud, PointCloud2"
 )
-# Types of visualization_msgs/Marker whose pose is a place of something: arrow, cube, sphere,
-# cylinder, mesh. Lines, lists and texts have their own points or none.
-_PLACED = {0, 1, 2, 3, 10}
-_BY_INDEX = 1  # id_type of a mocap4r2_msgs/Marker that has no name, but a `marker_index`
 _SINCE_1970 = 1e6  # s; stamps beyond it are not counted from the start of a simulation
 _ORIGIN = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-Rows = list[tuple[float, list[float]]]  # times [s] and values
-Sent = list[tuple[float, float, list[float]]]  # times of headers and of receipt [s], and values
+Rows = list[tuple[float, Any]]  # times [s] and values
+Sent = list[tuple[float, float, Any]]  # times of headers and of receipt [s], and values
 Links = dict[str, tuple[str, Rows]]  # frame -> its parent in TF, and its poses there
+Key = tuple[Kind, str, str, str]  # kind, name, topic, frame
 
 
-def read_bag(path: Path, scale: float = 1.0) -> Recording:
+def read_bag(path: Path, unit: str | None = None) -> Recording:
     """Read a bag: markers, poses and TF of grippers, wrenches, and clouds of points.
 
-    Times are those of the messages' headers; where these are zero, of their receipt. Markers and
-    clouds share one clock, grippers and force sensors another. A body is named after its topic or,
-    in TF, its frame. Markers, bodies and clouds are transformed from the frames of their headers to
-    the roots of these in TF; a wrench stays in the axes of its sensor. `scale` converts markers and
-    clouds to metres; all else is in metres in ROS. Raises MeasurementError if the bag holds none of
-    these.
+    Times are those of the messages' headers; without one, or where it is zero, of their receipt.
+    Markers and clouds share one clock, grippers and force sensors another. A body is named after
+    its topic, its own name in a list or, in TF, its frame. Markers, bodies and clouds are
+    transformed from the frames of their headers to the roots of these in TF; a wrench stays in the
+    axes of its sensor. Markers and clouds are in `unit`, by default metres; all else is in metres
+    in ROS. Topics that cannot be read are left out with a remark. Raises MeasurementError if the
+    bag holds nothing that can be read, or two markers of one name in one message.
     """
-    highlevel = library("rosbags.highlevel", "recordings", "reading this file")
-    typesys = library("rosbags.typesys", "recordings", "reading this file")
-    sent: dict[tuple[Kind, str, str, str], Sent] = {}  # of kind, name, topic, frame
-    moved: dict[str, tuple[str, Sent]] = {}
-    torn: set[str] = set()  # frames with several parents
-    left_out: set[str] = set()
-    clouds: dict[str, Sent] = {}  # of topics; messages in place of values
-    store = typesys.get_typestore(typesys.Stores.LATEST)
-    with highlevel.AnyReader([path], default_typestore=store) as reader:
-        topics = {item.topic: item.msgtype for item in reader.connections}
-        for connection, nanoseconds, raw in reader.messages():
-            received = _NANO * nanoseconds
-            topic = connection.topic.strip("/")
-            kind = connection.msgtype.rsplit("/", 1)[-1]
-            if kind not in _HANDLED and "arker" not in kind:
-                continue
-            message = reader.deserialize(raw, connection.msgtype)
-            if kind == "TFMessage":
-                for link in message.transforms:
-                    _add(link, moved, torn, received, topic.endswith("tf_static"))
-            elif kind == "PointCloud2":
-                clouds.setdefault(topic, []).append((_time(message), received, message))
-            elif kind in _BODIES:
-                of, row = _BODIES[kind]
-                key = of, topic, topic, _frame(message)
-                sent.setdefault(key, []).append((_time(message), received, row(message)))
-            else:
-                for name, holder, place in _markers(message, kind, topic):
-                    if place is None:
-                        left_out.add(name)
-                        continue
-                    key = "marker", name, topic, _frame(holder)
-                    place = [scale * x for x in place]
-                    sent.setdefault(key, []).append((_time(holder), received, place))
-    moved = {name: link for name, link in moved.items() if name not in torn}
+    scale = METRES[unit or "m"]
+    bag = _Bag()
+    try:
+        bag.read(path)
+    except MeasurementError:
+        raise
+    except Exception as error:
+        told = _trouble(path, error)
+        if told is None:
+            raise
+        raise MeasurementError(told) from error
+    moved = {name: link for name, link in bag.moved.items() if name not in bag.torn}
     unset: set[str] = set()  # topics
-    rows = {key: _dated(items, key[2], unset) for key, items in sent.items()}
+    rows = {key: _dated(items, key[2], unset) for key, items in bag.sent.items()}
     links = {name: (parent, _dated(x, "tf", unset)) for name, (parent, x) in moved.items()}
-    messages = [row for topic, items in clouds.items() for row in _dated(items, topic, unset)]
-    remarks = [f"markers {', '.join(sorted(left_out))} are left out: lines, lists or texts"]
-    remarks *= bool(left_out)
-    if torn:
-        remarks.append(f"frames {', '.join(sorted(torn))} of TF have several parents: left out")
-    if unset:
-        remarks.append(
-            f"header stamps in {', '.join(sorted(unset))} are zero: the times at which the bag "
-            "received these messages are taken"
-        )
-    if not rows and not links and not clouds:
-        held = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items()) or "no topics"
-        raise MeasurementError(f"holds {held}.\n  Try: record one or more of {_WANTED}.")
+    messages = [row for topic, items in bag.clouds.items() for row in _dated(items, topic, unset)]
+    remarks = bag.remarks(unset)
+    unread = bag.unread()
+    if not rows and not links and not messages:
+        held = ", ".join(f"{topic} ({kind})" for topic, kind in bag.topics.items()) or "no topics"
+        told = "".join(f"\n  {text}." for text in unread)
+        raise MeasurementError(f"holds {held}.{told}\n  Try: record one or more of {_WANTED}.")
     rows = {key: items for key, items in rows.items() if key[0] != "body" or key[1] not in links}
     for name in links:  # a frame is a body at its own origin, as often as what moves it most often
         times = max((links[below][1] for below in _chain(name, links)[:-1]), key=len)
         rows["body", name, "tf", name] = [(t, _ORIGIN) for t, _ in times]
-    sources = [_stream(kind, name, frame, items) for (kind, name, _, frame), items in rows.items()]
-    markers = Recording(tuple(x for x in sources if x.kind == "marker")).without_zeros()
+    sources = [
+        _stream(kind, shown, frame, items)
+        for ((kind, _, _, frame), items), shown in zip(rows.items(), _shown(rows), strict=True)
+    ]
+    at_zero = Recording(tuple(x for x in sources if x.kind == "marker")).without_zeros()
+    seen = [replace(x, values=scale * x.values) for x in at_zero.streams]
     others = [x for x in sources if x.kind != "marker"]
-    streams = [_rooted(stream, links) for stream in (*markers.streams, *others)]
-    seen = tuple(_cloud(message, t, links, scale) for t, message in messages)
-    roots = {x.frame for x in streams if x.kind != "wrench"} | {x.frame for x in seen}
+    streams = [_rooted(stream, links) for stream in (*seen, *others)]
+    clouds = tuple(_cloud(message, t, links, scale) for t, message in messages)
+    roots = {x.frame for x in streams if x.kind != "wrench"} | {x.frame for x in clouds}
     roots -= {x.name for x in streams if x.kind == "body"}
-    told = tuple(
+    told_in = tuple(
         replace(x, frame="") if x.kind == "wrench" and x.frame in roots else x for x in streams
     )
-    remarks += markers.assumptions
-    return Recording(told, seen, tuple(remarks), up_by="as ROS has it (REP 103)")
+    if seen or clouds:
+        assumed = f"markers and clouds of {path.name} are taken to be in {unit or 'm'}"
+        remarks.append(assumed if unit else f"{assumed}, as ROS has it; or --units")
+    remarks += at_zero.assumptions
+    up_by = "as ROS has it (REP 103)"
+    return Recording(told_in, clouds, tuple(remarks), up_by=up_by, unread=tuple(unread))
+
+
+@dataclass
+class _Bag:
+    """What has been read of a bag so far."""
+
+    topics: dict[str, str] = field(default_factory=dict)  # types of all topics
+    sent: dict[Key, Sent] = field(default_factory=dict)
+    moved: dict[str, tuple[str, Sent]] = field(default_factory=dict)
+    torn: set[str] = field(default_factory=set)  # frames with several parents
+    no_places: set[str] = field(default_factory=set)  # markers without a place
+    clouds: dict[str, Sent] = field(default_factory=dict)  # messages in place of values
+    undefined: dict[str, str] = field(default_factory=dict)  # types of topics without a definition
+    broken: dict[str, int] = field(default_factory=dict)  # first message of a topic that fails
+    idle: dict[str, str] = field(default_factory=dict)  # types of topics that hold nothing of use
+    counts: dict[str, set[int]] = field(default_factory=dict)  # markers without names in a message
+
+    def read(self, path: Path) -> None:
+        highlevel = library("rosbags.highlevel", "recordings", "reading this file")
+        typesys = library("rosbags.typesys", "recordings", "reading this file")
+        store = typesys.get_typestore(typesys.Stores.LATEST)
+        with highlevel.AnyReader([path], default_typestore=store) as reader:
+            known = reader.typestore.fielddefs
+            self.topics = {item.topic: item.msgtype for item in reader.connections}
+            used = []
+            for connection in reader.connections:
+                topic, msgtype = connection.topic, connection.msgtype
+                if msgtype not in known:
+                    self.undefined[topic] = msgtype
+                elif carries_places(msgtype, known):
+                    used.append(connection)
+                else:
+                    self.idle[topic] = msgtype
+            at: dict[str, int] = {}
+            for connection, nanoseconds, raw in reader.messages(used) if used else ():
+                topic = connection.topic
+                if topic in self.broken:
+                    continue
+                at[topic] = at.get(topic, 0) + 1
+                try:
+                    message = reader.deserialize(raw, connection.msgtype)
+                except Exception:  # what damaged or differently defined messages raise: many kinds
+                    self.broken[topic] = at[topic]
+                    self._forget(topic.strip("/"))
+                    continue
+                kind = connection.msgtype.rsplit("/", 1)[-1]
+                self._take(message, kind, topic.strip("/"), _NANO * nanoseconds)
+
+    def _forget(self, topic: str) -> None:
+        """Leave out what was read of a topic before it turned out to be damaged."""
+        self.sent = {key: items for key, items in self.sent.items() if key[2] != topic}
+        self.clouds.pop(topic, None)
+
+    def _take(self, message: Any, kind: str, topic: str, received: float) -> None:
+        """Add what a message carries."""
+        if kind in ("TFMessage", "tfMessage"):
+            for link in message.transforms:
+                self._add(link, received, topic.endswith("tf_static"))
+            return
+        if is_cloud(kind):
+            self.clouds.setdefault(topic, []).append((_time(message), received, message))
+            return
+        found = [*items_of(message, kind, topic)]
+        names = [(item.kind, item.name) for item in found]
+        if len({*names}) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise MeasurementError(
+                f"two {twice[0]}s are called {twice[1]!r} in one message of /{topic}: they cannot "
+                "be told apart.\n  Try: other names in the program that tracks them."
+            )
+        if any(item.by_order for item in found):
+            self.counts.setdefault(topic, set()).add(len(found))
+        for item in found:
+            if item.row is None:
+                self.no_places.add(item.name)
+                continue
+            key = item.kind, item.name, topic, _frame(item.holder)
+            self.sent.setdefault(key, []).append((_time(item.holder), received, item.row))
+
+    def _add(self, link: Any, received: float, static: bool) -> None:
+        """Add a TransformStamped to TF; of a static one only the last pose is valid.
+
+        A frame that has another parent than before is `torn`: its poses cannot be compared.
+        """
+        pose = transform_of(link)
+        frame, parent = link.child_frame_id.strip("/"), _frame(link)
+        if frame == parent or not np.isfinite(pose).all() or not any(pose[3:]):
+            return
+        known, poses = self.moved.setdefault(frame, (parent, []))
+        if known != parent:
+            self.torn.add(frame)
+        if static:
+            poses.clear()
+        poses.append((_time(link), received, pose))
+
+    def remarks(self, unset: set[str]) -> list[str]:
+        """What had to be assumed or left out in reading topics that are used."""
+        told = []
+        if self.no_places:
+            names = ", ".join(sorted(self.no_places))
+            told.append(f"markers {names} are left out: lines, lists or texts")
+        if self.torn:
+            names = ", ".join(sorted(self.torn))
+            told.append(f"frames {names} of TF have several parents: left out")
+        if unset:
+            told.append(
+                f"header stamps in {', '.join(sorted(unset))} are zero: the times at which the bag "
+                "received these messages are taken"
+            )
+        for topic, counts in self.counts.items():
+            varies = f", {min(counts)} to {max(counts)} of them" * (len(counts) > 1)
+            told.append(
+                f"markers of /{topic} have no names: their order in each message{varies} is taken "
+                "to be the same throughout"
+            )
+        return told
+
+    def unread(self) -> list[str]:
+        """Topics that are left out, and why."""
+        told = []
+        for topic, msgtype in self.undefined.items():
+            package = msgtype.partition("/")[0]
+            told.append(
+                f"{topic} is left out: its type {msgtype} is unknown, and the bag holds no "
+                "definition of it (a .db3 of ROS 2 Humble or older holds none). Try: `ros2 bag "
+                f"convert` to mcap on a computer where the package {package} is installed; it "
+                "writes the definitions, too"
+            )
+        for topic, k in self.broken.items():
+            told.append(
+                f"{topic} is left out: its message {k} is not of the type {self.topics[topic]} as "
+                "it is known here. Try: `ros2 bag convert` to mcap where it was recorded"
+            )
+        if self.idle:
+            names = ", ".join(f"{topic} ({kind})" for topic, kind in self.idle.items())
+            told.append(f"left out, without places or forces: {names}")
+        return told
+
+
+# What the reader of bags finds wrong -> what that means, and what to try.
+_TROUBLES = {
+    "not indexed": ("was not closed: it has no index", "`rosbag reindex`"),
+    "index looks damaged": ("has a damaged index", "`rosbag reindex`"),
+    "encryption": ("is encrypted", "decrypt it with `rosbag decrypt`"),
+    "compression": ("is compressed in a way that is not read", "`rosbag decompress`"),
+    "serialization": ("is not serialized as CDR", "`ros2 bag convert` to mcap with CDR"),
+    "files are missing": ("lacks some of its files", "the whole folder of the bag"),
+    "storage": ("is in a storage that is not read", "`ros2 bag convert` to mcap"),
+    "version": ("is of a version that is not read", "`ros2 bag convert` to mcap"),
+    "hash mismatch": (
+        "defines a type of message otherwise than its own digest says",
+        "`ros2 bag convert` to mcap where it was recorded",
+    ),
+}
+
+
+def _trouble(path: Path, error: Exception) -> str | None:
+    """What is wrong with a bag that cannot be opened, in our words; None if that is not known."""
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        return (
+            f"has no metadata.yaml, which a bag has once it is closed.\n  Try: `ros2 bag reindex "
+            f"{path.name}`; the file in it alone; the folder of the bag itself."
+        )
+    for sign, (what, remedy) in _TROUBLES.items():
+        if sign in str(error).lower():
+            return f"{what}.\n  Try: {remedy}."
+    return None
+
+
+def _shown(keys: Collection[Key]) -> list[str]:
+    """Names of streams; with their topics where two topics have the same ones."""
+    topics: dict[tuple[Kind, str], set[str]] = {}
+    for kind, name, topic, _ in keys:
+        topics.setdefault((kind, name), set()).add(topic)
+    return [
+        name if len(topics[kind, name]) == 1 else f"{topic}/{name}" for kind, name, topic, _ in keys
+    ]
 
 
 def _time(message: Any) -> float:
-    stamp = message.header.stamp
-    return float(stamp.sec + _NANO * stamp.nanosec)
+    """Time [s] of a header; zero without one."""
+    header = getattr(message, "header", None)
+    return 0.0 if header is None else float(header.stamp.sec + _NANO * header.stamp.nanosec)
 
 
 def _dated(items: Sent, topic: str, unset: set[str]) -> Rows:
@@ -129,69 +286,8 @@ def _dated(items: Sent, topic: str, unset: set[str]) -> Rows:
 
 
 def _frame(message: Any) -> str:
-    return str(message.header.frame_id.strip("/"))
-
-
-def _vector(v: Any) -> list[float]:
-    return [v.x, v.y, v.z]
-
-
-def _pose(place: Any, turn: Any) -> list[float]:
-    return [*_vector(place), turn.x, turn.y, turn.z, turn.w]
-
-
-# Type of a message -> kind of its stream, and function that reads its row.
-_BODIES: dict[str, tuple[Kind, Callable[[Any], list[float]]]] = {
-    "PoseStamped": ("body", lambda m: _pose(m.pose.position, m.pose.orientation)),
-    "PoseWithCovarianceStamped": (
-        "body",
-        lambda m: _pose(m.pose.pose.position, m.pose.pose.orientation),
-    ),
-    "Odometry": ("body", lambda m: _pose(m.pose.pose.position, m.pose.pose.orientation)),
-    "TransformStamped": ("body", lambda m: _pose(m.transform.translation, m.transform.rotation)),
-    "WrenchStamped": ("wrench", lambda m: [*_vector(m.wrench.force), *_vector(m.wrench.torque)]),
-}
-_HANDLED = {"TFMessage", "PointCloud2", "PoseArray", *_BODIES}
-
-
-def _markers(message: Any, kind: str, topic: str) -> Iterator[tuple[str, Any, list[float] | None]]:
-    """Name of each marker in a message, what holds its header, and its position if it has one.
-
-    Those that a message deletes are left out.
-    """
-    items = message.poses if kind == "PoseArray" else getattr(message, "markers", [message])
-    for k, item in enumerate(items):
-        pose = getattr(item, "pose", item)
-        place = getattr(pose, "position", None) or getattr(item, "translation", None)
-        if place is None or getattr(item, "action", 0) != 0:
-            continue
-        texts = [getattr(item, key, "") for key in ("ns", "marker_name", "name")]
-        named = [text for text in texts if text]
-        index = item.marker_index if getattr(item, "id_type", 0) == _BY_INDEX else k
-        number = getattr(item, "id", "" if named else f"{index:02d}")
-        name = "_".join(str(part) for part in (*(named or [topic]), number) if part != "")
-        placed = not hasattr(item, "action") or item.type in _PLACED
-        holder = item if hasattr(item, "header") else message
-        yield name, holder, _vector(place) if placed else None
-
-
-def _add(
-    link: Any, links: dict[str, tuple[str, Sent]], torn: set[str], received: float, static: bool
-) -> None:
-    """Add a TransformStamped to TF; of a static one only the last pose is valid.
-
-    A frame that has another parent than before is added to `torn`: its poses cannot be compared.
-    """
-    pose = _pose(link.transform.translation, link.transform.rotation)
-    frame, parent = link.child_frame_id.strip("/"), _frame(link)
-    if frame == parent or not np.isfinite(pose).all() or not any(pose[3:]):
-        return
-    known, poses = links.setdefault(frame, (parent, []))
-    if known != parent:
-        torn.add(frame)
-    if static:
-        poses.clear()
-    poses.append((_time(link), received, pose))
+    header = getattr(message, "header", None)
+    return "" if header is None else str(header.frame_id.strip("/"))
 
 
 def _chain(frame: str, links: Links) -> list[str]:
@@ -242,7 +338,19 @@ def _rooted(stream: Stream, links: Links) -> Stream:
 
 
 def _cloud(message: Any, t: float, links: Links, scale: float) -> Cloud:
-    """Read a sensor_msgs/PointCloud2 of the time t [s]."""
+    """Read a sensor_msgs/PointCloud2 or PointCloud of the time t [s]."""
+    frame = _frame(message)
+    root, place, turn = _in_root(frame, links, np.array([t]))
+    camera = np.zeros(3) if frame in links else None
+    cloud = _points_of(message)
+    seen = Cloud(scale * cloud.points, cloud.colors, camera, t, "markers", root)
+    return seen.moved(turn[0], place[0])
+
+
+def _points_of(message: Any) -> Cloud:
+    """Points of a cloud in its own axes."""
+    if not hasattr(message, "fields"):  # a PointCloud
+        return Cloud(np.array([[p.x, p.y, p.z] for p in message.points], float).reshape(-1, 3))
     order = ">" if message.is_bigendian else "<"
     kind: Any = {
         "names": [f.name for f in message.fields],
@@ -251,9 +359,4 @@ def _cloud(message: Any, t: float, links: Links, scale: float) -> Cloud:
         "itemsize": message.point_step,
     }
     shape, steps = (message.height, message.width), (message.row_step, message.point_step)
-    cloud = cloud_of(np.ndarray(shape, np.dtype(kind), bytes(message.data), 0, steps).ravel())
-    frame = _frame(message)
-    root, place, turn = _in_root(frame, links, np.array([t]))
-    camera = np.zeros(3) if frame in links else None
-    seen = Cloud(scale * cloud.points, cloud.colors, camera, t, "markers", root)
-    return seen.moved(turn[0], place[0])
+    return cloud_of(np.ndarray(shape, np.dtype(kind), bytes(message.data), 0, steps).ravel())

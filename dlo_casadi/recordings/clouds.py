@@ -13,7 +13,7 @@ from dlo_casadi import vision
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.fixtures import Gripper
-from dlo_casadi.recordings.recording import LARGEST, Cloud, Recording, Wishes, require
+from dlo_casadi.recordings.recording import LARGEST, METRES, Cloud, Recording, Wishes, require
 from dlo_casadi.recordings.stills import Still
 
 _AGAIN = "Try: save it again, whole, as binary or text."
@@ -35,8 +35,9 @@ class CloudView:
     """Colour of the cable: red, green, blue, 0 to 255; all points when empty."""
     box: Sequence[float] = ()
     """x, y, z of two corners [m] between which the cable is; everywhere when empty."""
-    units: str = "m"
-    """Unit of markers and clouds in bags and of files of clouds, which do not contain it."""
+    units: str | None = None
+    """Unit of lengths, m, cm or mm, of files that do not name it: bags (markers and clouds), files
+    of clouds, C3D without POINT:UNITS; of others only if all files name theirs."""
 
     def __post_init__(self) -> None:
         """Check the values; DloError names the option."""
@@ -76,18 +77,21 @@ class CloudView:
         return replace(cloud, points=points[kept], colors=None, camera=camera)
 
 
-def read_cloud(path: Path, scale: float = 1.0) -> Recording:
+def read_cloud(path: Path, unit: str | None = None) -> Recording:
     """Read a cloud: PLY or PCD (text or binary), or NPY, an array (K, 3), or (K, 6) with colours.
 
-    `scale` converts its points, and the camera's place in a PCD file, to metres. Raises
+    Its points, and the camera's place in a PCD file, are in `unit`, by default metres. Raises
     MeasurementError if it holds fewer points than it says, or none.
     """
+    scale = METRES[unit or "m"]
     cloud = {".ply": _ply, ".pcd": _pcd, ".npy": _npy}[path.suffix.lower()](path)
     if not len(cloud.points):
         raise MeasurementError(f"holds no points.\n  {_AGAIN}")
     camera = None if cloud.camera is None else scale * cloud.camera
     cloud = replace(cloud, points=scale * cloud.points, camera=camera)
-    return Recording(clouds=(cloud,), up_by=f"as in most {path.suffix} files")
+    assumed = f"{path.suffix} files are taken to be in {unit or 'm'}"
+    told = (assumed if unit else f"{assumed}, which they do not name; or --units",)
+    return Recording((), (cloud,), told, up_by=f"as in most {path.suffix} files")
 
 
 def cloud_of(table: Any) -> Cloud:

@@ -1,20 +1,50 @@
 """Fixtures of the cable in the poses of a recording: grippers with x along it, and forces."""
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray, length_of, unit
 from dlo_casadi.errors import MeasurementError
-from dlo_casadi.recordings.recording import Kind, Recording, Stream
+from dlo_casadi.recordings.recording import FREE, Kind, Recording, Stream, Wishes
 from dlo_casadi.recordings.stills import Still
 
 _INSIDE = 0.05  # share of a line's length, beyond the noise and the hidden ends of lines in clouds
 _IN_LINE = 0.05  # smallest sine of the angle at the first of three markers on a gripper
+# Share by which the distance of two markers on a gripper may change. Those of 20 mm that are known
+# to 0.5 mm change by 0.04; exchanged ones by half of it, unless the three are equally far apart.
+_RIGID = 0.15
 _STRAY = 0.5  # smallest cosine at which a gripper's axis may be the cable's
+
+
+def full_names(recording: Recording, wishes: Wishes) -> Wishes:
+    """The wishes with the full names of bodies and markers at the fixtures.
+
+    A name is full, or the last part of the full name, `subject/marker` or `asset:marker`, of one
+    marker or body. Raises MeasurementError if it is that of several.
+    """
+
+    def full(name: str, side: str, kind: Kind) -> str:
+        known, parts = recording.of(kind), re.split("[/:]", name)
+        if name in known:
+            return name
+        found = [one for one in known if re.split("[/:]", one)[-len(parts) :] == parts]
+        if len(found) > 1:
+            raise MeasurementError(
+                f"{kind} {name!r} at the {side} may be {' or '.join(found)}.\n  Try: --{side} "
+                "with the full names."
+            )
+        return found[0] if found else name
+
+    called = {}
+    for side, names in wishes.holders.items():
+        kind: Kind = "marker" if len(names) == 3 else "body"
+        called[side] = ",".join(full(name, side, kind) for name in names)
+    return replace(wishes, start=called["start"], end=called.get("end", FREE))
 
 
 @dataclass(frozen=True)
@@ -34,7 +64,9 @@ def find_gripper(
 ) -> Gripper | None:
     """The body, or the three markers, holding an end; None if the recording has no body."""
     if name.count(",") == 2:
-        o, x, y = (_means(stills, "marker", part.strip(), recording) for part in name.split(","))
+        trio = [part.strip() for part in name.split(",")]
+        o, x, y = (_means(stills, "marker", part, recording) for part in trio)
+        _check_rigid(dict(zip(trio, (o, x, y), strict=True)), side, stills)
         first = unit(x - o)
         across = np.cross(first, unit(y - o))
         sines = np.linalg.norm(across, axis=1)
@@ -58,10 +90,26 @@ def find_gripper(
             f"no body is called {name!r}, which holds the {side} of the cable; found: "
             f"{', '.join(bodies) or 'none'}{why}.\n  Try: --{side} NAME of one of them, or "
             f"--{side} O,X,Y of three markers on it: its place, along its x axis, on the side of y."
+            f"{recording.told_unread}"
         )
     values = _means(stills, "body", name, recording)
     frames = Rotation.from_quat(values[:, 3:]).as_matrix()
     return Gripper(values[:, :3] + frames @ np.array(offset or np.zeros(3)), frames)
+
+
+def _check_rigid(markers: Mapping[str, FloatArray], side: str, stills: Sequence[Still]) -> None:
+    """Raise MeasurementError if a distance of two markers (P, 3) on a gripper changes in a pose."""
+    for (one, a), (other, b) in combinations(markers.items(), 2):
+        apart = np.linalg.norm(a - b, axis=1)
+        usual = float(np.median(apart))
+        k = int(np.argmax(np.abs(apart - usual)))
+        if abs(apart[k] - usual) > _RIGID * usual:
+            raise MeasurementError(
+                f"markers {one} and {other} at the {side} are {1e3 * apart[k]:.1f} mm apart in "
+                f"pose {k + 1} ({stills[k].span}), but {1e3 * usual:.1f} mm in most poses: are "
+                "labels exchanged there?\n  Try: other labels there in the program that tracks "
+                "them, or cut the recording there."
+            )
 
 
 def _means(stills: Sequence[Still], kind: Kind, name: str, recording: Recording) -> FloatArray:
@@ -70,7 +118,7 @@ def _means(stills: Sequence[Still], kind: Kind, name: str, recording: Recording)
         known = ", ".join(recording.of(kind)) or "none"
         raise MeasurementError(
             f"no {kind} {name!r} was seen in any pose; found: {known}.\n  Try: --start or --end "
-            "with one of these names."
+            f"with one of these names.{recording.told_unread}"
         )
     for k, still in enumerate(stills, start=1):
         if (kind, name) not in still.values:

@@ -1,8 +1,7 @@
 """Exports of motion capture systems: CSV files and C3D files."""
 
-import csv
-from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from struct import unpack_from
 
@@ -12,7 +11,16 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.problems import show
 from dlo_casadi.errors import MeasurementError, counted, library
-from dlo_casadi.recordings.recording import Kind, Recording, Stream, checked_times, factor
+from dlo_casadi.io.tables import BLANK, SEPARATORS, as_numbers, decoded, numbered_lines, split
+from dlo_casadi.recordings.recording import (
+    METRES,
+    Kind,
+    Recording,
+    Stream,
+    checked_times,
+    factor,
+    length_unit,
+)
 
 # Sections of a Vicon file that hold positions; others (devices, model outputs) are skipped.
 _SECTIONS: dict[str, Kind] = {"Trajectories": "marker", "Objects": "body", "Segments": "body"}
@@ -20,10 +28,11 @@ _KINDS: dict[str, Kind] = {"Marker": "marker", "Rigid Body": "body"}  # Types in
 _RADIANS = dict.fromkeys(("deg", "degree", "degrees"), np.pi / 180.0)
 _RADIANS |= dict.fromkeys(("rad", "radian", "radians"), 1.0)
 _AGAIN = "Try: export it again, whole, as Motive (Tracking Data) or Vicon (ASCII) writes it."
+_HEAD = 12  # lines by which the separator of columns is told: all headers are shorter
 Rows = list[list[str]]
 
 
-def read_mocap_csv(path: Path) -> Recording:
+def read_mocap_csv(path: Path, unit: str | None = None) -> Recording:
     """Read a CSV file of Motive (format 1.2 or later) or of Vicon (Nexus, Tracker).
 
     Returns
@@ -31,7 +40,8 @@ def read_mocap_csv(path: Path) -> Recording:
     Recording
         Markers, and rigid bodies with their rotations: quaternions in Motive files, also rotation
         vectors in Vicon files. Unlabelled markers are left out. By default y points up in Motive
-        and z in Vicon.
+        and z in Vicon. Lengths of a file that names no unit are in `unit`. Columns of anything
+        else, such as a time code, are not parsed.
 
     Raises
     ------
@@ -43,106 +53,154 @@ def read_mocap_csv(path: Path) -> Recording:
     OptiTrack, "Data Export: CSV". Vicon Nexus, "ASCII file format"; its rotations of segments
     with three components are rotation vectors (angle-axis).
     """
-    text, remarks = _text(path)
-    rows = list(csv.reader(text.splitlines()))
-    head = next((row for row in rows if row and row[0].strip()), [""])
-    first = head[0].strip()
+    try:
+        text, remarks = decoded(path.read_bytes(), path.name)
+    except ValueError as error:
+        raise MeasurementError(f"{error}.\n  {_AGAIN}") from None
+    rows = _cells(text)
+    head = next((row for row in rows if row and row[0]), [""])
+    first = head[0]
     if first == "Format Version":
-        streams, own, program = list(_motive(rows, head)), "y", "Motive"
+        read, own, program = _motive(rows, head, unit, path.name), "y", "Motive"
     elif first in (*_SECTIONS, "Devices", "Model Outputs", "Joints"):
-        streams, own, program = list(_vicon(rows)), "z", "Vicon"
+        read, own, program = _vicon(rows, unit, path.name), "z", "Vicon"
     else:
         found = f"it begins with {show(first)}" if first else "it is empty"
         raise MeasurementError(
             f"is no CSV file of Motive or Vicon: {found}; Format Version or Trajectories belongs "
             f"there.\n  {_AGAIN}"
         )
-    if not streams:
+    if not read.streams:
         raise MeasurementError(
             "holds no labelled marker and no rigid body.\n  Try: label them before the export."
         )
+    told = tuple(dict.fromkeys((*remarks, *read.assumptions)))
     said = f"as {program} exports it"
-    return Recording(tuple(streams), (), remarks, own, said).without_zeros()
+    return replace(read, assumptions=told, up=own, up_by=said).without_zeros()
 
 
-def _text(path: Path) -> tuple[str, tuple[str, ...]]:
-    """Text of a file in UTF-8, UTF-16 with a byte-order mark, or Latin-1, which is remarked on."""
-    content = path.read_bytes()
-    marked = content.startswith((BOM_UTF16_LE, BOM_UTF16_BE))
-    try:
-        return content.decode("utf-16" if marked else "utf-8-sig"), ()
-    except UnicodeDecodeError as error:  # numbers and keywords are ASCII in all encodings
-        line = content.count(b"\n", 0, error.start) + 1
-        told = f"{path.name} is not UTF-8 (line {line}): its names are read as Latin-1"
-        return content.decode("latin-1"), (told,)
+def _cells(text: str) -> Rows:
+    """Cells of all lines, in the separator that gives most of them in the first lines."""
+    lines = [line for _, line in numbered_lines(text)]
+    some = [line for line in lines if line.strip()][:_HEAD]
+    signs = [sign for sign in SEPARATORS if sign != BLANK]  # names hold blanks
+    separator = max(signs, key=lambda sign: sum(len(split(line, sign)) for line in some))
+    return [split(line, separator) for line in lines]
 
 
-def _motive(rows: Rows, settings: Sequence[str]) -> Iterator[Stream]:
+def _motive(rows: Rows, settings: Sequence[str], unit: str | None, file: str) -> Recording:
     meta = dict(zip(settings[::2], settings[1::2], strict=False))
     heads = [k for k, row in enumerate(rows) if row[:1] == ["Frame"]]
     named = {row[1]: row for row in rows[: heads[0]] if len(row) > 2} if heads else {}
     if not heads or not {"Type", "Name"} <= named.keys():
         raise MeasurementError(f"has no rows Type, Name and Frame above its numbers.\n  {_AGAIN}")
+    for key in ("Type", "Name"):
+        if len(named[key]) < len(rows[heads[0]]):
+            raise MeasurementError(
+                f"line {rows.index(named[key]) + 1} has {len(named[key])} of "
+                f"{counted(len(rows[heads[0]]), 'cell')}.\n  {_AGAIN}"
+            )
     if meta.get("Coordinate Space", "Global") != "Global":
         raise MeasurementError(
             f"is in the space {meta['Coordinate Space']!r}.\n  Try: an export with Coordinate "
             "Space: Global"
         )
-    head, quantities = heads[0], rows[heads[0] - 1]
-    lines, table = _table(rows[head + 1 :], len(rows[head]), head + 2)
+    head, quantities = rows[heads[0]], rows[heads[0] - 1]
+    body = _filled(rows[heads[0] + 1 :], len(head), heads[0] + 2)
     said = meta.get("Total Exported Frames", "")
-    if said.isdigit() and int(said) != len(table):
+    if said.isdigit() and int(said) != len(body):
         raise MeasurementError(
-            f"ends after {len(table)} of {counted(int(said), 'frame')}.\n  {_AGAIN}"
+            f"ends after {len(body)} of {counted(int(said), 'frame')}.\n  {_AGAIN}"
         )
-    t = checked_times(table[:, 1], lines)
-    scale = factor(meta.get("Length Units", "m"))
-    columns: dict[tuple[str, str], dict[str, int]] = {}
-    for c in range(2, len(rows[head])):
-        columns.setdefault((named["Type"][c], named["Name"][c]), {})[
-            f"{quantities[c]} {rows[head][c]}".strip()
-        ] = c
-    for (label, name), at in columns.items():
+    t = checked_times(_numbers(body, [1], head)[:, 0], _places(body))
+    own, assumptions = length_unit(meta.get("Length Units", ""), unit, "m", file)
+    streams = []
+    for (label, name), at in _assets(named, quantities, head):
         places = [at.get(f"Position {axis}", -1) for axis in "XYZ"]
         if label not in _KINDS or min(places) < 0 or "Unlabeled" in name:
             continue
-        values = scale * table[:, places]
-        if label == "Rigid Body":
-            turns = [at.get(f"Rotation {axis}", -1) for axis in "XYZW"]
-            if min(turns) < 0:
-                raise MeasurementError(
-                    f"rotations of {name!r} are not quaternions ({meta.get('Rotation Type', '?')})."
-                    "\n  Try: an export with Rotation Type: Quaternion"
-                )
-            values = np.hstack([values, table[:, turns]])
-        yield Stream(name, _KINDS[label], t, values)
+        turns = [at.get(f"Rotation {axis}", -1) for axis in "XYZW"] * (label == "Rigid Body")
+        if turns and min(turns) < 0:
+            raise MeasurementError(
+                f"rotations of {name!r} are not quaternions ({meta.get('Rotation Type', '?')})."
+                "\n  Try: an export with Rotation Type: Quaternion"
+            )
+        values = _numbers(body, [*places, *turns], head)
+        values[:, :3] *= METRES[own]
+        streams.append(Stream(name, _KINDS[label], t, values))
+    return Recording(tuple(streams), (), tuple(assumptions), unit="" if assumptions else own)
 
 
-def _vicon(rows: Rows) -> Iterator[Stream]:
+def _assets(
+    named: Mapping[str, Sequence[str]], quantities: Sequence[str], head: Sequence[str]
+) -> list[tuple[tuple[str, str], dict[str, int]]]:
+    """Type and name of each asset, and the column of each of its quantities.
+
+    One of the name of another is called after its parent, too, if the file tells it.
+    """
+    owners = (
+        {named["ID"][c]: named["Name"][c] for c in range(2, len(head))} if "ID" in named else {}
+    )
+    found: dict[tuple[str, ...], dict[str, int]] = {}
+    for c in range(2, len(head)):
+        own = tuple(
+            named[row][c] if row in named else "" for row in ("Type", "Name", "Parent", "ID")
+        )
+        quantity = f"{quantities[c]} {head[c]}".strip()
+        while quantity in found.get(own, ()):  # another asset that nothing tells from this one
+            own = (*own, "")
+        found.setdefault(own, {})[quantity] = c
+    names = [own[:2] for own in found]
+    listed = []
+    for (label, name, parent, *_), at in found.items():
+        whose = owners.get(parent, parent)
+        full = f"{whose}:{name}" if whose and names.count((label, name)) > 1 else name
+        listed.append(((label, full), at))
+    return listed
+
+
+def _vicon(rows: Rows, unit: str | None, file: str) -> Recording:
     starts = [k for k in range(len(rows)) if _opens_section(rows, k)]
+    streams: list[Stream] = []
+    assumptions: list[str] = []
+    units = set()
     for k, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
-        kind = _SECTIONS.get(rows[k][0].strip())
+        kind = _SECTIONS.get(rows[k][0])
         if kind is None:
             continue
-        first, names, axes, units = rows[k + 1 : k + 5]
-        rate = "".join(first[:1])
+        if len(rows) < k + 5:
+            raise MeasurementError(f"ends above the numbers of {rows[k][0]}.\n  {_AGAIN}")
+        first, names, axes, own_units = rows[k + 1 : k + 5]
+        rate = "".join(first[:1]).replace(",", ".")
         if not (_is_number(rate) and 0.0 < float(rate) < np.inf):
             raise MeasurementError(
                 f"line {k + 2}: the rate is {show(rate)} frames a second.\n  {_AGAIN}"
             )
-        lines, table = _table(rows[k + 5 : stop], len(axes), k + 6)
-        t = checked_times(table[:, 0] / float(rate), lines)
-        heads = [c for c in range(2, len(names)) if names[c].strip()]
+        body = _filled(rows[k + 5 : stop], len(axes), k + 6)
+        t = checked_times(_numbers(body, [0], axes)[:, 0] / float(rate), _places(body))
+        heads = [c for c in range(2, len(names)) if names[c]]
         for c, following in zip(heads, [*heads[1:], len(axes)], strict=True):
-            at = {axes[i].strip(): i for i in range(c, following)}
+            at = {axes[i]: i for i in range(c, following)}
             places = [at.get(a, at.get(f"T{a}", -1)) for a in "XYZ"]
-            if min(places) < 0 or names[c].strip().startswith("*"):
+            if min(places) < 0 or names[c].startswith("*"):
                 continue
-            values = factor(units[places[0]]) * table[:, places]
+            named = own_units[places[0]] if places[0] < len(own_units) else ""
+            own, told = length_unit(named, unit, "mm", file)
+            assumptions += told
+            units.add("" if told else own)
+            turns = [at[f"R{a}"] for a in "XYZW" if f"R{a}" in at] if kind == "body" else []
+            if kind == "body" and not turns:
+                raise MeasurementError(
+                    f"{names[c]} has no rotation.\n  Try: an export of objects with their rotations"
+                )
+            values = _numbers(body, [*places, *turns], axes)
+            values[:, :3] *= METRES[own]
             if kind == "body":
-                turns = [at[f"R{a}"] for a in "XYZW" if f"R{a}" in at]
-                values = np.hstack([values, _quaternions(table[:, turns], units[turns[0]])])
-            yield Stream(names[c].strip(), kind, t, values)
+                turned = _quaternions(values[:, 3:], own_units[turns[0]])
+                values = np.hstack([values[:, :3], turned])
+            streams.append(Stream(names[c], kind, t, values))
+    of_all = units.pop() if len(units) == 1 else ""
+    return Recording(tuple(streams), (), tuple(assumptions), unit=of_all)
 
 
 def _opens_section(rows: Rows, k: int) -> bool:
@@ -174,32 +232,43 @@ def _quaternions(turns: FloatArray, unit: str) -> FloatArray:
     return found
 
 
-def _table(rows: Sequence[list[str]], width: int, first: int) -> tuple[list[str], FloatArray]:
-    """Lines in the file, and numbers (n, width), of rows that are not blank; nan in empty cells."""
-    filled = [(f"line {k}", row) for k, row in enumerate(rows, first) if any(map(str.strip, row))]
+def _filled(rows: Rows, width: int, first: int) -> list[tuple[int, list[str]]]:
+    """Rows that are not blank, with their lines in the file; the first one is in line `first`."""
+    filled = [(line, row) for line, row in enumerate(rows, first) if any(row)]
     if not filled:
         raise MeasurementError(f"holds no frames.\n  {_AGAIN}")
-    table = np.full((len(filled), width), np.nan)
-    for numbers, (line, row) in zip(table, filled, strict=True):
+    for line, row in filled:
         if len(row) < width:
             raise MeasurementError(
-                f"{line} has {len(row)} of {counted(width, 'cell')}: the file is truncated.\n"
+                f"line {line} has {len(row)} of {counted(width, 'cell')}: the file is truncated.\n"
                 f"  {_AGAIN}"
             )
-        try:
-            numbers[:] = [float(cell) if cell.strip() else np.nan for cell in row[:width]]
-        except ValueError as error:
-            raise MeasurementError(f"{line}: {error}.\n  {_AGAIN}") from None
-    return [line for line, _ in filled], table
+    return filled
+
+
+def _places(body: Sequence[tuple[int, list[str]]]) -> list[str]:
+    return [f"line {line}" for line, _ in body]
+
+
+def _numbers(
+    body: Sequence[tuple[int, list[str]]], at: Sequence[int], names: Sequence[str]
+) -> FloatArray:
+    """Numbers (n, columns) of the columns `at` alone; nan in empty cells."""
+    lines, rows = zip(*body, strict=True)
+    try:
+        return as_numbers(rows, at, lines, [names[c] for c in at], gaps=True)
+    except ValueError as error:
+        raise MeasurementError(f"{error}.\n  {_AGAIN}") from None
 
 
 _WHOLE = "Try: export the file again, whole."
 
 
-def read_c3d(path: Path) -> Recording:
+def read_c3d(path: Path, unit: str | None = None) -> Recording:
     """Read the labelled points of a C3D file as markers; a gripper is three of them.
 
-    POINT:Y_SCREEN names the axis that points up; without it that is z.
+    POINT:Y_SCREEN names the axis that points up; without it that is z. POINT:UNITS names the unit
+    of lengths; without it that is `unit`, by default mm.
 
     Raises
     ------
@@ -221,7 +290,8 @@ def read_c3d(path: Path) -> Recording:
         raise MeasurementError(
             f"ends after {places.shape[2]} of {counted(declared, 'frame')}.\n  {_WHOLE}"
         )
-    labels = [label.strip() for label in point["LABELS"]]
+    listed = ["LABELS", *(f"LABELS{k}" for k in range(2, 9))]  # each holds 255 of them
+    labels = [label.strip() for key in listed for label in point.get(key, [])]
     named = [k for k, label in enumerate(labels) if label and not label.startswith("*")]
     if not named or not places.size:
         raise MeasurementError(
@@ -231,10 +301,13 @@ def read_c3d(path: Path) -> Recording:
     if not 0.0 < rate < np.inf:
         raise MeasurementError(f"POINT:RATE is {rate:g} Hz.\n  {_WHOLE}")
     t = np.arange(places.shape[2]) / rate
-    scale = factor("".join(point.get("UNITS", [])[:1]) or "mm")  # mm by the standard
+    in_file = "".join(point.get("UNITS", [])[:1])
+    length, assumptions = length_unit(in_file, unit, "mm", path.name)
+    scale = METRES[length]
     streams = tuple(Stream(labels[k], "marker", t, scale * places[:, k].T) for k in named)
     screen = "".join(point.get("Y_SCREEN", [])).strip().lower()
     own, said = screen.lstrip("+"), "as POINT:Y_SCREEN tells"
     if own not in ("x", "y", "z"):
         own, said = "z", f"in most C3D files; POINT:Y_SCREEN is {screen.upper() or 'absent'}"
-    return Recording(streams, up=own, up_by=said).without_zeros()
+    told = "" if assumptions else length
+    return Recording(streams, (), tuple(assumptions), own, said, told).without_zeros()

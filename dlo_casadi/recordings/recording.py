@@ -9,6 +9,7 @@ from scipy.ndimage import find_objects, label
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.config.problems import show
 from dlo_casadi.errors import DloError, MeasurementError
 
 Kind = Literal["marker", "body", "wrench"]
@@ -28,6 +29,7 @@ _CHANGES = 0.8  # share of the frames in which a marker with noise changes; one 
 _EQUAL = 1e-9  # m, above the rounding of a change of axes, below the resolution of all files
 FREE = "free"  # name of an end that nothing holds
 _OFFSET = 1.0  # m, longest distance from a gripper's markers to where the cable leaves it
+_PLURALS = {"marker": "markers", "body": "bodies", "wrench": "force sensors"}
 METRES = {"m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 0.01, "centimeters": 0.01}
 METRES |= {"mm": 1e-3, "millimeters": 1e-3, "millimetres": 1e-3}
 
@@ -107,10 +109,19 @@ class Recording:
     """The axis, x, y or z, that points up."""
     up_by: str = ""
     """Why this axis is assumed to point up."""
+    unit: str = ""
+    """The unit of length that its file names, if it names one."""
+    unread: tuple[str, ...] = ()
+    """What the files hold beside it that was not read, and why."""
 
     def of(self, kind: Kind) -> dict[str, Stream]:
         """Streams of one kind, by name."""
         return {stream.name: stream for stream in self.streams if stream.kind == kind}
+
+    @property
+    def told_unread(self) -> str:
+        """What was not read, for the message of an error about something that is not there."""
+        return "".join(f"\n  {text}." for text in self.unread)
 
     def with_z_up(self, up: str | None) -> "Recording":
         """The recording rotated to z up, from axes in which `up` points up, or as it was read."""
@@ -121,7 +132,17 @@ class Recording:
             for stream in self.streams
         )
         clouds = tuple(cloud.moved(turn) for cloud in self.clouds)
-        return Recording(streams, clouds, (*self.assumptions, *assumed))
+        return Recording(streams, clouds, (*self.assumptions, *assumed), unread=self.unread)
+
+    def scaled(self, scale: float) -> "Recording":
+        """The recording with all places, but no forces, multiplied by `scale`."""
+        ones = np.ones(7)
+        ones[:3] = scale
+        streams = tuple(
+            x if x.kind == "wrench" else replace(x, values=x.values * ones[: x.values.shape[1]])
+            for x in self.streams
+        )
+        return replace(self, streams=streams)
 
     def without_zeros(self) -> "Recording":
         """The recording, streams nan where their position is exactly (0, 0, 0).
@@ -193,31 +214,55 @@ def together(recordings: Sequence[Recording]) -> Recording:
     names = [(stream.kind, stream.name) for stream in streams]
     for (kind, name), stream in zip(names, streams, strict=True):
         if names.count((kind, name)) > 1:
+            files = {other.file for other in streams if (other.kind, other.name) == (kind, name)}
             raise MeasurementError(
-                f"two streams ({kind}) are called {name!r}: of {stream.clock} and another.\n"
-                "  Try: one file or topic for each cable, or other names in the export."
+                f"two {_PLURALS[kind]} are called {name!r} in {' and '.join(sorted(files))}: they "
+                "cannot be told apart.\n  Try: another name for one of them in the program that "
+                "tracks them; recordings of different cables one by one."
             )
         places = stream.values[:, :3]
         far = float(np.abs(places[np.isfinite(places)]).max(initial=0.0))
         if kind != "wrench" and far > LARGEST:
             raise MeasurementError(
                 f"{kind} {name!r} is {far:.4g} m from the origin: are its coordinates in "
-                "metres?\n  Try: --units mm for a bag; an export that names its units."
+                "metres?\n  Try: --units mm; an export that names its units."
             )
     return Recording(
         tuple(streams),
         tuple(cloud for item in recordings for cloud in item.clouds),
         tuple(dict.fromkeys(text for item in recordings for text in item.assumptions)),
+        unread=tuple(dict.fromkeys(text for item in recordings for text in item.unread)),
     )
 
 
-def factor(unit: str, of: str = "length", known: Mapping[str, float] = METRES) -> float:
-    """Convert a unit named in a file, by default one of length to metres."""
+def factor(unit: str, of: str, known: Mapping[str, float]) -> float:
+    """Size of a unit that is named in a file, among those that are known."""
     if unit.strip().lower() not in known:
         raise MeasurementError(
             f"the unit of {of} is {unit!r}.\n  Try: an export in one of {', '.join(known)}."
         )
     return known[unit.strip().lower()]
+
+
+def length_unit(named: str, asked: str | None, usual: str, file: str) -> tuple[str, list[str]]:
+    """The unit of the lengths in a file, by its key in `METRES`, and what of it is assumed.
+
+    A file that names a known unit is in this one. One that names none is in the unit that its user
+    has `asked` for, or the `usual` one of its format. Raises MeasurementError if it names another.
+    """
+    own = named.strip().lower()
+    if own in METRES:
+        return own, []
+    if asked:
+        why = f"whatever {show(named)} means" if own else "which it does not name"
+        return asked, [f"{file} is taken to be in {asked}, {why}"]
+    if own:
+        known = "m, cm or mm"
+        raise MeasurementError(
+            f"the unit of length is {named!r}.\n  Try: an export in {known}; --units with the one "
+            "that it means."
+        )
+    return usual, [f"{file} names no unit of length: {usual} is assumed; or --units"]
 
 
 def checked_times(t: FloatArray, places: Sequence[str]) -> FloatArray:

@@ -3,35 +3,38 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
-from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.sparse.csgraph import depth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
-from dlo_casadi.arrays import FloatArray, chord_lengths
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.sections import DENSITY
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.clouds import cloud_lines
-from dlo_casadi.recordings.fixtures import Gripper, along_cable, find_gripper, readings_of
+from dlo_casadi.recordings.fixtures import (
+    Gripper,
+    along_cable,
+    find_gripper,
+    full_names,
+    readings_of,
+)
+from dlo_casadi.recordings.order import (
+    LONGER,
+    arc_lengths,
+    check_arc_lengths,
+    exchanged_labels,
+    in_order,
+)
 from dlo_casadi.recordings.recording import FREE, Cloud, Recording, Stream, Wishes
 from dlo_casadi.recordings.stills import Still, align_clocks, find_stills
-from dlo_casadi.thresholds import STRETCHED
 
 _COLUMNS = 98  # width of a comment
-_LONGER = 0.03  # relative difference of declared and measured length beyond which one is a mistake
 # Scatter of the length from pose to pose beyond which arc lengths are doubtful, relative. Rendered
 # from one session: below 0.1 % for eight markers or more, up to 0.15 % for six, 0.9 % for four, 2.9
 # % for three; errors of arc lengths are 0.5 to 1.6 times the scatter. Grippers 20 mm off: 0.3 %.
 _DOUBTFUL = 2e-3
-_FEW = 4  # markers through which a spline is often shorter than the cable
-# m, distance of a marker from a fixture below which their direction is not the cable's: a spline
-# through a marker 1 mm from a gripper's origin, in any direction, was 4 to 14 mm too long.
-_BESIDE = 0.01
-_SAMPLES = 50  # points of a spline between two markers, to compute its length: exact to 1e-5
 _LENGTH = DeclaredTolerances().length  # m
 
 Points = tuple[FloatArray, FloatArray | None]  # (K, 3) [m], and arc lengths (K,) [m] of markers
@@ -90,6 +93,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     Called `name`. Raises MeasurementError if the recording lacks something that a session needs;
     the message says what to try.
     """
+    asked, wishes = wishes.holders, full_names(recording, wishes)
     recording, offsets = align_clocks(recording.without_held())
     stills = find_stills(recording, wishes.hold)
     start = find_gripper(wishes.start, wishes.start_offset, "start", stills, recording)
@@ -98,7 +102,7 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
         end = find_gripper(wishes.end, wishes.end_offset, "end", stills, recording)
     doubts: list[str] = []
     tolerances: dict[str, float] = {}
-    remarks = [*recording.assumptions, *(offset.told for offset in offsets)]
+    remarks = [*recording.assumptions, *recording.unread, *(offset.told for offset in offsets)]
     holders = wishes.holders.values()
     used: list[Stream | Cloud] = list(recording.clouds)
     used += [s for s in recording.streams if s.kind == "marker" or [s.name] in holders]
@@ -126,7 +130,8 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     else:
         told = [still.told for still in stills]
         markers = _cable_markers(recording, stills, wishes)
-        order = _in_order(markers, start, end)
+        _check_labels(markers, stills, start, end, wishes)
+        order = in_order(markers, start, end)
         names, places = [list(markers)[k] for k in order], np.array([*markers.values()])[order]
         seen = np.isfinite(places).all(axis=2)
         lines = [places[here, k] for k, here in enumerate(seen.T)]
@@ -150,7 +155,8 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             (np.round(line, 6), np.round(s[here], 6))
             for line, here in zip(lines, seen.T, strict=True)
         ]
-    readings, on_forces = readings_of(recording, stills, wishes.holders)
+    called = {side: [*names, *asked[side]] for side, names in wishes.holders.items()}
+    readings, on_forces = readings_of(recording, stills, called)
     remarks += on_forces
     whole = {"length": length} if start and end else {}  # beyond the last marker it is unknown
     known = {**whole, **wishes.known}
@@ -219,48 +225,39 @@ def _cable_markers(
     }
     found = {name: places for name, places in found.items() if np.isfinite(places).any()}
     if len(found) < 2:
-        known = ", ".join(recording.of("marker")) or "none"
+        known = recording.of("marker")
+        remedy = "\n  Try: --cable with a part of their names." if known else recording.told_unread
+        remedy = remedy or "\n  Try: a recording with markers on the cable."
         raise MeasurementError(
             f"{counted(len(found), 'marker')} of the cable: a pose takes two or more. Markers in "
-            f"this recording: {known}.\n  Try: --cable with a part of their names."
+            f"this recording: {', '.join(known) or 'none'}.{remedy}"
         )
     return found
 
 
-def _in_order(
-    markers: Mapping[str, FloatArray], start: Gripper | None, end: Gripper | None
-) -> list[int]:
-    """Order of the markers from the start to the end of the cable.
-
-    The largest distance of two markers over all poses approximates their distance along the cable.
-    With these distances the shortest tree that joins all markers is the cable itself.
-    """
-    places = np.array([*markers.values()])
-
-    def away(a: FloatArray, b: FloatArray) -> float:
-        return float(np.nanmax(np.linalg.norm(a - b, axis=1), initial=0.0))
-
-    apart = np.array([[away(a, b) for b in places] for a in places])
-    tree = minimum_spanning_tree(apart)  # without edges between markers never seen together
-    neighbours = np.bincount(np.concatenate(tree.nonzero()), minlength=len(places))
-    if neighbours.max() > 2:
-        branch = list(markers)[int(np.argmax(neighbours))]
-        raise MeasurementError(
-            f"the markers are no chain: three lead to {branch!r}.\n  Try: --cable with a part of "
-            "the names of the cable's own markers."
-        )
-    tips = np.flatnonzero(neighbours <= 1).tolist()
-    if start is not None:
-        tips.sort(key=lambda k: away(places[k], start.places))
-    elif end is not None:
-        tips.sort(key=lambda k: -away(places[k], end.places))
-    order, _ = depth_first_order(tree, tips[0], directed=False)
-    if len(order) < len(places):
-        raise MeasurementError(
-            f"no pose shows one of the markers {', '.join(np.array([*markers])[order])} and one of "
-            "the others.\n  Try: fill their gaps, or leave some out: --cable"
-        )
-    return [int(k) for k in order]
+def _check_labels(
+    markers: Mapping[str, FloatArray],
+    stills: Sequence[Still],
+    start: Gripper | None,
+    end: Gripper | None,
+    wishes: Wishes,
+) -> None:
+    """Raise MeasurementError with the markers and the poses if labels are exchanged."""
+    holders = wishes.holders
+    names = [*markers, *(holders.get(side, [side])[0] for side in ("start", "end"))]
+    found = exchanged_labels(np.array([*markers.values()]), start, end)
+    if not found:
+        return
+    told = []
+    for (i, j), poses in found.items():
+        where = ", ".join(f"pose {k + 1} ({stills[k].span})" for k in poses)
+        one, other = sorted((names[i], names[j]))
+        told.append(f"the labels of {one} and {other} are exchanged in {where}")
+    raise MeasurementError(
+        f"{'; '.join(told)}: exchanged back, their distances from their neighbours are those of "
+        "the other poses.\n  Try: exchange the labels there in the program that tracks them, or "
+        "cut the recording there."
+    )
 
 
 def _along(
@@ -272,13 +269,13 @@ def _along(
     remarks: list[str],
 ) -> tuple[FloatArray, float, float]:
     """Arc lengths (M,) [m] of the markers; the measured length of the cable and its scatter [m]."""
-    s, length, scatter = _arc_lengths(start, places, end)
+    s, length, scatter = arc_lengths(start, places, end)
     if not wishes.at:
-        _check_arc_lengths(s, length, scatter, places, names)
+        check_arc_lengths(s, length, scatter, places, names)
     fixtures = "from fixture to fixture" if start and end else "as far as fixtures and markers go"
     declared = wishes.known.get("length")
     longer = length / declared - 1.0 if declared else 0.0
-    slack = _LONGER + 3.0 * scatter / length  # splines through few markers are too short
+    slack = LONGER + 3.0 * scatter / length  # splines through few markers are too short
     if longer > slack or (start and end and longer < -slack):
         raise MeasurementError(
             f"the cable is {length:.4f} m long {fixtures} (a spline through the markers), but "
@@ -300,7 +297,7 @@ def _along(
             f"--at gives {counted(len(wishes.at), 'arc length')} of "
             f"{counted(len(names), 'marker')} ({', '.join(names)})"
         )
-    longest = declared or (1.0 + _LONGER) * length
+    longest = declared or (1.0 + LONGER) * length
     if start and end and wishes.at[-1] > longest:
         raise MeasurementError(
             f"--at ends at {wishes.at[-1]:g} m, but the cable is {length:.4f} m long {fixtures} (a "
@@ -308,93 +305,3 @@ def _along(
         )
     remarks.append(f"markers: {', '.join(names)}, at the arc lengths of --at")
     return np.array(wishes.at), length, scatter
-
-
-def _arc_lengths(
-    start: Gripper | None, places: FloatArray, end: Gripper | None
-) -> tuple[FloatArray, float, float]:
-    """Arc lengths (M,) [m] of markers from the start; length of the cable and its scatter [m].
-
-    They are means over all poses of lengths along a cubic spline through fixtures and markers,
-    clamped in the grippers' directions. A marker beside a fixture is no knot of it.
-    """
-    knots = places
-    if start is not None:
-        knots = np.concatenate([start.places[None], knots])
-    if end is not None:
-        knots = np.concatenate([knots, end.places[None]])
-    spans = np.full((knots.shape[1], len(knots) - 1), np.nan)
-    for k, row in enumerate(spans):
-        seen = np.flatnonzero(np.isfinite(knots[:, k]).all(axis=1))
-        if len(seen) < 2:
-            continue
-        x = knots[seen, k]
-        ends: Any = tuple(
-            (1, gripper.frames[k, :, 0]) if gripper is not None else (2, np.zeros(3))
-            for gripper in (start, end)
-        )
-        chords = np.linalg.norm(np.diff(x, axis=0), axis=1)
-        at_start = start is not None and chords[0] < _BESIDE
-        at_end = end is not None and chords[-1] < _BESIDE
-        kept = np.ones(len(x), bool)
-        kept[1] &= not at_start
-        kept[-2] &= not at_end
-        s = np.zeros(len(x))
-        s[kept] = _along_spline(x[kept], ends)
-        if at_start:
-            s[1] = chords[0]
-        if at_end:
-            s[-2] = s[-1] - chords[-1]
-        near = np.diff(seen) == 1
-        row[seen[:-1][near]] = np.diff(s)[near]
-    if np.isnan(spans).all(axis=0).any():
-        raise MeasurementError(
-            "two neighbouring markers of the cable are seen together in no pose.\n  Try: fill "
-            "their gaps, or leave one of them out: --cable"
-        )
-    found = np.nanmean(spans, axis=0)
-    s = np.concatenate([[0.0], np.cumsum(found)])
-    first = 0 if start is None else 1
-    scatter = float(np.where(np.isnan(spans), found, spans).sum(axis=1).std())
-    return s[first : first + len(places)], float(s[-1]), scatter
-
-
-def _along_spline(x: FloatArray, ends: Any) -> FloatArray:
-    """Lengths (K,) [m] to each of the points (K, 3) along a cubic spline with these conditions."""
-    s = chord_lengths(x)
-    for _ in range(3):  # the parameter converges to the arc length
-        fine = np.linspace(s[:-1], s[1:], _SAMPLES + 1, axis=1)
-        curve = CubicSpline(s, x, bc_type=ends)(fine)
-        s = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=1), axis=2).sum(axis=1)))
-    return s
-
-
-def _check_arc_lengths(
-    s: FloatArray, length: float, scatter: float, places: FloatArray, names: Sequence[str]
-) -> None:
-    """Raise MeasurementError if measured arc lengths (M,) [m] are proven wrong.
-
-    No marker is farther from the next than the cable between them is long, and the length does not
-    change from pose to pose.
-    """
-    chords = np.linalg.norm(np.diff(places, axis=0), axis=2)  # (M - 1, P)
-    excess = np.nanmax(chords, axis=1, initial=0.0) - np.diff(s)
-    k = int(np.argmax(excess))
-    if excess[k] > STRETCHED * length:
-        pose = int(np.nanargmax(chords[k])) + 1
-        cause = f"{counted(len(s), 'marker')} are too few for that"
-        if len(s) > _FEW:
-            cause = f"are labels exchanged in pose {pose}?"
-        raise MeasurementError(
-            f"markers {names[k]} and {names[k + 1]} are {np.nanmax(chords[k]):.4f} m apart in pose "
-            f"{pose}, but {np.diff(s)[k]:.4f} m along a spline through the markers (mean of all "
-            f"poses): {cause}.\n  Try: --length and --at, measured with a tape; more markers; "
-            "other labels; --start-offset."
-        )
-    if scatter > _LONGER * length:
-        raise MeasurementError(
-            f"the cable's length along a spline through {counted(len(s), 'marker')} is "
-            f"{length:.4f} m with a scatter of {scatter:.4f} m from pose to pose: a cable does not "
-            "change its length.\n  Try: --length and --at, measured with a tape; the body that "
-            "holds each end: --start, --end; cable and grippers in one frame."
-        )
