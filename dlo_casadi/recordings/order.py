@@ -19,9 +19,9 @@ _FEW = 4  # markers through which a spline is often shorter than the cable
 # through a marker 1 mm from a gripper's origin, in any direction, was 4 to 14 mm too long.
 _BESIDE = 0.01
 _SAMPLES = 50  # points of a spline between two markers, to compute its length: exact to 1e-5
-# Largest share of a pose's misfit that the exchange of two labels may leave. Of 252 exchanges in the
-# lines of sample sessions (5 to 20 markers) the right one leaves 0.02 in the median and 0.14 in 95 %;
-# the best of the others 0.40 or more in 95 %.
+# Largest share of a pose's misfit that the exchange of two labels may leave. Of 252 exchanges in
+# lines of sample sessions (5 to 20 markers) the right one leaves 0.02 in the median, 0.14 in 95 %;
+# the best of the others leaves 0.40 or more in 95 %.
 _EXPLAINED = 0.3
 
 
