@@ -3,7 +3,7 @@
 from dlo_casadi.effects.across_gravity import GravityTilt, SideLoad
 from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening
-from dlo_casadi.effects.cable import CableData, Setup
+from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle, ClampCompliance, ClampRotation
 from dlo_casadi.effects.clips import ClipAngle, ClipOffset, ClipSlip
@@ -38,6 +38,28 @@ from dlo_casadi.effects.rest_shape import PlasticSet, RestCurvatureDrift
 from dlo_casadi.effects.standoff_error import StandoffError
 from dlo_casadi.effects.stiffness import StiffnessGradient, StiffSection
 from dlo_casadi.effects.tether import Tether
+from dlo_casadi.rod.element import Cell
+
+# What an effect of one's own is written with.
+__all__ = [
+    "EFFECTS",
+    "BoundaryEffect",
+    "CableData",
+    "Cell",
+    "ContactEffect",
+    "Effect",
+    "EndConditions",
+    "Kinematics",
+    "Load",
+    "MeasurementEffect",
+    "Parameter",
+    "PointForceAt",
+    "PointLoad",
+    "SectionLaw",
+    "SpringAt",
+    "StateEffect",
+    "Viewpoint",
+]
 
 EFFECTS = Registry(
     (effect.name, effect)
