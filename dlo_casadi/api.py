@@ -8,6 +8,8 @@ result.plot().savefig("poses.png")
 result.cable.solve(end=(0.3, -0.1)).points
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import fields
@@ -15,7 +17,7 @@ from functools import cached_property
 from inspect import Signature, signature
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Never, Self
 
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
@@ -32,10 +34,10 @@ from dlo_casadi.config import (
     any_photographs,
     checked_config,
     known_config,
-    load_as,
+    load_config,
 )
+from dlo_casadi.config.frozen import Numbers, Rows, plain
 from dlo_casadi.config.problems import Arguments
-from dlo_casadi.config.values import plain
 from dlo_casadi.errors import DloError, library
 from dlo_casadi.report.documents import cable_of_known, fitted_cable
 from dlo_casadi.report.figures_poses import outcome_figure
@@ -188,7 +190,7 @@ class Session(Config):
         cable: Cable,
         poses: Sequence[Pose],
         *,
-        gravity: ArrayLike | None = None,
+        gravity: Numbers | None = None,
         boundary: Sequence[str] | None = None,
         obstacles: Sequence[Obstacle | Mapping[str, Any]] | None = None,
         std: float | None = None,
@@ -202,7 +204,7 @@ class Session(Config):
         estimation: Mapping[str, Any] | None = None,
         diagnosis: Mapping[str, Any] | None = None,
         limits: Mapping[str, float] | None = None,
-        **unknown: Any,
+        **unknown: Never,  # refused with a hint
     ) -> None:
         equipment = _given(camera=camera, board=board, reference=reference)
         pictures = equipment or any_photographs(poses)
@@ -214,11 +216,8 @@ class Session(Config):
         )
         options = _given(model=model, estimation=estimation, diagnosis=diagnosis, limits=limits)
         given = plain({"cable": cable, "experiment": experiment, **options, **unknown})
-        checked = checked_config(Arguments(given, tuple(signature(Session).parameters)), Config)
-        super().__init__(**{name: getattr(checked, name) for name in checked.model_fields_set})
-        self._warnings, self._skipped = checked.warnings, checked.skipped
-
-    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+        checked = checked_config(Arguments(given, tuple(signature(Session).parameters)))
+        vars(self).update(vars(checked))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -229,7 +228,9 @@ class Session(Config):
         ConfigError
             If the file cannot be used; the message lists every problem with its line.
         """
-        return load_as(cls, path)
+        session = cls.__new__(cls)
+        vars(session).update(vars(load_config(path)))
+        return session
 
     def fit(
         self,
@@ -285,7 +286,7 @@ class Session(Config):
 
 # Arguments of a session: without `self` and the unknown ones, which are refused.
 _KNOWN = list(signature(Session.__init__).parameters.values())[1:-1]
-Session.__signature__ = Signature(_KNOWN)
+Session.__signature__ = Signature(_KNOWN)  # type: ignore[attr-defined]
 
 
 def _given(**values: Any) -> dict[str, Any]:
@@ -316,12 +317,12 @@ def fit(path: str | Path, **options: Any) -> Result:
 def known_cable(
     cable: Cable,
     *,
-    gravity: ArrayLike | None = None,
+    gravity: Numbers | None = None,
     boundary: Sequence[str] | None = None,
-    rest_curvature: ArrayLike | None = None,
+    rest_curvature: float | Numbers | Rows | None = None,
     model: Mapping[str, Any] | None = None,
     limits: Mapping[str, float] | None = None,
-    **unknown: Any,
+    **unknown: Never,  # refused with a hint
 ) -> FittedCable:
     """A cable with known data, without poses and without a fit.
 

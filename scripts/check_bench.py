@@ -186,9 +186,7 @@ def run_one(name: str, without_true_effect: bool) -> dict:
     config = load_config(config_of(name))
     if without_true_effect:
         hidden = tuple(true_effects(name))
-        config = config.model_copy(
-            update={"diagnosis": config.diagnosis.model_copy(update={"exclude": hidden})}
-        )
+        config = config.changed(diagnosis=config.diagnosis.changed(exclude=hidden))
     return compare(name, run_session(config))
 
 

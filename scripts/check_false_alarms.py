@@ -83,11 +83,9 @@ def hanging(config, generator):
     own = {"length": length, "mass": mass, "bending_stiffness": prior, "youngs_modulus": None}
     own["rest_shape"] = "curved"
     known = {"length": 0.003, "heading": 0.02, "end": 0.002}
-    experiment = config.experiment.model_copy(
-        update={"tolerances": config.experiment.tolerances.model_copy(update=known)}
-    )
-    cable = config.cable.model_copy(update=own)
-    config = config.model_copy(update={"cable": cable, "experiment": experiment})
+    experiment = config.experiment.changed(tolerances=config.experiment.tolerances.changed(**known))
+    cable = config.cable.changed(**own)
+    config = config.changed(cable=cable, experiment=experiment)
     model = declared_model(config).model.with_mesh(40)
     p = model.nominal.copy()
     p[0] = stiffness
@@ -325,9 +323,9 @@ def run_one(index: int, seed: int, scatter: bool) -> dict:
     """Simulate one set, whose random numbers depend on seed and index alone, and diagnose it."""
     name = HANGING if scatter else SESSIONS[index % len(SESSIONS)]
     config = load_config(ROOT / "tests" / "data" / "bench" / name / "session.yaml")
-    plain = config.experiment.measurement.model_copy(update={"std": None})
-    experiment = config.experiment.model_copy(update={"measurement": plain})
-    config = config.model_copy(update={"experiment": experiment})
+    plain = config.experiment.measurement.changed(std=None)
+    experiment = config.experiment.changed(measurement=plain)
+    config = config.changed(experiment=experiment)
     generator = generator_of(seed, index)
     if scatter:
         config, measured, stiffness = hanging(config, generator)

@@ -49,8 +49,8 @@ MOST_STD, MOST_OFFSET = 0.3, 0.005  # standard deviations; s, half a frame
 def fitted(path: Path) -> list[Estimate]:
     """EI and GJ of a session, without a diagnosis."""
     session = dlo.Session.load(path)
-    quick = session.diagnosis.model_copy(update={"enabled": False})
-    result = session.model_copy(update={"diagnosis": quick}).fit()
+    quick = session.diagnosis.changed(enabled=False)
+    result = session.changed(diagnosis=quick).fit()
     return [result.params[name] for name in STIFFNESSES]
 
 

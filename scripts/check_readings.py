@@ -65,12 +65,12 @@ def measured_with(config: Config, readings: tuple[str, ...], number: int) -> Con
         if pose.role == "fit" and left:
             given = {name: (0.0,) * (1 if "moment" in name else 2) for name in readings}
             left -= 1
-        poses.append(pose.model_copy(update=given))
-    measurement = config.experiment.measurement.model_copy(
-        update={"std": STD, "force_std": FORCE_STD, "moment_std": MOMENT_STD}
+        poses.append(pose.changed(**given))
+    measurement = config.experiment.measurement.changed(
+        std=STD, force_std=FORCE_STD, moment_std=MOMENT_STD
     )
     update = {"poses": tuple(poses), "measurement": measurement}
-    return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})
+    return config.changed(experiment=config.experiment.changed(**update))
 
 
 def simulate(config: Config, generator, hidden: dict[str, dict[str, float]], factor: float = 1.0):
@@ -123,8 +123,8 @@ def load_bench() -> Config:
     """configs/cable.yaml with lines in place of photographs."""
     config = load_config(ROOT / "configs" / "cable.yaml")
     other = load_config(ROOT / "tests" / "data" / "bench" / "short_clean" / "session.yaml")
-    experiment = config.experiment.model_copy(update={"measurement": other.experiment.measurement})
-    return config.model_copy(update={"experiment": experiment})
+    experiment = config.experiment.changed(measurement=other.experiment.measurement)
+    return config.changed(experiment=experiment)
 
 
 def inside(interval, value: float) -> bool:
@@ -153,8 +153,8 @@ def clean(generator) -> dict:
 def mass(generator) -> dict:
     """A mass that is not declared."""
     config = load_bench()
-    unknown = config.cable.model_copy(update={"mass": None})
-    config = measured_with(config.model_copy(update={"cable": unknown}), ("end_force",), 3)
+    unknown = config.cable.changed(mass=None)
+    config = measured_with(config.changed(cable=unknown), ("end_force",), 3)
     measured, stiffness = drawn(config, generator, factor=1.1)
     fit = fit_declared(config, declared_model(config), measured)
     found = profile_intervals(fit)
@@ -172,17 +172,14 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
     (right,) = hidden
     gains = {}
     for name, side in ((right, held), (wrong, other)):
-        boundary = config.experiment.boundary.model_copy(update={"start": side})
+        boundary = config.experiment.boundary.changed(start=side)
         poses = tuple(
-            pose.model_copy(update={"start_heading": 0.0 if side == "clamped" else None})
+            pose.changed(start_heading=0.0 if side == "clamped" else None)
             for pose in config.experiment.poses
         )
         update = {"boundary": boundary, "poses": poses}
-        as_held = config.model_copy(
-            update={
-                "experiment": config.experiment.model_copy(update=update),
-                "model": config.model.model_copy(update={"n": 20}),
-            }
+        as_held = config.changed(
+            experiment=config.experiment.changed(**update), model=config.model.changed(n=20)
         )
         if name == right:
             measured, _ = drawn(as_held, generator, hidden)

@@ -80,35 +80,35 @@ def variants(
     experiment, measurement = config.experiment, config.experiment.measurement
 
     def changed(**parts: Any) -> Config:
-        return config.model_copy(update={"experiment": experiment.model_copy(update=parts)})
+        return config.changed(experiment=experiment.changed(**parts))
 
     for name, factor in (("x 3", FACTOR), ("/ 3", 1 / FACTOR)):
         if "std" in changes:
             std = {"std": factor * (measurement.std or base.std)}
-            yield f"std {name}", changed(measurement=measurement.model_copy(update=std))
+            yield f"std {name}", changed(measurement=measurement.changed(**std))
         if "tolerances" in changes:
-            scaled = {k: factor * v for k, v in experiment.tolerances.model_dump().items()}
-            tolerances = experiment.tolerances.model_copy(update=scaled)
+            scaled = {k: factor * v for k, v in vars(experiment.tolerances).items()}
+            tolerances = experiment.tolerances.changed(**scaled)
             yield f"tolerances {name}", changed(tolerances=tolerances)
         if "prior" in changes:
             prior = factor * config.cable.prior_bending_stiffness
             cable = {"bending_stiffness": prior, "youngs_modulus": None}
             yield (
                 f"prior EI {name}",
-                config.model_copy(update={"cable": config.cable.model_copy(update=cable)}),
+                config.changed(cable=config.cable.changed(**cable)),
             )
         if "mesh" in changes:
             n = max(2 * round(factor * base.n / 2), 4)
             yield (
                 f"{n} elements",
-                config.model_copy(update={"model": config.model.model_copy(update={"n": n})}),
+                config.changed(model=config.model.changed(n=n)),
             )
     fitted = [k for k, pose in enumerate(experiment.poses) if pose.role == "fit"]
     if "poses" in changes and len(fitted) > 1:
         for k in fitted[:: -(-len(fitted) // poses)]:
             # It was held all the same, and has changed the rest curvature of later poses.
             out = list(experiment.poses)
-            out[k] = out[k].model_copy(update={"role": "held_out"})
+            out[k] = out[k].changed(role="held_out")
             yield f"without {out[k].name}", changed(poses=tuple(out))
 
 
@@ -134,9 +134,9 @@ def run(config: Config) -> Row:
 def check(session: Path, changes: list[str], poses: int, diagnosed: bool, jobs: int) -> int:
     """Print a session's table; how many variants are not as the session itself."""
     config = load_config(session)
-    estimation = config.estimation.model_copy(update={"algorithm1": False})
-    diagnosis = config.diagnosis.model_copy(update={"enabled": diagnosed})
-    config = config.model_copy(update={"estimation": estimation, "diagnosis": diagnosis})
+    estimation = config.estimation.changed(algorithm1=False)
+    diagnosis = config.diagnosis.changed(enabled=diagnosed)
+    config = config.changed(estimation=estimation, diagnosis=diagnosis)
     base, bad = run(config), 0
     print(f"{session.parent.name} | as it is | {base.text()}", flush=True)
     names, listed = zip(*variants(config, base, changes, poses), strict=True)

@@ -50,11 +50,11 @@ def main() -> None:
         table, inside = [], []
         for k in range(len(measured)):
             poses = tuple(
-                pose.model_copy(update={"role": "held_out" if i == k else "fit"})
+                pose.changed(role="held_out" if i == k else "fit")
                 for i, pose in enumerate(config.experiment.poses)
             )
-            experiment = config.experiment.model_copy(update={"poses": poses})
-            outcome = run_session(config.model_copy(update={"experiment": experiment}))
+            experiment = config.experiment.changed(poses=poses)
+            outcome = run_session(config.changed(experiment=experiment))
             row = {"floor": floor(measured, k, config.cable.length)}
             for stage in outcome.stages:
                 row[stage.name] = stage.rmse_held_out

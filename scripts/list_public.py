@@ -81,7 +81,7 @@ def python_lines(module: Any) -> list[str]:
 
 def _is_declared(value: Any) -> bool:
     """Whether it is a part of a session: its attributes are the parameters of its constructor."""
-    return hasattr(value, "model_fields")
+    return hasattr(value, "__pydantic_fields__")
 
 
 def _members(kind: type, listed: set[Any]) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """Where to put clips: against a search on a grid and random places, and messages for bad input."""
 
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -59,7 +60,7 @@ def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():
 def test_two_clips_on_a_wall_keep_limits_with_what_is_said_of_them():
     known, wall = cable(), ((0.05, -0.1), (0.4, -0.1))
     found = placed(known, 2, POSES, wall, LIMITS, "margin")
-    clips = [clip.model_dump() for clip in found.clips]
+    clips = [asdict(clip) for clip in found.clips]
     again = list(used(known, clips, LIMITS))
     assert [x.value for x in again] == pytest.approx([x.value for x in found.uses], rel=1e-3)
     assert 0 < found.margin == found.binding.margin < 1
@@ -129,7 +130,7 @@ def test_no_place_near_a_clip_in_space_is_better():
     known = cable(8, gravity=(0.0, 0.0, -9.81), also={"torsional_stiffness": 0.015})
     poses, box = [{"end": (0.5, 0.1, 0.0)}], ((0.1, -0.1, -0.3), (0.4, 0.2, 0.0))
     found = placed(known, 1, poses, box, {"force": 3.0}, "margin")
-    (clip,) = (one.model_dump() for one in found.clips)
+    (clip,) = (asdict(one) for one in found.clips)
     rng = np.random.default_rng(0)
     for ds, *step in rng.uniform(-0.01, 0.01, (5, 4)):
         place = np.clip(np.add(clip["place"], step), *box)

@@ -4,7 +4,7 @@ import copy
 import inspect
 import pickle
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +22,7 @@ from dlo_casadi.report.page import configuration_text
 from dlo_casadi.report.writer import write_numbers
 
 SCHEMA = config_schema()
+KEYS = [field.name for field in fields(Config)]
 BENCH = Path(__file__).parent / "data/bench/short_clean"
 LINE = [[0.0, 0.0], [0.1, -0.1], [0.3, -0.1]]
 
@@ -225,20 +226,20 @@ def test_arguments_make_what_a_file_makes(name, tmp_path):
         pose[key] = named[0] if key == "file" else named
     (tmp_path / "session.yaml").write_text(dump_yaml(tree))
     from_file, session = load_config(tmp_path / "session.yaml"), from_arguments(tree)
-    for section in Config.model_fields:
+    for section in KEYS:
         assert getattr(session, section) == getattr(from_file, section)
     assert session.warnings == from_file.warnings
 
     (tmp_path / "again.yaml").write_text(session.text)
     again = load_config(tmp_path / "again.yaml")
-    assert all(getattr(again, x) == getattr(session, x) for x in Config.model_fields)
+    assert all(getattr(again, x) == getattr(session, x) for x in KEYS)
     assert pickle.loads(pickle.dumps(session)) == session
 
 
 def test_every_key_is_an_argument():
     arguments = set(inspect.signature(dlo.Session).parameters)
     keys = {
-        *Config.model_fields,
+        *KEYS,
         *IN_PLANE["experiment"],
         *BY_REFERENCE["experiment"],
         *leaves(IN_PLANE["experiment"]["measurement"]),

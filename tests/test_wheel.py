@@ -56,7 +56,7 @@ def built(folder, what):
     code = f"from setuptools import build_meta; build_meta.build_{what}({str(target)!r})"
     target.mkdir(exist_ok=True)
     run(sys.executable, "-c", code, cwd=folder)
-    return next(target.glob({"wheel": "*.whl", "sdist": "*.tar.gz"}[what]))
+    return next(target.glob("*.tar.gz" if what == "sdist" else "*.whl"))
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +88,16 @@ def test_the_wheel_says_what_it_needs_and_offers(wheel):
     assert re.search(r"^Requires-Python: >=3\.11$", metadata, re.M)
     assert {"casadi", "numpy", "scipy"} <= set(re.findall(r"^Requires-Dist: (\w+)", metadata, re.M))
     assert "dlo = dlo_casadi.cli:main" in told.read(f"{notes}/entry_points.txt").decode()
+
+
+def test_an_editable_install_is_a_path_that_type_checkers_follow(source, tmp_path):
+    """They read paths in a .pth file, and run no hook that finds the package at its import."""
+    shutil.copytree(source, tmp_path / "source", ignore=shutil.ignore_patterns("dist"))
+    with zipfile.ZipFile(built(tmp_path / "source", "editable")) as told:
+        (path,) = (name for name in told.namelist() if name.endswith(".pth"))
+        found = Path(told.read(path).decode().strip())
+    assert (found / "dlo_casadi/py.typed").is_file()
+    assert found.samefile(tmp_path / "source")
 
 
 def test_an_unpacked_wheel_works_without_the_checkout(wheel, tmp_path):

@@ -12,7 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +23,7 @@ from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.config import Limits
 from dlo_casadi.config.document import Document
+from dlo_casadi.config.frozen import OpenSection
 from dlo_casadi.config.options import ElementName
 from dlo_casadi.config.problems import ConfigProblem, show
 from dlo_casadi.config.sections import Boundary
@@ -33,7 +34,6 @@ from dlo_casadi.config.values import (
     Name,
     NonNegative,
     Number,
-    OpenSection,
     Place,
     Positive,
     Quaternion,
@@ -291,10 +291,11 @@ def _results_near(path: Path) -> str:
 
 
 def _model(file: ParametersFile) -> CableModel:
-    cable = file.cable.model_dump(exclude={"rest_shape"})
+    cable = asdict(file.cable)
+    straight = cable.pop("rest_shape") == "straight"
     tolerances = {name: row.tolerance for name, row in file.parameters.items()}
     return CableModel(
-        cable=CableData(**cable, straight=file.cable.rest_shape == "straight"),
+        cable=CableData(**cable, straight=straight),
         n=file.n,
         element=file.element,
         start=file.boundary.start,
@@ -375,7 +376,7 @@ def _other_rest(file: ParametersFile, model: CableModel) -> Iterator[ConfigProbl
         yield ConfigProblem((), "'state' is missing: effects change the rest shape")
     if wrong or model.has_state or file.state is None:
         return
-    state, fitted = _rest(file, model), _rest(file.model_copy(update={"state": None}), model)
+    state, fitted = _rest(file, model), _rest(file.changed(state=None), model)
     gap = float(np.abs(state - fitted).max(initial=0.0))
     if gap > _DIGITS * float(np.abs(state).max(initial=0.0)):
         text = (
@@ -402,7 +403,7 @@ def metadata_of(
     document: dict[str, Any], source: Path | None, file: ParametersFile | None = None
 ) -> Metadata:
     """Contents of a document besides the model; `file`: the same, if it is checked already."""
-    file = file or ParametersFile.model_validate(document)
+    file = file or ParametersFile(**document)
     names = file.covariance.names
     covariance = np.array(file.covariance.values, dtype=float).reshape(len(names), len(names))
     scatter = file.scatter or _Scatter()

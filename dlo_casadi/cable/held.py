@@ -10,8 +10,9 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
+from dlo_casadi.config.frozen import ConfigSection
 from dlo_casadi.config.supports import Obstacle, Sides, clip_problems, obstacle_problems
-from dlo_casadi.config.values import AXES, ConfigSection
+from dlo_casadi.config.values import AXES
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.spread import Tipping

@@ -10,7 +10,8 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import EstimatedCable
 from dlo_casadi.config import DeclaredTolerances, Limits
-from dlo_casadi.config.values import ConfigSection
+from dlo_casadi.config.frozen import ConfigSection
+from dlo_casadi.config.problems import keys_of
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.limits import (
     Exceedance,
@@ -206,8 +207,9 @@ def check_limits(
     """
     known, asked = cable.metadata, asked_limits(cable, limits)
     beside = _given(DeclaredTolerances, tolerances, "tolerances={'end': 2e-3} [m]")
-    stds = (beside or DeclaredTolerances()).model_dump(exclude_unset=True)
-    possible = tolerances_of(with_tolerances(cable.model, DeclaredTolerances.model_fields))
+    names = tolerances if isinstance(tolerances, Mapping) else beside.declared if beside else ()
+    stds = {name: getattr(beside, name) for name in names}
+    possible = tolerances_of(with_tolerances(cable.model, keys_of(DeclaredTolerances)))
     if strange := [name for name in stds if name not in possible]:
         text = f"tolerances.{strange[0]}: the shape of this cable does not depend on it"
         raise DloError(f"{text}.\n  Try: {', '.join(possible)}")

@@ -4,13 +4,13 @@ No other package imports yaml and pydantic. All units are SI. All problems of a 
 together, each with its line.
 """
 
+from dlo_casadi.config.cable import Cable
 from dlo_casadi.config.document import dump_yaml, read_yaml
 from dlo_casadi.config.effects import declared_effects, declared_setup, wrong_effects
 from dlo_casadi.config.load import (
     any_photographs,
     checked_config,
     known_config,
-    load_as,
     load_config,
 )
 from dlo_casadi.config.options import (
@@ -22,5 +22,5 @@ from dlo_casadi.config.options import (
     Images,
     Limits,
 )
-from dlo_casadi.config.sections import Cable, Config, Pose, SkippedPose
+from dlo_casadi.config.sections import Config, Pose, SkippedPose
 from dlo_casadi.config.supports import Clip, Obstacle

@@ -2,6 +2,7 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from dataclasses import asdict
 
 from dlo_casadi.config.options import DeclaredEffect, EffectParameter
 from dlo_casadi.config.problems import ConfigProblem, Place, did_you_mean
@@ -39,7 +40,7 @@ def declared_setup(config: Config) -> Setup:
         center=(0.0, 0.0) if measurement.kind == "images" else None,
         camera=measurement.kind == "images" and None not in (measurement.board, measurement.camera),
         readings=tuple({name for pose in experiment.poses for name in pose.readings}),
-        tolerances=experiment.tolerances.model_dump(),
+        tolerances=asdict(experiment.tolerances),
         clips=experiment.clips,
         obstacles=len(experiment.obstacles),
         level=float(height_of(starts[0], experiment.gravity)),

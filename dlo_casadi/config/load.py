@@ -5,14 +5,17 @@ import math
 import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.config.cable import Cable
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.effects import without_values, wrong_effects, wrong_limits
+from dlo_casadi.config.frozen import plain
 from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.problems import (
     Arguments,
@@ -20,10 +23,11 @@ from dlo_casadi.config.problems import (
     Place,
     Source,
     did_you_mean,
+    keys_of,
     kind_of,
     show,
 )
-from dlo_casadi.config.sections import Cable, Config, Experiment, Pose, SkippedPose
+from dlo_casadi.config.sections import Config, Experiment, Pose, SkippedPose
 from dlo_casadi.config.supports import (
     clip_problems,
     clips_differ,
@@ -32,12 +36,10 @@ from dlo_casadi.config.supports import (
     undetermined,
     unused_directions,
 )
-from dlo_casadi.config.values import AXES, REST_COEFFICIENTS, Range, plain
+from dlo_casadi.config.values import AXES, REST_COEFFICIENTS, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS, RestCurvature
-
-Kind = TypeVar("Kind", bound=Config)
 
 
 def load_config(path: str | Path) -> Config:
@@ -60,11 +62,6 @@ def load_config(path: str | Path) -> Config:
         cannot be reached or has no file is left out and noted in `Config.skipped`; it is an error
         only if no pose to fit remains.
     """
-    return load_as(Config, path)
-
-
-def load_as(kind: type[Kind], path: str | Path) -> Kind:
-    """`load_config` for a subclass of Config."""
     if not isinstance(path, str | os.PathLike):
         raise ConfigError(
             f"{path!r} is no configuration.\n"
@@ -80,12 +77,12 @@ def load_as(kind: type[Kind], path: str | Path) -> Kind:
     if str(document.data.get("schema")).startswith("dlo-parameters"):
         text = "a fitted cable, no configuration.\n  Try: dlo_casadi.load(path), or dlo predict"
         raise ConfigError(text, file=source)
-    return checked_config(document, kind).noted(path=source.absolute())
+    return checked_config(document).noted(path=source.absolute())
 
 
-def checked_config(source: Source, kind: type[Kind]) -> Kind:
+def checked_config(source: Source) -> Config:
     """Check a configuration from a file or from arguments; raises ConfigError as `load_config`."""
-    config = source.checked(kind)
+    config = source.checked(Config)
     if problems := [
         *_contradictions(config.experiment, config.cable.length),
         *_weightless(config),
@@ -139,7 +136,7 @@ def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config,
     held = {key: given.pop(key) for key in ("gravity", "boundary") if key in given}
     nothing = {"measurement": {"kind": "centerlines"}, "poses": ()}
     source = Arguments(given | {"experiment": nothing | held}, names)
-    if strange := sorted(given.keys() & Config.model_fields.keys() - {*names}):
+    if strange := sorted(given.keys() & keys_of(Config).keys() - {*names}):
         hint = did_you_mean(strange[0], names)
         raise source.error([ConfigProblem((), f"unknown key {strange[0]!r} in {source.top}{hint}")])
     config = source.checked(Config)
@@ -430,7 +427,7 @@ def _impossible_values(experiment: Experiment, length: float) -> Iterator[Config
     # A tolerance must fit within its bounds; otherwise the bounds decide instead.
     torsional_stiffness = 1.0 if experiment.in_space else None
     cable = CableData(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)
-    declared = experiment.tolerances.model_dump()
+    declared = asdict(experiment.tolerances)
     taken_up = {
         kind.tolerances[q.name]: q
         for kind in EFFECTS.values()

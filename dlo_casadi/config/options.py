@@ -7,13 +7,13 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from dlo_casadi.config.frozen import ConfigSection, entry
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
 from dlo_casadi.config.values import (
     COORDINATE,
     FORCE,
     LENGTH,
     MOMENT,
-    ConfigSection,
     Elements,
     NonNegative,
     Number,
@@ -53,7 +53,7 @@ class DeclaredEffect(ConfigSection):
 
     name: str
     """Name of the effect, such as lumped_mass."""
-    parameters: dict[str, Annotated[EffectParameter, _as_parameter]] = Field(default={})
+    parameters: dict[str, Annotated[EffectParameter, _as_parameter]] = entry(default={})
     """Initial guess of each parameter by its name; {value: ..., fixed: true} keeps a value."""
 
 
@@ -132,8 +132,7 @@ class Limits(ConfigSection):
     @property
     def given(self) -> dict[str, float]:
         """The declared limits, by name."""
-        values = {name: getattr(self, name) for name in type(self).model_fields}
-        return {name: value for name, value in values.items() if value is not None}
+        return self.declared
 
     def problems(
         self, held: Sequence[str], sprung: bool, twists: bool, length: float, avoided: bool
@@ -271,19 +270,34 @@ class Reference(ConfigSection):
 class Measurement(ConfigSection):
     """How well was measured."""
 
-    std: Positive | None = None
-    """Standard deviation of one centre-line coordinate [m]; estimated when absent, and, with a
-    warning, where the points scatter more."""
-    force_std: Annotated[Positive, within(FORCE_STD)] | None = None
-    """Standard deviation of one component of a force on a fixture [N]; estimated when absent."""
-    moment_std: Annotated[Positive, within(MOMENT_STD)] | None = None
-    """Standard deviation of one component of a moment on a fixture [N m]; estimated when absent."""
+    # As descriptions, which the classes below inherit, unlike docstrings.
+    std: Annotated[
+        Positive | None,
+        Field(
+            description="Standard deviation of one centre-line coordinate [m]; estimated when "
+            "absent, and, with a warning, where the points scatter more."
+        ),
+    ] = None
+    force_std: Annotated[
+        Annotated[Positive, within(FORCE_STD)] | None,
+        Field(
+            description="Standard deviation of one component of a force on a fixture [N]; "
+            "estimated when absent."
+        ),
+    ] = None
+    moment_std: Annotated[
+        Annotated[Positive, within(MOMENT_STD)] | None,
+        Field(
+            description="Standard deviation of one component of a moment on a fixture [N m]; "
+            "estimated when absent."
+        ),
+    ] = None
 
 
 class Images(Measurement):
     """Photographs of the cable, with a board or two known points."""
 
-    kind: Literal["images"] = "images"
+    kind: Literal["images"]
     """images."""
     camera: DeclaredCamera | None = None
     """The camera. Without it, it is found from the session's photographs where it is needed (in
@@ -304,7 +318,7 @@ class Images(Measurement):
 class Centerlines(Measurement):
     """Centre-lines that were measured elsewhere, one CSV file a pose."""
 
-    kind: Literal["centerlines"] = "centerlines"
+    kind: Literal["centerlines"]
     """centerlines."""
 
 

@@ -6,12 +6,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args
 
-from pydantic import BaseModel, ValidationError
+from pydantic import TypeAdapter, ValidationError
+from pydantic.dataclasses import is_pydantic_dataclass
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from dlo_casadi.errors import ConfigError
 
-Model = TypeVar("Model", bound=BaseModel)
+Section = TypeVar("Section")
 Place = tuple[str | int, ...]
 """Keys and indices that lead from the top of a file to a value."""
 
@@ -59,16 +61,21 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 # ---- what pydantic finds ---------------------------------------------------------------------
 
 
+def keys_of(section: type) -> dict[str, FieldInfo]:
+    """The keys of a section, with what pydantic knows of each."""
+    return section.__pydantic_fields__  # type: ignore[attr-defined]
+
+
 # Maps the path of keys in a file, with the kinds chosen in it, to the class of the section there
 # and its name in messages.
-_Sections = dict[Place, tuple[type[BaseModel], str]]
+_Sections = dict[Place, tuple[type, str]]
 
 
-def _sections(model: type[BaseModel], at: Place = (), name: str = "") -> _Sections:
+def _sections(model: type, at: Place = (), name: str = "") -> _Sections:
     found = {at: (model, name)}
-    for key, field in model.model_fields.items():
+    for key, field in keys_of(model).items():
         for inner in _models(field.annotation):
-            kind = inner.model_fields.get("kind")
+            kind = keys_of(inner).get("kind")
             kinds = () if kind is None else get_args(kind.annotation)
             # The key alone selects a class that covers several kinds.
             kinds = kinds if len(kinds) == 1 else ()
@@ -77,14 +84,14 @@ def _sections(model: type[BaseModel], at: Place = (), name: str = "") -> _Sectio
     return found
 
 
-def _models(annotation: Any) -> list[type[BaseModel]]:
+def _models(annotation: Any) -> list[type]:
     """The sections that an annotation names."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if isinstance(annotation, type) and is_pydantic_dataclass(annotation):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models(part)]
 
 
-def _section_at(place: Place, sections: _Sections) -> type[BaseModel]:
+def _section_at(place: Place, sections: _Sections) -> type:
     """The section at a place; parts that are no keys of a section, such as indices, are skipped."""
 
     def leads(at: Place) -> bool:
@@ -111,10 +118,11 @@ class Source:
         """Where the files are that it names."""
         return Path() if self.source is None else self.source.absolute().parent
 
-    def checked(self, model: type[Model], heading: str = "", remedy: str = "") -> Model:
+    def checked(self, model: type[Section], heading: str = "", remedy: str = "") -> Section:
         """Check the data against a model; raises one ConfigError with all problems, see `error`."""
         try:
-            return model.model_validate(self.data, context={"folder": self.folder})
+            checker = TypeAdapter(model)
+            return checker.validate_python(self.data, context={"folder": self.folder})
         except ValidationError as error:
             raise self.error(explain(model, error.errors(), self), heading, remedy) from None
 
@@ -188,9 +196,9 @@ class Arguments(Source):
         return f'{own}={{"{key}": ...}}' if known else ""
 
 
-def _help(section: type[BaseModel], key: object) -> str:
+def _help(section: type, key: object) -> str:
     """Help on a key, if the section has any."""
-    field = section.model_fields.get(str(key))
+    field = keys_of(section).get(str(key))
     description = " ".join((field.description or "").split()) if field else ""
     return f": {description.rstrip('.')}" if description else ""
 
@@ -207,9 +215,9 @@ def _about_number(value: object) -> str:
     return ""
 
 
-def _allowed(section: type[BaseModel], key: object) -> str:
+def _allowed(section: type, key: object) -> str:
     """The range of a number with two limits."""
-    field = section.model_json_schema()["properties"].get(str(key), {})
+    field = TypeAdapter(section).json_schema()["properties"].get(str(key), {})
     ends: dict[str, float] = {}
     for part in (field, *field.get("anyOf", ())):
         ends |= {name: part[name] for name in ("minimum", "maximum") if name in part}
@@ -232,7 +240,7 @@ _MESSAGES: dict[str, str] = {
     "less_than": "must be smaller than {lt:g}, found {input}",
     "less_than_equal": "must not be larger than {le:g}, found {input}{allowed}",
     "literal_error": "allowed are {expected}, found {input}",
-    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), _MAPPING),
+    **dict.fromkeys(("dataclass_type", "dict_type"), _MAPPING),
     "tuple_type": "a list belongs here, found {kind}",
     "too_short": "at least {min_length} belongs here, found {actual_length}",
     "too_long": "at most {max_length} belong here, found {actual_length}",
@@ -240,16 +248,14 @@ _MESSAGES: dict[str, str] = {
 }
 
 
-def explain(
-    model: type[BaseModel], errors: Sequence[ErrorDetails], source: Source
-) -> Iterator[ConfigProblem]:
+def explain(model: type, errors: Sequence[ErrorDetails], source: Source) -> Iterator[ConfigProblem]:
     """Rewrite what pydantic found in the words of the source."""
     sections = _sections(model)
     suggested: set[Place] = set()
     for error in errors:
-        if error["type"] == "extra_forbidden":
+        if error["type"] == "unexpected_keyword_argument":
             *above, key = error["loc"]
-            known = _section_at(tuple(above), sections).model_fields
+            known = keys_of(_section_at(tuple(above), sections))
             near = difflib.get_close_matches(str(key), known, 1, cutoff=0.6)
             suggested.update((*above, name) for name in near)
     for error in errors:
@@ -265,14 +271,14 @@ def explain(
             if place in suggested:
                 continue
             text = f"{key!r} is missing in {label}{_help(section, key)}"
-        elif kind == "extra_forbidden":
+        elif kind == "unexpected_keyword_argument":
             at_top = len(place) == 1 and source.names
-            names = source.names if at_top else tuple(section.model_fields)
+            names = source.names if at_top else tuple(keys_of(section))
             hint = did_you_mean(str(key), names)
             homes = [
                 source.inside(str(key), name) if name else source.top
                 for inner, name in sections.values()
-                if str(key) in inner.model_fields
+                if str(key) in keys_of(inner)
             ]
             homes = [home for home in homes if home]
             if homes and "did you mean" not in hint:

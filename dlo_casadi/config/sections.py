@@ -4,11 +4,12 @@ Sensors, tolerances and options are in `options`.
 """
 
 import dataclasses
-import math
 import re
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import (
     BeforeValidator,
@@ -19,7 +20,9 @@ from pydantic import (
     model_validator,
 )
 
+from dlo_casadi.config.cable import Cable
 from dlo_casadi.config.document import dump_yaml, yaml_text
+from dlo_casadi.config.frozen import ConfigSection, Given, Numbers, Rows, Turned, entry, optional
 from dlo_casadi.config.options import (
     Centerlines,
     DeclaredTolerances,
@@ -32,9 +35,7 @@ from dlo_casadi.config.options import (
 from dlo_casadi.config.problems import PLACEHOLDER, ConfigProblem, Contradiction, show
 from dlo_casadi.config.supports import Clip, Obstacle
 from dlo_casadi.config.values import (
-    STIFFNESS,
     ArcLengths,
-    ConfigSection,
     Force,
     Gravity,
     Heading,
@@ -43,85 +44,14 @@ from dlo_casadi.config.values import (
     Number,
     Place,
     Points,
-    Positive,
     Quaternion,
     checked,
-    implausible_sizes,
-    optional,
-    within,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import counted, well_formed
 from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.ends import REACTIONS, clip_force
 from dlo_casadi.rod.obstacles import Obstacle as Surface
-
-# Density of copper in plastic [kg/m^3]: two test sessions have 2200. `mass_error` can find a fifth
-# of it (foam) up to five times it, more than any metal in cables.
-DENSITY = 2200.0
-
-
-class Cable(ConfigSection):
-    """The cable between its two fixtures."""
-
-    name: Name = "cable"
-    """What to call the cable."""
-    length: Positive
-    """Length along the cable between its two fixtures [m]."""
-    mass: Positive | None
-    """Mass of that length [kg]; null (None in Python) where it is
-    not known: readings of a force tell it."""
-    diameter: Positive
-    """Outer diameter [m]."""
-    youngs_modulus: Positive | None = None
-    """Young's modulus E of a solid round rod [Pa], a crude prior; or give bending_stiffness."""
-    bending_stiffness: Positive | None = None
-    """Bending stiffness EI [N m^2], a crude prior; or give youngs_modulus."""
-    torsional_stiffness: Annotated[Positive, within(STIFFNESS)] | None = None
-    """Torsional stiffness GJ [N m^2] of a cable in space, a crude prior; EI / 1.3 when absent."""
-    rest_shape: Literal["straight", "curved"] = "curved"
-    """Shape without load: straight (no rest curvature is fitted) or curved."""
-
-    @property
-    def prior_bending_stiffness(self) -> float:
-        """First guess of EI [N m^2]: the declared value, or E pi d^4 / 64."""
-        if self.bending_stiffness is not None:
-            return self.bending_stiffness
-        assert self.youngs_modulus is not None  # checked when the object was made
-        square = self.diameter * self.diameter  # infinite of an absurd one, where ** raises
-        return self.youngs_modulus * math.pi * square * square / 64.0
-
-    @property
-    def prior_mass(self) -> float:
-        """Mass [kg]: the declared value, or that of a solid round rod of DENSITY."""
-        if self.mass is not None:
-            return self.mass
-        return DENSITY * math.pi / 4.0 * self.diameter * self.diameter * self.length
-
-    @property
-    def prior_torsional_stiffness(self) -> float:
-        """First guess of GJ [N m^2]: the declared value, or EI / 1.3 (round rod, nu = 0.3)."""
-        return self.torsional_stiffness or self.prior_bending_stiffness / 1.3
-
-    @model_validator(mode="after")
-    def _plausible(self) -> Self:
-        declared, young = self.bending_stiffness, self.youngs_modulus
-        problems = implausible_sizes(self.length, self.prior_mass, self.diameter)
-        if self.mass is None and ("mass",) in [place for place, _ in problems]:
-            text = f"{self.diameter:g} m: a solid cable has {self.prior_mass:.2g} kg: in metres?"
-            sizes = [problem for problem in problems if problem.place != ("mass",)]
-            problems = sizes or [ConfigProblem(("diameter",), text)]
-        if declared is not None and (wrong := STIFFNESS.complaint(declared)):
-            problems.append(ConfigProblem(("bending_stiffness",), wrong))
-        if (young is None) == (declared is None):
-            found, key = ("neither", ()) if young is None else ("both", ("bending_stiffness",))
-            text = f"give youngs_modulus [Pa] or bending_stiffness [N m^2], found {found}"
-            problems.append(ConfigProblem(key, text))
-        elif young and (wrong := STIFFNESS.complaint(self.prior_bending_stiffness)):
-            problems.append(ConfigProblem(("youngs_modulus",), f"{wrong} for EI = E pi d^4 / 64"))
-        if problems:
-            raise Contradiction(*problems)
-        return self
 
 
 class Boundary(ConfigSection):
@@ -161,52 +91,51 @@ class Pose(ConfigSection):
     """One shape: where the ends were held, and the file, the files or the points that show it.
 
     From Python `start` and `end` may stand without their names: `Pose(start, end, points=...)`.
+    Numbers may be arrays or CasADi's DM, and a quaternion SciPy's Rotation.
     """
 
-    _without_names = ("start", "end")
-
-    file: Path | None = None
+    file: Given[Path | None, str | PathLike[str] | None] = entry(default=None)
     """Photograph or CSV, found relative to the YAML; an absolute path once loaded."""
-    files: tuple[Path, ...] = ()
+    files: Given[tuple[Path, ...], Sequence[str | PathLike[str]]] = entry(default=())
     """Photographs from several places [a.jpg, b.jpg, ...] of a cable in space, instead of file."""
-    points: Points | None = None
+    points: Given[Points | None, Rows | None] = entry(default=None)
     """Points [[x, y], ...] along the cable [m], in space [[x, y, z], ...], instead of a file."""
-    at: ArcLengths | None = None
+    at: Given[ArcLengths | None, Numbers | None] = entry(default=None)
     """Arc lengths [m] of the points from the start, [s, ...], which makes them markers."""
-    name: Annotated[Name, checked(_no_file_name)] = Field(default="", validate_default=True)
+    name: Annotated[Name, checked(_no_file_name)] = entry(default="", validate_default=True)
     """What to call the pose; as its file without folder and ending, or by its number, when
     absent."""
-    start: Place
+    start: Given[Place, Numbers] = entry(kw_only=False)
     """Where the start is held [m]: [x, y], in space [x, y, z]."""
-    end: Place | None = None
+    end: Given[Place | None, Numbers | None] = entry(default=None, kw_only=False)
     """Where the end is held [m]: [x, y], in space [x, y, z]; a free end has none."""
     start_heading: Heading | None = None
     """Direction of the cable in a clamped start, counter-clockwise from +x [rad]."""
     end_heading: Heading | None = None
     """Direction of the cable in a clamped end, continuous along the cable [rad]."""
-    start_orientation: Quaternion | None = None
+    start_orientation: Given[Quaternion | None, Turned | None] = entry(default=None)
     """Frame of a clamped start in space, a quaternion [qx, qy, qz, qw]; x forward along the
     cable."""
-    end_orientation: Quaternion | None = None
+    end_orientation: Given[Quaternion | None, Turned | None] = entry(default=None)
     """Frame of a clamped end in space, a quaternion [qx, qy, qz, qw]; x forward along the cable."""
     turns: Number = 0.0
     """Of the twists that bring the end into its clamp, the one nearest to so many full turns about
     its x axis; 0.5 or -0.5 tells which way a clamp is rolled by half a turn."""
     role: Literal["fit", "held_out"] = "fit"
     """fit, or held_out to check the prediction."""
-    start_force: Force | None = None
+    start_force: Given[Force | None, Numbers | None] = entry(default=None)
     """Force [N] that the cable exerts on its start fixture, in the frame of gravity; what hangs
     between sensor and cable is taken off before."""
-    start_moment: Moment | None = None
+    start_moment: Given[Moment | None, float | Numbers | None] = entry(default=None)
     """Moment [N m] that the cable exerts on its start fixture, about `start`, counter-clockwise;
     in space [mx, my, mz] about axes parallel to the world's."""
-    end_force: Force | None = None
+    end_force: Given[Force | None, Numbers | None] = entry(default=None)
     """Force [N] that the cable exerts on its end fixture, as start_force."""
-    end_moment: Moment | None = None
+    end_moment: Given[Moment | None, float | Numbers | None] = entry(default=None)
     """Moment [N m] that the cable exerts on its end fixture, about `end`, as start_moment."""
     branch: Literal["ccw", "cw", "previous"] | None = None
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
-    clips: tuple[Clip, ...] = ()
+    clips: Given[tuple[Clip, ...], Sequence[Clip | Mapping[str, Any]]] = entry(default=())
     """What holds the cable between its ends, in the order along it."""
     over: StrictBool | dict[str, StrictBool] | None = None
     """Whether the cable passes over (true) or under (false) the bars among the obstacles, or some
@@ -357,7 +286,7 @@ class Experiment(ConfigSection):
         if nothing := [k for k, x in enumerate(poses) if not x.paths and x.points is None]:
             raise Contradiction(*(ConfigProblem((k,), text) for k in nothing))
         return tuple(
-            pose if pose.name else pose.model_copy(update={"name": f"pose_{k:02d}"})
+            pose if pose.name else pose.changed(name=f"pose_{k:02d}")
             for k, pose in enumerate(poses, start=1)
         )
 
@@ -371,6 +300,14 @@ class SkippedPose(NamedTuple):
     name: str
     reason: str
     role: Literal["fit", "held_out"]
+
+
+class _Notes(NamedTuple):
+    """What is known of a configuration beside its contents."""
+
+    path: Path | None = None
+    warnings: tuple[str, ...] = ()
+    skipped: tuple[SkippedPose, ...] = ()
 
 
 class Config(ConfigSection):
@@ -389,19 +326,17 @@ class Config(ConfigSection):
     limits: Annotated[Limits, optional(Limits)] = Limits()
     """What the cable must keep in every pose, checked with a probability."""
 
-    _path: Path | None = None
-    _warnings: tuple[str, ...] = ()
-    _skipped: tuple[SkippedPose, ...] = ()
+    _notes: ClassVar[_Notes] = _Notes()
 
     @property
     def path(self) -> Path | None:
         """The YAML file, absolute; None for a session made in Python."""
-        return self._path
+        return self._notes.path
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What looks unintended but does not stop the fit."""
-        return self._warnings
+        return self._notes.warnings
 
     @property
     def skipped(self) -> tuple[SkippedPose, ...]:
@@ -411,7 +346,7 @@ class Config(ConfigSection):
         `experiment.poses`. Poses whose file is missing stay there, because their end conditions are
         part of the cable's history, but they are not in `measured_poses`.
         """
-        return self._skipped
+        return self._notes.skipped
 
     def __repr__(self) -> str:
         poses = counted(len(self.experiment.poses), "pose")
@@ -421,9 +356,8 @@ class Config(ConfigSection):
 
     def noted(self, **notes: Any) -> Self:
         """The same configuration with other `path`, `warnings` or `skipped`."""
-        noted = self.model_copy()
-        for name, value in notes.items():
-            setattr(noted, f"_{name}", value)
+        noted = self.changed()
+        vars(noted)["_notes"] = self._notes._replace(**notes)
         return noted
 
     @property
@@ -438,7 +372,7 @@ class Config(ConfigSection):
         Raises OSError if its file cannot be read any more.
         """
         if self.path is None:
-            return dump_yaml(self.model_dump(exclude_unset=True))
+            return dump_yaml(self.plain)
         return yaml_text(self.path)
 
     @property

@@ -4,10 +4,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, get_args
 
+from dlo_casadi.config.frozen import ConfigSection, Given, Numbers, Turned, entry
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
 from dlo_casadi.config.values import (
     AXES,
-    ConfigSection,
     Force,
     Heading,
     Name,
@@ -53,16 +53,16 @@ class Clip(ConfigSection):
     roll, too) or eyelet (the cable slides through without friction)."""
     at: NonNegative | None = None
     """Arc length from the start at which it holds the cable [m]; an eyelet has none."""
-    place: Place
+    place: Given[Place, Numbers] = entry()
     """Where the cable is held [m]: [x, y], in space [x, y, z]."""
     heading: Heading | None = None
     """Direction of the cable in a clamped clip in a plane, continuous along the cable [rad]."""
-    orientation: Quaternion | None = None
+    orientation: Given[Quaternion | None, Turned | None] = entry(default=None)
     """Frame of a clamped clip in space, a quaternion [qx, qy, qz, qw]; x forward along the
     cable."""
     roll: Literal["held", "free"] = "held"
     """In space: whether a clamped clip holds the roll of the cable about its axis."""
-    clip_force: Force | None = None
+    clip_force: Given[Force | None, Numbers | None] = entry(default=None)
     """Force [N] that the cable exerts on the clip, where it was measured, as start_force."""
 
     def held(self, number: int) -> HeldClip:
@@ -164,15 +164,15 @@ class Obstacle(ConfigSection):
     kind: Literal["plane", "sphere", "capsule"]
     """plane (point, normal), sphere (center, radius) or capsule (a, b, radius: a rod with round
     ends); in a plane a sphere is a disc, a capsule a stadium."""
-    point: Place | None = None
+    point: Given[Place | None, Numbers | None] = entry(default=None)
     """A point of a plane [m]."""
-    normal: Place | None = None
+    normal: Given[Place | None, Numbers | None] = entry(default=None)
     """Normal of a plane, of any length; the cable is on its side."""
-    center: Place | None = None
+    center: Given[Place | None, Numbers | None] = entry(default=None)
     """Centre of a sphere [m]."""
-    a: Place | None = None
+    a: Given[Place | None, Numbers | None] = entry(default=None)
     """Start of a capsule's axis [m]."""
-    b: Place | None = None
+    b: Given[Place | None, Numbers | None] = entry(default=None)
     """End of a capsule's axis [m]."""
     radius: Positive | None = None
     """Radius of a sphere or capsule [m]."""

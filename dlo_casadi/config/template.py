@@ -6,6 +6,7 @@ from importlib.resources import files as folder_of
 from typing import Any, Literal
 
 from jinja2 import Template
+from pydantic import TypeAdapter
 
 from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.problems import PLACEHOLDER
@@ -97,7 +98,7 @@ def config_schema() -> dict[str, Any]:
 
     It covers keys, types, ranges and help; only `load_config` checks several values together.
     """
-    schema: dict[str, Any] = _plain(Config.model_json_schema())
+    schema: dict[str, Any] = _plain(TypeAdapter(Config).json_schema())
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **schema, "title": "Configuration of dlo_casadi"}
 

@@ -5,31 +5,15 @@ refused, and the message gives the range. A computable but unlikely value is a w
 `load_config`.
 """
 
-import inspect
 import math
-import textwrap
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-)
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from dlo_casadi.config.problems import (
-    Arguments,
-    ConfigProblem,
-    Contradiction,
-    explain,
-    show,
-)
+from dlo_casadi.config.problems import ConfigProblem, Contradiction, show
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS
-from dlo_casadi.errors import ConfigError, DloError, counted
 
 
 class Range(NamedTuple):
@@ -156,115 +140,6 @@ AXES = {
 
 
 # ---- types -------------------------------------------------------------------------------------
-
-
-# Longest list that is shown in full when a section is printed.
-_SHOWN = 6
-
-
-def plain(value: Any) -> Any:
-    """Convert arrays, tables, CasADi matrices and NumPy numbers to Python numbers as in a file."""
-    if hasattr(value, "full"):  # a CasADi matrix
-        value = value.full()
-    if hasattr(value, "to_numpy"):  # a table of pandas
-        value = value.to_numpy()
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    return value
-
-
-class _Long(int):
-    """A long list, printed as its number of items."""
-
-    def __repr__(self) -> str:
-        return f"<{counted(int(self), 'item')}>"
-
-
-class ConfigSection(BaseModel):
-    """A frozen mapping of the file: unknown keys are errors, the docstring of a key is its help.
-
-    From Python its keys are arguments; arrays are taken for lists.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
-
-    _without_names: ClassVar[tuple[str, ...]] = ()
-
-    def __init__(self, *first: Any, **values: Any) -> None:
-        if len(first) > len(self._without_names):
-            alone = " and ".join(self._without_names)
-            text = f"{alone} alone may stand without their names" if alone else "all need theirs"
-            count = f"{counted(len(first), 'argument')} without a name"
-            raise ConfigError(f"{type(self).__name__}: {count}: {text}")
-        named = dict(zip(self._without_names, first, strict=False))
-        if twice := named.keys() & values.keys():
-            raise ConfigError(f"{type(self).__name__}: {min(twice)} is given twice")
-        values = plain(named | values)
-        try:
-            super().__init__(**values)
-        except ValidationError as error:
-            given = Arguments(values)
-            raise given.error(explain(type(self), error.errors(), given)) from None
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not name.startswith("_"):
-            kind = type(self).__name__
-            raise DloError(
-                f"{name} of a {kind} cannot be set.\n  Try: another {kind}, made with it"
-            )
-        super().__setattr__(name, value)
-
-    def changed(self, **values: Any) -> Self:
-        """Copy with other values, unchecked; values of a nested section are given as a mapping."""
-        inner = {name: getattr(self, name) for name, x in values.items() if isinstance(x, dict)}
-        changed = {name: section.changed(**values[name]) for name, section in inner.items()}
-        return self.model_copy(update=values | changed)
-
-    def without(self, keys: Collection[str]) -> Self:
-        """Copy with the defaults of these keys, as if they were not given."""
-        defaults = {key: type(self).model_fields[key].default for key in keys}
-        copy = self.model_copy(update=defaults)
-        copy.model_fields_set.difference_update(keys)
-        return copy
-
-    @classmethod
-    def __pydantic_init_subclass__(cls, **options: Any) -> None:
-        """Put the keys' help in `help`, and in the docstring but not the schema."""
-        own = inspect.cleandoc(cls.__doc__ or "")
-        cls.model_config["json_schema_extra"] = {"description": own}
-        if "Parameters\n" not in own:
-            rows = [
-                f"{key}\n{textwrap.indent(x.description or '', '    ')}"
-                for key, x in cls.model_fields.items()
-            ]
-            cls.__doc__ = "\n".join([own, "", "Parameters", "----------", *rows])
-
-    def __repr_args__(self) -> Iterator[tuple[str, Any]]:
-        """What was given; long lists are shown by their length."""
-        for name in (x for x in type(self).model_fields if x in self.model_fields_set):
-            value = getattr(self, name)
-            long = isinstance(value, tuple) and len(value) > _SHOWN
-            yield name, _Long(len(value)) if long else value
-
-    # Pydantic constructs nested sections and collects all problems of the whole.
-    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
-
-
-class OpenSection(ConfigSection):
-    """A section that may have other keys than those that are read."""
-
-    model_config = ConfigDict(extra="ignore")
-
-
-def optional(section: type[ConfigSection]) -> BeforeValidator:
-    """Let a section be empty, such as `model:` without a value."""
-    return BeforeValidator(
-        lambda value: {} if value is None else value, json_schema_input_type=section | None
-    )
 
 
 def checked(complaint: Callable[[Any], str | list[ConfigProblem]]) -> AfterValidator:

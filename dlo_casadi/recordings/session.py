@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.config.cable import DENSITY
 from dlo_casadi.config.options import DeclaredTolerances
-from dlo_casadi.config.sections import DENSITY
 from dlo_casadi.config.template import template
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.recordings.clouds import cloud_lines

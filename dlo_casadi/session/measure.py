@@ -109,7 +109,7 @@ def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
         return None
     try:
         image = vision.read_image(pose.paths[0])
-        free = pose.model_copy(update={"end": None})
+        free = pose.changed(end=None)
         view = view_of(config, image)
         return vision.extract_centerline(image, view, _held(config, free)).points
     except MeasurementError:
@@ -334,8 +334,8 @@ def calibrated(config: Config, step: Step = nobody) -> Config:
             f"measurement.camera is missing, photographs of a cable {why} need it, and they "
             f"do not show it themselves: {error.message}"
         ) from None
-    own = {key: getattr(found.camera, key).tolist() for key in DeclaredCamera.model_fields}
-    camera = DeclaredCamera.model_validate(own)
+    matrix, distortion = found.camera.matrix.tolist(), found.camera.distortion.tolist()
+    camera = DeclaredCamera(matrix=matrix, distortion=distortion)
     return config.changed(experiment={"measurement": {"camera": camera}}).noted(
         warnings=(*config.warnings, f"no camera is declared: {summary(found)}", *found.advice)
     )

@@ -327,7 +327,7 @@ def _exchanged(session: ReadSession, keys: Sequence[str]) -> ReadSession:
     pairs = [(f"start{key}", f"end{key}") for key in keys]
     both = [*pairs, *((b, a) for a, b in pairs)]
     poses = tuple(
-        pose.model_copy(update={a: getattr(pose, b) for a, b in both})
+        pose.changed(**{a: getattr(pose, b) for a, b in both})
         for pose in session.config.experiment.poses
     )
     read = (x if x.s is not None else replace(x, points=x.points[::-1]) for x in session.read)

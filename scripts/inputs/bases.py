@@ -222,8 +222,8 @@ def make_bases(folder: Path) -> Bases:
         place = folder / str(k)
         place.mkdir()
         config = load_config(session.write(place))
-        quick = config.estimation.model_copy(update={"plausibility": False})
-        outcome = run_session(config.model_copy(update={"estimation": quick}))
+        quick = config.estimation.changed(plausibility=False)
+        outcome = run_session(config.changed(estimation=quick))
         (place / "parameters.yaml").write_text(parameters_text(outcome), encoding="utf-8")
         parameters.append(read_yaml(place / "parameters.yaml"))
     return Bases(

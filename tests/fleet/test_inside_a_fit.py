@@ -33,11 +33,9 @@ def test_a_whole_session(tmp_path, pool, name, tried, verdict):
     config = load_config(write_session(tmp_path / "cable", name))
     few = {tried, "rest_curvature_drift"}
     limits = {"enabled": True, "max_effects": 1, "exclude": tuple(sorted(set(EFFECTS) - few))}
-    config = config.model_copy(
-        update={
-            "estimation": config.estimation.model_copy(update={"algorithm1": True}),
-            "diagnosis": config.diagnosis.model_copy(update=limits),
-        }
+    config = config.changed(
+        estimation=config.estimation.changed(algorithm1=True),
+        diagnosis=config.diagnosis.changed(**limits),
     )
     both = [report_dict(run_session(config, executor=where)) for where in (None, pool)]
     for report in both:

@@ -41,16 +41,14 @@ def some(session, names):
     """Configuration of a quick run of a few poses of a session in configs."""
     config = load_config(CONFIGS / f"{session}.yaml")
     poses = tuple(pose for pose in config.experiment.poses if pose.name in names)
-    experiment = config.experiment.model_copy(update={"poses": poses})
-    return quick(config.model_copy(update={"experiment": experiment}))
+    experiment = config.experiment.changed(poses=poses)
+    return quick(config.changed(experiment=experiment))
 
 
 def quick(config):
     """The same session on a coarse mesh, without the parts that take time."""
-    return config.model_copy(
-        update={
-            "model": config.model.model_copy(update={"n": 20}),
-            "estimation": config.estimation.model_copy(update={"algorithm1": False}),
-            "diagnosis": config.diagnosis.model_copy(update={"enabled": False}),
-        }
+    return config.changed(
+        model=config.model.changed(n=20),
+        estimation=config.estimation.changed(algorithm1=False),
+        diagnosis=config.diagnosis.changed(enabled=False),
     )

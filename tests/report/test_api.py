@@ -150,8 +150,8 @@ def test_a_result_is_kept_and_copied(result):
 
 
 def test_a_notebook_gets_a_table_with_everything_escaped(result):
-    cable = result.config.cable.model_copy(update={"name": "<script>&"})
-    shown = dataclasses.replace(result, config=result.config.model_copy(update={"cable": cable}))
+    cable = result.config.cable.changed(name="<script>&")
+    shown = dataclasses.replace(result, config=result.config.changed(cable=cable))
     html = shown._repr_html_()
     assert "<table><tr><td>bending_stiffness</td>" in html
     assert "&lt;script&gt;&amp;" in html

@@ -47,10 +47,10 @@ PROPOSAL = NextPose(
 
 def diagnosed(outcome, **changes):
     """The outcome as if its diagnosis had added an effect: the last stage once more."""
-    diagnosis = outcome.config.diagnosis.model_copy(update={"enabled": True})
+    diagnosis = outcome.config.diagnosis.changed(enabled=True)
     closed = replace(outcome.stage("batch"), name="closed")
     found = {
-        "config": outcome.config.model_copy(update={"diagnosis": diagnosis}),
+        "config": outcome.config.changed(diagnosis=diagnosis),
         "stages": (*outcome.stages, closed),
         "effects": (EFFECT,),
         "candidates": CANDIDATES,
@@ -167,17 +167,17 @@ def test_units_and_names_are_set_for_reading():
 def hostile(outcome):
     """The outcome as if cable, file and messages had been named to do harm."""
     name = HOSTILE.replace("/", "")
-    cable = outcome.config.cable.model_copy(update={"name": HOSTILE})
+    cable = outcome.config.cable.changed(name=HOSTILE)
     first, *others = outcome.config.experiment.poses
-    first = first.model_copy(update={"file": first.file.with_name(f"{name}.csv"), "name": name})
-    experiment = outcome.config.experiment.model_copy(update={"poses": (first, *others)})
+    first = first.changed(file=first.file.with_name(f"{name}.csv"), name=name)
+    experiment = outcome.config.experiment.changed(poses=(first, *others))
     stages = tuple(
         replace(stage, shapes={name: stage.shapes.get("pose_01"), **stage.shapes})
         for stage in outcome.stages
         if stage.shapes
     )
     poses = (replace(outcome.poses[0], name=name, messages=(HOSTILE,)), *outcome.poses[1:])
-    config = outcome.config.model_copy(update={"cable": cable, "experiment": experiment})
+    config = outcome.config.changed(cable=cable, experiment=experiment)
     return replace(outcome, config=config, poses=poses, stages=stages, warnings=(HOSTILE,))
 
 
@@ -222,11 +222,9 @@ def test_a_photograph_that_is_small_enough_keeps_its_size(photographed):
 
 def test_a_photograph_that_has_gone_is_replaced_by_the_board(photographed, tmp_path):
     declared = photographed.config.experiment.poses
-    poses = (declared[0].model_copy(update={"file": tmp_path / "pose_01.jpg"}), *declared[1:])
-    experiment = photographed.config.experiment.model_copy(update={"poses": poses})
-    gone = replace(
-        photographed, config=photographed.config.model_copy(update={"experiment": experiment})
-    )
+    poses = (declared[0].changed(file=tmp_path / "pose_01.jpg"), *declared[1:])
+    experiment = photographed.config.experiment.changed(poses=poses)
+    gone = replace(photographed, config=photographed.config.changed(experiment=experiment))
     first, second = pictures(gone)[:2]
 
     assert (first.behind.photograph, bool(first.behind.grid), len(first.lines)) == ("", True, 3)

@@ -65,9 +65,9 @@ def test_a_lost_pose_in_space_is_listed(in_room):
 
 def test_a_pose_given_as_points_needs_no_photograph(photographed):
     config, poses = photographed.config, photographed.config.experiment.poses
-    points = poses[0].model_copy(update={"file": None, "points": ((0.0, 0.0), (0.1, 0.0))})
-    experiment = config.experiment.model_copy(update={"poses": (points, *poses[1:])})
-    page = failure_page(config.model_copy(update={"experiment": experiment}), DloError("too early"))
+    points = poses[0].changed(file=None, points=((0.0, 0.0), (0.1, 0.0)))
+    experiment = config.experiment.changed(poses=(points, *poses[1:]))
+    page = failure_page(config.changed(experiment=experiment), DloError("too early"))
 
     assert page.count("data:image/jpeg;base64,") == 4
 
@@ -88,11 +88,11 @@ def test_hints_are_told_once():
 def test_a_failed_session_carries_what_was_read(outcome):
     """Of a configuration whose files have gone."""
     first, *others = outcome.config.experiment.poses
-    gone = [first] + [p.model_copy(update={"role": "held_out"}) for p in others]
-    gone[0] = first.model_copy(update={"file": first.file.with_name("gone.csv"), "name": "gone"})
-    experiment = outcome.config.experiment.model_copy(update={"poses": tuple(gone)})
+    gone = [first] + [p.changed(role="held_out") for p in others]
+    gone[0] = first.changed(file=first.file.with_name("gone.csv"), name="gone")
+    experiment = outcome.config.experiment.changed(poses=tuple(gone))
     with pytest.raises(MeasurementError, match="no fit pose") as caught:
-        run_session(outcome.config.model_copy(update={"experiment": experiment}))
+        run_session(outcome.config.changed(experiment=experiment))
 
     assert [pose.name for pose in caught.value.poses] == [pose.name for pose in gone]
     assert "cannot be read" in caught.value.poses[0].problem

@@ -117,7 +117,7 @@ def test_a_stage_that_lost_poses_is_a_warning(outcome):
 
 
 def test_nothing_lifts_a_free_tip(outcome):
-    boundary = outcome.config.experiment.boundary.model_copy(update={"end": "free"})
+    boundary = outcome.config.experiment.boundary.changed(end="free")
     free = outcome.config.changed(experiment={"boundary": {"end": "free"}})
     assert free.experiment.boundary == boundary
     for force, config, told in (

@@ -72,12 +72,10 @@ def test_no_number_is_given_for_what_the_shapes_do_not_tell(outcome, interval, w
 
 
 def test_without_gravity_a_reading_is_asked_for_and_no_weight(outcome):
-    experiment = outcome.config.experiment.model_copy(update={"gravity": (0.0, 0.0)})
+    experiment = outcome.config.experiment.changed(gravity=(0.0, 0.0))
     unknown = with_stiffness(outcome, (None, None))
     assert "hang a known weight" in said(unknown)
-    text = said(
-        replace(unknown, config=outcome.config.model_copy(update={"experiment": experiment}))
-    )
+    text = said(replace(unknown, config=outcome.config.changed(experiment=experiment)))
     assert "Try: end_force or start_force of a pose: without gravity" in text
     assert "hang a known weight" not in text
 
@@ -114,9 +112,7 @@ def test_an_added_effect_is_told_with_its_clip(outcome):
 
 def test_an_added_effect_is_told_with_its_rivals(outcome):
     closed = replace(outcome.stage("batch"), name="closed")
-    config = outcome.config.model_copy(
-        update={"diagnosis": outcome.config.diagnosis.model_copy(update={"enabled": True})}
-    )
+    config = outcome.config.changed(diagnosis=outcome.config.diagnosis.changed(enabled=True))
     text = said(
         replace(
             outcome,
@@ -175,9 +171,7 @@ def test_poses_on_another_branch_have_a_row_and_a_fact(outcome):
 
 
 def test_an_unexplained_residual_tells_where_the_cable_is_pulled(outcome):
-    config = outcome.config.model_copy(
-        update={"diagnosis": outcome.config.diagnosis.model_copy(update={"enabled": True})}
-    )
+    config = outcome.config.changed(diagnosis=outcome.config.diagnosis.changed(enabled=True))
     text = said(replace(outcome, config=config, verdict="unexplained", unexplained=LOAD))
 
     assert "Verdict: unexplained. The residual is not noise." in text
@@ -225,8 +219,8 @@ def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcom
     assert "the place in the plane (z > 7)" in line
     (line,) = structure_lines(replace(found, measurement=photographs))
     assert "the place in the picture (z > 7)" in line
-    experiment = found.config.experiment.model_copy(update={"gravity": (0.0, 0.0, -9.81)})
-    in_space = found.config.model_copy(update={"experiment": experiment})
+    experiment = found.config.experiment.changed(gravity=(0.0, 0.0, -9.81))
+    in_space = found.config.changed(experiment=experiment)
     (line,) = structure_lines(replace(found, config=in_space))
     assert "the place in space (z > 7)" in line
 

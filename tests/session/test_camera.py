@@ -62,21 +62,21 @@ def test_photographs_from_one_direction_are_no_calibration(tmp_path, capsys):
     assert "focal length is known to" in told.err
     assert "matrix" not in told.out
     config = load_config(path)
-    measurement = config.experiment.measurement.model_copy(update={"camera": None})
-    bare = config.experiment.model_copy(update={"measurement": measurement})
+    measurement = config.experiment.measurement.changed(camera=None)
+    bare = config.experiment.changed(measurement=measurement)
     said = (
         r"camera is missing.* focal length is known to .* % only, .* within \d+ degrees.* Try: .*"
     )
     with pytest.raises(MeasurementError, match=said + "30 to 90 degrees apart, or .*camera"):
-        calibrated(config.model_copy(update={"experiment": bare}))
+        calibrated(config.changed(experiment=bare))
 
 
 def test_too_few_photographs(session):
     config = load_config(session)
     poses = config.experiment.poses
-    few = config.experiment.model_copy(update={"poses": (poses[1],)})
+    few = config.experiment.changed(poses=(poses[1],))
     with pytest.raises(MeasurementError, match=r"camera is missing.* needs 3 photographs .* are 2"):
-        calibrated(config.model_copy(update={"experiment": few}))
+        calibrated(config.changed(experiment=few))
 
 
 def test_a_session_without_photographs(capsys):

@@ -60,10 +60,8 @@ def exchanged(config, keys):
     for pose in config.experiment.poses:
         pairs = [(f"start{key}", f"end{key}") for key in keys]
         update = {a: getattr(pose, b) for pair in pairs for a, b in (pair, pair[::-1])}
-        poses.append(pose.model_copy(update=update))
-    return config.model_copy(
-        update={"experiment": config.experiment.model_copy(update={"poses": tuple(poses)})}
-    )
+        poses.append(pose.changed(**update))
+    return config.changed(experiment=config.experiment.changed(poses=tuple(poses)))
 
 
 def suspected(config):

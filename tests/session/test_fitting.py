@@ -34,12 +34,10 @@ NOISE = 3e-4
 
 def test_a_declared_mesh_is_kept_and_its_error_told():
     config = load_config(BENCH / "short_clean" / "session.yaml")
-    coarse = config.model.model_copy(update={"n": 6})
-    estimation = config.estimation.model_copy(update={"algorithm1": False})
-    diagnosis = config.diagnosis.model_copy(update={"enabled": False})
-    config = config.model_copy(
-        update={"model": coarse, "estimation": estimation, "diagnosis": diagnosis}
-    )
+    coarse = config.model.changed(n=6)
+    estimation = config.estimation.changed(algorithm1=False)
+    diagnosis = config.diagnosis.changed(enabled=False)
+    config = config.changed(model=coarse, estimation=estimation, diagnosis=diagnosis)
     outcome = run_session(config)
     assert outcome.fit.model.n == 6
     (warning,) = [text for text in outcome.warnings if "mesh" in text]
@@ -175,8 +173,8 @@ def test_the_warning_of_a_contradicted_noise_names_outliers(tmp_path):
 def test_the_residual_of_a_missing_effect_has_no_outliers():
     """A hidden pull moves lines of 40 and of 15 points by many times their noise."""
     config = load_config(BENCH / "unknown_pull" / "session.yaml").changed(model={"n": 12})
-    few = config.experiment.model_copy(update={"poses": config.experiment.poses[::2]})
-    config, inputs = read_session(config.model_copy(update={"experiment": few}))
+    few = config.experiment.changed(poses=config.experiment.poses[::2])
+    config, inputs = read_session(config.changed(experiment=few))
     declared = declared_model(config)
     for every in (6, 16):
         poses = tuple(replace(item, points=item.points[::every], means=None) for item in inputs)

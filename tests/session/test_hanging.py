@@ -61,9 +61,7 @@ def curved(tmp_path_factory):
 
 
 def under(config, gravity):
-    return config.model_copy(
-        update={"experiment": config.experiment.model_copy(update={"gravity": tuple(gravity)})}
-    )
+    return config.changed(experiment=config.experiment.changed(gravity=tuple(gravity)))
 
 
 def test_a_curved_cable_between_ball_joints_is_no_mistake(curved, monkeypatch):

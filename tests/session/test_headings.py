@@ -88,12 +88,9 @@ def test_the_heading_of_a_pinned_side_is_not_used(tmp_path):
 
     config, inputs = session(tmp_path, change)
     assert wrong_directions(ReadSession(config, inputs))
-    boundary = config.experiment.boundary.model_copy(update={"start": "pinned"})
-    experiment = config.experiment.model_copy(update={"boundary": boundary})
-    assert (
-        wrong_directions(ReadSession(config.model_copy(update={"experiment": experiment}), inputs))
-        == ()
-    )
+    boundary = config.experiment.boundary.changed(start="pinned")
+    experiment = config.experiment.changed(boundary=boundary)
+    assert wrong_directions(ReadSession(config.changed(experiment=experiment), inputs)) == ()
 
 
 @pytest.mark.parametrize("turns", [-1, 0, 1])
@@ -104,9 +101,9 @@ def test_behind_a_pinned_start_full_turns_mean_nothing(turns, tmp_path):
         pose["end_heading"] += 2 * np.pi * turns * (k > 0)
 
     config, inputs = session(tmp_path, change)
-    boundary = config.experiment.boundary.model_copy(update={"start": "pinned"})
-    experiment = config.experiment.model_copy(update={"boundary": boundary})
-    bare = config.model_copy(update={"experiment": experiment})
+    boundary = config.experiment.boundary.changed(start="pinned")
+    experiment = config.experiment.changed(boundary=boundary)
+    bare = config.changed(experiment=experiment)
     assert wrong_directions(ReadSession(bare, inputs)) == ()
     chain = declared_model(bare).model.chain
     for pose, item in zip(config.experiment.poses, inputs, strict=True):

@@ -95,18 +95,18 @@ def test_the_steps_of_the_camera_in_every_photograph(config):
     ]
     assert draw_steps(config, config.experiment.poses[2]) == {}
     board = config.experiment.poses[0]
-    only = board.model_copy(update={"files": board.files[2:]})
+    only = board.changed(files=board.files[2:])
     assert list(draw_steps(config, only)) == ["pose_01_c_4_centerline"]  # no board is found in it
 
 
 def test_a_camera_of_another_picture_size_is_told(config):
     """A matrix for half the width and height: named, with what to multiply."""
     pose = config.experiment.poses[0]
-    only = pose.model_copy(update={"files": pose.files[1:2]})
+    only = pose.changed(files=pose.files[1:2])
     camera = DeclaredCamera(matrix=((540.0, 0.0, 321.0), (0.0, 540.0, 237.0), (0.0, 0.0, 1.0)))
-    measurement = config.experiment.measurement.model_copy(update={"camera": camera})
-    experiment = config.experiment.model_copy(update={"poses": (only,), "measurement": measurement})
-    (item,) = read_inputs(config.model_copy(update={"experiment": experiment}))
+    measurement = config.experiment.measurement.changed(camera=camera)
+    experiment = config.experiment.changed(poses=(only,), measurement=measurement)
+    (item,) = read_inputs(config.changed(experiment=experiment))
     assert "pose_01_b: camera.matrix, with its principal point at (321, 237)" in item.problem
     assert "is not that of this picture of 1280 x 960 px" in item.problem
     assert not item.readable

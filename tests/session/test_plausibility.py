@@ -223,9 +223,7 @@ def test_no_session_of_the_repository_looks_like_a_mistake(path):
     config = load_config(path)
     if config.experiment.measurement.kind == "images":
         poses = config.experiment.poses[::6]
-        config = config.model_copy(
-            update={"experiment": config.experiment.model_copy(update={"poses": poses})}
-        )
+        config = config.changed(experiment=config.experiment.changed(poses=poses))
     assert find_suspicions(config, read_inputs(config)) == ()
 
 

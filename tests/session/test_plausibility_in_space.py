@@ -41,9 +41,9 @@ def session(request):
 
 def posed(config, change):
     """The configuration with poses changed: change(pose) -> new values."""
-    poses = tuple(pose.model_copy(update=change(pose)) for pose in config.experiment.poses)
-    experiment = config.experiment.model_copy(update={"poses": poses})
-    return config.model_copy(update={"experiment": experiment})
+    poses = tuple(pose.changed(**change(pose)) for pose in config.experiment.poses)
+    experiment = config.experiment.changed(poses=poses)
+    return config.changed(experiment=experiment)
 
 
 def oriented(config, change, sides=("start", "end")):
@@ -157,8 +157,8 @@ def test_files_out_of_step(session):
 @pytest.mark.long
 def test_gravity_is_held_against_the_load_that_the_shapes_show(session, gravity):
     config, inputs = session[0], session[1][::3]
-    experiment = config.experiment.model_copy(update={"gravity": gravity})
-    (found,) = find_suspicions(config.model_copy(update={"experiment": experiment}), inputs)
+    experiment = config.experiment.changed(gravity=gravity)
+    (found,) = find_suspicions(config.changed(experiment=experiment), inputs)
     assert "does not hang along gravity" in found.message
     assert "with gravity (0, 0, -9.81) m/s^2" in found.message
 

@@ -202,9 +202,9 @@ def test_a_session_whose_readings_have_the_other_sign():
         model, model.nominal, np.zeros(model.chain.n_rests), [x.held for x in declared]
     )
     poses = tuple(
-        pose.model_copy(update={"end_force": tuple(-one.equilibrium.end_force)})
+        pose.changed(end_force=tuple(-one.equilibrium.end_force))
         for pose, one in zip(declared, found, strict=True)
     )
-    experiment = config.experiment.model_copy(update={"poses": poses})
-    said = find_suspicions(config.model_copy(update={"experiment": experiment}), inputs)
+    experiment = config.experiment.changed(poses=poses)
+    said = find_suspicions(config.changed(experiment=experiment), inputs)
     assert any("end_force" in x.message and "other sign" in x.message for x in said), said

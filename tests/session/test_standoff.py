@@ -67,9 +67,9 @@ def test_without_a_calibrated_camera_it_is_no_candidate(config):
 
 
 def test_a_configuration_that_was_changed_by_hand_is_checked_again(config):
-    options = config.diagnosis.model_copy(update={"exclude": ("stand_off",)})
+    options = config.diagnosis.changed(exclude=("stand_off",))
     with pytest.raises(ConfigError, match=r"diagnosis\.exclude: no effect is called 'stand_off'"):
-        declared_model(config.model_copy(update={"diagnosis": options}))
+        declared_model(config.changed(diagnosis=options))
 
 
 def test_it_cannot_be_declared_without_a_calibrated_camera(tmp_path):

@@ -45,7 +45,7 @@ def declared_effect(name: str, true: dict[str, float]) -> DeclaredEffect:
     for key, value in true.items():
         own = inverse.get(key)
         values[own or key] = GUESS * (1 / value if own else value)
-    return DeclaredEffect.model_validate({"name": name, "parameters": values})
+    return DeclaredEffect(name=name, parameters=values)
 
 
 @pytest.mark.parametrize(
@@ -55,9 +55,7 @@ def test_stiffness_and_effects_are_those_of_the_truth(name):
     config = load_config(ROOT / "tests" / "data" / "bench" / name / "session.yaml")
     true = true_effects(name)
     effects = tuple(declared_effect(*item) for item in true.items())
-    config = config.model_copy(
-        update={"model": config.model.model_copy(update={"effects": effects})}
-    )
+    config = config.changed(model=config.model.changed(effects=effects))
     measured = measured_poses(config, read_inputs(config))
     declared = declared_model(config)
     fit = fit_model(
