@@ -2,8 +2,9 @@
 
 import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,6 +19,11 @@ _LARGEST = 500_000
 _MOST_VALUES = _LARGEST // 2
 # Maximum nesting of lists and mappings; a configuration has seven levels.
 _DEEPEST = 30
+# What helps against a backslash that is more than itself.
+BACKSLASH = (
+    "In double quotes a backslash begins an escape. Try: single quotes, as in 'C:\\lab\\a.csv', or "
+    "forward slashes, C:/lab/a.csv"
+)
 # Refused characters: control characters other than tab and line breaks, which a terminal would
 # obey; and lone surrogates, except those that stand for bytes of file names (PEP 383).
 _NO_TEXT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udc7f\udd00-\udfff]")
@@ -30,6 +36,11 @@ def read_yaml(path: str | Path) -> Any:
     Raises ConfigError if the file cannot be read, is empty, or is not YAML.
     """
     return Document.read(Path(path)).data
+
+
+def parsed_yaml(content: bytes, source: Path) -> Any:
+    """Plain data of the content of a YAML file, as `read_yaml` returns them."""
+    return Document.of(content, source).data
 
 
 def yaml_text(path: Path) -> str:
@@ -142,7 +153,11 @@ class Document(Source):
     @classmethod
     def read(cls, source: Path, largest: int = _LARGEST) -> Self:
         """Read a file of at most `largest` bytes, or raise a ConfigError."""
-        text = _read_bytes(source, largest)
+        return cls.of(_read_bytes(source, largest), source)
+
+    @classmethod
+    def of(cls, text: bytes, source: Path) -> Self:
+        """Document of the content of a file, or a ConfigError."""
         try:
             loader = _Loader(text)
             root = loader.get_single_node()
@@ -153,6 +168,7 @@ class Document(Source):
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             hint = " (indent with spaces)" if "'\\t'" in str(error.problem) else ""
+            hint = f". {BACKSLASH}" if "escape" in str(error.problem) else hint
             raise ConfigError(
                 f"not valid YAML: {error.problem}{hint}",
                 file=source,
@@ -205,6 +221,44 @@ def _read_bytes(source: Path, largest: int) -> bytes:
     return text
 
 
+_WHOLE, _DIGITS = re.compile(r"[-+]?[0-9]+"), re.compile(r"[0-9]+(?:[eE][-+]?[0-9]+)?")
+
+
+def _tight(one: yaml.Node, other: yaml.Node) -> bool:
+    """Whether a comma without a blank is between two whole numbers, as in a decimal of a comma."""
+    if not (isinstance(one, yaml.ScalarNode) and isinstance(other, yaml.ScalarNode)):
+        return False
+    plain = not (one.style or other.style)
+    together = other.start_mark.index - one.end_mark.index == 1
+    whole = _WHOLE.fullmatch(one.value) and _DIGITS.fullmatch(other.value)
+    return bool(plain and together and whole)
+
+
+def _split_numbers(node: yaml.MappingNode) -> Iterator[str]:
+    """Decimal commas in braces: {length: 0,8} has the value 0, and a key 8 without one."""
+    for (key, value), (other, nothing) in pairwise(node.value):
+        empty = nothing.start_mark.index == nothing.end_mark.index
+        if empty and _tight(value, other):
+            yield f"{key.value}: {value.value},{other.value} means {value.value}.{other.value}"
+
+
+def _split_list(items: Sequence[yaml.Node]) -> Iterator[str]:
+    """Decimal commas in brackets: [0,6, 0,1] has four numbers.
+
+    If no comma has a blank behind it, they may be what they are in other lists.
+    """
+    if all(b.start_mark.index - a.end_mark.index == 1 for a, b in pairwise(items)):
+        return
+    tight = [_tight(a, b) for a, b in pairwise(items)]
+    if not any(tight):
+        return
+    found = meant = str(items[0].value)
+    for item, joined in zip(items[1:], tight, strict=True):
+        found += f"{',' if joined else ', '}{item.value}"
+        meant += f"{'.' if joined else ', '}{item.value}"
+    yield f"[{found}] means [{meant}], or {len(items)} numbers with a blank behind each comma"
+
+
 def _too_deep() -> str:
     return f"lists and mappings more than {_DEEPEST} levels deep. Try: brackets and braces closed?"
 
@@ -213,6 +267,7 @@ def _inspect(root: yaml.Node, source: Path) -> None:
     """Refuse valid YAML that is not plain data; nodes are visited once, aliases counted in full."""
     measured: dict[int, tuple[int, int]] = {}
     above: set[int] = set()
+    split: set[tuple[int, str]] = set()  # lines and words of decimal commas
 
     def refuse(message: str, node: yaml.Node) -> ConfigError:
         return ConfigError(message, file=source, line=node.start_mark.line + 1)
@@ -227,8 +282,10 @@ def _inspect(root: yaml.Node, source: Path) -> None:
         parts: list[yaml.Node] = []
         if isinstance(node, yaml.ScalarNode):
             if found := _NO_TEXT.search(node.value):
-                raise refuse(f"{show(node.value)} holds {found[0]!r}, which is no text", node)
+                hint = f". {BACKSLASH}" if node.style == '"' else ""
+                raise refuse(f"{show(node.value)} holds {found[0]!r}, which is no text{hint}", node)
         elif isinstance(node, yaml.MappingNode):
+            split.update((node.start_mark.line + 1, said) for said in _split_numbers(node))
             first: dict[str, int] = {}
             for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
                 if key.value in first:
@@ -238,6 +295,7 @@ def _inspect(root: yaml.Node, source: Path) -> None:
             parts = [part for pair in node.value for part in pair]
         else:
             parts = node.value
+            split.update((node.start_mark.line + 1, said) for said in _split_list(parts))
         inner = [inspect(part) for part in parts]
         values = 1 + sum(size for size, _ in inner)
         levels = 1 + max((depth for _, depth in inner), default=0)
@@ -254,3 +312,6 @@ def _inspect(root: yaml.Node, source: Path) -> None:
         return values, levels
 
     inspect(root)
+    if split:
+        told = "; ".join(f"line {line}: {said}" for line, said in sorted(split))
+        raise ConfigError(f"the decimal sign is a point; {told}", file=source)

@@ -13,7 +13,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.cable import Cable
-from dlo_casadi.config.document import Document
+from dlo_casadi.config.document import BACKSLASH, Document
 from dlo_casadi.config.effects import without_values, wrong_effects, wrong_limits
 from dlo_casadi.config.frozen import plain
 from dlo_casadi.config.options import DeclaredTolerances
@@ -369,6 +369,10 @@ def _absent(file: Path) -> str:
         names = [path.name for path in file.parent.glob("*")]
         near = difflib.get_close_matches(file.name, names, 1, cutoff=0.8)
         meant = f"did you mean {near[0]}?" if near else _RELATIVE
+        if any(ord(sign) < 32 for sign in str(file)):
+            return f"{show(str(file))} does not exist. {BACKSLASH}"
+        if "\\" in str(file):  # folders are separated by it on Windows alone, by / everywhere
+            meant = f"write / between folders: {file.name.replace(chr(92), '/')}"
         return f"{file} does not exist; {meant}"
     except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
         reason = getattr(error, "strerror", None) or error

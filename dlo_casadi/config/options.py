@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from dlo_casadi.config.cameras import camera_of
 from dlo_casadi.config.frozen import ConfigSection, entry
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
 from dlo_casadi.config.values import (
@@ -299,9 +300,13 @@ class Images(Measurement):
 
     kind: Literal["images"]
     """images."""
-    camera: DeclaredCamera | None = None
-    """The camera. Without it, it is found from the session's photographs where it is needed (in
-    space, or with a standoff); else the board's plane is mapped by a homography."""
+    camera: Annotated[
+        DeclaredCamera | None,
+        BeforeValidator(camera_of, json_schema_input_type=str | DeclaredCamera | None),
+    ] = None
+    """The camera: matrix and distortion, or the content or the file of a calibration by ROS, OpenCV
+    or Kalibr. Without it, it is found from the session's photographs where it is needed (in space,
+    or with a standoff); else the board's plane is mapped by a homography."""
     board: DeclaredBoard | None = None
     """The board with its markers; or give reference."""
     reference: Reference | None = None

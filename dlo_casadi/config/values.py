@@ -181,7 +181,10 @@ def _listed(belongs: str, schema: Any, *counts: int) -> BeforeValidator:
 
     def check(value: object) -> object:
         if not isinstance(value, list | tuple) or len(value) not in counts:
-            raise ValueError(f"{belongs}, found {show(value)}")
+            twice = isinstance(value, list | tuple) and len(value) in [2 * n for n in counts]
+            whole = isinstance(value, list | tuple) and all(type(x) is int for x in value)
+            hint = "; decimal commas? The decimal sign is a point" * (twice and whole)
+            raise ValueError(f"{belongs}, found {show(value)}{hint}")
         return value
 
     return BeforeValidator(check, json_schema_input_type=schema)

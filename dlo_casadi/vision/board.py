@@ -13,6 +13,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import VisionError, counted
 from dlo_casadi.vision.camera import Camera, CameraPose, Picture, View
 from dlo_casadi.vision.image import spoilt
+from dlo_casadi.vision.other_markers import find_markers, other_markers
 
 MAX_ERROR_PX = 2.0  # largest error of a marker at its declared place
 LEAST_MARKERS = 3  # fewest markers for a camera's pose: two define only a line
@@ -147,6 +148,7 @@ def _located(
             f"{'only ' if seen else ''}{sorted(seen)} of {sorted(board.marker_centers)} are seen. "
             "Try: a photograph with the whole board in it, sharp and not covered."
             + spoilt(image)
+            + _instead(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8), board)
             + "".join(f" The {copy}" for copy in copies)
         )
     height, width = image.shape[:2]
@@ -328,31 +330,27 @@ def detect_markers(image: Picture, board: Board) -> tuple[dict[int, FloatArray],
     if not board.dictionary.startswith("DICT_") or number is None:
         known = ", ".join(sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_"))[:6])
         raise VisionError(f"unknown ArUco dictionary {board.dictionary!r}. Try: {known}, ...")
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number))
-
-    def markers(picture: Picture) -> dict[int, list[FloatArray]]:
-        """Corners of all markers by number, a list for each."""
-        quads, numbers, _ = detector.detectMarkers(picture)
-        found: dict[int, list[FloatArray]] = {}
-        for n, quad in zip([] if numbers is None else numbers.ravel(), quads, strict=True):
-            found.setdefault(int(n), []).append(quad.reshape(4, 2))
-        return found
-
-    found = markers(grey)
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    found = find_markers(grey, board.dictionary)
     ours = {n: quads for n, quads in found.items() if n in board.marker_centers}
     if not ours:
         other = f"only markers {sorted(found)}" if found else "no marker at all"
-        flipped = set(markers(np.ascontiguousarray(grey[:, ::-1]))) & set(board.marker_centers)
-        mirrored = f" The picture is mirrored: in its mirror image there are {sorted(flipped)}."
         raise VisionError(
             f"board not found: {other} of {board.dictionary} in the picture, but the board has "
             f"{sorted(board.marker_centers)}. Try: the right dictionary; markers flat, in focus, "
             f"inside the picture, with a white margin (mean brightness {grey.mean():.0f} of 255)."
-            f"{spoilt(image)}{mirrored if flipped else ''}"
+            f"{spoilt(image)}{_instead(grey, board)}"
         )
     single = {n: _refine(grey, quads[0]) for n, quads in ours.items() if len(quads) == 1}
     return single, set(ours) - set(single)
+
+
+def _instead(grey: Picture, board: Board) -> str:
+    """Sentence on what a picture shows in place of the board's markers; empty if nothing is."""
+    mirrored = find_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)
+    if flipped := sorted({*mirrored} & {*board.marker_centers}):
+        return f" The picture is mirrored: in its mirror image there are {flipped}."
+    return other_markers(grey, board.dictionary, board.marker_centers)
 
 
 def _refine(grey: Picture, quad: FloatArray) -> FloatArray:

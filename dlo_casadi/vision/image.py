@@ -21,6 +21,9 @@ _BLUE, _ORANGE, _RED = (178, 114, 0), (0, 159, 230), (0, 94, 213)
 _GREEN, _GREY = (115, 158, 0), (150, 150, 150)
 _SATURATED = 4.0  # contrast that is drawn white, relative to the cut
 _WHITE, _MUCH_WHITE = 250, 0.3  # grey level; share of such pixels in an overexposed picture
+# Grey level below which nearly all of a black picture is; a rendered board in light that fades is
+# lost where 99 % of the picture are below 20.
+_DARK = 40.0
 _BLURRED_PX = 2.0  # std of blurred edges beyond which markers of some 30 px cannot be read
 
 # Largest number of pixels of a picture. The camera step was measured to need 15 bytes per pixel:
@@ -114,12 +117,17 @@ def _is_whole(picture: ImageFile.ImageFile) -> bool:
 
 
 def spoilt(image: Picture) -> str:
-    """Sentence for a photograph (H, W, 3) that is overexposed or blurred; empty if it is neither.
+    """Sentence for a photograph (H, W, 3) that is black, overexposed or blurred; empty if not.
 
     A step of height h blurred by the standard deviation s has the largest slope
     h / (s sqrt(2 pi)).
     """
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if (lightest := float(np.percentile(grey, 99.0))) < _DARK:
+        return (
+            f" The picture is nearly black: 99 % of it are at most {lightest:.0f} of 255; more "
+            "light or a longer exposure."
+        )
     white = float(np.mean(grey >= _WHITE))
     if white > _MUCH_WHITE:
         return f" The picture is overexposed: {100 * white:.0f} % of it are white; less light."
