@@ -19,10 +19,11 @@ from dlo_casadi.effects import CableData, Setup
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipKind, HeldClip
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.report.canvas import WIDTH, line_of
 from dlo_casadi.report.scene import seen
 from dlo_casadi.rod.obstacles import Plane
+from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.show.style import BLACK, BLUE, GREY, styled
 
 PICTURES = Path(__file__).parents[1] / "docs/pages/effects"
@@ -41,7 +42,7 @@ class Shown:
     space: Mapping[str, float] = field(default_factory=dict)
     clamped: bool = False
     history: bool = False  # the third pose is the first one again
-    clip: ClipKind | None = None  # what holds the middle
+    clip: SupportKind | None = None  # what holds the middle
     touching: bool = False  # the cable lies on a table
     level: bool = False  # all ends are at one height
 
@@ -121,7 +122,7 @@ def poses_in_space() -> list[HeldPose]:
     ]
 
 
-def middle_clip(pose: HeldPose, kind: ClipKind) -> HeldClip:
+def middle_clip(pose: HeldPose, kind: SupportKind) -> HeldClip:
     """A clip that holds the middle of the cable below the middle of its ends, along the chord."""
     start, end = np.array(pose.start), np.array(pose.end)
     place = (start + end) / 2
@@ -135,7 +136,7 @@ def shapes(name: str, values: Mapping[str, float], shown: Shown, spatial: bool) 
     cable = IN_SPACE if spatial else IN_PLANE
     held = "clamped" if spatial or shown.clamped else "pinned"
     gravity = (0.0, 0.0, -9.81) if spatial else (0.0, -9.81)
-    kinds: tuple[ClipKind, ...] = () if shown.clip is None else (shown.clip,)
+    kinds: tuple[SupportKind, ...] = () if shown.clip is None else (shown.clip,)
     setup = Setup(cable, held, held, gravity, center=(0.4, -0.1), camera=True, clips=kinds)
     effects = (dlo.EFFECTS[name].made_for(setup),) if values else ()
     up = tuple(-g / 9.81 for g in gravity)

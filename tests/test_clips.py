@@ -34,6 +34,9 @@ from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.rod.obstacles import Plane
+from dlo_casadi.rod.supports import SupportKind
+
+CLAMPED, EYELET = SupportKind.CLAMPED, SupportKind.EYELET
 
 LENGTH, EI = 1.0, 0.02  # m, N m^2
 CABLE = CableData(LENGTH, mass=0.2, diameter=0.01, bending_stiffness=EI)
@@ -141,7 +144,7 @@ def test_a_rod_clamped_in_three_places_is_two_rods():
     clipped = Clipped.none(Chain(0.5, 10), 1)
     bends = [curvatures_along(one.curvature[None, None], clipped)[0, -2:] for one in (first, last)]
     held, at = np.array([clip.vector(Heading)])[None], np.array([[0.5]])
-    between = Clipped.of(Chain(LENGTH, 20), ("clamped",), held, at, np.zeros((1, 1)), whole.x[None])
+    between = Clipped.of(Chain(LENGTH, 20), (CLAMPED,), held, at, np.zeros((1, 1)), whole.x[None])
     found = curvatures_along(whole.curvature[None, None], between)[0, -4:]
     np.testing.assert_allclose(found, np.concatenate(bends), rtol=1e-6)
     assert len(set(np.round(found, 3))) == 4
@@ -359,7 +362,7 @@ def test_places_and_directions_at_even_arc_lengths_are_exact_for_cubics():
     chain, rng = Chain(LENGTH, 10), np.random.default_rng(0)
     held, at = np.zeros((1, 3, 4)), np.array([[0.17, 0.5, 0.74]])
     held[..., -1] = at
-    clipped = Clipped.of(chain, ("clamped",) * 3, held, at, np.zeros((3, 1)), np.zeros((1, 11, 1)))
+    clipped = Clipped.of(chain, (CLAMPED,) * 3, held, at, np.zeros((3, 1)), np.zeros((1, 11, 1)))
     assert clipped.places[0, [2, 5, 7]].tolist() == at[0].tolist()
     curve = [np.polynomial.Polynomial(cubic) for cubic in rng.normal(size=(2, 4))]
 
@@ -375,7 +378,7 @@ def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():
     chain, (a, b, c) = Chain(LENGTH, 10), (1.0, -4.0, 9.0)
     held, at = np.zeros((1, 2, 4)), np.array([[0.17, 0.74]])
     held[..., -1] = at
-    clipped = Clipped.of(chain, ("clamped",) * 2, held, at, np.zeros((2, 1)), np.zeros((1, 11, 1)))
+    clipped = Clipped.of(chain, (CLAMPED,) * 2, held, at, np.zeros((2, 1)), np.zeros((1, 11, 1)))
 
     def inside(cells):
         middle, width = cells.mean(axis=1), np.diff(cells, axis=1)[:, 0]
@@ -393,7 +396,7 @@ def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():
 )
 def test_clips_are_in_order_within_the_cable(at, ordered):
     none = np.zeros((1, 2, 4)), np.array([at]), np.zeros((2, 1)), np.zeros((1, 11, 1))
-    assert Clipped.of(Chain(LENGTH, 10), ("eyelet",) * 2, *none).in_order.tolist() == [ordered]
+    assert Clipped.of(Chain(LENGTH, 10), (EYELET,) * 2, *none).in_order.tolist() == [ordered]
 
 
 def test_a_pose_with_other_clips_than_the_model():

@@ -17,6 +17,7 @@ from dlo_casadi.export.rod import Rod
 from dlo_casadi.export.targets import TARGETS, losses, samples_of, target_of, write_rods
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.rod.supports import SupportKind
 
 SPACE = CableData(0.6, 0.03, 0.004, 0.015, "loom <&>", torsional_stiffness=0.011)
 PLANE = CableData(0.8, 0.2, 0.012, 0.3, "rope")
@@ -215,7 +216,7 @@ def test_an_unstressed_rod_keeps_its_rest_shape_in_mujoco():
     mj = pytest.importorskip("mujoco", reason="the extra `peers` is not installed")
     held = in_space()
     rod = Rod.of(held, 30)
-    rod = replace(rod, gravity=np.zeros(3), end=replace(rod.end, kind="free"))
+    rod = replace(rod, gravity=np.zeros(3), end=replace(rod.end, kind=SupportKind.FREE))
     at_rest = TARGETS["mujoco"].settle(TARGETS["mujoco"].write(rod, []), rod)
 
     turns = [rod.frames[0]]

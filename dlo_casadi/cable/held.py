@@ -19,7 +19,6 @@ from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.errors import DloError
 from dlo_casadi.io.tables import read_table
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS
 from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.show.text import millimetres, vector
@@ -65,7 +64,7 @@ def reaction_texts(
     forces, turned = (found.start_force, found.end_force), functions_of(model).moment_ends
     for (side, at, reached), force, moment in zip(ends, forces, found.moments, strict=True):
         if at is None:
-            rows.append((side, "free"))
+            rows.append((side, str(model.end)))
             continue
         rows.append((side, vector(at, "g", "m")))
         if math.dist(at, reached) > _SHOWN:
@@ -75,7 +74,7 @@ def reaction_texts(
     for clip, load in zip(pose.clips, found.clips, strict=True):
         place = vector(clip.place, "g", "m")
         rows.append((clip.name, f"{clip.kind} at {load.at:.4g} m of the cable, {place}"))
-        rows += _load_texts(clip.name, load.force, load.moment if clip.kind in CLAMPS else None)
+        rows += _load_texts(clip.name, load.force, load.moment if clip.kind.direction else None)
     for one in found.contacts:
         apart = one.end > one.start
         where = f"from {one.start:.4g} to {one.end:.4g}" if apart else f"at {one.start:.4g}"
@@ -134,9 +133,9 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
         raise DloError(f"branch must be 'ccw', 'cw' or None, found {branch!r}")
     if branch not in (None, *model.node.branches):
         raise DloError(f"{name} is in space: a branch has no meaning")
-    if model.end == "free" and "end" in given:
+    if not model.end.place and "end" in given:
         raise DloError(f"the end of {name} is free: it cannot be held at {given['end']} m")
-    if model.end != "free" and "end" not in given:
+    if model.end.place and "end" not in given:
         raise DloError(
             f"the end of {name} is {model.end}: where is it?\n"
             f"  Try: end={own.place} [m], of the command --end {' '.join(model.node.axes).upper()}."
@@ -147,9 +146,9 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
         if (strange := f"{side}_{other.direction}") in given:
             text = f"{strange}: {name} is in {own.where} ({gravity})"
             raise DloError(f"{text}.\n  Try: {key} {own.unit}")
-        if held != "clamped" and key in given:
+        if not held.direction and key in given:
             raise DloError(f"the {side} of {name} is {held}: {key} has no meaning")
-        if held == "clamped" and given.setdefault(key, shared.get(key)) is None:
+        if held.direction and given.setdefault(key, shared.get(key)) is None:
             raise DloError(
                 f"the {side} of {name} is clamped, with no {kind} that all poses share: "
                 f"give {key} {own.unit}"
@@ -162,7 +161,7 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     for key, at in (("start", pose.start), ("end", pose.end)):
         if at is not None and len(at) != model.node.dimension:
             raise DloError(f"{key}: {own.place} belongs here ({gravity}), found {at}")
-    if pose.turns and not (model.node.twists and model.start == model.end == "clamped"):
+    if pose.turns and not (model.node.twists and model.start.roll and model.end.roll):
         raise DloError(f"{name} has no turns: it is not in space and clamped at both ends")
     return replace(pose, name=model.cable.name or "cable")
 

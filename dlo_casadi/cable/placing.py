@@ -35,6 +35,7 @@ from dlo_casadi.equilibrium.spread import SolvedCable, Uncertainty
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.show.text import vector
 
 Aim = Literal["margin", "force"]
@@ -136,7 +137,7 @@ def placed(
         replace(held_pose(cable.model, known.fixtures, default | dict(pose)), name=f"pose_{k}")
         for k, pose in enumerate(poses, start=1)
     )
-    between, asked = cable.with_clips(["pinned"] * int(count)), Limits()
+    between, asked = cable.with_clips([SupportKind.PINNED] * int(count)), Limits()
     if aim == "margin" or limits is not None or known.limits.given:
         asked = asked_limits(between, limits)
     box = np.sort(region, axis=0) / cable.model.cable.length
@@ -220,7 +221,7 @@ class _Search:
         """The poses with the clips added."""
         rows = self.length * z.reshape((self.count, -1))
         clips = tuple(
-            HeldClip("pinned", tuple(row[1:].tolist()), float(row[0]), name=f"clip_{k}")
+            HeldClip(SupportKind.PINNED, tuple(row[1:].tolist()), float(row[0]), name=f"clip_{k}")
             for k, row in enumerate(rows, start=1)
         )
         return [replace(pose, clips=clips) for pose in self.poses]
@@ -424,5 +425,5 @@ class _Search:
             named = zip(sizes["force"], fixtures_of(one.held), strict=True)
             worst += [(float(x), f"{holder.name} in {one.held.pose.name}") for x, holder in named]
         held = now.shapes[0].held.pose.clips
-        clips = (Clip(name=x.name, kind="pinned", at=x.at, place=x.place) for x in held)
+        clips = (Clip(name=x.name, kind=SupportKind.PINNED, at=x.at, place=x.place) for x in held)
         return Placing(tuple(clips), tuple(uses), *max(worst))

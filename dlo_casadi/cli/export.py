@@ -106,7 +106,7 @@ def _held(cable: FittedCable, chosen: argparse.Namespace) -> dict[str, Any]:
     try:
         given = session_of(cable, None if chosen.check in (None, _NEAR) else chosen.check)
     except DloError as error:
-        if cable.model.end == "free":
+        if not cable.model.end.place:
             return held
         reason = error.message.partition("\n")[0]
         axes = " ".join(cable.model.node.axes).upper()
@@ -115,7 +115,7 @@ def _held(cable: FittedCable, chosen: argparse.Namespace) -> dict[str, Any]:
             f"  Try: --end {axes}"
         ) from None
     first, ends = given.experiment.poses[0], ("start", "end")
-    turning = tuple(f"{side}_" for side in ends if getattr(cable.model, side) != "clamped")
+    turning = tuple(f"{side}_" for side in ends if not getattr(cable.model, side).direction)
     held = {name: getattr(first, name) for name in HELD if not name.startswith(turning)}
     held |= {"clips": first.clips, "over": first.over, "obstacles": given.experiment.obstacles}
     return held | {"branch": first.branch if first.branch != "previous" else None}

@@ -3,7 +3,7 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
@@ -27,8 +27,8 @@ from dlo_casadi.effects import ContactEffect
 from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.fleet import shape_table as tables
 from dlo_casadi.fleet.shape_table import COLUMNS, Grid, Plan, PoseList
-from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.chain import ELEMENTS
+from dlo_casadi.rod.supports import CLIPS
 from dlo_casadi.runtime.parallel import open_executor
 
 BRANCH = option("--branch", choices=("ccw", "cw"), help="which way the cable turns")
@@ -166,7 +166,7 @@ def _found_offsets(cable: FittedCable) -> str:
 
 def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:
     """Clips or obstacles from the command's file; empty without a file."""
-    path, kind = getattr(chosen, name), {"clips": "pinned", "obstacles": "plane"}[name]
+    path, kind = getattr(chosen, name), {"clips": CLIPS[0], "obstacles": "plane"}[name]
     found = [] if path is None else read_yaml(path)
     if not isinstance(found, list):
         raise DloError(f"{path}: a list of {name} belongs here: - {{kind: {kind}, ...}}")
@@ -320,7 +320,7 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
     for side in ("start", "end"):
         held, name = getattr(model, side), f"{side}_heading"
         heading = getattr(chosen, name)
-        if held != "clamped":
+        if not held.direction:
             if heading is not None:
                 raise DloError(f"--{side}-heading: the {side} of this cable is {held}")
             continue
@@ -330,9 +330,9 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
         else:
             fixed[name] = float(heading)
     if chosen.grid is None:
-        place = () if model.end == "free" else ("end_x_m", "end_y_m")
+        place = ("end_x_m", "end_y_m") if model.end.place else ()
         return PoseList(chosen.list, (*place, *(f"{name}_rad" for name in unknown)), fixed)
-    if model.end == "free":
+    if not model.end.place:
         raise DloError("--grid: the end of this cable is free, it has no place; use --list")
     if unknown:
         raise DloError(
@@ -347,9 +347,7 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
     PARAMETERS,
     option("--output", type=Path, required=True, help="folder for the C files"),
     option("--prefix", default="dlo", help="begins all public names (dlo)"),
-    option(
-        "--clips", nargs="+", default=(), choices=get_args(ClipKind), help="what holds it between"
-    ),
+    option("--clips", nargs="+", default=(), choices=CLIPS, help="what holds it between"),
     option(
         "--obstacles",
         type=int,

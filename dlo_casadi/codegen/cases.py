@@ -22,6 +22,7 @@ from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.obstacles import Obstacle, Plane
+from dlo_casadi.rod.supports import SupportKind
 
 
 def template(name: str) -> str:
@@ -136,8 +137,10 @@ class Case:
         inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
         bare = replace(model, clips=(), effects=tuple(inside))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
-        if bare.end == "free" and (self.obstacles.most or self.holds):
-            bare = replace(bare, end="pinned")  # segments before a clip or a contact carry a force
+        if not bare.end.place and (self.obstacles.most or self.holds):
+            bare = replace(
+                bare, end=SupportKind.PINNED
+            )  # segments before a clip or a contact carry a force
         if not self.holds:
             return kernels_of(bare, p, rest, self.inline)
         if not bare.chain.kind.smooth:
@@ -311,7 +314,7 @@ class _PlaneCase(Case):
         # Each first guess starts one free descent, and one guided by springs in 15 stages; a
         # descent takes 100 steps, and 6 more off saddles; each may land on obstacles, in 100. The
         # template checks the number. The lowest stretches between saddles are joined in 10.
-        guesses = 5 if (model.start, model.end) == ("pinned", "pinned") else 4
+        guesses = 5 if model.start.turns and model.end.turns else 4
         held = 0
         if self.holds:
             held = 2 * self.held_doubles * self.holds + (5 + 15) * chain.n_segments
@@ -324,8 +327,8 @@ class _PlaneCase(Case):
             "WORKSPACE": self.doubles * (count + 1) + held,
             "ELEMENTS": chain.n_segments,
             "FIRST": chain.layout.advancing[0],
-            "LOW": model.start == "clamped" and not gives[0],
-            "HIGH": count - (model.end == "clamped" and not gives[1]),
+            "LOW": model.start.direction and not gives[0],
+            "HIGH": count - (model.end.direction and not gives[1]),
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
             "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings + mixing,
@@ -353,7 +356,7 @@ class _SpaceCase(Case):
         model = self.model
         eyelets = len(model.sliding) if model.clamped_between else 0
         spans = len(model.clips) - eyelets + 1
-        if model.end == "free" and not model.clips:
+        if not (model.end.place or model.clips):
             return 0
         least = max(self.least_coarse, round(model.n / self.coarsening))
         if model.clips:
@@ -407,7 +410,7 @@ class _SpaceCase(Case):
         # Each first guess starts a descent on the coarse mesh, whose minimum starts one on the fine
         # mesh; if all fail, the first guess starts one on the fine mesh. A descent takes 80 steps.
         # The template checks the number.
-        hangs = self.model.end == "free" and not self.model.clips
+        hangs = not (self.model.end.place or self.model.clips)
         guesses = 3 if hangs else 8 + 2 * bool(self.model.sliding)
         held = self.held_doubles * self.holds + (11 + 58) * n if self.holds else 0
         return {

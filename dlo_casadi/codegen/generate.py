@@ -17,13 +17,12 @@ from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import FolderDraft, is_marked, refuse_foreign, write_file
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS
 from dlo_casadi.model.contact import gap_per_force
+from dlo_casadi.rod.supports import SupportKind
 
 # Maximum number of steps between two poses of a path, as in the templates.
 FINEST = 4096
 # Freedoms that a support between the ends leaves to the cable, as in the templates.
-_CLAMP_KINDS = {"clamped": 1, "swivel": 2}
 # Text in all templates that identifies a generated file.
 MARK = "written by dlo-casadi"
 # Keywords of C99, C11 and C++, and names that every program defines.
@@ -116,7 +115,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
     model, node, kind = case.model, case.model.node, case.model.chain.kind
     effects = comment(", ".join(effect.label for effect in model.effects)) or "none"
     ends, among = f"start {model.start}, end {model.end}", case.obstacles.most
-    held = [*model.clips, *["pinned"] * len(case.tethers)]
+    held = [*model.clips, *[SupportKind.PINNED] * len(case.tethers)]
     table, values = case.table, case.values
     tries = case.try_steps * (2 if among else 1)
     most = tries + (case.iterations if among else 0)
@@ -138,9 +137,9 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "N": model.n,
             "NODES": model.chain.n_nodes,
             "NODES_ARE": kind.nodes_are,
-            "START_CLAMPED": model.start == "clamped",
-            "END_CLAMPED": model.end == "clamped",
-            "END_FREE": model.end == "free",
+            "START_CLAMPED": model.start.direction,
+            "END_CLAMPED": model.end.direction,
+            "END_FREE": not model.end.place,
             "GIVES_START": case.compliances[0] > 0,
             "GIVES_END": case.compliances[1] > 0,
             "LENGTH": c_number(case.length),
@@ -157,8 +156,8 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "HOLDS": case.holds,
             "CLIPS": len(model.clips),
             "CLIP_KINDS": ", ".join(model.clips),
-            "CLAMPS": sum(kind in CLAMPS for kind in model.clips),
-            "CLAMP_KINDS": ", ".join(str(_CLAMP_KINDS.get(kind, 0)) for kind in held),
+            "CLAMPS": sum(kind.direction for kind in model.clips),
+            "CLAMP_KINDS": ", ".join(str(kind.direction * (1 + (not kind.roll))) for kind in held),
             "EYELETS": len(model.sliding),
             "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
             "EXAMPLE_CLIPS": case.example_clips,

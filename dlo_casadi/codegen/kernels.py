@@ -19,6 +19,7 @@ from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentDerivatives
+from dlo_casadi.rod.supports import SupportKind
 
 # Largest difference at which two numbers count as equal: rounding of the mesh.
 _ROUNDING = 1e-14
@@ -206,7 +207,7 @@ def kernels_of(
     """Kernels of a model without clips and tethers; `inline` as in `generate`."""
     bare, moved = model, held is not None and held.moved
     if held is not None:
-        model = replace(model, clips=("clamped" if moved else "pinned",))
+        model = replace(model, clips=(SupportKind.CLAMPED if moved else SupportKind.PINNED,))
     places = model.chain.layout.segments
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
@@ -332,7 +333,7 @@ def _derivatives(
         found = in_frame(lagrangian_of(model), x, forces, numbers).derivatives()
         return found.about(found.turn, found.turn)
     # At a free end lam is zero, but the derivative with respect to it is still the advance.
-    free = model.end == "free"
+    free = not model.end.place
     multipliers = ca.SX.zeros(model.n_lam)
     for rows, own in zip((model.end_pull, *model.pulls), ca.vertsplit(lam, 2), strict=True):
         multipliers[rows] = own[: len(rows)]

@@ -13,7 +13,7 @@ from dlo_casadi.equilibrium.implicit import pose_size
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, HeldClip
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import EndConditions
 
 # Same values as in the header.
@@ -341,7 +341,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
             f"a Pose belongs here, found {_told(pose)}\n  Try: dlo_casadi.Pose(start, end)"
         )
     said = f"{pose.name}: " if pose.name else ""
-    if pose.end is None and model.end != "free":
+    if pose.end is None and model.end.place:
         raise DloError(f"{said}the end of the cable is {model.end}: where is it?\n  Try: end")
     d = model.node.dimension
     places = {"start": pose.start, "end": pose.end}
@@ -356,12 +356,12 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     directions = {
         f"{side}_{own.direction}": getattr(pose, f"{side}_{own.direction}")
         for side in ("start", "end")
-        if getattr(model, side) == "clamped"
+        if getattr(model, side).direction
     }
     directions |= {
         f"the {own.direction} of clip {k}": getattr(clip, own.direction)
         for k, clip in enumerate(pose.clips, 1)
-        if clip.kind in CLAMPS
+        if clip.kind.direction
     }
     for name, direction in directions.items():
         if direction is None:

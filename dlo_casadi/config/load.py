@@ -310,7 +310,7 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
             text = f"is for a cable in {other.where}; gravity has {own.gravity}"
             yield f"{strange} {text}. Try: {key}_{own.direction}", strange
         angle = getattr(pose, heading) or 0.0
-        if how == "clamped" and abs(angle) > most:
+        if how.direction and abs(angle) > most:
             yield f"{heading}: {angle:g} rad: in degrees? then {math.radians(angle):.4g}", heading
         for kind, count, what in (
             ("force", d, own.force),
@@ -319,16 +319,16 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
             reading = getattr(pose, f"{key}_{kind}")
             if reading is not None and len(reading) != count:
                 yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
-        if how == "clamped" and getattr(pose, f"{key}_{own.direction}") is None:
+        if how.direction and getattr(pose, f"{key}_{own.direction}") is None:
             one = "an" if key == "end" else "a"
             yield f"a clamped {key} needs {one} {key}_{own.direction} {own.unit}", None
-    if held.end != "free" and pose.end is None:
+    if held.end.place and pose.end is None:
         yield f"a {held.end} end needs its position: end: {own.place}", None
-    if held.end == "free":
+    if not held.end.place:
         for key in ("end", "end_heading", "end_orientation", "end_force", "end_moment"):
             if getattr(pose, key) is not None:
                 yield f"a free end has no {key}; boundary.end: pinned or clamped?", None
-    if pose.turns and not (space and held.start == held.end == "clamped"):
+    if pose.turns and not (space and held.start.roll and held.end.roll):
         yield "turns are of a cable in space that is clamped at both ends", "turns"
     if pose.branch in ("ccw", "cw") and space:
         yield f"branch: {pose.branch} is of a cable in a plane", "branch"

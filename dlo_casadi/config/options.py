@@ -29,6 +29,7 @@ from dlo_casadi.config.values import (
 )
 from dlo_casadi.errors import counted
 from dlo_casadi.model.cable_model import Tolerances
+from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.thresholds import SIGNIFICANCE
 
 ElementName = Literal["quadratic", "arc", "link"]
@@ -136,7 +137,7 @@ class Limits(ConfigSection):
         return self.declared
 
     def problems(
-        self, held: Sequence[str], sprung: bool, twists: bool, length: float, avoided: bool
+        self, held: Sequence[SupportKind], sprung: bool, twists: bool, length: float, avoided: bool
     ) -> Iterator[ConfigProblem]:
         """Find limits that are meaningless for a cable.
 
@@ -158,7 +159,7 @@ class Limits(ConfigSection):
         if self.twist is not None and not twists:
             text = "limits.twist: a cable in a plane (two numbers of gravity) does not twist"
             yield ConfigProblem(("twist",), f"{text}. Try: leave it out")
-        if self.moment is not None and not (sprung or {"clamped", "swivel"} & {*held}):
+        if self.moment is not None and not (sprung or any(kind.direction for kind in held)):
             text = f"limits.moment: nothing takes a moment, no end is clamped ({', '.join(held)})"
             yield ConfigProblem(("moment",), f"{text}. Try: leave it out")
 

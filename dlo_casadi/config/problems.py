@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from dlo_casadi.errors import ConfigError
+from dlo_casadi.rod.supports import SupportKind
 
 Section = TypeVar("Section")
 Place = tuple[str | int, ...]
@@ -302,7 +303,7 @@ def explain(model: type, errors: Sequence[ErrorDetails], source: Source) -> Iter
                 "object": source.instead(str(context.get("class_name"))),
             }
             text = f"{label}: {_MESSAGES[kind].format(**(context | words))}"
-            if key == "start" and found == "free":
+            if key == "start" and found == SupportKind.FREE:
                 text += "; only the end can be free"
             if "tolerances" in place and found == 0:
                 text += "; for a value that is known exactly write a small one, such as 1.0e-6"

@@ -33,7 +33,7 @@ from dlo_casadi.config.options import (
     ModelOptions,
 )
 from dlo_casadi.config.problems import PLACEHOLDER, ConfigProblem, Contradiction, show
-from dlo_casadi.config.supports import Clip, Obstacle
+from dlo_casadi.config.supports import Boundary, Clip, Obstacle
 from dlo_casadi.config.values import (
     ArcLengths,
     Force,
@@ -49,18 +49,9 @@ from dlo_casadi.config.values import (
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import counted, well_formed
-from dlo_casadi.model.clips import ClipKind
 from dlo_casadi.rod.ends import REACTIONS, clip_force
 from dlo_casadi.rod.obstacles import Obstacle as Surface
-
-
-class Boundary(ConfigSection):
-    """How the two ends are held."""
-
-    start: Literal["pinned", "clamped"]
-    """Start of the cable: pinned (free to turn) or clamped (its heading is held)."""
-    end: Literal["pinned", "clamped", "free"]
-    """End of the cable: pinned, clamped or free."""
+from dlo_casadi.rod.supports import SupportKind
 
 
 def _no_file_name(name: str) -> str:
@@ -264,7 +255,7 @@ class Experiment(ConfigSection):
         return tuple(item.surface(k) for k, item in enumerate(self.obstacles, start=1))
 
     @property
-    def clips(self) -> tuple[ClipKind, ...]:
+    def clips(self) -> tuple[SupportKind, ...]:
         """Kinds of the clips, the same in all poses."""
         return tuple(clip.kind for pose in self.poses[:1] for clip in pose.held.clips)
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Literal, get_args
+from typing import Annotated, Literal, TypeAlias
 
 from dlo_casadi.config.frozen import ConfigSection, Given, Numbers, Turned, entry
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
@@ -15,20 +15,39 @@ from dlo_casadi.config.values import (
     Place,
     Positive,
     Quaternion,
+    one_of,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 from dlo_casadi.rod.obstacles import Obstacle as Surface
+from dlo_casadi.rod.supports import CLIPS, ENDS, STARTS, SupportKind
 
 # Kinds of clips that a configuration may declare.
-_Kind = Literal["pinned", "clamped", "eyelet"]
-KINDS = get_args(_Kind)
+KINDS = tuple(kind for kind in CLIPS if kind.roll or not kind.direction)
+# What type checkers accept as the kind of a start, an end, a clip.
+_Start: TypeAlias = SupportKind | Literal["pinned", "clamped"]
+_End: TypeAlias = SupportKind | Literal["pinned", "clamped", "free"]
+_Clip: TypeAlias = SupportKind | Literal["pinned", "clamped", "eyelet"]
 
 
-def undetermined(start: str, end: str, in_space: bool) -> Iterator[ConfigProblem]:
+class Boundary(ConfigSection):
+    """How the two ends are held."""
+
+    start: Given[Annotated[SupportKind, one_of(STARTS)], _Start] = entry()
+    """Start of the cable: pinned (free to turn) or clamped (its heading is held)."""
+    end: Given[Annotated[SupportKind, one_of(ENDS)], _End] = entry()
+    """End of the cable: pinned, clamped or free."""
+
+    @property
+    def directed(self) -> bool:
+        """Whether an end holds the direction of the cable."""
+        return self.start.direction or self.end.direction
+
+
+def undetermined(start: SupportKind, end: SupportKind, in_space: bool) -> Iterator[ConfigProblem]:
     """Why ends held in this way leave the cable's position undetermined."""
-    if in_space and start == "pinned" and end == "free":
+    if in_space and not (start.direction or end.place):
         text = (
             "on a ball joint and with a free end a cable in space can turn freely about the "
             "direction of gravity, so its position is undetermined. Try: start: clamped, with "
@@ -37,9 +56,9 @@ def undetermined(start: str, end: str, in_space: bool) -> Iterator[ConfigProblem
         yield ConfigProblem(("experiment", "boundary"), text)
 
 
-def unused_directions(start: str, end: str) -> list[str]:
+def unused_directions(start: SupportKind, end: SupportKind) -> list[str]:
     """Keys of a pose that ends held in this way do not use: directions of pinned ends."""
-    pinned = [side for side, how in (("start", start), ("end", end)) if how == "pinned"]
+    pinned = [side for side, how in (("start", start), ("end", end)) if how.turns]
     return [f"{side}_{axes.direction}" for side in pinned for axes in AXES.values()]
 
 
@@ -48,7 +67,7 @@ class Clip(ConfigSection):
 
     name: Name = ""
     """What to call the clip; clip_1, clip_2, ... when absent."""
-    kind: _Kind
+    kind: Given[Annotated[SupportKind, one_of(KINDS)], _Clip] = entry()
     """pinned (holds the cable at `at`, it may turn), clamped (a saddle: holds its direction and
     roll, too) or eyelet (the cable slides through without friction)."""
     at: NonNegative | None = None
@@ -68,7 +87,7 @@ class Clip(ConfigSection):
     def held(self, number: int) -> HeldClip:
         """The clip in the form that the statics use; `number` names it if it has no name."""
         return HeldClip(
-            kind="swivel" if self.kind == "clamped" and self.roll == "free" else self.kind,
+            kind=self.kind if self.roll == "held" else self.kind.without_roll(),
             place=self.place,
             at=self.at,
             heading=self.heading,
@@ -85,7 +104,7 @@ def clip_problems(clips: Sequence[Clip], length: float, axes: int) -> Iterator[t
     last, own, other = 0.0, AXES[axes], AXES[5 - axes]
     names = [clip.held(k).name for k, clip in enumerate(clips, start=1)]
     for k, (clip, called) in enumerate(zip(clips, names, strict=True)):
-        clamped = clip.kind == "clamped"
+        clamped = clip.kind.direction
         if names.index(called) < k:
             yield f"two clips are called {called}", k
         if len(clip.place) != axes:
@@ -98,9 +117,9 @@ def clip_problems(clips: Sequence[Clip], length: float, axes: int) -> Iterator[t
             yield f"{called}: {own.direction} is of a clamped clip, it is {clip.kind}", k
         if clip.clip_force is not None and len(clip.clip_force) != axes:
             yield f"{called}: clip_force: {own.force} belongs here", k
-        if clip.roll == "free" and not (clamped and own is AXES[3]):
+        if clip.roll != "held" and not (clamped and own is AXES[3]):
             yield f"{called}: roll: free is of a clamped clip in space", k
-        if (clip.at is None) != (clip.kind == "eyelet"):
+        if (clip.at is None) != clip.kind.slides:
             how = "no at: the cable slides through" if clip.at is not None else "at [m]"
             yield f"{called}: {clip.kind} clips have {how}", k
         elif clip.at is not None and not 0.0 < clip.at < length:

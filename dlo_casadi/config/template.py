@@ -12,6 +12,7 @@ from dlo_casadi.config.document import dump_yaml
 from dlo_casadi.config.problems import PLACEHOLDER
 from dlo_casadi.config.sections import Config
 from dlo_casadi.errors import counted
+from dlo_casadi.rod.supports import SupportKind
 
 Kind = Literal["images", "centerlines"]
 
@@ -24,7 +25,7 @@ def template(
     *,
     cable: Mapping[str, str] = {},
     poses: Sequence[Mapping[str, str]] = (),
-    end: str = "clamped",
+    end: str = SupportKind.CLAMPED,
     clips: Sequence[str] = (),
     tolerances: Mapping[str, str] = {},
     remarks: Sequence[str] = (),
@@ -69,6 +70,7 @@ def template(
         in_space=in_space,
         cable=cable,
         end=end,
+        held=SupportKind(end).place,
         clips=[_clip(one, in_space) for one in clips],
         tolerances=tolerances,
         remarks=remarks,
@@ -83,8 +85,9 @@ def to_fill_in(text: str) -> str:
 
 def _clip(kind: str, in_space: bool) -> str:
     """A clip with placeholders."""
-    keys = [] if kind == "eyelet" else ["at"]
-    keys += ["place"] + ["orientation" if in_space else "heading"] * (kind == "clamped")
+    held = SupportKind(kind)
+    keys = [] if held.slides else ["at"]
+    keys += ["place"] + ["orientation" if in_space else "heading"] * held.direction
     return f"{{kind: {kind}, {', '.join(f'{key}: {PLACEHOLDER}' for key in keys)}}}"
 
 

@@ -7,13 +7,28 @@ refused, and the message gives the range. A computable but unlikely value is a w
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic_core import PydanticKnownError
 
 from dlo_casadi.config.problems import ConfigProblem, Contradiction, show
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS
+from dlo_casadi.rod.supports import SupportKind
+
+
+def one_of(kinds: Sequence[SupportKind]) -> BeforeValidator:
+    """Annotation of a field: the word of one of these kinds of supports."""
+    words = " or ".join(f"'{kind}'" for kind in kinds)
+    words = words.replace(" or ", ", ", len(kinds) - 2)
+
+    def known(value: object) -> SupportKind:
+        if not isinstance(value, str) or value not in kinds:
+            raise PydanticKnownError("literal_error", {"expected": words})
+        return SupportKind(value)
+
+    return BeforeValidator(known, json_schema_input_type=Literal[*map(str, kinds)])
 
 
 class Range(NamedTuple):

@@ -170,7 +170,7 @@ def equivalents(
         if name not in tried and kind.applies(setup) and kind.made_for(setup).may_be(found)
     ]
     loads = any(isinstance(item.effect, Load) for item in (added, *rivals))
-    if fit.model.end == "free" and loads:
+    if not fit.model.end.place and loads:
         names += [
             name
             for name, kind in EFFECTS.items()

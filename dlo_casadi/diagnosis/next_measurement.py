@@ -43,7 +43,7 @@ def hidden_weight(fit: Fit, exclude: Sequence[str] = ()) -> HiddenWeight | None:
     Only for a free tip: with both ends held the force between them determines the stiffness.
     """
     model = fit.model
-    free = model.end == "free" and BENDING_STIFFNESS in fit.problem.unknowns.names
+    free = not model.end.place and BENDING_STIFFNESS in fit.problem.unknowns.names
     if not free or not any(model.gravity):
         return None
     listed = candidates(model, setup_of(model, n_poses=len(fit.problem.used)), exclude)
@@ -100,7 +100,7 @@ def _interval(fit: Fit) -> tuple[float, float]:
 
 def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
     """Direction [rad] of the clamp at which two fits differ most, and that difference [m], RMS."""
-    if fit.model.in_space or fit.model.start != "clamped":
+    if fit.model.in_space or not fit.model.start.direction:
         return None, None
     base = fit.problem.fit_poses[0].pose
     places = np.linspace(0.0, fit.model.cable.length, 51)
@@ -199,7 +199,7 @@ def next_pose(first: Fit, second: Fit) -> NextPose | None:
     the cable's length from the start. None for a free end.
     """
     poses = [item.pose for item in first.problem.history]
-    if first.model.end == "free":
+    if not first.model.end.place:
         return None
     ends = np.array([pose.end for pose in poses])
     low, high = ends.min(axis=0), ends.max(axis=0)

@@ -104,7 +104,7 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     model = fit.model
     coefficients, own, arms = [], [], []
     for k, (item, s) in enumerate(zip(problem.fit_poses, fit.point.projections, strict=True)):
-        modes = smooth_modes(s, model.cable.length, SLOW_MODES, model.end == "free")
+        modes = smooth_modes(s, model.cable.length, SLOW_MODES, not model.end.place)
         basis, _ = np.linalg.qr(problem.whitening[k] @ item.slow_rows(modes))
         a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
         block, cross, _ = normal.inner[k]

@@ -43,7 +43,7 @@ class BendingAnisotropy(SectionLaw):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """True if a clamp or a rest curvature determines the roll of the section."""
-        told = "clamped" in (setup.start, setup.end) or setup.curved
+        told = setup.start.roll or setup.end.roll or setup.curved
         return super().applies(setup) and told
 
     def bending(self, stiffness: ca.SX, params: Params) -> ca.SX:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dlo_casadi.errors import DloError
+from dlo_casadi.rod.supports import SupportKind
 
 # Bounds of a bending stiffness [N m^2]: below that of a carbon fibre, above that of a steel bar.
 STIFFNESS_BOUNDS = (1e-12, 1e9)
@@ -153,8 +154,8 @@ class Setup:
     Parameters
     ----------
     cable : CableData
-    start : "pinned" or "clamped"
-    end : "pinned", "clamped" or "free"
+    start, end : SupportKind
+        How the ends are held; also by its word.
     gravity : (dimension,) [m/s^2]
     curved : bool
         Whether a rest curvature is fitted.
@@ -175,7 +176,7 @@ class Setup:
         Mean headings at start and end.
     largest_bend : float, optional [1/m]
         Largest |curvature - rest curvature| of all poses.
-    clips : tuple of str
+    clips : tuple of SupportKind
         Kinds of the clips between the ends.
     obstacles : int
         Number of obstacles that the cable may touch.
@@ -186,8 +187,8 @@ class Setup:
     """
 
     cable: CableData
-    start: str = "pinned"
-    end: str = "pinned"
+    start: SupportKind = SupportKind.PINNED
+    end: SupportKind = SupportKind.PINNED
     gravity: tuple[float, ...] = (0.0, -9.81)
     curved: bool = True
     n_poses: int = 1
@@ -198,7 +199,12 @@ class Setup:
     tolerances: Mapping[str, float] = field(default_factory=dict)
     directions: tuple[float, float] = (0.0, 0.0)
     largest_bend: float | None = None
-    clips: tuple[str, ...] = ()
+    clips: tuple[SupportKind, ...] = ()
     obstacles: int = 0
     level: float = 0.0
     resting: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("start", "end"):
+            object.__setattr__(self, name, SupportKind(getattr(self, name)))
+        object.__setattr__(self, "clips", tuple(map(SupportKind, self.clips)))

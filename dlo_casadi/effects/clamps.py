@@ -31,7 +31,7 @@ class ClampEffect(BoundaryEffect):
     @classmethod
     def impossible(cls, setup: Setup) -> str:
         """It needs a clamp."""
-        if "clamped" in (setup.start, setup.end):
+        if setup.start.direction or setup.end.direction:
             return super().impossible(setup)
         return (
             "it turns a clamp, and no end is clamped. "
@@ -41,7 +41,7 @@ class ClampEffect(BoundaryEffect):
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
         """The effect with errors of the clamped ends."""
-        return cls(start=setup.start == "clamped", end=setup.end == "clamped")
+        return cls(start=setup.start.direction, end=setup.end.direction)
 
     def may_be(self, found: Fitted) -> bool:
         """A local effect next to a clamp may be caused by the clamp."""

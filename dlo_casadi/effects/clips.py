@@ -96,7 +96,7 @@ class ClipSlip(_OfOneClip):
     @classmethod
     def numbers(cls, setup: Setup) -> list[int]:
         """All but eyelets, through which the cable slides anyway."""
-        return [k for k, kind in enumerate(setup.clips) if kind != "eyelet"]
+        return [k for k, kind in enumerate(setup.clips) if not kind.slides]
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the slip."""
@@ -128,7 +128,7 @@ class ClipAngle(_OfOneClip):
     @classmethod
     def numbers(cls, setup: Setup) -> list[int]:
         """The clamped ones, also those in which the cable may roll."""
-        return [k for k, kind in enumerate(setup.clips) if kind in ("clamped", "swivel")]
+        return [k for k, kind in enumerate(setup.clips) if kind.direction]
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the errors."""

@@ -31,7 +31,7 @@ class EndOffset(BoundaryEffect):
     @classmethod
     def impossible(cls, setup: Setup) -> str:
         """It needs a fixture at the end."""
-        if setup.end != "free":
+        if setup.end.place:
             return super().impossible(setup)
         return (
             "it moves the end fixture, and the end is free. "

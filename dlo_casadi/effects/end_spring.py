@@ -41,12 +41,12 @@ class PinSpring(BoundaryEffect):
     def impossible(cls, setup: Setup) -> str:
         """It needs a pin at that end."""
         held = getattr(setup, cls.side)
-        if held == "pinned":
+        if held.turns:
             return super().impossible(setup)
         return (
             f"it is a spring at a pin, and the {cls.side} is {held}. "
             f"Try: experiment.boundary, with the {cls.side} pinned"
-            + (", or clamp_compliance" if held == "clamped" else "")
+            + (", or clamp_compliance" if held.direction else "")
         )
 
     def scans(self, setup: Setup) -> tuple[Scan, ...]:
@@ -103,13 +103,13 @@ class PinMoment(BoundaryEffect):
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """True if an end is a pin."""
-        return super().applies(setup) and "pinned" in (setup.start, setup.end)
+        return super().applies(setup) and (setup.start.turns or setup.end.turns)
 
     @classmethod
     def made_for(cls, setup: Setup) -> Self:
         """The effect with moments at the pinned ends."""
         ends = {"start": setup.start, "end": setup.end}
-        return cls(sides=tuple(side for side, held in ends.items() if held == "pinned"))
+        return cls(sides=tuple(side for side, held in ends.items() if held.turns))
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the curvatures."""

@@ -48,7 +48,7 @@ def _held(
     Lengths are relative to the cable's. The chord is None for a free end, the frame for a pin.
     """
     (start, end), clamps, length = true_ends(model, p, pose)
-    chord = None if model.end == "free" else (end - start) / length
+    chord = (end - start) / length if model.end.place else None
     return model.chain.places / model.chain.length, chord, clamps
 
 
@@ -60,8 +60,8 @@ def true_ends(
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
     clamps = (
-        first if model.start == "clamped" else None,
-        last if model.end == "clamped" else None,
+        first if model.start.direction else None,
+        last if model.end.direction else None,
     )
     return (start, end), clamps, float(length)
 
@@ -103,7 +103,7 @@ def guesses(model: CableModel, p: FloatArray, rest: FloatArray, pose: HeldPose) 
     sides = (-1, 1) if pose.branch == "cw" else (1, -1)
     if chord is None:
         found = _hanging(model, u, bent, clamps[0])
-    elif model.start == model.end == "pinned":
+    elif model.start.turns and model.end.turns:
         found = [arc_headings(u, 1.0, chord, side) for side in sides]
         found += _curved(model.n, u, bent, chord)
     else:
@@ -432,7 +432,7 @@ def line_nodes(points: FloatArray, pose: HeldPose, chain: Chain, places: FloatAr
             headings += 2 * np.pi * np.round((heading - headings[there]) / (2 * np.pi))
         return np.interp(chain.places, middles, headings)[:, None]
     tangents = unit(np.stack([np.interp(chain.places, middles, x) for x in chords.T], axis=1))
-    clips = [(clip.at, clip.frame) for clip in pose.clips if clip.kind == "clamped"]
+    clips = [(clip.at, clip.frame) for clip in pose.clips if clip.kind.roll]
     held = [
         (0.0, pose.start_orientation if chain.start_clamped else None),
         *((at, frame) for at, frame in clips if at is not None),

@@ -51,12 +51,12 @@ def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None
     start, end, first, last, turns = np.split(numbers, np.cumsum([d, d, c, c]))
     held: dict[str, Any] = {}
     for side, frame in (("start", first), ("end", last)):
-        if getattr(model, side) == "clamped":
+        if getattr(model, side).direction:
             held[f"{side}_{model.node.direction}"] = model.node.declared(frame)
-    both = model.start == model.end == "clamped"
+    both = model.start.roll and model.end.roll
     return HeldPose(
         start=tuple(start.tolist()),
-        end=None if model.end == "free" else tuple(end.tolist()),
+        end=tuple(end.tolist()) if model.end.place else None,
         turns=float(turns[0]) if model.node.twists and both else 0.0,
         branch=branch,
         **held,
@@ -73,10 +73,10 @@ def symbols_of(
     )
     frames = []
     for held, frame in ((model.start, first), (model.end, last)):
-        if held != "clamped":
+        if not held.direction:
             frame = ca.MX(ca.DM(model.node.identity))
         frames.append(model.node.normalised(frame))
-    end = end if model.end != "free" else ca.MX.zeros(d)
+    end = end if model.end.place else ca.MX.zeros(d)
     camera = ca.MX.zeros(model.n_pose - EndConditions.size(model.node))
     full = ca.vertcat(start, end, *frames, camera)
     still = ca.DM.zeros(len(model.deviation_names))

@@ -17,7 +17,7 @@ from dlo_casadi.equilibrium.equilibrium import curvatures_along, places_along
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import Repeats, SolvedCable
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
-from dlo_casadi.model.clips import CLAMPS, tangents
+from dlo_casadi.model.clips import tangents
 from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.ends import reaction_rows
@@ -49,9 +49,9 @@ def fixtures_of(held: SolvedCable) -> list[Fixture]:
     model = held.model
     ends = (("start", 0.0, model.start), ("end", model.cable.length, model.end))
     turned = functions_of(model).moment_ends
-    on_ends = [Fixture(name, at, name in turned) for name, at, kind in ends if kind != "free"]
+    on_ends = [Fixture(name, at, name in turned) for name, at, kind in ends if kind.place]
     clips = zip(held.pose.clips, held.equilibrium.clips, strict=True)
-    return [*on_ends, *(Fixture(x.name, load.at, x.kind in CLAMPS) for x, load in clips)]
+    return [*on_ends, *(Fixture(x.name, load.at, x.kind.direction) for x, load in clips)]
 
 
 def places_of(held: SolvedCable, quantity: str) -> tuple[FloatArray, list[str]]:
@@ -87,13 +87,13 @@ def sizes_of(found: Assembly, quantity: str) -> FloatArray:
             return np.abs(strain[:, : chain.n_cells])  # the first strain in space
         return curvatures_along(chain.curvatures(strain), found.clipped)
     reactions, loads = found.reactions(), found.clip_loads()
-    held = tuple(side for side in ("start", "end") if getattr(model, side) != "free")
+    held = tuple(side for side in ("start", "end") if getattr(model, side).place)
     ends = held if quantity == "force" else functions_of(model).moment_ends
     each = [reactions[:, rows[f"{side}_{quantity}"]] for side in ends]
     each += [
         np.array([np.atleast_1d(getattr(load[k], quantity)) for load in loads])
         for k, kind in enumerate(model.clips)
-        if quantity == "force" or kind in CLAMPS
+        if quantity == "force" or kind.direction
     ]
     return np.stack([np.linalg.norm(one, axis=1) for one in each], axis=1)
 

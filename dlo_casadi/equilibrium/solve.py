@@ -199,7 +199,7 @@ def _chosen(
         guessed = "its first guesses" if start is None else "a nearby shape"
         what = f"no equilibrium found from {guessed} with {where}"
         return no_equilibrium(pose, what, hint)
-    if named is not None and (model.start, model.end) == ("pinned", "pinned"):
+    if named is not None and model.start.turns and model.end.turns:
         for eq in found:
             if eq.stable and eq.has_branch(named):
                 return eq
@@ -304,7 +304,7 @@ class _PoseSearch:
         stable, iterations = minima.converged[kept], minima.iterations[kept]
         equilibria = equilibria_of(found.subset(kept), stable=stable, iterations=iterations)
         out: list[list[Equilibrium]] = [[] for _ in poses]
-        untold = self.model.end == "free" and bool(self.model.surfaces)  # not in IPOPT's problem
+        untold = not self.model.end.place and bool(self.model.surfaces)  # not in IPOPT's problem
         for k, (j, x, _) in enumerate(guesses):
             eq = equilibria.pop(0) if kept[k] else None
             if eq is None and not (self.model.in_space or untold):
@@ -359,7 +359,7 @@ def _twists(model: CableModel, pose: HeldPose, twist: FloatArray) -> FloatArray:
 
     `twist` (m, n_cells). A clamped clip holds the roll: turns of the end stop there.
     """
-    holding = [clip for clip in pose.clips if clip.kind == "clamped"]
+    holding = [clip for clip in pose.clips if clip.kind.roll]
     first = max(clamped_nodes(model.chain, holding), default=0)
     widths = np.diff(node_places(model.chain, pose.clips))
     return twist[:, first:] @ widths[first:] / (2 * np.pi)

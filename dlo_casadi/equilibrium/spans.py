@@ -95,10 +95,10 @@ def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
     found = [_Holder(0.0, start, clamps[0])]
     places, at, turns = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
     for k, clip in enumerate(pose.clips):
-        s = None if clip.kind == "eyelet" else float(at[k, 0])
+        s = None if clip.kind.slides else float(at[k, 0])
         frame = None if clip.frame is None else model.node.moved(clip.frame, turns[:, k])
-        found.append(_Holder(s, places[:, k], frame, clip.kind == "swivel"))
-    found.append(_Holder(model.cable.length, None if model.end == "free" else end, clamps[1]))
+        found.append(_Holder(s, places[:, k], frame, not clip.kind.roll))
+    found.append(_Holder(model.cable.length, end if model.end.place else None, clamps[1]))
     return found
 
 
@@ -353,7 +353,7 @@ def no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
 
 def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
     """Why a pose is out of reach: its end is missing or too far, or a number is meaningless."""
-    if pose.end is None and model.end != "free":
+    if pose.end is None and model.end.place:
         what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
         return no_equilibrium(pose, what, "Pose(start, end).")
     if wrong := _meaningless(pose) or _wrong_clips(model, p, pose) or _inside(model, p, pose):

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple, Self, get_args
+from typing import Any, NamedTuple, Self
 
 import casadi as ca
 import numpy as np
@@ -25,9 +25,10 @@ from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipKind, Clipped
+from dlo_casadi.model.clips import Clipped
 from dlo_casadi.model.whole_pose import PoseSymbols, balance, shape
 from dlo_casadi.rod.node import STRAIGHT
+from dlo_casadi.rod.supports import CLIPS, SupportKind
 
 # Longest step of a node [rad] from a shape that counts as an equilibrium.
 FARTHEST = 1e-6
@@ -57,7 +58,7 @@ class CasadiCable:
     p: FloatArray
     rest: FloatArray
 
-    def with_clips(self, clips: Sequence[ClipKind]) -> Self:
+    def with_clips(self, clips: Sequence[SupportKind | str]) -> Self:
         """Return the same cable held by clips of these kinds, in the order along it.
 
         Raises
@@ -65,14 +66,14 @@ class CasadiCable:
         DloError
             If they are no list of kinds: pinned, clamped, swivel, eyelet.
         """
-        known = get_args(ClipKind)
+        known = CLIPS
         listed = isinstance(clips, Sequence) and not isinstance(clips, str)
         if not listed or any(kind not in known for kind in clips):
             raise DloError(
                 f"clips: a list of kinds belongs here, found {clips!r}\n"
-                f'  Try: ["pinned"]; kinds are {", ".join(known)}'
+                f"  Try: [{known[0]!r}]; kinds are {', '.join(known)}"
             )
-        return replace(self, model=replace(self.model, clips=tuple(clips)))
+        return replace(self, model=replace(self.model, clips=tuple(map(SupportKind, clips))))
 
     def function(
         self,

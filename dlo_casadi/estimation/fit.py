@@ -301,7 +301,7 @@ def resting_height(problem: Problem) -> float | None:
     seen = problem.equilibria.seen(shapes, problem.unknowns.fixed, rest)
     heights = height_of([seen[j].curve.at(places) for j in problem.used], model.gravity)
     lowest, inside = heights.min(axis=1), heights.argmin(axis=1)
-    ends = heights[:, :1] if model.end == "free" else heights[:, [0, -1]]
+    ends = heights[:, [0, -1]] if model.end.place else heights[:, :1]
     highest = ends.min(axis=1)
     for k, item in enumerate(problem.fit_poses):
         known = height_of(item.traced.points, model.gravity) if item.has_line else heights[k]

@@ -178,8 +178,8 @@ def _kinematic_step(
         system.append(10 * slopes[-1, :d])
         target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))
     for held, index, frame in (
-        (model.start == "clamped", 0, item.pose.frames[0]),
-        (model.end == "clamped", n - 1, item.pose.frames[1]),
+        (model.start.direction, 0, item.pose.frames[0]),
+        (model.end.direction, n - 1, item.pose.frames[1]),
     ):
         if held:
             rows = np.zeros((b, n * b))

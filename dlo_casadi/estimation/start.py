@@ -114,7 +114,7 @@ def weighed(problem: Problem, theta: FloatArray) -> Problem:
 
 def _first_solved(relaxation: Relaxation, values: Values, fixed: BoolArray | None = None) -> Values:
     """Values after the first iterations, which start at measured shapes."""
-    if set(relaxation.problem.unknowns.model.clips) - {"pinned"}:
+    if any(k.direction or k.slides for k in relaxation.problem.unknowns.model.clips):
         every = np.ones(len(values.theta), dtype=bool)
         values = relaxation.solve(values, every, STEPS_AT_CLIPS)
     return relaxation.solve(values, fixed, FIRST_STEPS)

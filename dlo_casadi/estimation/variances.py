@@ -280,7 +280,7 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     for k, (item, s) in enumerate(zip(problem.fit_poses, point.projections, strict=True)):
         directions = ways[k]
         own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
-        sines = smooth_modes(s, length, modes, model.end == "free")
+        sines = smooth_modes(s, length, modes, not model.end.place)
         slow = item.slow_rows(sines)[kept[k]]
         if rest is not None:
             way = rest[k][kept[k]]

@@ -30,7 +30,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     """The model as MJCF."""
     comment = "\n".join(f"  {line}".rstrip().replace("--", "–") for line in head)
     bodies = "\n".join(_bodies(rod))
-    ends = f"\n    {_gripper('end', rod.end)}\n    </body>" if rod.end.kind != "free" else ""
+    ends = f"\n    {_gripper('end', rod.end)}\n    </body>" if rod.end.kind.place else ""
     return f"""<mujoco model="{_escaped(rod.name)}">
   <!--
 {comment}
@@ -85,7 +85,7 @@ def _bodies(rod: Rod) -> list[str]:
     middle = len(rod.masses) - 1
     lines = []
     for k, mass in enumerate(rod.masses):
-        if k == 0 and rod.start.kind == "clamped":
+        if k == 0 and rod.start.kind.direction:
             inside = place - frame.apply([rod.h / 2, 0.0, 0.0])
             lines.append(f'<body name="cable_0" pos="{_row(inside)}" quat="{_turned(frame)}">')
         elif k == 0:
@@ -94,8 +94,8 @@ def _bodies(rod: Rod) -> list[str]:
             joints = _hinges(rod, k, stiffness[k - 1] / rod.h, axes[k - 1], rest[k - 1])
             lines.append(f'<body name="cable_{k}" pos="{rod.h:.9g} 0 0">{joints}')
         lines[-1] += f'<geom class="cable" mass="{mass:.9g}"/>'
-        if k == middle and rod.end.kind != "free":
-            at = rod.h / 2 if rod.end.kind == "clamped" else rod.h
+        if k == middle and rod.end.kind.place:
+            at = rod.h / 2 if rod.end.kind.direction else rod.h
             lines[-1] += f'<site name="cable_end" pos="{at:.9g} 0 0"/>'
         for carried, s in rod.lumps:
             if k == np.clip(np.searchsorted(rod.s, s) - 1, 0, middle):
@@ -161,9 +161,9 @@ def _in_axes(turns: Rotation, axes: Rotation) -> FloatArray:
 
 
 def _held(rod: Rod) -> str:
-    if rod.end.kind == "free":
+    if not rod.end.kind.place:
         return ""
-    kind = "weld" if rod.end.kind == "clamped" else "connect"
+    kind = "weld" if rod.end.kind.direction else "connect"
     return f"""
   <equality>
     <{kind} name="end" site1="cable_end" site2="end" solref="{2 * STEP:g} 1" \
@@ -174,7 +174,7 @@ solimp="0.9999 0.9999 0.001"/>
 def _angles(rod: Rod) -> FloatArray:
     """Positions of all joints in the pose."""
     about = rod.node.about
-    start = _PINS[about][1](rod.frames[0]) if rod.start.kind == "pinned" else np.zeros(0)
+    start = _PINS[about][1](rod.frames[0]) if rod.start.kind.turns else np.zeros(0)
     angles = _in_axes(rod.turns, principal(rod)[1])
     free = np.array([[name in about for name in _order(k + 1)] for k in range(len(angles))])
     return np.concatenate([start, angles[free]])

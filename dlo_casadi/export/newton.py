@@ -85,7 +85,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     rest_nodes, rest_frames = rod.unloaded
     step, inertia = rod.explicit(masses, stiff, _COURANT)
     sides = [(rod.start, 0, -1), (rod.end, -1, 1)]
-    pinned = [(end, side) for fixture, end, side in sides if fixture.kind == "pinned"]
+    pinned = [(end, side) for fixture, end, side in sides if fixture.kind.turns]
     numbers = [
         ("H", f"{rod.h:.12g}", "length of a link [m]"),
         ("RADIUS", f"{rod.radius:.9g}", "[m]"),
@@ -95,7 +95,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
         ("INERTIA", f"{inertia:.9g}", "of a link [kg m^2], raised for STEP"),
         ("STEP", f"{step:.6g}", "time step [s]: not larger, see above"),
         ("ITERATIONS", f"{ITERATIONS}", "of the solver in a step, or more"),
-        ("CLAMPED", str([end for f, end, _ in sides if f.kind == "clamped"]), ""),
+        ("CLAMPED", str([end for f, end, _ in sides if f.kind.direction]), ""),
         ("PINNED", str(pinned), "node, and side of its link"),
         ("NODES", array(rod.nodes), "[m]"),
         ("QUATERNIONS", array((rod.frames * AXES).as_quat()), "frames of the links (x, y, z, w)"),
@@ -167,4 +167,4 @@ def settled(model: Any, rod: Rod, name: str) -> Relaxed:
     stretch = gap @ along[0] * along[0]
     pull = (stiff * (gap - stretch) + min(rod.axial, stiff) * stretch) / rod.h
     weight = rod.link_masses[-1] * rod.gravity
-    return Relaxed(nodes, (weight - pull) * (rod.end.kind != "free"))
+    return Relaxed(nodes, (weight - pull) * rod.end.kind.place)

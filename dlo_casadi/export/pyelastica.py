@@ -102,8 +102,8 @@ def write(rod: Rod, head: Sequence[str]) -> str:
 
 def _held(fixture: Fixture, first: int, second: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Nodes and elements held by a fixture."""
-    kinds: dict[str, Any] = {"clamped": ((first, second), (first,)), "pinned": ((first,), ())}
-    return kinds.get(fixture.kind, ((), ()))
+    nodes = (first, second) if fixture.kind.direction else (first,) * fixture.kind.place
+    return nodes, (first,) * fixture.kind.direction
 
 
 def settle(text: str, rod: Rod) -> Relaxed:

@@ -31,6 +31,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.node import Node
+from dlo_casadi.rod.supports import SupportKind
 
 # Features beyond a straight uniform round cable with its weight; targets support some of them.
 Feature = Literal[
@@ -61,10 +62,10 @@ _CLOSING = 200
 class Fixture:
     """The support of an end: as declared, and the true end of the cable, world axes.
 
-    `kind`: "pinned", "clamped" or "free"; places (3,) [m]; frames with x along the cable.
+    Places (3,) [m]; frames with x along the cable.
     """
 
-    kind: str
+    kind: SupportKind
     place: FloatArray
     frame: Rotation
     cable_place: FloatArray
@@ -135,7 +136,7 @@ class Rod:
         if segments is None:
             sharpest = np.linalg.norm(curve.at(np.linspace(0, length, 400), 2), axis=1).max()
             segments = int(np.clip(np.ceil(sharpest * length / TURN), *SEGMENTS))
-        clamped = [kind == "clamped" for kind in (model.start, model.end)]
+        clamped = [kind.direction for kind in (model.start, model.end)]
         h = length / (segments - sum(clamped) / 2)
         s = h * (np.arange(segments + 1) - clamped[0] / 2)
         fixtures = _fixtures(model, pose, true, curve)
@@ -319,9 +320,9 @@ def _fixtures(
         (place, frame), (cable_place, cable_frame) = (
             (_spatial(part[k]), model.node.rotations(part[2 + k])) for part in parts
         )
-        if kind != "clamped":
+        if not kind.direction:
             frame = cable_frame = Rotation.identity()
-        if kind == "free":
+        if not kind.place:
             place = cable_place = _spatial(curve.at(np.array([curve.length])))[0]
         out.append(Fixture(kind, place, frame, cable_place, cable_frame))
     return out[0], out[1]
@@ -339,7 +340,7 @@ def _segments(
     )
     ways = np.diff(_spatial(cable.curve.at(np.clip(s, 0.0, length))), axis=0)
     first, last = start.cable_place, end.cable_place
-    held = [k for k, side in ((0, start), (-1, end)) if side.kind == "clamped"]
+    held = [k for k, side in ((0, start), (-1, end)) if side.kind.direction]
     for k in held:
         ways[k] = (start, end)[k].cable_frame.apply([1.0, 0.0, 0.0])
     ways = unit(ways)
@@ -348,7 +349,7 @@ def _segments(
     if -1 in held:
         last = last + h / 2 * ways[-1]
     free = np.setdiff1d(np.arange(len(ways)), np.array(held, dtype=int) % len(ways))
-    for _ in range(_CLOSING if end.kind != "free" else 0):
+    for _ in range(_CLOSING if end.kind.place else 0):
         gap = (last - first) / h - ways.sum(axis=0)
         ways[free] = unit(ways[free] + gap / len(free))
     nodes = np.vstack([first, first + h * np.cumsum(ways, axis=0)])

@@ -88,9 +88,9 @@ def Xform "World"
 
 def _gripper(side: str, fixture: Fixture, link: int, rod: Rod) -> str:
     """A fixture, and the attachment of the cable to it."""
-    if fixture.kind == "free":
+    if not fixture.kind.place:
         return ""
-    if fixture.kind == "clamped":  # coordinates: weight of the first point, normal, binormal
+    if fixture.kind.direction:  # coordinates: weight of the first point, normal, binormal
         lever = _LEVER * rod.h
         kind, index = "segment", [link] * 3
         on_link = np.array([[0.5, 0.0, 0.0], [0.5 - _LEVER, 0.0, 0.0], [0.5, lever, 0.0]])

@@ -402,10 +402,10 @@ def table_of(
     import pyarrow as pa
 
     lost, ends = statuses != 0, ("start", "end")
-    clamped = [side for side in ends if getattr(model, side) == "clamped"]
+    clamped = [side for side in ends if getattr(model, side).direction]
     turned = functions_of(model).moment_ends  # clamps, and pins with springs
     known = {
-        *("start_x", "start_y", *([] if model.end == "free" else ["end_x", "end_y"])),
+        *("start_x", "start_y", *(["end_x", "end_y"] if model.end.place else [])),
         *(f"{side}_heading" for side in clamped),
     }
     results = {
@@ -443,7 +443,7 @@ def _schema(model: CableModel, metadata: dict[str, Any]) -> pyarrow.Schema:
         "length_m": model.cable.length,
         "n": model.n,
         "element": model.element,
-        "boundary": [model.start, model.end],
+        "boundary": [str(model.start), str(model.end)],
         **metadata,
     }
     texts = {key: item if isinstance(item, str) else json.dumps(item) for key, item in said.items()}

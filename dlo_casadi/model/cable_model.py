@@ -19,14 +19,12 @@ from dlo_casadi.effects import (
 )
 from dlo_casadi.effects.cable import STIFFNESS_BOUNDS, Parameter
 from dlo_casadi.errors import DloError, counted
-from dlo_casadi.model.clips import CLAMPS, ClipKind, clip_size
+from dlo_casadi.model.clips import clip_size
 from dlo_casadi.rod.chain import DEFAULT_ELEMENT, Chain, RestCurvature
 from dlo_casadi.rod.ends import EndConditions, deviation_names
 from dlo_casadi.rod.node import NODES, Node
 from dlo_casadi.rod.obstacles import Capsule, Obstacle
-
-StartKind = Literal["pinned", "clamped"]
-EndKind = Literal["pinned", "clamped", "free"]
+from dlo_casadi.rod.supports import SupportKind
 
 BENDING_STIFFNESS = "bending_stiffness"
 # Prior std of log EI, ln(1000): a first guess may be wrong by three decades.
@@ -64,8 +62,8 @@ class CableModel:
         Number of elements.
     element : str
         A name of `rod.chain.ELEMENTS`.
-    start : "pinned" or "clamped"
-    end : "pinned", "clamped" or "free"
+    start, end : SupportKind
+        How the ends are held; also by its word. One of `STARTS` and of `ENDS`.
     gravity : (dimension,) [m/s^2]
         In the board frame; three numbers for a cable in space.
     effects : tuple of Effect
@@ -75,7 +73,7 @@ class CableModel:
     priors : dict
         Standard deviations of Gaussian priors on effect parameters, by qualified name. These
         effects are nuisances within a declared tolerance, not findings.
-    clips : tuple of ClipKind
+    clips : tuple of SupportKind
         Kinds of the clips between the ends, in the order along the cable.
     obstacles : tuple of Obstacle
         What the cable may touch in any pose, without friction.
@@ -90,17 +88,20 @@ class CableModel:
     cable: CableData
     n: int = 40
     element: str = DEFAULT_ELEMENT
-    start: StartKind = "pinned"
-    end: EndKind = "pinned"
+    start: SupportKind = SupportKind.PINNED
+    end: SupportKind = SupportKind.PINNED
     gravity: tuple[float, ...] = (0.0, -9.81)
     effects: tuple[Effect, ...] = ()
     n_rest: int = 9
     priors: Mapping[str, float] = field(default_factory=dict, hash=False)
-    clips: tuple[ClipKind, ...] = ()
+    clips: tuple[SupportKind, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     random: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("start", "end"):
+            object.__setattr__(self, name, SupportKind(getattr(self, name)))
+        object.__setattr__(self, "clips", tuple(map(SupportKind, self.clips)))
         if len(self.gravity) != len(self.cable.axes):
             raise DloError(
                 f"gravity has {counted(len(self.gravity), 'number')}, but the cable "
@@ -122,7 +123,7 @@ class CableModel:
     @cached_property
     def chain(self) -> Chain:
         """The chain of n elements."""
-        held = (self.start == "clamped", self.end == "clamped")
+        held = (self.start.direction, self.end.direction)
         return Chain(self.cable.length, self.n, self.element, *held, node=self.node)
 
     @property
@@ -193,7 +194,7 @@ class CableModel:
             torsion = _stiffness(TORSIONAL_STIFFNESS, self.cable.torsional_stiffness)
             # Its prior is on the ratio to the bending stiffness, see `Unknowns.prior`.
             listed.append(replace(torsion, prior_std=np.inf))
-            if self.start == self.end == "clamped":
+            if self.start.roll and self.end.roll:
                 std = self.priors.get(END_ROLL, ROLL_STD)
                 listed.append(
                     Parameter(END_ROLL, "rad", scale=0.1, lower=-9.0, upper=9.0, prior_std=std)
@@ -269,7 +270,7 @@ class CableModel:
 
         This is so in space between ball joints, with one bending stiffness about all axes.
         """
-        held = "clamped" in (self.start, self.end, *self.clips)
+        held = any(kind.roll for kind in (self.start, self.end, *self.clips))
         laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
         return self.node.twists and not held and all(law.isotropic for law in laws)
 
@@ -301,7 +302,7 @@ class CableModel:
     @property
     def n_contacts(self) -> int:
         """Number of places at which the cable may touch obstacles, see `contact`."""
-        return len(self.surfaces) * (self.n - (self.end != "free"))
+        return len(self.surfaces) * (self.n - self.end.place)
 
     @property
     def n_lam(self) -> int:
@@ -315,7 +316,7 @@ class CableModel:
         With obstacles a free end has these rows, too, with values of zero: all forces beyond a
         segment act on it like one force at its end.
         """
-        free = self.end == "free"
+        free = not self.end.place
         if free and not self.surfaces:
             return []
         what = "free_end" if free else "end_position"
@@ -324,7 +325,7 @@ class CableModel:
     @property
     def no_pull(self) -> list[int]:
         """Those rows of `end_pull` that are zero, for a free end."""
-        return self.end_pull if self.end == "free" else []
+        return [] if self.end.place else self.end_pull
 
     @cached_property
     def border_kinds(self) -> dict[str, Literal["distance", "angle", "place"]]:
@@ -344,9 +345,9 @@ class CableModel:
             kinds |= {f"spring_{k}.{name}": "distance" for name in pulls}
         for k, kind in enumerate(self.clips):
             kinds |= {f"clip_{k}.{name}": "distance" for name in pulls}
-            if kind == "eyelet":
+            if kind.slides:
                 kinds[f"clip_{k}.place_s"] = "place"
-        if self.surfaces and self.end == "free":
+        if self.surfaces and not self.end.place:
             kinds |= {f"free_end_{axis}": "distance" for axis in self.node.axes}
         for k in range(self.n_contacts):
             kinds[f"contact_{k} on {self.n}"] = "distance"
@@ -368,13 +369,13 @@ class CableModel:
     @cached_property
     def sliding(self) -> dict[int, int]:
         """Index of each eyelet among the clips -> border row of its arc length."""
-        eyelets = [k for k, kind in enumerate(self.clips) if kind == "eyelet"]
+        eyelets = [k for k, kind in enumerate(self.clips) if kind.slides]
         return {k: self.border_names.index(f"clip_{k}.place_s") for k in eyelets}
 
     @property
     def clamped_between(self) -> bool:
         """Whether a clip between the ends holds the direction of the cable."""
-        return any(kind in CLAMPS for kind in self.clips)
+        return any(kind.direction for kind in self.clips)
 
     @property
     def n_multipliers(self) -> int:
@@ -393,9 +394,10 @@ class CableModel:
 
     def _held(self, place: str) -> tuple[str, ...]:
         """Names of the held components: of the end's place, named `place`, and of clamps."""
-        names = [] if self.end == "free" else [f"{place}_{axis}" for axis in self.node.axes]
+        names = [f"{place}_{axis}" for axis in self.node.axes if self.end.place]
         for side, kind in (("start", self.start), ("end", self.end)):
-            names += [f"{side}_{turn}" for turn in self.node.turns if kind == "clamped"]
+            held = zip(self.node.turns, kind.rotations(self.node), strict=True)
+            names += [f"{side}_{turn}" for turn, blocked in held if blocked]
         return tuple(names)
 
     @cached_property
@@ -405,8 +407,9 @@ class CableModel:
         A free end falls to either side of a clamp that points up. Between two clamps in space, one
         rolled by half a turn, the cable is twisted either way. Other cables have no two sides.
         """
-        turned = {("clamped", "free"): "start_heading", ("clamped", "clamped"): "end_rotation_x"}
-        name = turned.get((self.start, self.end))
+        rolled = self.start.roll and self.end.roll
+        hangs = self.start.direction and not self.end.place
+        name = "start_heading" if hangs else "end_rotation_x" if rolled else None
         return name if name in self.condition_names else None
 
     @cached_property

@@ -9,7 +9,7 @@ frame, so that the curvature does not jump inside an element.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,10 +18,8 @@ from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Heading, Node, conjugate, quaternion_product
+from dlo_casadi.rod.supports import SupportKind
 
-# A swivel is a clamp in space in which the cable may roll about its axis.
-ClipKind = Literal["pinned", "clamped", "swivel", "eyelet"]
-CLAMPS = ("clamped", "swivel")
 # Distance before the edge of a segment, as a share of its length, from which on a place counts as
 # beyond it. Rounding is smaller, so that just one segment has the derivatives by the place.
 BESIDE = 1e-9
@@ -42,17 +40,20 @@ class HeldClip:
         Frame of a clamped clip in space: a unit quaternion (x, y, z, w), x forward.
     """
 
-    kind: ClipKind
+    kind: SupportKind
     place: tuple[float, ...]
     at: float | None = None
     heading: float | None = None
     orientation: tuple[float, ...] | None = None
     name: str = "clip"
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kind", SupportKind(self.kind))
+
     @property
     def frame(self) -> FloatArray | None:
         """Its frame (coordinates,) in the form of a node; None if the cable may turn."""
-        if self.kind not in CLAMPS:
+        if not self.kind.direction:
             return None
         if self.orientation is None:
             return np.array([self.heading], dtype=float)
@@ -90,7 +91,7 @@ def clip_rows(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[dict
     return [
         {
             "name": clip.name,
-            "kind": "clamped" if clip.kind == "swivel" else clip.kind,
+            "kind": str(SupportKind.CLAMPED if clip.kind.direction else clip.kind),
             "at": load.at,
             "force": load.force.tolist(),
             "moment": load.moment.tolist(),
@@ -122,7 +123,7 @@ class Clipped:
 
     Parameters
     ----------
-    kinds : (k,) str
+    kinds : (k,) SupportKind
     at : (m, k) [m]
         Arc lengths of the clips.
     places : (m, n + 1) [m]
@@ -130,7 +131,7 @@ class Clipped:
     """
 
     chain: Chain
-    kinds: tuple[str, ...]
+    kinds: tuple[SupportKind, ...]
     at: FloatArray
     clamps: tuple[ClampNode, ...]
     places: FloatArray
@@ -139,7 +140,7 @@ class Clipped:
     def of(
         cls,
         chain: Chain,
-        kinds: tuple[str, ...],
+        kinds: tuple[SupportKind, ...],
         declared: FloatArray,
         at: FloatArray,
         turn: FloatArray,
@@ -153,13 +154,12 @@ class Clipped:
         node, rows = chain.kind.node, np.arange(len(x))
         places, clamps = np.tile(chain.places, (len(x), 1)), []
         for k, kind in enumerate(kinds):
-            if kind not in CLAMPS:
+            if not kind.direction:
                 continue
             index = np.rint(declared[:, k, -1] / chain.h).astype(np.intp).clip(1, chain.n - 1)
             frame = node.moved(declared[:, k, node.dimension : -1], turn[k])
-            held = np.ones(node.increment, dtype=bool)
-            if kind == "swivel":
-                held[0] = False
+            held = kind.rotations(node)
+            if not held.all():
                 frame = _rolled_with(frame, x[rows, index])
             places[rows, index] = at[:, k]
             clamps.append(ClampNode(index, frame, held))
@@ -198,7 +198,7 @@ class Clipped:
         cells, nodes = self.cells, iter(self.clamped.T)
         found = [(cells[:, 0, 0], np.zeros(len(cells), dtype=np.intp))]
         for kind, at in zip(self.kinds, self.at.T, strict=True):
-            if kind in CLAMPS:
+            if kind.direction:
                 node = next(nodes)
                 found += [(at, node - 1), (at, node)]
             else:
@@ -288,7 +288,7 @@ class Clipped:
         """
         node, rows = self.chain.kind.node, np.arange(len(forces))
         moments = np.zeros((*forces.shape[:2], node.increment))
-        clamped = [k for k, kind in enumerate(self.kinds) if kind in CLAMPS]
+        clamped = [k for k, kind in enumerate(self.kinds) if kind.direction]
         for k, clamp in zip(clamped, self.clamps, strict=True):
             own = -by_turns[rows, clamp.index] * clamp.held
             moments[:, k] = node.to_world(clamp.frame, own)
@@ -334,14 +334,14 @@ def moved_rest(chain: Chain, inside: ca.SX, low: ca.SX, width: ca.SX) -> ca.SX:
 
 def clamped_nodes(chain: Chain, clips: Sequence[HeldClip]) -> tuple[int, ...]:
     """Nodes held by the clamped clips: those nearest to them."""
-    at = np.array([clip.at for clip in clips if clip.kind in CLAMPS], dtype=float)
+    at = np.array([clip.at for clip in clips if clip.kind.direction], dtype=float)
     return tuple(np.rint(at / chain.h).astype(int).clip(1, chain.n - 1).tolist())
 
 
 def node_places(chain: Chain, clips: Sequence[HeldClip]) -> FloatArray:
     """Arc lengths (n_nodes,) [m] of the nodes; nodes of clamped clips are moved to these."""
     places = chain.places.copy()
-    held = [clip.at for clip in clips if clip.kind in CLAMPS]
+    held = [clip.at for clip in clips if clip.kind.direction]
     places[list(clamped_nodes(chain, clips))] = held
     return places
 

@@ -355,9 +355,9 @@ class Lagrangian:
         """Lagrangian of the ends: holders, end conditions, and the work of loads at the start."""
         first, last = self.moved
         true, gap = self.true_ends, self.node.difference
-        gaps = [] if self.model.end == "free" else [true.start - true.end]
-        gaps += [gap(true.start_frame, first)] if self.model.start == "clamped" else []
-        gaps += [gap(true.end_frame, last)] if self.model.end == "clamped" else []
+        gaps = [true.start - true.end] if self.model.end.place else []
+        gaps += [gap(true.start_frame, first)] if self.model.start.direction else []
+        gaps += [gap(true.end_frame, last)] if self.model.end.direction else []
         held = self.lam[: len(self.model.condition_names)]
         total = ca.dot(held, ca.vertcat(*gaps)) if gaps else ca.SX(0)
         for effect, local in self.effects_of(BoundaryEffect):

@@ -13,7 +13,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import BESIDE, CLAMPS
+from dlo_casadi.model.clips import BESIDE
 from dlo_casadi.rod.band import BandMatrix
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame, Heading
@@ -303,7 +303,7 @@ class Unheld:
         """Segments of a model with clips, from rows of `Clipped.segments`."""
         width = table[..., 1:2] if model.clamped_between else model.chain.h
         share = (table[..., -len(model.clips) :] - table[..., :1]) / width
-        nodes = [k for k, kind in enumerate(model.clips) if kind not in CLAMPS]
+        nodes = [k for k, kind in enumerate(model.clips) if not kind.direction]
         end = model.end_pull or [-1] * model.node.dimension
         # A clip at a node counts in one segment only: derivatives by its arc length are one-sided.
         inside = np.maximum((share >= -BESIDE).sum(axis=1)[:, nodes] - 1, 0)

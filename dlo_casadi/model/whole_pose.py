@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, clip_size, moved_rest
+from dlo_casadi.model.clips import clip_size, moved_rest
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import conjugate, quaternion_product
@@ -199,12 +199,12 @@ def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) ->
     As in `clips.Clipped.of`.
     """
     size, c, count = clip_size(model.node), model.node.coordinates, len(model.clips)
-    held, frames = [k for k, kind in enumerate(model.clips) if kind in CLAMPS], []
+    held, frames = [k for k, kind in enumerate(model.clips) if kind.direction], []
     turns = functions_of(model).true_clips(s.p, s.pose)[2]
     for k, node in zip(held, clamped, strict=True):
         last = model.n_pose - size * (count - k) + size - 1
         frame = model.node.moved(s.pose[last - c : last], ca.SX(turns[:, k]))
-        if model.clips[k] == "swivel":
+        if not model.clips[k].roll:
             parts, own = ca.vertsplit(frame), ca.vertsplit(s.x[_rows(model, node)])
             roll, _, _, rest = quaternion_product(conjugate(parts), own)
             length = ca.sqrt(roll**2 + rest**2)
@@ -228,7 +228,7 @@ def _segment_arguments(
         for k, row in model.sliding.items():
             at[k] = s.lam[row]
         places = ca.SX(ca.DM(chain.places))
-        held = [k for k, kind in enumerate(model.clips) if kind in CLAMPS]
+        held = [k for k, kind in enumerate(model.clips) if kind.direction]
         for k, node, frame in zip(held, clamped, _clip_frames(model, s, clamped), strict=True):
             x[:, node], places[node] = frame, at[k]
         low, width = places[:-1].T, (places[1:] - places[:-1]).T

@@ -263,7 +263,7 @@ class InnerProblem:
 
 def applies(model: CableModel) -> bool:
     """Whether the paper's method applies: a cable in a plane, pinned at both ends, nothing else."""
-    held = model.start == model.end == "pinned" and not (model.clips or model.surfaces)
+    held = model.start.turns and model.end.turns and not (model.clips or model.surfaces)
     return model.node is Heading and held
 
 

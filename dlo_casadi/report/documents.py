@@ -287,7 +287,7 @@ def _cable_dict(
             **fields_of(model.cable, *STIFFNESSES[: 1 + model.in_space]),
             "rest_shape": "straight" if model.cable.straight else "curved",
         },
-        "boundary": {"start": model.start, "end": model.end},
+        "boundary": {"start": str(model.start), "end": str(model.end)},
         "gravity": list(model.gravity),
         **fields_of(model, "element", "n", "n_rest"),
         "effects": [_effect_row(effect) for effect in model.effects],

@@ -51,7 +51,7 @@ def figures_of(outcome: Outcome) -> dict[str, Figure]:
         ("candidates", outcome.candidates, candidates_figure),
         ("unexplained", outcome.unexplained, unexplained_figure),
         ("next_pose", outcome.next_pose, next_pose_figure),
-        ("moment", end == "free", moment_figure),
+        ("moment", not end.place, moment_figure),
         ("limits", outcome.limits, limits_figure),
     ]
     drawn = {name: draw(outcome) for name, needed, draw in wanted if needed}

@@ -115,7 +115,7 @@ def _legend_of(
         canvas.line_of("measured", color=style.BLACK, marker=".", ls="none", ms=7),
         *(canvas.line_of(label, **canvas.STAGE_LINES[kind]) for kind, label, _ in stages),
     ]
-    if experiment.in_space and "clamped" in (experiment.boundary.start, experiment.boundary.end):
+    if experiment.in_space and experiment.boundary.directed:
         handles += [
             canvas.line_of(f"clamp's {name}", **canvas.STYLES[f"axis-{name}"]) for name in "xyz"
         ]

@@ -146,7 +146,7 @@ def footnotes(outcome: Outcome) -> list[str]:
 def _best_reading(outcome: Outcome) -> list[str]:
     """Pose in which a force reading determines mass and stiffnesses best (all scale together)."""
     experiment = outcome.config.experiment
-    ends = ("start", "end") if experiment.boundary.end != "free" else ("start",)
+    ends = ("start", "end") if experiment.boundary.end.place else ("start",)
     forces = {
         (name, side): float(np.linalg.norm(force))
         for name, shape in outcome.stages[-1].shapes.items()

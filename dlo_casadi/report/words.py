@@ -165,7 +165,7 @@ def details(outcome: Outcome) -> list[str]:
             f"average at {load.position:.3f} m ({low:.3f} to {high:.3f} m) from the start."
         )
         experiment = outcome.config.experiment
-        if experiment.boundary.end == "free" and np.dot(load.force, experiment.gravity) < 0:
+        if not experiment.boundary.end.place and np.dot(load.force, experiment.gravity) < 0:
             lines.append(
                 "  Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or "
                 "another stiffness may stand behind it."

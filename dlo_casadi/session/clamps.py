@@ -171,7 +171,7 @@ def _try(shown: Sequence[_Shown]) -> str:
 def _shown(session: ReadSession, side: str) -> Iterator[_Shown]:
     """Directions of the lines at the clamps of one side, where the lines determine them."""
     cable, experiment = session.config.cable, session.config.experiment
-    if getattr(experiment.boundary, side) != "clamped":
+    if not getattr(experiment.boundary, side).direction:
         return
     weight = cable.prior_mass * float(np.linalg.norm(experiment.gravity))
     layer = np.sqrt(cable.prior_bending_stiffness / max(weight, 1e-12))
@@ -184,7 +184,7 @@ def _shown(session: ReadSession, side: str) -> Iterator[_Shown]:
             ways = [] if value is None else _ways(pose, item, side, cable.length, reach)
             if len(ways):
                 # Behind a pinned start no turns are counted: full turns mean nothing there.
-                turns = experiment.boundary.start == "clamped" and key == "end_heading"
+                turns = experiment.boundary.start.direction and key == "end_heading"
                 far = turns and abs(value) > _TURN
                 turned = _turned_to(pose, item.points, cable.length) if far else None
                 yield _Shown(item.name, key, value, np.asarray(ways), turned)

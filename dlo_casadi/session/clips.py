@@ -11,7 +11,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config import Pose
-from dlo_casadi.model.clips import CLAMPS, HeldClip, tangents
+from dlo_casadi.model.clips import HeldClip, tangents
 from dlo_casadi.rod.node import Node
 from dlo_casadi.session.hypotheses import ReadSession, Suspicion
 from dlo_casadi.session.outcome import PoseInput
@@ -107,7 +107,7 @@ def _of_other_kind(own: Sequence[_Passed], length: float) -> list[Suspicion]:
 
 def _turned(own: Sequence[_Passed], node: type[Node]) -> list[Suspicion]:
     """A clamped clip that the lines leave in another direction than declared."""
-    if own[0].clip.kind not in CLAMPS:
+    if not own[0].clip.kind.direction:
         return []
     frames = np.array([one.clip.frame for one in own])
     cosines = (tangents(node, frames) * np.array([one.ahead for one in own])).sum(axis=1)

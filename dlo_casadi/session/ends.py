@@ -333,7 +333,7 @@ def shorter(session: ReadSession) -> tuple[Suspicion, ...]:
     hides it only in a loop. Gaps to the held ends count as straight.
     """
     length, lines = session.config.cable.length, []
-    if session.config.experiment.boundary.end == "free":
+    if not session.config.experiment.boundary.end.place:
         return ()
     read = [item for item in session.read if item.s is None and len(item.points) > 2]
     for item in read:

@@ -187,7 +187,7 @@ def first_mesh(model: CableModel) -> int:
     parameters leave twice the residual on 10 elements as on 20. Contact with an obstacle starts
     and ends at nodes.
     """
-    more = sum(kind != "pinned" for kind in model.clips) + 2 * bool(model.surfaces)
+    more = sum(kind.direction or kind.slides for kind in model.clips) + 2 * bool(model.surfaces)
     return FIRST_MESH // len(model.node.curvatures) * (2 + more) // 2
 
 
@@ -205,7 +205,7 @@ def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) ->
     count = 1 + int((np.diff(places) > SAME_PLACE * places[-1]).sum())
     # In twenty simulated cables with two to four markers a constant left structure in two, both
     # with two markers; a linear function left none.
-    return max(min(count, 2), count - (model.start, model.end).count("clamped"))
+    return max(min(count, 2), count - (model.start.direction + model.end.direction))
 
 
 class Minimum(NamedTuple):

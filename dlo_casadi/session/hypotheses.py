@@ -73,7 +73,7 @@ class ReadSession:
         """
         experiment, found = self.config.experiment, {item.name: item for item in self.read}
         lines = _lines(self.config, found)
-        if experiment.boundary.end != "free":
+        if experiment.boundary.end.place:
             fits = lines.misfit(lines.measured, lines.declared) < OUT_OF_STEP
             sound = {name for name, ok in zip(lines.names, fits, strict=True) if ok}
             poses = [pose for pose in experiment.poses if pose.name not in sound]
@@ -294,7 +294,7 @@ def shown_pull(session: ReadSession) -> FloatArray | None:
     lines have too few points.
     """
     boundary = session.config.experiment.boundary
-    if boundary.start == boundary.end == "pinned":
+    if boundary.start.turns and boundary.end.turns:
         pull = _off_the_chord(session)
     else:
         pull = load_over_stiffness([(item.points, item.s) for item in session.read])

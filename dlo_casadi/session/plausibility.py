@@ -19,6 +19,7 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
 from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.clamps import ComparedReading, misread, wrong_directions
 from dlo_casadi.session.clips import wrong_clips
@@ -281,7 +282,7 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
         own = [k for k, pose in enumerate(poses) if name in pose.readings]
         if not own:
             continue
-        held = getattr(fit.model, side, "clip") == "clamped"
+        held = getattr(fit.model, side, SupportKind.FREE).direction
         forces = felt[own, rows[f"{side}_force"]]
         compared.append(
             ComparedReading(
@@ -305,7 +306,7 @@ def ends_exchanged(session: ReadSession) -> tuple[Suspicion, ...]:
     Sparse points do not show the directions at clamps; the vectors from clamp to first point do.
     """
     boundary = session.config.experiment.boundary
-    if not (len(session.read) and boundary.start == boundary.end == "clamped"):
+    if not (len(session.read) and boundary.start.direction and boundary.end.direction):
         return ()
     own = _off(session)
     if own < np.pi / 2:
@@ -399,7 +400,7 @@ def _other_gravity(
             tried.append(way)
             meant = session.with_experiment(gravity=tuple(way.tolist()))
             yield Hypothesis(f"gravity ({listed(way + 0.0, 'g')}) m/s^2", meant)
-    if weightless or experiment.boundary.start == experiment.boundary.end == "pinned":
+    if weightless or not experiment.boundary.directed:
         return  # between pins, rotating the points equals rotating gravity
     kept = [_kept_by_turning(session.declared[item.name], length) for item in session.read]
     for axes in frames:

@@ -4,7 +4,8 @@ import shutil
 
 import numpy as np
 import pytest
-from cables.free import (
+from benchmarks.ipopt import Ipopt
+from benchmarks.random_cables import (
     AnyCable,
     check,
     check_in_space,
@@ -14,7 +15,6 @@ from cables.free import (
     random_problem,
     space_problem,
 )
-from cables.ipopt import Ipopt
 
 from dlo_casadi.codegen import STATUSES
 from dlo_casadi.equilibrium.solve import solve_equilibrium

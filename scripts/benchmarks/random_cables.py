@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cables.ipopt import Ipopt
+from benchmarks.ipopt import Ipopt
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.codegen.generate import generate, table_of
 from dlo_casadi.codegen.shapes import pose_table, records_of
@@ -25,13 +25,15 @@ from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses, limited
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
-from dlo_casadi.model.cable_model import CableModel, EndKind, StartKind
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.supports import STARTS, SupportKind
 
 FloatArray = NDArray[np.floating]
 
-BOUNDARIES: tuple[tuple[StartKind, EndKind], ...] = (
-    *(("pinned", "pinned"), ("clamped", "pinned"), ("pinned", "clamped"), ("clamped", "clamped")),
-    *(("pinned", "free"), ("clamped", "free")),
+# Every kind of start with every kind of end, ends that are held first.
+BOUNDARIES = (
+    *((start, end) for end in STARTS for start in STARTS),
+    *((start, SupportKind.FREE) for start in STARTS),
 )
 
 # The public functions read the solver's own table; this one is given another.
@@ -215,7 +217,7 @@ def random_problem(
 
 
 def held_problem(
-    rng: np.random.Generator, start: StartKind, end: EndKind, poses: int, n: int = 16
+    rng: np.random.Generator, start: SupportKind, end: SupportKind, poses: int, n: int = 16
 ) -> Problem:
     """A cable of 1 m of any ratio of stiffness to weight, held anywhere in any directions.
 
@@ -344,7 +346,7 @@ def compare_with_ipopt(problem: Problem, shape: NDArray[np.void], end: FloatArra
 
 
 def missed(
-    rng: np.random.Generator, start: StartKind, end: EndKind, problems: int, starts: int = 24
+    rng: np.random.Generator, start: SupportKind, end: SupportKind, problems: int, starts: int = 24
 ) -> tuple[int, list[tuple[Problem, NDArray[np.void]]]]:
     """Of random problems held so, how many have a lower equilibrium than the one that is found.
 
