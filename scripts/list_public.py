@@ -193,6 +193,11 @@ def c_lines() -> list[str]:
             own_where = where if name in ("dlo_pose", "dlo_clip") else ""
             types.add(f"{name}{own_where}: {inside}")
         functions |= {" ".join(f.split()) for f in re.findall(r"DLO_API\n([^;#]+);", header)}
+        offered = re.findall(
+            r"^ALL_FOR_CASADI\((\w+), \w+, (\w+)", source.files["dlo_solver.c"], re.M
+        )
+        names = ", ".join(sorted(sum(offered, ())))
+        functions.add(f"for casadi.external, ccw and cw in a plane: {names}")
         public = own.partition("private:")[0]
         types |= {f"dlo::{name}" for name in re.findall(r"^(?:struct|class) (\w+)", public, re.M)}
         for name, given in re.findall(r" (\w+)\(([^)]*)\)\n    \{", public):
