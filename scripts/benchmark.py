@@ -26,12 +26,12 @@ from benchmarks import (
     fleet,
     memory,
     peers,
-    random_cables,
     space_peers,
     space_speed,
     speed,
 )
-from benchmarks.ipopt import Ipopt
+from cables import free
+from cables.ipopt import Ipopt
 
 from dlo_casadi.codegen import STATUSES
 from dlo_casadi.io.files import make_folder, write_file
@@ -81,17 +81,17 @@ def run_random(cables: int, poses: int) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for element in ELEMENTS:
         rng = np.random.default_rng(0)
-        solver = random_cables.AnyCable(random_cables.random_problem(rng, 1, element=element))
+        solver = free.AnyCable(free.random_problem(rng, 1, element=element))
         ok, wrong, worst, total, slowest = 0, 0, 0.0, 0.0, 0.0
         for _ in range(cables):
-            problem = random_cables.random_problem(rng, poses, element=element)
+            problem = free.random_problem(rng, poses, element=element)
             shapes, statuses, seconds = solver.solve(problem)
             total, slowest = total + seconds, max(slowest, seconds / poses)
             for shape, status, end in zip(shapes, statuses, problem.ends, strict=True):
                 if status:
                     continue
                 ok += 1
-                stable, error = random_cables.check(problem, shape, end)
+                stable, error = free.check(problem, shape, end)
                 wrong += not stable
                 worst = max(worst, error)
         out[element] = {
@@ -109,8 +109,8 @@ def run_random(cables: int, poses: int) -> dict[str, Any]:
 def run_starts(problems: int) -> dict[str, Any]:
     """Random cables held in every way: how often 24 random starts find a lower equilibrium."""
     out: dict[str, Any] = {}
-    for start, end in random_cables.BOUNDARIES:
-        count, _ = random_cables.missed(np.random.default_rng(0), start, end, problems)
+    for start, end in free.BOUNDARIES:
+        count, _ = free.missed(np.random.default_rng(0), start, end, problems)
         out[f"{start}-{end}"] = {"problems": problems, "missed": count}
         print(out, flush=True)
     return out
@@ -119,13 +119,13 @@ def run_starts(problems: int) -> dict[str, Any]:
 def run_ipopt(problems: int) -> dict[str, Any]:
     """The lowest equilibrium found against that of IPOPT from the same first guesses."""
     rng = np.random.default_rng(1)
-    solver = random_cables.AnyCable(random_cables.random_problem(rng, 5))
+    solver = free.AnyCable(free.random_problem(rng, 5))
     counts: dict[str, int] = {}
     for _ in range(problems // 5):
-        problem = random_cables.random_problem(rng, 5)
+        problem = free.random_problem(rng, 5)
         shapes, statuses, _ = solver.solve(problem)
         for shape, status, end in zip(shapes, statuses, problem.ends, strict=True):
-            word = random_cables.compare_with_ipopt(problem, shape, end) if not status else "failed"
+            word = free.compare_with_ipopt(problem, shape, end) if not status else "failed"
             counts[word] = counts.get(word, 0) + 1
     compared = sum(n for word, n in counts.items() if word != "ipopt_failed")
     good = counts.get("same", 0) + counts.get("lower", 0)
@@ -164,7 +164,7 @@ def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for element in ELEMENTS_IN_SPACE:
         rng = np.random.default_rng(0)
-        solver = random_cables.AnyCable(random_cables.space_problem(rng, 1, 12, element))
+        solver = free.AnyCable(free.space_problem(rng, 1, 12, element))
         counts = {
             "ok": 0,
             "turns_shed": 0,
@@ -174,21 +174,21 @@ def run_space_random(cables: int, poses: int, compared: int) -> dict[str, Any]:
             "higher": 0,
             "ipopt_failed": 0,
         }
-        ipopt = Ipopt(random_cables.space_problem(rng, 1, 12, element).model)
+        ipopt = Ipopt(free.space_problem(rng, 1, 12, element).model)
         worst, total = 0.0, 0.0
         for cable in range(cables):
-            problem = random_cables.space_problem(rng, poses, 12, element)
+            problem = free.space_problem(rng, poses, 12, element)
             shapes, statuses, seconds = solver.solve(problem)
             total += seconds
             for status in ("ok", "turns_shed"):
                 counts[status] += int(np.count_nonzero(statuses == STATUSES.index(status)))
             for i in np.flatnonzero(statuses == 0)[: max(1, 2000 // cables)]:
-                right, error = random_cables.check_in_space(problem, shapes[i], i)
+                right, error = free.check_in_space(problem, shapes[i], i)
                 counts["wrong"] += not right
                 worst = max(worst, error)
             share = compared * (cable + 1) // cables - compared * cable // cables
             for i in np.flatnonzero(statuses == 0)[:share]:
-                counts[random_cables.compare_in_space(problem, shapes[i], i, ipopt)] += 1
+                counts[free.compare_in_space(problem, shapes[i], i, ipopt)] += 1
         out[element] = {
             "problems": cables * poses,
             **counts,

@@ -12,7 +12,6 @@ Exit code 1 if an interval is told that the shape cannot bear: here, any.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from pathlib import Path
@@ -23,6 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
+from harness import options, run
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -89,32 +89,35 @@ def session(wire: str, tags: FloatArray) -> tuple[dict[str, Any], float]:
 
 def main() -> int:
     """Fit each shape and print the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, jobs=True)
     parser.add_argument("tags", type=Path, help="tags.csv")
-    told = 0
-    for (wire, test), tags in shapes(parser.parse_args().tags).items():
-        document, scatter = session(wire, tags)
-        with TemporaryDirectory() as folder:
-            header = "x_m,y_m,z_m"
-            np.savetxt(Path(folder) / "tags.csv", tags, "%.6f", ",", header=header, comments="")
-            (Path(folder) / "session.yaml").write_text(yaml.safe_dump(document))
-            outcome = run_session(load_config(Path(folder) / "session.yaml"))
-        stage = outcome.stages[-1]
-        stiffness = stage.parameters["bending_stiffness"]
-        low, high = stiffness.interval_95 or (None, None)
-        sides = [
-            "unbounded" if side is None else f"{side / (9.81 * MASS_PER_LENGTH):.2g}"
-            for side in (low, high)
-        ]
-        told += bool(stiffness.identifiable)
-        print(
-            f"{wire} {test}: {len(tags)} tags over {document['cable']['length']:.3f} m; tags about "
-            f"a cubic {1e3 * np.sqrt(3) * scatter:.1f} mm, about the cable "
-            f"{1e3 * stage.rmse_fit:.1f} mm; EI over weight per length {sides[0]} to {sides[1]} m^3"
-            f", {'' if stiffness.identifiable else 'not '}identifiable",
-            flush=True,
-        )
-    return 1 if told else 0
+    chosen = parser.parse_args()
+    rows = run(fitted, shapes(chosen.tags).items(), chosen, lambda shape, row, seconds: row[0])
+    return int(any(identifiable for _, identifiable in rows))
+
+
+def fitted(shape: tuple[tuple[str, str], FloatArray]) -> tuple[str, bool]:
+    """What a fit says of a shape, and whether it claims to know the stiffness."""
+    (wire, test), tags = shape
+    document, scatter = session(wire, tags)
+    with TemporaryDirectory() as folder:
+        header = "x_m,y_m,z_m"
+        np.savetxt(Path(folder) / "tags.csv", tags, "%.6f", ",", header=header, comments="")
+        (Path(folder) / "session.yaml").write_text(yaml.safe_dump(document))
+        outcome = run_session(load_config(Path(folder) / "session.yaml"))
+    stage = outcome.stages[-1]
+    stiffness = stage.parameters["bending_stiffness"]
+    sides = [
+        "unbounded" if side is None else f"{side / (9.81 * MASS_PER_LENGTH):.2g}"
+        for side in stiffness.interval_95 or (None, None)
+    ]
+    text = (
+        f"{wire} {test}: {len(tags)} tags over {document['cable']['length']:.3f} m; tags about "
+        f"a cubic {1e3 * np.sqrt(3) * scatter:.1f} mm, about the cable "
+        f"{1e3 * stage.rmse_fit:.1f} mm; EI over weight per length {sides[0]} to {sides[1]} m^3"
+        f", {'' if stiffness.identifiable else 'not '}identifiable"
+    )
+    return text, bool(stiffness.identifiable)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ rendered: an independent rod simulator and a camera renderer made them.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 from dataclasses import replace
 from functools import partial
@@ -19,11 +17,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
+from harness import options, run
 
 from dlo_casadi.config import load_config
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.io.files import write_file
-from dlo_casadi.runtime.parallel import map_as_completed, open_executor
 from dlo_casadi.session import run_session
 from dlo_casadi.session.outcome import Outcome
 
@@ -158,27 +155,16 @@ def _pull(name: str, tether: list[float], outcome: Outcome) -> dict:
 
 def main() -> None:
     """Run the sessions that are asked for."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, jobs=True, scheduler=True, output=True)
     parser.add_argument("names", nargs="*", help="sessions; all by default")
     parser.add_argument(
         "--without-true-effect",
         action="store_true",
         help="take the true effects out of the library: what is named then?",
     )
-    parser.add_argument("--output", type=Path, help="JSON file for the table")
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
-    parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
     names = args.names or sorted(path.name for path in TRUTH.iterdir() if path.is_dir())
-    rows: dict[int, dict] = {}
-    work = partial(run_one, without_true_effect=args.without_true_effect)
-    with open_executor(args.jobs, args.scheduler) as executor:
-        for done in map_as_completed(executor, work, names):
-            rows[done.index] = done.value
-            show(done.value, done.seconds)
-            if args.output:
-                ordered = [rows[k] for k in sorted(rows)]
-                write_file(args.output, json.dumps(ordered, indent=1, default=str))
+    run(partial(run_one, without_true_effect=args.without_true_effect), names, args, text_of)
 
 
 def run_one(name: str, without_true_effect: bool) -> dict:
@@ -190,15 +176,15 @@ def run_one(name: str, without_true_effect: bool) -> dict:
     return compare(name, run_session(config))
 
 
-def show(row: dict, seconds: float) -> None:
-    """Print one session."""
-    print(
+def text_of(_: str, row: dict, seconds: float) -> str:
+    """One session."""
+    lines = [
         f"{row['session']:15s} {row['verdict']:12s} true {','.join(row['true']) or '-':24s} "
         f"found {','.join(row['found']) or '-'}  ties {row['ties']}"
-    )
+    ]
     ends = row["EI_interval_95"] or ()  # none if the session is unexplained
     bounds = ", ".join(f"{x:.4g}" if x is not None else "-" for x in ends)
-    print(
+    lines.append(
         f"    EI {row['EI']:.4g} [{bounds}] true {row['EI_true']:.4g}   noise "
         f"{row['noise_mm']:.3f} mm  held out {row['held_out_batch_mm'] or np.nan:.3f} -> "
         f"{row['held_out_mm'] or np.nan:.3f} mm = {row['held_out_over_noise']:.2f} noise, of which "
@@ -208,13 +194,13 @@ def show(row: dict, seconds: float) -> None:
     )
     for key, item in row["parameters"].items():
         relative = "" if item["relative"] is None else f"  {item['relative']:+.0%}"
-        print(
+        lines.append(
             f"    {key} {item['value']:.4g} +/- {item['std']:.2g}, true {item['true']:.4g}: "
             f"{item['deviations']:+.1f} std{relative}"
         )
     if "pull" in row:
-        print(f"    pull {row['pull']}")
-    print(end="", flush=True)
+        lines.append(f"    pull {row['pull']}")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -27,12 +27,9 @@ where all that is hidden shows and is named.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -41,6 +38,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from harness import options, run
 from hidden_sets import LINE, RANDOM_SIZES, Simulated, about_axis, simulated
 from simulated import random_session
 
@@ -55,10 +53,9 @@ from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.descent import descend, refit
 from dlo_casadi.estimation.fit import SEARCH_MESH, fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.io.files import write_file
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import SMOOTHNESS, PoseScatter, modes_in
-from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.runtime.parallel import generator_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.session.fitting import declared_model, fit_declared
@@ -136,11 +133,8 @@ def simulate(config, generator):
 
 def main() -> None:
     """Simulate, diagnose, count."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, first=True, seed=0, jobs=True, scheduler=True, output=True)
     parser.add_argument("--sets", type=int, default=300)
-    parser.add_argument("--first", type=int, default=0, help="number of the first set")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--output", type=Path)
     kinds = parser.add_mutually_exclusive_group()
     kinds.add_argument("--scatter", action="store_true", help="of cables that do not repeat")
     kinds.add_argument("--plane", action="store_true", help="of random cables in the plane")
@@ -148,56 +142,47 @@ def main() -> None:
     parser.add_argument("--hidden", action="store_true", help="one or two effects hidden in each")
     parser.add_argument("--random", default="", choices=RANDOM_SIZES, help="of each pose's own")
     parser.add_argument("--table", action="store_true", help="on a table that is not declared")
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
-    parser.add_argument("--scheduler", help="address of a Dask scheduler, instead")
     args = parser.parse_args()
     kind, dimension = random_effects().get(args.random), 3 if args.space else 2
     if kind is not None and dimension not in kind.dimensions:
         where = "in space" if args.space else "in a plane"
         parser.error(f"--random {args.random} is not of cables {where}")
-    rows: dict[int, dict] = {}
-    seconds = []
-    with open_executor(args.jobs, args.scheduler) as executor:
-        if args.plane or args.space or args.hidden or args.random or args.table:
-            count_random(args, executor)
-            return
+    sets = range(args.first, args.first + args.sets)
+    if args.plane or args.space or args.hidden or args.random or args.table:
+        asked = {"space": args.space, "hide": args.hidden, "random": args.random}
+        work = partial(run_random, seed=args.seed, table=args.table, **asked)
+        run(work, sets, args, odd_set, summary=summary)
+    else:
         work = partial(run_one, seed=args.seed, scatter=args.scatter)
-        for done in map_as_completed(executor, work, range(args.first, args.first + args.sets)):
-            row = rows[done.item] = done.value
-            seconds.append([row["fit_seconds"], row["diagnosis_seconds"]])
-            if not row["right"]:
-                print(f"  set {done.item}: {row}", flush=True)
-            if len(rows) % 20 == 0 or len(rows) == args.sets:
-                alarms = sum(bool(row["added"]) and not row["right"] for row in rows.values())
-                unexplained = sum(row["verdict"] == "unexplained" for row in rows.values())
-                inside = np.mean([row["inside"] for row in rows.values()])
-                band = np.mean(np.concatenate([row["in_band"] for row in rows.values()]))
-                fit, diagnosis = np.median(seconds, axis=0)
-                print(
-                    f"{len(rows)} sets: {alarms} with a wrong effect, {unexplained} unexplained, "
-                    f"EI in its interval in {100 * inside:.1f} %, "
-                    f"{100 * band:.1f} % of points left out in their band; "
-                    f"median {fit:.1f} s for the fit, {diagnosis:.1f} s for the diagnosis",
-                    flush=True,
-                )
-                if args.output:
-                    write_file(args.output, json.dumps([rows[k] for k in sorted(rows)]))
+        run(work, sets, args, wrong_set, summary=alarms_in)
 
 
-def count_random(args: argparse.Namespace, executor: Executor) -> None:
-    """Random sessions with nothing hidden, or with one or two effects."""
-    rows: dict[int, dict] = {}
-    options = {"space": args.space, "hide": args.hidden, "random": args.random}
-    options["table"] = args.table
-    work = partial(run_random, seed=args.seed, **options)
-    for done in map_as_completed(executor, work, range(args.first, args.first + args.sets)):
-        row = rows[done.item] = done.value
-        if row["missed"] or row["wrong"] or not all(row["inside"].values()) or row["worse"]:
-            print(f"  set {done.item}: {row}", flush=True)
-        if len(rows) % 20 == 0 or len(rows) == args.sets:
-            print(summary(list(rows.values())), flush=True)
-            if args.output:
-                write_file(args.output, json.dumps([rows[k] for k in sorted(rows)]))
+def wrong_set(number: int, row: dict, _: float) -> str:
+    """A set in which something false was found."""
+    return "" if row["right"] else f"  set {number}: {row}"
+
+
+def odd_set(number: int, row: dict, _: float) -> str:
+    """A random set in which anything is not as it should be."""
+    odd = row["missed"] or row["wrong"] or not all(row["inside"].values()) or row["worse"]
+    return f"  set {number}: {row}" if odd else ""
+
+
+def alarms_in(rows: list[dict]) -> str:
+    """False alarms of some sets, in a line."""
+    alarms = sum(bool(row["added"]) and not row["right"] for row in rows)
+    unexplained = sum(row["verdict"] == "unexplained" for row in rows)
+    inside = np.mean([row["inside"] for row in rows])
+    band = np.mean(np.concatenate([row["in_band"] for row in rows]))
+    fit, diagnosis = (
+        np.median([row[f"{name}_seconds"] for row in rows]) for name in ("fit", "diagnosis")
+    )
+    return (
+        f"{len(rows)} sets: {alarms} with a wrong effect, {unexplained} unexplained, "
+        f"EI in its interval in {100 * inside:.1f} %, "
+        f"{100 * band:.1f} % of points left out in their band; "
+        f"median {fit:.1f} s for the fit, {diagnosis:.1f} s for the diagnosis"
+    )
 
 
 def summary(rows: list[dict]) -> str:

@@ -11,7 +11,6 @@ the planner's; and the time of `casadi.external` beside that of the bare C. Exit
 above 1e-9, 1e-6, 1e-5, 40 iterations, or 1.3 times the bare C.
 """
 
-import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -26,6 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import casadi as ca
 import numpy as np
 from examples import lead_the_end
+from harness import options, run
 from numpy.typing import NDArray
 
 from dlo_casadi.codegen import Capsule, CompiledSolver, generate
@@ -196,25 +196,36 @@ def slowdown(dimension: int, calls: int = 3000) -> float:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print a line for each effect."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = options(__doc__, jobs=True)
     parser.add_argument("effects", nargs="*", help="names; all by default")
-    asked = parser.parse_args(argv).effects
-    bad = False
-    for name in asked or ["none", *EFFECTS]:
-        for dimension in (2, 3):
-            effect = EFFECTS.get(name)
-            if effect is not None and dimension not in effect.dimensions:
-                continue
-            found = errors(effect, dimension)
-            wrong = any(not error < most for error, most in zip(found, MOST, strict=True))
-            bad |= wrong
-            texts = "  ".join(f"{error:.1e}" for error in found)
-            where = {2: "plane", 3: "space"}[dimension]
-            print(f"{name:22s} {where}  {texts}{'  BAD' * wrong}", flush=True)
-    if not asked:
+    chosen = parser.parse_args(argv)
+    cases = [
+        (name, dimension)
+        for name in chosen.effects or ["none", *EFFECTS]
+        for dimension in (EFFECTS[name].dimensions if name in EFFECTS else (2, 3))
+    ]
+    bad = any(map(wrong, run(errors_of, cases, chosen, text_of)))
+    if not chosen.effects:
         bad |= not (held_best() and led_easily())
         bad |= max(map(slowdown, (2, 3))) > 1.3
     return int(bad)
+
+
+def errors_of(case: tuple[str, int]) -> tuple[float, ...]:
+    """Errors with an effect, by its name, in the plane or in space."""
+    return errors(EFFECTS.get(case[0]), case[1])
+
+
+def wrong(found: tuple[float, ...]) -> bool:
+    """Whether an error is too large."""
+    return any(not error < most for error, most in zip(found, MOST, strict=True))
+
+
+def text_of(case: tuple[str, int], found: tuple[float, ...], _: float) -> str:
+    """A line of the table."""
+    texts = "  ".join(f"{error:.1e}" for error in found)
+    where = {2: "plane", 3: "space"}[case[1]]
+    return f"{case[0]:22s} {where}  {texts}{'  BAD' * wrong(found)}"
 
 
 if __name__ == "__main__":

@@ -18,12 +18,14 @@ import os
 import re
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
+from harness import options, run
 from recorded.clouds import CABLE, depth_cloud, write_ply
 from recorded.takes import OFFSET, WRITERS, led, rendered, write_grippers
 from scipy.interpolate import CubicSpline
@@ -97,8 +99,12 @@ def clouds(folder: Path) -> bool:
     return right
 
 
-def main(kinds: list[str]) -> int:
+def main() -> int:
     """Print the table; 1 if anything is off."""
+    parser = options(__doc__, jobs=True)
+    parser.add_argument("kinds", nargs="*", help=f"{', '.join(WRITERS)}, clouds; all by default")
+    chosen = parser.parse_args()
+    kinds = chosen.kinds
     right = True
     if not kinds or "clouds" in kinds:
         with tempfile.TemporaryDirectory() as folder:
@@ -112,21 +118,27 @@ def main(kinds: list[str]) -> int:
         f"{own[1].std:.5f} N m^2\n"
     )
     print("format    poses  offset ms  EI std  GJ std")
-    for kind in kinds:
-        with tempfile.TemporaryDirectory() as folder:
-            path = imported(kind, Path(folder))
-            text = path.read_text()
-            poses = text.count("- {file:")
-            found = re.search(r"is (\d+) ms\s+ahead", text.replace("\n#", ""))
-            offset = int(found[1]) / 1e3 if found else float("nan")
-            off = [(a.value - b.value) / b.std for a, b in zip(fitted(path), own, strict=True)]
-        print(
-            f"{kind:8}  {poses:5}  {1e3 * offset:9.0f}  {off[0]:+6.2f}  {off[1]:+6.2f}", flush=True
-        )
+    for poses, offset, off in run(partial(compared, own=own), kinds, chosen, text_of):
         right &= poses == 10 and abs(offset - OFFSET) <= MOST_OFFSET
         right &= max(map(abs, off)) <= MOST_STD
     return not right
 
 
+def compared(kind: str, own: list[Estimate]) -> tuple[int, float, list[float]]:
+    """Poses and offset of the clock [s] in a format, and both stiffnesses off `own` [std]."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = imported(kind, Path(folder))
+        text = path.read_text()
+        found = re.search(r"is (\d+) ms\s+ahead", text.replace("\n#", ""))
+        off = [(a.value - b.value) / b.std for a, b in zip(fitted(path), own, strict=True)]
+    return text.count("- {file:"), int(found[1]) / 1e3 if found else float("nan"), off
+
+
+def text_of(kind: str, row: tuple[int, float, list[float]], _: float) -> str:
+    """A line of the table."""
+    poses, offset, off = row
+    return f"{kind:8}  {poses:5}  {1e3 * offset:9.0f}  {off[0]:+6.2f}  {off[1]:+6.2f}"
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -12,7 +12,6 @@ are offenders.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
@@ -28,6 +27,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from harness import options
 from inputs import mutations
 from inputs.bases import CONFIG, Bases, Session, make_bases
 from inputs.watch import MOST_SECONDS, watched
@@ -226,11 +226,8 @@ def run_only(seed: int, index: int, keep: Path | None) -> int:
 
 def main() -> int:
     """Run and count."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
+    parser = options(__doc__, count=(10_000, "inputs"), seed=0, only="run one input, unwatched")
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="number of processes")
-    parser.add_argument("--only", type=int, metavar="INDEX", help="run one input, unwatched")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where --only writes it")
     args = parser.parse_args()
     if args.only is not None:

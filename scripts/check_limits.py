@@ -12,13 +12,13 @@ Exit code 1 if a probability of first order is more than 2 percentage points off
 more than four standard errors of both counts.
 """
 
-import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from time import process_time
 
 import numpy as np
+from harness import options
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -268,7 +268,7 @@ def compared(case: Case, rng: np.random.Generator, draws: int) -> tuple[int, int
 
 def main() -> int:
     """Compare all kinds; the exit code."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = options(__doc__)
     parser.add_argument("--draws", type=int, default=10_000, help="of each pose, in thousands")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     chosen = parser.parse_args()

@@ -24,7 +24,6 @@ A session takes some ten seconds, with photographs of nine poses a minute.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -35,7 +34,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -43,6 +42,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from harness import options, run
 from matplotlib import pyplot
 from matrix.cells import CELLS, Cell, pairwise
 from matrix.sessions import FULL, Session, Size, draw_session
@@ -56,11 +56,10 @@ from dlo_casadi.cable.fitted_cable import Shape
 from dlo_casadi.cli import main as command
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import student_95, threshold
-from dlo_casadi.io.files import write_file
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.report.terminal import candidate_table, print_summary
 from dlo_casadi.report.writer import OWNED
-from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.runtime.parallel import generator_of
 
 # Largest difference between the generated C and Python, as a share of the length.
 APART = 1e-6
@@ -295,29 +294,19 @@ def summary(rows: Sequence[Row]) -> list[str]:
 
 def main() -> int:
     """Run the sessions; 1 if there is anything to mend."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, seed=0, jobs=True, output=True)
     parser.add_argument("--only", default="", metavar="FILTER", help="levels, joined by dashes")
     parser.add_argument("--pairwise", action="store_true", help="few that hold all pairs of levels")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--output", type=Path, help="all rows as JSON")
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="sessions and results stay there"
     )
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     args = parser.parse_args()
     cells = list(pairwise() if args.pairwise else CELLS)
     cells = matching(cells, args.only) if args.only else cells
     if not cells:
         parser.error(f"no kind of session has the levels {args.only}, in this order")
-    rows: dict[int, Row] = {}
     work = partial(run_cell, size=FULL, seed=args.seed, keep=args.keep)
-    with open_executor(args.jobs) as executor:
-        for done in map_as_completed(executor, work, cells):
-            rows[done.index] = done.value
-            print(done.value.text(), flush=True)
-            if args.output:
-                write_file(args.output, json.dumps([asdict(rows[k]) for k in sorted(rows)]))
-    found = [rows[k] for k in sorted(rows)]
+    found = run(work, cells, args, lambda cell, row, seconds: row.text())
     print(*summary(found), sep="\n")
     bad = any(r.traceback or r.halves or r.refused or r.accused for r in found)
     return int(bad or any(row.inside_99 is False for row in found))

@@ -9,13 +9,14 @@ from our shape on a table that is higher, and falls. It is no dependency: `pip i
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import mujoco as mj
 import numpy as np
+from harness import options, run
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -172,27 +173,30 @@ def _row(values: object) -> str:
 
 def main() -> int:
     """Compare all three, print a line for each."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, jobs=True)
     parser.add_argument("--links", type=int, default=40, help="of MuJoCo's cable")
     chosen = parser.parse_args()
-    wrong = 0
-    for case in CASES:
-        began = time.process_time()
-        _, found, curve = ours(case, 0.0)
-        nodes, simulated = relaxed(case, chosen.links)
-        here = curve.at(np.linspace(0.0, CABLE.length, len(nodes)))
-        apart = np.linalg.norm(nodes - here, axis=1)
-        share = float(apart.max()) / CABLE.length
-        wrong += share > ALLOWED
-        touched = ", ".join(f"{one.start:.3f} to {one.end:.3f} m" for one in found.contacts)
-        print(
-            f"{case.name}: {1e3 * apart.max():.2f} mm apart, {share:.2%} of the length; touches "
-            f"from {touched}; MuJoCo's lowest node {1e3 * nodes[:, 2].min():.2f} mm, ours "
-            f"{1e3 * found.points[:, 2].min():.2f} mm; {simulated:.1f} s simulated, "
-            f"{time.process_time() - began:.0f} s",
-            flush=True,
-        )
-    return int(wrong > 0)
+    work = partial(compared, links=chosen.links)
+    rows = run(work, CASES, chosen, lambda case, row, seconds: row[0])
+    return int(any(share > ALLOWED for _, share in rows))
+
+
+def compared(case: Case, links: int) -> tuple[str, float]:
+    """A line of the table, and how far MuJoCo's shape is from ours, as a share of the length."""
+    began = time.process_time()
+    _, found, curve = ours(case, 0.0)
+    nodes, simulated = relaxed(case, links)
+    here = curve.at(np.linspace(0.0, CABLE.length, len(nodes)))
+    apart = np.linalg.norm(nodes - here, axis=1)
+    share = float(apart.max()) / CABLE.length
+    touched = ", ".join(f"{one.start:.3f} to {one.end:.3f} m" for one in found.contacts)
+    text = (
+        f"{case.name}: {1e3 * apart.max():.2f} mm apart, {share:.2%} of the length; touches "
+        f"from {touched}; MuJoCo's lowest node {1e3 * nodes[:, 2].min():.2f} mm, ours "
+        f"{1e3 * found.points[:, 2].min():.2f} mm; {simulated:.1f} s simulated, "
+        f"{time.process_time() - began:.0f} s"
+    )
+    return text, share
 
 
 if __name__ == "__main__":

@@ -19,10 +19,10 @@ the markers.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
+from harness import options, run
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
@@ -187,7 +188,7 @@ def cells_of_rough(outcome: Outcome, truth: dict[str, Any]) -> tuple[list[str], 
 
 def main() -> int:
     """Print the table; 1 if anything in it is not as it should be."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, jobs=True)
     parser.add_argument("sessions", type=Path, help="folders with a session.yaml")
     parser.add_argument("truths", type=Path, help="folders of the same names with a truth.yaml")
     parser.add_argument("names", nargs="*", help="sessions; all by default")
@@ -197,24 +198,27 @@ def main() -> int:
     if lost := set(given.names) - set(found) or ({"session.yaml"} if not found else set()):
         parser.error(f"no {', '.join(sorted(lost))} in {given.sessions}")
     print(TITLES[given.rough])
-    good, bands = True, []
-    for name in given.names or found:
-        began = time.process_time()
-        outcome = run_session(load_config(given.sessions / name / "session.yaml"))
-        spent = time.process_time() - began
-        truths = given.truths / name
-        truth = yaml.safe_load((truths / "truth.yaml").read_text(encoding="utf-8"))
-        if given.rough:
-            cells, passed = cells_of_rough(outcome, truth)
-            bands.append(outcome.inside_band)
-        else:
-            cells, passed = cells_in_space(outcome, truth, truths)
-        good = good and passed
-        cells += [f"{spent:.0f}", "ok" if passed else "NOT"]
-        print(name, outcome.verdict, *cells, sep=" | ", flush=True)
-    if shares := [share for share in bands if share is not None]:
+    work = partial(judged, sessions=given.sessions, truths=given.truths, rough=given.rough)
+    rows = run(work, given.names or found, given, lambda name, row, _: " | ".join(row[0]))
+    if shares := [share for _, _, share in rows if share is not None and given.rough]:
         print(f"held-out points inside their bands: {100 * np.mean(shares):.0f} %")
-    return 0 if good else 1
+    return 0 if all(passed for _, passed, _ in rows) else 1
+
+
+def judged(
+    name: str, sessions: Path, truths: Path, rough: bool
+) -> tuple[list[str], bool, float | None]:
+    """Cells of a session, whether it is as it should be, and what lies in its bands."""
+    began = time.process_time()
+    outcome = run_session(load_config(sessions / name / "session.yaml"))
+    spent = time.process_time() - began
+    truth = yaml.safe_load((truths / name / "truth.yaml").read_text(encoding="utf-8"))
+    if rough:
+        cells, passed = cells_of_rough(outcome, truth)
+    else:
+        cells, passed = cells_in_space(outcome, truth, truths / name)
+    cells = [name, str(outcome.verdict), *cells, f"{spent:.0f}", "ok" if passed else "NOT"]
+    return cells, passed, outcome.inside_band
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ Exit code 1 if a shape differs, another is lower, one is unstable, or 0.5 % are 
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from collections.abc import Sequence
@@ -27,7 +26,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from benchmarks import kirchhoff
 from benchmarks.kirchhoff import FORCE, FRAME, MOMENT, PLACE, Ends, Rod
-from benchmarks.random_cables import SpaceProblem, space_problem
+from cables.free import SpaceProblem, space_problem
+from harness import options
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -270,7 +270,7 @@ def shot_at(
 
 def main() -> int:
     """Run all parts."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__)
     parser.add_argument("--collocated", type=int, default=50, help="poses against solve_bvp")
     parser.add_argument("--sets", type=int, default=100, help=f"cables, {POSES} poses each")
     chosen = parser.parse_args()

@@ -25,10 +25,10 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from harness import options, run
 
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.errors import DloError
-from dlo_casadi.runtime.parallel import map_as_completed, open_executor
 from dlo_casadi.session import run_session
 from dlo_casadi.session.remarks import worse_than_simpler
 
@@ -112,7 +112,7 @@ def variants(
             yield f"without {out[k].name}", changed(poses=tuple(out))
 
 
-def run(config: Config) -> Row:
+def fitted(config: Config) -> Row:
     """Fit one variant."""
     try:
         outcome = run_session(config)
@@ -131,31 +131,33 @@ def run(config: Config) -> Row:
     )
 
 
-def check(session: Path, changes: list[str], poses: int, diagnosed: bool, jobs: int) -> int:
+def check(session: Path, changes: list[str], chosen: argparse.Namespace) -> int:
     """Print a session's table; how many variants are not as the session itself."""
     config = load_config(session)
     estimation = config.estimation.changed(algorithm1=False)
-    diagnosis = config.diagnosis.changed(enabled=diagnosed)
+    diagnosis = config.diagnosis.changed(enabled=not chosen.without_diagnosis)
     config = config.changed(estimation=estimation, diagnosis=diagnosis)
-    base, bad = run(config), 0
+    base = fitted(config)
     print(f"{session.parent.name} | as it is | {base.text()}", flush=True)
-    names, listed = zip(*variants(config, base, changes, poses), strict=True)
-    with open_executor(jobs, None) as executor:
-        for done in map_as_completed(executor, run, listed):
-            row = done.value
-            marks = row.against(base)
-            bad += bool(marks)
-            print(session.parent.name, names[done.index], row.text(), *marks, sep=" | ", flush=True)
-    return bad
+
+    def line(case: tuple[str, Config], row: Row, _: float) -> str:
+        return " | ".join([session.parent.name, case[0], row.text(), *row.against(base)])
+
+    rows = run(fitted_variant, variants(config, base, changes, chosen.poses), chosen, line)
+    return sum(bool(row.against(base)) for row in rows)
+
+
+def fitted_variant(case: tuple[str, Config]) -> Row:
+    """Fit one variant, given with its name."""
+    return fitted(case[1])
 
 
 def main() -> int:
     """Print all tables; 1 if any variant is not as its session."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, jobs=True)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--changes", default=",".join(CHANGES), help="those to try")
     parser.add_argument("--poses", type=int, default=8, help="at most so many are left out in turn")
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument("--without-diagnosis", action="store_true", help="EI alone, much faster")
     args = parser.parse_args()
     changes = args.changes.split(",")
@@ -165,7 +167,7 @@ def main() -> int:
     for folder in args.folders:
         own = folder / "session.yaml"
         for session in [own] if own.is_file() else sorted(folder.glob("*/session.yaml")):
-            bad += check(session, changes, args.poses, not args.without_diagnosis, args.jobs)
+            bad += check(session, changes, args)
             sessions += 1
     print(f"{sessions} sessions: {bad} variants with another verdict, a jump of EI or a worse fit")
     return 1 if bad or not sessions else 0

@@ -10,7 +10,6 @@ the same photographs, beside the declared one.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from pathlib import Path
@@ -19,6 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
+from harness import options
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
@@ -41,7 +41,7 @@ def compare(line: vision.SpaceLine, truth: np.ndarray) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__)
     parser.add_argument("session", type=Path, help="a session.yaml with photographs")
     parser.add_argument("truth", type=Path, nargs="?", help="points along the true curves, .npz")
     given = parser.parse_args()

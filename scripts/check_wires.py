@@ -9,13 +9,13 @@ the points of the trial left out that lie in their 90 % band.
 
 from __future__ import annotations
 
-import argparse
 import os
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from harness import options, run
 
 from dlo_casadi.config import load_config
 from dlo_casadi.session import run_session
@@ -37,42 +37,50 @@ def floor(measured, k: int, length: float) -> float:
     return float(np.sqrt((gap**2).sum(-1).min(axis=1).mean()))
 
 
+def left_out(case: tuple[str, int]) -> tuple[dict[str, float | None], str, float]:
+    """Errors [m] of the stages without one trial of a wire, effects, share in the band."""
+    name, k = case
+    config = load_config(ROOT / "configs" / f"{name}.yaml")
+    measured = measured_poses(config, read_inputs(config))
+    poses = tuple(
+        pose.changed(role="held_out" if i == k else "fit")
+        for i, pose in enumerate(config.experiment.poses)
+    )
+    experiment = config.experiment.changed(poses=poses)
+    outcome = run_session(config.changed(experiment=experiment))
+    row: dict[str, float | None] = {"floor": floor(measured, k, config.cable.length)}
+    row |= {stage.name: stage.rmse_held_out for stage in outcome.stages}
+    row.setdefault("closed", row["batch"])
+    effects = ",".join(effect.name for effect in outcome.effects) or "-"
+    return row, effects, 100 * (outcome.inside_band or np.nan)
+
+
+def text_of(
+    case: tuple[str, int], found: tuple[dict[str, float | None], str, float], _: float
+) -> str:
+    """A line of the table."""
+    row, effects, inside = found
+    cells = "  ".join(f"{key} {1e3 * x:6.2f}" for key, x in row.items() if x is not None)
+    text = f"{case[0]} trial {case[1]} left out [mm]: {cells}  effects {effects}"
+    return f"{text}  {inside:.0f} % in their band"
+
+
 def main() -> None:
     """Leave each trial out, print the errors of the stages."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options(__doc__, jobs=True)
     parser.add_argument("names", nargs="*", help=", ".join(WIRES))
-    names = parser.parse_args().names or WIRES
+    chosen = parser.parse_args()
+    names = chosen.names or WIRES
     if lost := set(names) - set(WIRES):
         parser.error(f"no {', '.join(sorted(lost))}: try {', '.join(WIRES)}")
     for name in names:
-        config = load_config(ROOT / "configs" / f"{name}.yaml")
-        measured = measured_poses(config, read_inputs(config))
-        table, inside = [], []
-        for k in range(len(measured)):
-            poses = tuple(
-                pose.changed(role="held_out" if i == k else "fit")
-                for i, pose in enumerate(config.experiment.poses)
-            )
-            experiment = config.experiment.changed(poses=poses)
-            outcome = run_session(config.changed(experiment=experiment))
-            row = {"floor": floor(measured, k, config.cable.length)}
-            for stage in outcome.stages:
-                row[stage.name] = stage.rmse_held_out
-            row.setdefault("closed", row["batch"])
-            table.append(row)
-            effects = ",".join(effect.name for effect in outcome.effects) or "-"
-            cells = "  ".join(
-                f"{key} {1e3 * value:6.2f}" for key, value in row.items() if value is not None
-            )
-            inside.append(100 * (outcome.inside_band or np.nan))
-            band = f"{inside[-1]:.0f} % in their band"
-            print(f"{name} trial {k} left out [mm]: {cells}  effects {effects}  {band}", flush=True)
+        count = len(load_config(ROOT / "configs" / f"{name}.yaml").experiment.poses)
+        found = run(left_out, [(name, k) for k in range(count)], chosen, text_of)
         for key in ("floor", "stiffness_only", "batch", "closed"):
-            values = [row[key] for row in table if row[key] is not None]
+            values = [x for row, *_ in found if (x := row[key]) is not None]
             print(f"{name} mean {key}: {1e3 * np.mean(values):.2f} mm", flush=True)
-        print(
-            f"{name}: {np.nanmean(inside):.0f} % of left-out points in their 90 % band", flush=True
-        )
+        inside = np.nanmean([share for *_, share in found])
+        print(f"{name}: {inside:.0f} % of left-out points in their 90 % band", flush=True)
 
 
 if __name__ == "__main__":

@@ -259,22 +259,6 @@ def test_the_schema_knows_the_short_forms(tmp_path):
 # ---- diagnose, reproduce, benchmark ------------------------------------------------------------
 
 
-def test_diagnose_searches_although_the_configuration_does_not(tmp_path, monkeypatch, capsys):
-    asked = []
-
-    def run(config, progress, executor):
-        asked.append(config.diagnosis.enabled)
-        raise ConfigError("enough")
-
-    monkeypatch.setattr("dlo_casadi.session.run_session", run)
-    config = tmp_path / "rope.yaml"
-    text = (BENCH / "short_clean/session.yaml").read_text() + "diagnosis: {enabled: false}\n"
-    config.write_text(text.replace("file: ", f"file: {BENCH}/short_clean/"))
-    assert main(["diagnose", str(config)]) == 2
-    assert asked == [True]
-    assert "enough" in capsys.readouterr().err
-
-
 def test_scripts_of_the_checkout_are_run_with_their_options(tmp_path, monkeypatch, capsys):
     (tmp_path / "dlo_casadi").mkdir()
     monkeypatch.setattr(dlo_casadi, "__file__", str(tmp_path / "dlo_casadi/__init__.py"))

@@ -66,12 +66,16 @@ def test_python_runs_from_top_to_bottom(page, bench, monkeypatch, capsys, reques
     folder, result = bench
     monkeypatch.chdir(folder)
     monkeypatch.setattr(dlo, "fit", lambda config: {"configs/cable.yaml": result}[config])
-    monkeypatch.setattr("dlo_casadi.effects.EFFECTS", dict(dlo.EFFECTS))
+    known = set(dlo.EFFECTS)
     names = {"__name__": page}
     sys.modules[page] = type(sys)(page)  # where dataclasses look up the names of their types
-    for block in blocks(TEXTS[page], "python"):
-        exec(block, names)
-    del sys.modules[page]
+    try:
+        for block in blocks(TEXTS[page], "python"):
+            exec(block, names)
+    finally:
+        del sys.modules[page]
+        for name in set(dlo.EFFECTS) - known:  # registered on that page
+            del dlo.EFFECTS[name]
     said = capsys.readouterr().out
     shown = re.findall(r"^```python\n[^`]*^```\n\n```text\n(.*?)^```", TEXTS[page], re.M | re.S)
     assert [text for text in shown if text not in said] == []

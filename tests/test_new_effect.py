@@ -45,6 +45,7 @@ class Balloon(PointLoad):
     """A balloon tied to the cable: a force against gravity."""
 
     name = "balloon"
+    dimensions = (2,)
     inverses: ClassVar = {"lift": ("compliance", "1/N")}
 
     up: tuple[float, float] = (0.0, 1.0)
@@ -235,7 +236,7 @@ class Uncounted(Plumb):
     ("name", "kind", "said"),
     [
         ("uncounted", Uncounted, "its springs returns 1 spring, and n_springs is 0.*n_springs = 1"),
-        ("no_place", NoPlace, "NoPlace .* one of its methods fails, KeyError: 'position'"),
+        ("no_place", NoPlace, "NoPlace .* its scans name 'position', and it has mass"),
         ("plumb", Plumb, "Plumb cannot be an effect: it has no law and would do nothing.*springs"),
         ("no_tuple", NoTuple, "NoTuple .* its forces must return a tuple of PointForceAt, found"),
         ("no_parameters", NoParameters, "its parameters must return a tuple of Parameter, found"),

@@ -1,13 +1,14 @@
 """The effects by their names; what enters is checked, so that a mistake names its class."""
 
 import inspect
+import re
 from collections.abc import Iterator
 
-import casadi as ca
+from dlo_casadi.effects.effect import ContactEffect, Effect
+from dlo_casadi.effects.trial import Mistake, try_out
+from dlo_casadi.errors import DloError
 
-from dlo_casadi.effects.cable import CableData, Parameter, Setup
-from dlo_casadi.effects.effect import ContactEffect, Effect, Load, PointForceAt, SpringAt
-from dlo_casadi.errors import DloError, counted
+_PACKAGE = "dlo_casadi."
 
 
 class Registry(dict[str, type[Effect]]):
@@ -16,15 +17,27 @@ class Registry(dict[str, type[Effect]]):
     Raises
     ------
     DloError
-        If a class is no effect, has another name, lacks parameters or the law of its kind, or if
-        one of its methods raises an error. `update` and `setdefault` do not check.
+        If a class is no effect, has another name or that of an effect of the package, lacks
+        parameters or the law of its kind, or if one of its methods, called once as a model calls
+        it, raises an error, takes other arguments, or returns something of another shape, a symbol
+        of its own, or a number that is not finite. `update` and `setdefault` do not check.
     """
 
     def __setitem__(self, name: str, kind: type[Effect]) -> None:
-        if wrong := next(_mistakes(name, kind), ""):
+        if wrong := self._taken(name, kind) or next(_mistakes(name, kind), ""):
             called = kind.__name__ if isinstance(kind, type) else repr(kind)
             raise DloError(f"{called} cannot be an effect: {wrong}.")
         super().__setitem__(name, kind)
+
+    def _taken(self, name: str, kind: type[Effect]) -> str:
+        """Why a name cannot be used; empty if it can. A class may replace its own earlier form."""
+        if not (isinstance(name, str) and name.isidentifier()):
+            return f"its name is {name!r}.\n  Try: letters, digits and underscores"
+        own = [known for known, one in self.items() if one.__module__.startswith(_PACKAGE)]
+        base = re.sub(r"_\d+$", "", name)  # lumped_mass_2 is a second lumped mass
+        if base in own and self[base] is not kind:
+            return f"{base} is an effect of the package.\n  Try: another name"
+        return ""
 
 
 def _mistakes(name: str, kind: type[Effect]) -> Iterator[str]:
@@ -50,41 +63,6 @@ def _mistakes(name: str, kind: type[Effect]) -> Iterator[str]:
         yield f"it has no law and would do nothing.\n  Try: a method {' or '.join(laws)}"
         return
     try:
-        yield from _wrong_values(kind)
-    except Exception as error:
-        yield (
-            f"one of its methods fails, {type(error).__name__}: {error}.\n"
-            "  Try: parameters(self, cable) that declares each name which the laws use"
-        )
-
-
-def _wrong_values(kind: type[Effect]) -> Iterator[str]:
-    """Methods that return something else than a tuple of what belongs there, for some cable."""
-    d = min(kind.dimensions)
-    cable = CableData(1.0, 1.0, 0.01, 1.0, torsional_stiffness=None if d == 2 else 1.0)
-    setup = Setup(cable, gravity=(*(0.0,) * (d - 1), -9.81))
-    if not kind.applies(setup):
-        return
-    effect = kind.made_for(setup)
-    parameters = effect.parameters(cable)
-    yield from _not_a_tuple("parameters", parameters, Parameter)
-    if isinstance(effect, Load):
-        names = (*(q.name for q in parameters), *effect.per_pose(cable))
-        symbols = {name: ca.SX.sym(name) for name in names}
-        found = effect.forces(ca.SX(ca.DM(setup.gravity)), symbols)
-        yield from _not_a_tuple("forces", found, PointForceAt)
-        springs = effect.springs(symbols)
-        yield from _not_a_tuple("springs", springs, SpringAt)
-        if len(springs) != effect.n_springs:
-            yield (
-                f"its springs returns {counted(len(springs), 'spring')}, and n_springs is "
-                f"{effect.n_springs}.\n  Try: n_springs = {len(springs)} in the class"
-            )
-
-
-def _not_a_tuple(method: str, found: object, item: type) -> Iterator[str]:
-    if not isinstance(found, tuple) or not all(isinstance(one, item) for one in found):
-        yield (
-            f"its {method} must return a tuple of {item.__name__}, found {type(found).__name__}.\n"
-            f"  Try: return ({item.__name__}(...),), with the comma"
-        )
+        try_out(kind)
+    except Mistake as mistake:
+        yield str(mistake).rstrip(".")

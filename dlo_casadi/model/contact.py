@@ -37,7 +37,7 @@ from dlo_casadi.rod.obstacles import Obstacle, Surface, surfaces_near
 # Depth [lengths] under a force as large as the cable's weight; it separates contacts that depend
 # on each other. Energies do not include it (`Touching.given_way`): those of 481 of 500 random
 # cables, which touch where IPOPT's do, are the same to 3e-11 of m g L + EI/L
-# (`scripts/check_contact.py`).
+# (`scripts/check_cables.py`).
 DEPTH = 1e-10
 # Gap [lengths] that counts as much as a force of the cable's weight in deciding whether a contact
 # is active: it exceeds what this force bends segments.

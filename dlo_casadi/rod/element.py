@@ -28,9 +28,16 @@ _ORDER = 4
 
 @dataclass(frozen=True)
 class Cell:
-    """Interval of the cable on which one discrete strain acts: `width` [m], beginning at `low` [m].
+    """Interval of the cable on which one discrete strain acts: what `SectionLaw.along` is given.
 
-    `mesh` [m] is the largest width of such a cell; kinks are rounded over a share of this width.
+    Parameters
+    ----------
+    low : scalar [m]
+        Arc length of its start, from the start of the cable; `middle` and `high` are those of its
+        middle and end.
+    width : scalar [m]
+    mesh : scalar [m]
+        Largest width of a cell of the mesh: a law rounds its kinks over a share of it.
     """
 
     low: ca.SX

@@ -21,10 +21,10 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from cables.ipopt import Ipopt
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.ipopt import Ipopt
 from benchmarks.peers import COURANT, missing_elastica, missing_mujoco, relax, relax_rod
 from benchmarks.space_speed import CABLE, FINE, Timed, problem, reference
 from dlo_casadi.equilibrium.guesses import guessed_frames

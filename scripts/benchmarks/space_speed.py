@@ -13,10 +13,10 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from cables.free import SpaceProblem
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.random_cables import SpaceProblem
 from benchmarks.speed import FLAGS, HERE, summary
 from dlo_casadi.codegen import CompiledSolver, generate
 from dlo_casadi.codegen.compiled import compile_library

@@ -4,8 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
-from benchmarks.ipopt import Ipopt
-from benchmarks.random_cables import (
+from cables.free import (
     AnyCable,
     check,
     check_in_space,
@@ -15,6 +14,7 @@ from benchmarks.random_cables import (
     random_problem,
     space_problem,
 )
+from cables.ipopt import Ipopt
 
 from dlo_casadi.codegen import STATUSES
 from dlo_casadi.equilibrium.solve import solve_equilibrium

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from dlo_casadi.diagnosis import next_measurement
 from dlo_casadi.diagnosis.candidates import _like_stiffness, candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.next_measurement import hidden_weight
-from dlo_casadi.effects import EFFECTS, CableData, LumpedMass, RestCurvatureDrift
+from dlo_casadi.effects import EFFECTS, CableData, LumpedMass
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model
@@ -98,21 +97,3 @@ def test_a_load_is_like_the_stiffness_that_nearly_all_of_its_uncertainty_moves(c
 def test_a_weight_that_shows_is_not_hidden():
     """Sixty points a pose to 0.1 mm tell a twentieth of the cable's mass."""
     assert hidden_weight(fitted(1e-4, 60, 0.0)) is None
-
-
-def test_the_pose_that_would_tell_follows_those_of_the_session(monkeypatch):
-    """A cable that takes a set is predicted as the last pose leaves it."""
-    model = MODEL.with_effect(RestCurvatureDrift())
-    values = model.nominal + np.isin(model.names, ["rest_curvature_drift.rate"]) * 0.1
-    free = ["bending_stiffness"]
-    fit = fitted(6e-3, 2, 0.0, model, values=values, free=free, refined=False)
-    rests, predict = [], next_measurement.predict_poses
-
-    def predicted(model, p, rest, poses):
-        rests.append(rest)
-        return predict(model, p, rest, poses)
-
-    monkeypatch.setattr(next_measurement, "predict_poses", predicted)
-    next_measurement._pose_that_tells(fit, fit)
-    assert np.abs(fit.rest_now - fit.rest).max() > 0.01
-    assert all((rest == fit.rest_now).all() for rest in rests)

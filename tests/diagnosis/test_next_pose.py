@@ -5,14 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis import next_measurement
-from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.next_measurement import (
-    NextPose,
     _displaced,
     _separations,
     next_reading,
-    separating_pose,
 )
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
@@ -93,29 +89,3 @@ def test_a_reading_is_repeated_until_noise_and_bias_hide_no_difference(gap, time
     found = next_reading(fit, one, other)
     assert (found.name, found.times) == ("end_force", times)
     assert found.separation == pytest.approx(gap / np.hypot(0.15, 0.1))
-
-
-def test_a_rival_without_a_later_effect_is_not_told_apart_by_that(monkeypatch):
-    """The tether was fitted before the tilt was found, the force beside it."""
-    plain = CableModel(CableData(LENGTH, 0.05, 0.008, 0.05), 8)
-    known = {x.name: x for x in candidates(plain, setup_of(plain, n_poses=3))}
-
-    def fitted(*names):
-        fit = SimpleNamespace(model=plain)
-        for name in names:
-            fit.model = known[name].add_to(fit.model)
-        return SimpleNamespace(fit=fit, candidate=known[names[0]])
-
-    fit = fitted("lumped_mass", "gravity_tilt").fit
-    early, late = fitted("tether"), fitted("point_force", "gravity_tilt")
-    tilt = SimpleNamespace(candidate=known["gravity_tilt"], rivals=())
-    compared = []
-
-    def pose(first, second):
-        compared.append((first, second))
-        return NextPose((0.0, 0.0), 1.0, 1.0, 1, None)
-
-    monkeypatch.setattr(next_measurement, "next_pose", pose)
-    added = [SimpleNamespace(candidate=known["lumped_mass"], rivals=(early, late)), tilt]
-    assert separating_pose(fit, added).separates == ("lumped_mass", "point_force")
-    assert compared == [(fit, late.fit)]

@@ -1,11 +1,8 @@
 """An effect that was added is dropped again once a later one has made it superfluous."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from dlo_casadi.diagnosis import selection
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.screening import sidak, survival
@@ -154,19 +151,3 @@ def test_significance_of_two_parameters_and_of_the_best_of_many_tests():
 @pytest.mark.parametrize("noise_degrees", [np.inf, 1000.0])
 def test_a_gain_that_rounding_makes_negative_shows_nothing(noise_degrees):
     assert survival(-1e-9, 1, noise_degrees) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(("without", "significant"), [(55.0, True), (99.0, False)])
-def test_a_scatter_is_estimated_anew_without_an_effect(monkeypatch, without, significant):
-    """With its four degrees of freedom the gain of 90 alone would have a probability of 7e-4."""
-    fit, smaller = (
-        SimpleNamespace(log_evidence=evidence, scatters=True, point=SimpleNamespace(objective=left))
-        for evidence, left in ((100.0, 120.0), (54.0, 165.0))
-    )
-    monkeypatch.setattr(selection, "noise_degrees", lambda _: 4.0)
-    monkeypatch.setattr(selection, "settle", lambda _: SimpleNamespace(log_evidence=without))
-    length = SimpleNamespace(frees=("length_error.length_difference",))
-    p_value = selection.p_of_removal(fit, smaller, length, tried=20)
-    assert (p_value < 1e-6) is significant
-    if not significant:
-        assert p_value > 0.05

@@ -276,30 +276,6 @@ def test_a_scatter_may_be_of_the_rest_shape_if_a_rival_is(near):
         assert bends_at_random(both) is expected
 
 
-@pytest.mark.parametrize(
-    ("score", "gains", "second", "worth"),
-    [
-        (90.0, [], 0.0, True),
-        (70.0, [], 0.0, False),
-        (70.0, [60.0, 70.0], 40.0, False),
-        (70.0, [60.0, 70.0], 60.0, True),
-    ],
-)
-def test_effects_without_a_scatter_are_sought_where_scores_promise_as_much(
-    score, gains, second, worth, monkeypatch
-):
-    """One effect of 0.4 times what the scatter gains, or two of 0.6 times."""
-    refitted = [SimpleNamespace(gain=gain, fit=gain) for gain in gains]
-    screened = {gain: [SimpleNamespace(score=x) for x in (second, 1.0)] for gain in gains[1:]}
-    monkeypatch.setattr(Trials, "tried", lambda *_, pairs: SimpleNamespace(refits=refitted))
-    monkeypatch.setattr(Trials, "screened", lambda _, fit: screened[fit])
-    repeating = SimpleNamespace(log_evidence=0.0, converged=True)
-    trials = Trials(repeating, None, (), SIGNIFICANCE, InProcess())
-    vars(trials)["first"] = [SimpleNamespace(score=score)]
-    search = Search(trials, 4, lambda *_: None)
-    assert search._may_gain(SimpleNamespace(log_evidence=100.0)) is worth
-
-
 def test_simulated_shapes_do_not_depend_on_the_mesh_that_the_simulation_starts_with(monkeypatch):
     points = []
     for elements in (10, 40):

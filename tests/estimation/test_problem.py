@@ -26,10 +26,9 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation import descent
-from dlo_casadi.estimation import fit as fit_module
 from dlo_casadi.estimation.batch import solve_batch
 from dlo_casadi.estimation.descent import descend
-from dlo_casadi.estimation.fit import fit_model, fit_to_misfit
+from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
@@ -501,14 +500,6 @@ def test_a_misfit_need_not_be_known_exactly(share, needed, steps, converged, mon
     monkeypatch.setattr(Normal, "promised", lambda *_: np.inf)
     assert descend(start, steps=10, share=share).converged is converged
     assert len(taken) == steps
-
-
-def test_a_fit_to_its_misfit_is_such_a_descent(monkeypatch):
-    asked = []
-    monkeypatch.setattr(fit_module, "descend", lambda near, **given: asked.append(given) or near)
-    assert fit_to_misfit(start_without_a_mass()).noise.source == "misfit"
-    assert asked == [{"share": descent.MISFIT_GAIN}]
-    assert 0 < descent.MISFIT_GAIN < 0.02  # one percent of the distances
 
 
 @pytest.mark.long

@@ -1,13 +1,10 @@
 """From one mesh to the next: a fit that gets stuck on the finer one starts again."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation import fit as fitting
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.prediction import predict_poses
@@ -62,32 +59,3 @@ def test_the_error_of_a_mesh_is_the_distance_from_a_much_finer_one():
     assert apart > 1e-4
     # Between nodes, chords of both meshes differ otherwise than nodes do.
     assert fitting.mesh_error(fit) == pytest.approx(apart, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("lost", "found"), [(None, (36, True)), ("mesh", (20, True)), ("noise", (10, True))]
-)
-def test_noise_is_estimated_on_the_last_mesh(lost, found, monkeypatch):
-    """Or, if a finer one has no equilibria or no noise can be estimated, on the last possible."""
-
-    def fit(n, known):
-        model = SimpleNamespace(n=n, element=MODEL.element)
-        noise = SimpleNamespace(source="estimated")
-        return SimpleNamespace(model=model, noise=noise, known=known)
-
-    def moved(near, n):
-        if lost == "mesh" and n > 20:
-            raise EstimationError("no equilibria")
-        return fit(n, False)
-
-    def refine(near, **_):
-        if lost == "noise":
-            raise EstimationError("too few points")
-        return fit(near.model.n, True)
-
-    monkeypatch.setattr(fitting, "_moved", moved)
-    monkeypatch.setattr(fitting, "refine", refine)
-    monkeypatch.setattr(fitting, "mesh_error", lambda near: 1 / near.model.n**2)
-    monkeypatch.setattr(fitting, "allowed_mesh_error", lambda near: 1 / 36**2)
-    near = fitting.fine_enough(fit(10, True), 10)
-    assert (near.model.n, near.known) == found

@@ -19,7 +19,7 @@ pytest.importorskip("pyarrow", reason="tables need pyarrow: pip install 'dlo-cas
 import pyarrow.parquet as pq
 from tiny_sessions import QUICK, without_times, write_fleet
 
-from dlo_casadi.cli import fit, main
+from dlo_casadi.cli import main
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.fleet.rows import (
     COLUMNS,
@@ -107,20 +107,6 @@ def test_a_bug_names_a_log_only_where_there_is_one(fleet, tmp_path, monkeypatch)
     monkeypatch.setattr("dlo_casadi.fleet.run.load_config", lambda _: 1 / 0)
     (row, *_) = fit_fleet(find_sessions(fleet)[1], tmp_path, InProcess(), QUICK)
     assert row["message"] == "a bug: ZeroDivisionError: division by zero"
-
-
-def test_a_run_opens_one_pool_of_workers(tmp_path, monkeypatch, capsys):
-    (tmp_path / "broken.yaml").write_text("cable: {lenght: 1.0}\nexperiment: {}\n")
-    opened = []
-
-    def opens(*options):
-        opened.append(options)
-        return open_executor(*options)
-
-    monkeypatch.setattr(fit, "open_executor", opens)
-    assert main(["fit-many", str(tmp_path), "--output", str(tmp_path / "out")]) == 2
-    assert len(opened) == 1
-    assert "unknown key 'lenght' in cable" in capsys.readouterr().out
 
 
 @pytest.mark.long

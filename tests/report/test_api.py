@@ -8,7 +8,6 @@ import re
 import sys
 from io import StringIO
 from pathlib import Path
-from types import SimpleNamespace
 
 import casadi as ca
 import matplotlib as mpl
@@ -16,17 +15,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
-from small_sessions import small
 from test_figures import EFFECT
 
 import dlo_casadi as dlo
-from dlo_casadi import api
 from dlo_casadi.cli import main
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.effects.nuisances import EdgeBias
-from dlo_casadi.report import writer
 from dlo_casadi.report.terminal import candidate_table
-from dlo_casadi.session import Outcome
 
 
 @pytest.fixture(scope="module")
@@ -34,24 +29,6 @@ def result(outcome):
     """The small session's outcome as `fit` returns it."""
     values = {field.name: getattr(outcome, field.name) for field in dataclasses.fields(outcome)}
     return dlo.Result(**values)
-
-
-@pytest.mark.parametrize("searched", [None, True, False])
-def test_a_fit_is_that_of_the_session(searched, outcome, monkeypatch):
-    """Its outcome, whole; the diagnosis as asked for, else as configured."""
-    listener, called = SimpleNamespace(step=lambda *_: None), []
-
-    def run(session, progress, executor):
-        called.append((session.diagnosis.enabled, progress))
-        return outcome
-
-    monkeypatch.setattr(api, "run_session", run)
-    session = dlo.Session.load(small("short_clean").path)
-    result = session.fit(diagnosis=searched, progress=listener)
-    assert called == [(searched is not False, listener)]
-    assert isinstance(result, Outcome)
-    for field in dataclasses.fields(outcome):
-        assert getattr(result, field.name) is getattr(outcome, field.name)
 
 
 def test_a_path_is_a_configuration(tmp_path):
@@ -231,14 +208,6 @@ def test_cables_and_covariances_are_short(result):
 def test_a_number_is_no_executor(outcome):
     with pytest.raises(dlo.DloError, match=r"executor=2 is no Executor.\n  Try: with dlo_casadi"):
         dlo.fit(outcome.config.path, executor=2)
-
-
-def test_a_result_writes_what_the_command_writes(result, tmp_path, monkeypatch):
-    filled = []
-    for step in ("write_numbers", "draw"):
-        monkeypatch.setattr(writer, step, lambda folder, outcome, *_: filled.append(outcome))
-    assert result.write(tmp_path / "rope") == tmp_path / "rope"
-    assert filled == [result, result]
 
 
 def test_the_solver_of_a_folder_of_results(written, tmp_path, capsys):

@@ -20,7 +20,6 @@ from dlo_casadi.estimation.prediction import (
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session import fitting
 from dlo_casadi.session import stages as stages_module
 from dlo_casadi.session.fitting import nearest_to_poses, not_worse
 from dlo_casadi.session.outcome import PoseInput
@@ -201,7 +200,7 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
     assert again.converged
 
 
-def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable(monkeypatch):
+def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable():
     """On a table that is not declared: fitted to 0.3 mm, rest shape and clamps bend to it."""
     held = {"start": "clamped", "end": "clamped"}
     model = CableModel(CableData(0.8, 0.08, 0.006, bending_stiffness=0.06), 12, n_rest=4, **held)
@@ -230,12 +229,6 @@ def test_a_fit_that_lacks_something_predicts_no_worse_than_a_straight_cable(monk
     assert stage.rmse_fit_measured_branch < stages[0].rmse_fit_measured_branch
     again = [stages[0], stage]
     assert nearest_to_poses(nearest, again, staged, diagnosed=True) == (nearest, stage)
-
-    # If all fits are worse, at an edge of stability, the declared model at the simpler fit is not.
-    monkeypatch.setattr(fitting, "descend", lambda _, **__: fit)
-    monkeypatch.setattr(fitting, "fit_to_misfit", lambda _: fit)
-    _, stage = nearest_to_poses(fit, stages, staged, diagnosed=True)
-    assert stage.rmse_fit_measured_branch == pytest.approx(stages[0].rmse_fit_measured_branch)
 
 
 def test_a_cable_twisted_the_other_way_round_is_told_by_its_turns():

@@ -1,11 +1,12 @@
-"""Contact in the generated C solver: python scripts/check_contact_c.py [--count N] [--python M].
+"""Contact in the generated C solver on random poses among one to three obstacles.
 
-Random cables in random poses among one to three obstacles near where they hang without: how many
-have a shape, how deep nodes and whole cables are in obstacles, the sign of the forces, how many are
-no strict minimum when they are evaluated again (without derivatives), and the processor time beside
-that of the same poses without obstacles. Of the first poses the energy beside Python's, as a share
-of m g L + EI/L.
+Cables in random poses, obstacles near where they hang without: how many have a shape, how deep
+nodes and whole cables are in obstacles, the sign of the forces, how many are no strict minimum when
+they are evaluated again (without derivatives), and the processor time beside that of the same poses
+without obstacles. Of the first poses the energy beside Python's, as a share of m g L + EI/L.
 """
+
+from __future__ import annotations
 
 import argparse
 from collections import Counter
@@ -13,8 +14,8 @@ from dataclasses import replace
 from time import process_time
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from cables.draw import bar, directions, table
 from dlo_casadi.codegen.compiled import CompiledSolver
 from dlo_casadi.codegen.shapes import CompiledShape
 from dlo_casadi.effects import CableData
@@ -23,11 +24,21 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.rod.obstacles import Capsule, Obstacle, Plane
+from dlo_casadi.rod.obstacles import Obstacle
 
 CABLES = 8
-# As in check_contact.py.
-SAME_ENERGY, LIGHTEST = 1e-8, 1e-6
+# Least force of a contact that counts, relative to m g L + EI/L per length.
+LIGHTEST = 1e-6
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Options of this part."""
+    parser.add_argument("--python", type=int, default=0, help="in C, poses beside Python")
+    parser.add_argument("--kinds", nargs="+", choices=("plane", "all"), default=["plane", "all"])
+    parser.add_argument("--elements", type=int, default=12, help="in C")
+    parser.add_argument(
+        "--end", choices=("clamped", "pinned", "free"), default="clamped", help="in C"
+    )
 
 
 def random_cable(rng: np.random.Generator, spatial: bool, n: int, end: str) -> CableModel:
@@ -44,11 +55,7 @@ def random_pose(rng: np.random.Generator, model: CableModel) -> HeldPose:
     d, turns = model.node.dimension, rng.normal(0, 0.35, (2, 3))
     reach = tuple(float(x) for x in (rng.uniform(0.5, 0.85), *rng.normal(0, 0.1, d - 1)))
     end = None if model.end == "free" else reach
-    if model.in_space:
-        first, last = (tuple(map(float, x)) for x in Rotation.from_rotvec(turns).as_quat())
-        return HeldPose((0.0,) * d, end, start_orientation=first, end_orientation=last)
-    headings = {"start_heading": float(turns[0, 2]), "end_heading": float(turns[1, 2])}
-    return HeldPose((0.0,) * d, end, **headings)
+    return HeldPose((0.0,) * d, end, **directions(turns, d))
 
 
 def random_obstacles(rng: np.random.Generator, hung: CompiledShape, kinds: str) -> list[Obstacle]:
@@ -57,17 +64,9 @@ def random_obstacles(rng: np.random.Generator, hung: CompiledShape, kinds: str) 
     lowest, highest = hung.points[:, -1].min(), min(0.0, hung.points[-1, -1])
     for k in range(1 if kinds == "plane" else rng.integers(1, 4)):
         if kinds == "plane" or (k == 0 and rng.random() < 0.6):
-            level = lowest + rng.uniform(0.05, 0.7) * (highest - lowest) - 0.006
-            normal = np.array([*rng.normal(0, 0.1, d - 1), 1.0])
-            normal /= np.linalg.norm(normal)
-            found.append(Plane((*[0.0] * (d - 1), float(level)), tuple(normal.tolist())))
-            continue
-        place = hung.points[rng.integers(len(hung.points) // 5, 4 * len(hung.points) // 5)]
-        place = place + rng.normal(0, 0.03, d)
-        half = Rotation.random(rng=rng).apply([0.2 if d == 3 else 0.03, 0.0, 0.0])[:d]
-        half *= rng.random() < 0.5  # balls and discs
-        a, b = (tuple((place + side * half).tolist()) for side in (-1, 1))
-        found.append(Capsule(a, b, float(rng.uniform(0.02, 0.06))))
+            found.append(table(rng, lowest, highest, d))
+        else:
+            found.append(bar(rng, hung.points, 0.5, ""))
     return found
 
 
@@ -92,9 +91,11 @@ def compare(
     return ("C lower" if apart < 0 else "C higher"), apart
 
 
-def check(count: int, spatial: bool, beside: int, kinds: str, n: int, end: str, seed: int) -> None:
-    """Random poses of one dimension."""
-    rng, found, compared = np.random.default_rng(seed), Counter(), Counter()
+def check(case: tuple[str, str], chosen: argparse.Namespace) -> str:
+    """What is found in random poses, in the plane or in space, among obstacles of a kind."""
+    spatial, kinds = case[0] == "space", case[1]
+    count, beside, n, end = chosen.count, chosen.python, chosen.elements, chosen.end
+    rng, found, compared = np.random.default_rng(chosen.seed), Counter(), Counter()
     depth = whole = lowest = 0.0
     times, steps = [0.0, 0.0], []
     apart: dict[str, list[float]] = {}
@@ -146,31 +147,13 @@ def check(count: int, spatial: bool, beside: int, kinds: str, n: int, end: str, 
                     near = one.near(shape.points[first:last]).distance - model.cable.diameter / 2
                     depth = max(depth, -float(near.min()))
     told = {key: max(map(abs, row)) for key, row in apart.items()}
-    print(
-        f"{'space' if spatial else 'plane'}, {kinds}, n = {n}, end {end}: {dict(found)}; nodes at "
+    text = (
+        f"{case[0]}, {kinds}, n = {n}, end {end}: {dict(found)}; nodes at "
         f"most {depth:.1e} m deep, between them {whole:.1e} m, least force {lowest:.1e} N; time of "
         f"touching ones {times[1] / max(times[0], 1e-9):.2f} of that without, steps "
         f"{np.mean(steps, axis=0) if steps else None} and at most "
-        f"{np.max(steps, axis=0) if steps else None}",
-        flush=True,
+        f"{np.max(steps, axis=0) if steps else None}"
     )
     if beside:
-        print(f"    beside Python: {dict(compared)}; energies apart {told}; {differ}", flush=True)
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=2000, help="random poses of each kind")
-    parser.add_argument("--python", type=int, default=0, help="how many of them beside Python")
-    parser.add_argument(
-        "--where", nargs="+", choices=("plane", "space"), default=["plane", "space"]
-    )
-    parser.add_argument("--kinds", nargs="+", choices=("plane", "all"), default=["plane", "all"])
-    parser.add_argument("--elements", type=int, default=12)
-    parser.add_argument("--end", choices=("clamped", "pinned", "free"), default="clamped")
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
-    for where in chosen.where:
-        for kinds in chosen.kinds:
-            given = (chosen.python, kinds, chosen.elements, chosen.end, chosen.seed)
-            check(chosen.count, where == "space", *given)
+        text += f"\n    beside Python: {dict(compared)}; energies apart {told}; {differ}"
+    return text

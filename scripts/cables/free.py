@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.ipopt import Ipopt
+from cables.ipopt import Ipopt
 from dlo_casadi.codegen.compiled import compile_library
 from dlo_casadi.codegen.generate import generate, table_of
 from dlo_casadi.codegen.shapes import pose_table, records_of

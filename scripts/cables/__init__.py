@@ -1,0 +1,1 @@
+"""Random cables, and what they are held against: closed forms, IPOPT, Python and C."""
