@@ -84,7 +84,8 @@ def _of_xml(content: bytes) -> dict[str, Any]:
     try:
         root = ElementTree.fromstring(content)
     except ElementTree.ParseError as error:
-        raise ValueError(f"not valid XML (line {error.position[0]})") from None
+        line = error.position[0]
+        raise ValueError(f"not valid XML (line {line}). Try: the file as it was written") from None
     return {
         item.tag: [float(x) for x in item.findtext("data", "").split()]
         if item.get("type_id") == "opencv-matrix"

@@ -195,13 +195,14 @@ def as_numbers(
         cells = [cell if cell and not cell.isspace() else "nan" for cell in cells]
     if any("," in cell for cell in cells):
         cells = _with_points(cells, lines, len(at))
+    wrong = any("_" in cell for cell in cells)  # Python's float reads 1_000, which no file means
+    found = np.full(len(cells), np.nan)
     try:
         found = np.array([float(cell) for cell in cells])
     except ValueError:
-        found = np.full(len(cells), np.nan)
-    # Python's float reads 1_000, which no file means.
-    sound = np.isnan(found) if gaps else np.zeros(len(cells), bool)
-    if not (np.isfinite(found) | sound).all() or any("_" in cell for cell in cells):
+        wrong = True
+    allowed = np.isnan(found) if gaps else np.zeros(len(cells), bool)
+    if wrong or not (np.isfinite(found) | allowed).all():
         for k, cell in enumerate(cells):
             if reason := _no_number(cell, names[k % shape[1]], gaps):
                 raise ValueError(f"line {lines[k // shape[1]]}: {reason}")
@@ -264,20 +265,24 @@ def _table(
     if not body:
         return Table(head.names, head.columns, np.zeros((0, len(head.columns))), (), (), remarks)
     read: list[tuple[FloatArray, list[list[str]]]] = []
-    failed: list[tuple[int, str]] = []
+    failed: list[tuple[bool, int, str]] = []
+    at = [head.names.index(name) for name in head.columns]
     for separator in dict.fromkeys([head.separator, *SEPARATORS]):
+        counted = False
         try:
             rows = _rows(body, separator, quoted, head)
-            at = [head.names.index(name) for name in head.columns]
+            counted = True
             numbers = as_numbers(rows, at, [k for k, _ in body], head.columns)
         except ValueError as error:
             at_line = re.match(r"line (\d+)", str(error))
-            failed.append((int(at_line[1]) if at_line else 0, str(error)))
+            failed.append((counted, int(at_line[1]) if at_line else 0, str(error)))
             continue
         if not any(np.array_equal(numbers, other) for other, _ in read):
             read.append((numbers, rows))
+        if separator == head.separator and separator in ";\t":
+            break  # a comma below it is a decimal sign; below a comma it may be either
     if not read:  # the way to read it that leads farthest tells most
-        raise ValueError(max(failed, key=lambda item: item[0])[1])
+        raise ValueError(max(failed, key=lambda item: item[:2])[2])
     if len(read) > 1:
         line, said = body[0]
         ways = " or ".join(str(numbers[0].tolist()) for numbers, _ in read)
@@ -320,7 +325,10 @@ def _header(line: str, columns: Columns) -> tuple[_Header | None, str]:
         while len(names) > 1 and not names[-1]:
             names = names[:-1]
         try:
-            return _Header(separator, names, tuple(columns(names))), ""
+            chosen = tuple(columns(names))
+            if missing := [name for name in chosen if name not in names]:
+                raise ValueError(f"the column {missing[0]} is missing")
+            return _Header(separator, names, chosen), ""
         except ValueError as error:
             reasons.setdefault(len(names), error.args)
     why, *remedy = reasons[max(reasons)]

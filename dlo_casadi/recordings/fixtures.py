@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,6 +18,7 @@ _IN_LINE = 0.05  # smallest sine of the angle at the first of three markers on a
 # Share by which the distance of two markers on a gripper may change. Those of 20 mm that are known
 # to 0.5 mm change by 0.04; exchanged ones by half of it, unless the three are equally far apart.
 _RIGID = 0.15
+_TINY = 1e-9  # m
 _STRAY = 0.5  # smallest cosine at which a gripper's axis may be the cable's
 
 
@@ -99,17 +100,43 @@ def find_gripper(
 
 def _check_rigid(markers: Mapping[str, FloatArray], side: str, stills: Sequence[Still]) -> None:
     """Raise MeasurementError if a distance of two markers (P, 3) on a gripper changes in a pose."""
-    for (one, a), (other, b) in combinations(markers.items(), 2):
-        apart = np.linalg.norm(a - b, axis=1)
-        usual = float(np.median(apart))
-        k = int(np.argmax(np.abs(apart - usual)))
-        if abs(apart[k] - usual) > _RIGID * usual:
-            raise MeasurementError(
-                f"markers {one} and {other} at the {side} are {1e3 * apart[k]:.1f} mm apart in "
-                f"pose {k + 1} ({stills[k].span}), but {1e3 * usual:.1f} mm in most poses: are "
-                "labels exchanged there?\n  Try: other labels there in the program that tracks "
-                "them, or cut the recording there."
-            )
+    names, places = [*markers], np.array([*markers.values()])
+
+    def apart(trio: FloatArray) -> FloatArray:
+        return np.linalg.norm(trio - np.roll(trio, 1, axis=0), axis=-1)
+
+    by_pose = apart(places)  # (3, P)
+    usual = np.median(by_pose, axis=1)
+    off = np.abs(by_pose - usual[:, None]) / np.maximum(usual[:, None], _TINY)
+    if off.max() <= _RIGID:
+        return
+    pair, k = np.unravel_index(int(off.argmax()), off.shape)
+    exchanges = []
+    for i, (kind, other) in product(range(len(names)), stills[k].values):
+        if kind != "marker" or other == names[i]:
+            continue
+        trio = places[:, k].copy()
+        if other in names:
+            trio[names.index(other)] = trio[i]
+        trio[i] = stills[k].values[kind, other][:3]
+        if np.all(np.abs(apart(trio) - usual) <= _RIGID * usual):
+            exchanges.append(tuple(sorted((names[i], other))))
+    where = f"pose {k + 1} ({stills[k].span})"
+    one, two = names[pair], names[pair - 1]
+    told = (
+        f"markers {one} and {two} at the {side} are {1e3 * by_pose[pair, k]:.1f} mm apart in "
+        f"{where}, but {1e3 * usual[pair]:.1f} mm in most poses: are labels exchanged there?"
+    )
+    if len(found := {*exchanges}) == 1:
+        one, two = found.pop()
+        told = (
+            f"the labels of {one} and {two} are exchanged in {where}: exchanged back, the markers "
+            f"at the {side} are as far apart as in the other poses."
+        )
+    raise MeasurementError(
+        f"{told}\n  Try: other labels there in the program that tracks them, or cut the recording "
+        "there."
+    )
 
 
 def _means(stills: Sequence[Still], kind: Kind, name: str, recording: Recording) -> FloatArray:
