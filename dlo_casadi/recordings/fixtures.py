@@ -110,7 +110,7 @@ def _check_rigid(markers: Mapping[str, FloatArray], side: str, stills: Sequence[
     off = np.abs(by_pose - usual[:, None]) / np.maximum(usual[:, None], _TINY)
     if off.max() <= _RIGID:
         return
-    pair, k = np.unravel_index(int(off.argmax()), off.shape)
+    pair, k = (int(i) for i in np.unravel_index(int(off.argmax()), off.shape))
     exchanges = []
     for i, (kind, other) in product(range(len(names)), stills[k].values):
         if kind != "marker" or other == names[i]:
