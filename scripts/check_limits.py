@@ -36,7 +36,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.equilibrium.spread import SolvedCable, Uncertainty
 from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipKind, HeldClip
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter, modes_in
 
 FloatArray = NDArray[np.floating]
@@ -46,7 +46,7 @@ CABLES = {
     True: CableData(0.6, 0.03, 0.004, 0.015, torsional_stiffness=0.011),
 }
 # Number of poses, clips, how ends are held, and elements.
-KINDS: dict[str, tuple[int, tuple[ClipKind, ...], dict[str, object]]] = {
+KINDS: dict[str, tuple[int, tuple[str, ...], dict[str, object]]] = {
     "plane, pins": (5, (), {"n": 20}),
     "plane, clamps, two pinned clips": (
         5,

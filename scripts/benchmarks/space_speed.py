@@ -24,7 +24,8 @@ from dlo_casadi.codegen.shapes import pose_table, records_of
 from dlo_casadi.effects import BendingSoftening, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import CLAMPS, ClipKind, HeldClip
+from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.rod.supports import SupportKind
 
 FloatArray = NDArray[np.floating]
 # Elements of the mesh against which errors are measured: of fourth order, 1e-6 m and less.
@@ -227,7 +228,7 @@ def softening(n: int) -> dict[str, float]:
     return found
 
 
-def near(kinds: Sequence[ClipKind], n: int = 12) -> tuple[HeldPose, ...]:
+def near(kinds: Sequence[str], n: int = 12) -> tuple[HeldPose, ...]:
     """The poses with clips evenly along the cable, 0.1 % of its length off its shape without."""
     plain, rng, length = problem(n, "quadratic"), np.random.default_rng(0), CABLE.length
     bare = CompiledSolver(plain.model, plain.model.nominal, plain.rest)
@@ -237,14 +238,14 @@ def near(kinds: Sequence[ClipKind], n: int = 12) -> tuple[HeldPose, ...]:
         for kind, node in zip(kinds, nodes, strict=True):
             off = rng.normal(size=3)
             place = shape.points[node] + 1e-3 * length * off / np.linalg.norm(off)
-            frame = tuple(shape.x[node]) if kind in CLAMPS else None
+            frame = tuple(shape.x[node]) if SupportKind(kind).direction else None
             at = None if kind == "eyelet" else node * length / n
             clips.append(HeldClip(kind, tuple(place), at, orientation=frame))
         poses.append(replace(pose, clips=tuple(clips)))
     return tuple(poses)
 
 
-def slack(kinds: Sequence[ClipKind], count: int = 100) -> tuple[HeldPose, ...]:
+def slack(kinds: Sequence[str], count: int = 100) -> tuple[HeldPose, ...]:
     """Random poses whose spans have chords of 55 to 95 % of their lengths."""
     rng, many, length = np.random.default_rng(7), len(kinds), CABLE.length
     poses = []
@@ -259,7 +260,9 @@ def slack(kinds: Sequence[ClipKind], count: int = 100) -> tuple[HeldPose, ...]:
                 kind,
                 tuple(places[k]),
                 None if kind == "eyelet" else float(at[k]),
-                orientation=_facing(ways[k] + ways[k + 1], rng) if kind in CLAMPS else None,
+                orientation=_facing(ways[k] + ways[k + 1], rng)
+                if SupportKind(kind).direction
+                else None,
             )
             for k, kind in enumerate(kinds)
         ]
@@ -281,15 +284,13 @@ def _facing(way: FloatArray, rng: np.random.Generator) -> tuple[float, ...]:
 
 
 @lru_cache(maxsize=2)
-def _held(kinds: tuple[ClipKind, ...]) -> Timed:
+def _held(kinds: tuple[str, ...]) -> Timed:
     """The solver of the cable in clips of these kinds."""
     plain = problem(12, "quadratic")
     return Timed(replace(plain, model=replace(plain.model, clips=kinds), poses=()), copies=3)
 
 
-def clipped(
-    kinds: tuple[ClipKind, ...], poses: Sequence[HeldPose], rounds: int = 2
-) -> dict[str, float]:
+def clipped(kinds: tuple[str, ...], poses: Sequence[HeldPose], rounds: int = 2) -> dict[str, float]:
     """Processor time of solves over that of the same ends without clips, cold and warm.
 
     Of all poses together, and the median of theirs, of the fastest solves of both, which take
