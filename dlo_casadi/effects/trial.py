@@ -30,6 +30,7 @@ from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.ends import ClipConditions, reaction_rows
 from dlo_casadi.rod.node import Frame, Heading, Node
 from dlo_casadi.rod.obstacles import Capsule, Plane
+from dlo_casadi.rod.supports import SupportKind
 
 # Step from the value at which an effect vanishes to another trial value, in scales.
 _STEP = 0.3
@@ -246,14 +247,14 @@ def _setups(d: int) -> Iterator[Setup]:
         camera=True,
         readings=tuple(rows),
         largest_bend=2.0,
-        clips=("clamped", "eyelet"),
+        clips=(SupportKind.CLAMPED, SupportKind.EYELET),
         obstacles=1,
         resting=-0.5,
     )
     yield plain
     yield seen
-    yield replace(seen, start="clamped", end="clamped")
-    yield replace(seen, start="clamped", end="free")
+    yield replace(seen, start=SupportKind.CLAMPED, end=SupportKind.CLAMPED)
+    yield replace(seen, start=SupportKind.CLAMPED, end=SupportKind.FREE)
 
 
 def _beside(q: Parameter) -> float:
