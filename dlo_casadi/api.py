@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import Covariance, Estimate, Named
+from dlo_casadi.cable.estimate import Covariance, Estimates, Named
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.config import (
@@ -79,14 +79,16 @@ class Result(Outcome):
         return outcome_figure(self)
 
     @cached_property
-    def params(self) -> dict[str, Estimate]:
+    def params(self) -> Estimates:
         """All parameters of the last stage by name: value, std, interval_95, unit, fixed.
+
+        A notebook shows them as a table, `print` as lines; `stderr` is lmfit's name of `std`.
 
         Parameters known within a tolerance, such as `length_error.length_difference`, follow the
         fitted ones. Intervals are profile likelihoods; a model that does not explain the
         measurements has none.
         """
-        return Named(estimates_of(self))
+        return Estimates(estimates_of(self))
 
     @property
     def covariance(self) -> Covariance:

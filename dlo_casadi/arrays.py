@@ -1,11 +1,49 @@
 """Types of arrays, and vectorized geometry."""
 
+from dataclasses import fields, is_dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.floating]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
+
+
+# Longest text of one value, and most items of one value, in a `Brief`.
+_LONGEST, _MOST = 60, 8
+
+
+class Brief:
+    """A dataclass in one line: arrays by their shapes, many items by their number or names.
+
+    For a dataclass of `repr=False`, which would otherwise print all that it holds.
+    """
+
+    def __repr__(self) -> str:
+        kept: Any = self
+        shown = ((x.name, getattr(self, x.name)) for x in fields(kept) if x.repr)
+        inside = ", ".join(f"{name}={_brief(x)}" for name, x in shown if x is not None)
+        return f"{type(self).__name__}({inside})"
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"<array {value.shape}>"
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return f"{{{', '.join(value)}}}" if len(value) <= _MOST else f"<{len(value)} items>"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if is_dataclass(value):
+        return f"<{type(value).__name__}>"
+    text = repr(value) if not isinstance(value, tuple | list | dict) or len(value) <= _MOST else ""
+    return text if text and len(text) <= _LONGEST and "\n" not in text else _counted(value)
+
+
+def _counted(value: Any) -> str:
+    items = f" of {len(value)}" if hasattr(value, "__len__") else ""
+    return f"<{type(value).__name__}{items}>"
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -1,10 +1,14 @@
 """A cable of which everything is known, beside closed forms; and it is what a fit returns."""
 
+import copy
 import json
+import multiprocessing
 import pickle
 import re
 import shutil
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -181,6 +185,70 @@ def test_it_is_what_a_fit_returns(rope, fewer_starts, tmp_path):
 def test_its_compiled_solver_finds_its_shape(rope):
     found = rope.compile().solve(dlo.Pose((0, 0), (0.5, 0.1)))
     assert found.end_force == pytest.approx(rope.solve(end=(0.5, 0.1)).end_force, rel=1e-6)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_a_compiled_solver_is_pickled_and_copied(rope):
+    """The C is made again: to the last digit the same shapes, in another process as well."""
+    solver, pose = rope.compile(flags=("-O0",)), dlo.Pose((0, 0), (0.5, 0.1))
+    points = solver.solve(pose).points
+    for other in (pickle.loads(pickle.dumps(solver)), copy.copy(solver)):
+        assert np.array_equal(other.solve(pose).points, points)
+        assert other.most_obstacles == solver.most_obstacles
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
+        found = executor.submit(solver.solve, pose).result()
+    assert np.array_equal(found.points, points)
+
+
+def test_a_known_cable_is_saved_for_the_commands(rope, tmp_path, capsys):
+    path = rope.save(tmp_path / "results/rope")
+    assert path == tmp_path / "results/rope/parameters.yaml"
+    end = ["--end", "0.5", "0.1", "--json"]
+    assert main(["predict", str(path.parent), *end]) == 0
+    points = json.loads(capsys.readouterr().out)["points"]
+    assert np.array_equal(points, rope.solve((0.5, 0.1)).points)
+    assert main(["generate-solver", str(path.parent), "--output", str(tmp_path / "c")]) == 0
+    assert (tmp_path / "c/dlo_solver.c").exists()
+    assert rope.save(str(tmp_path / "one.yaml")) == tmp_path / "one.yaml"
+    assert dlo.load(tmp_path / "one.yaml").metadata.model_hash == rope.metadata.model_hash
+
+
+def test_a_saved_cable_has_its_mesh(tmp_path):
+    bent = dlo.known_cable(ROPE, **FREE, rest_curvature=[0.0, 1.0, 4.0, 2.0], model={"n": 10})
+    fine = bent.with_mesh(30)
+    again = dlo.load(fine.save(tmp_path))
+    assert again.model == fine.model
+    assert not again.metadata.edited
+    assert again.rest == pytest.approx(fine.rest, abs=1e-12)
+    assert again.metadata.model_hash != bent.metadata.model_hash
+
+
+def test_a_cable_is_not_saved_over_what_is_not_one(rope, tmp_path):
+    (tmp_path / "notes.yaml").write_text("mine: 1")
+    with pytest.raises(dlo.DloError, match=r"holds notes.yaml from elsewhere, which would be re"):
+        rope.save(tmp_path / "notes.yaml")
+    assert (tmp_path / "notes.yaml").read_text() == "mine: 1"
+    with pytest.raises(dlo.DloError, match=r"(?s)clips are of a pose, .*Try: cable.with_clips"):
+        rope.with_clips(["pinned"]).save(tmp_path)
+    with pytest.raises(dlo.DloError, match="a path belongs here, found 3"):
+        rope.save(3)
+
+
+def test_placing_and_lists_of_limits_tell_their_progress(rope, fewer_starts, tmp_path, capsys):
+    told = []
+    listener = SimpleNamespace(step=lambda *news: told.append(news))
+    region = ((0, -0.3), (0.5, 0.1))
+    rope.place(1, [{"end": (0.5, 0.1)}], region, {"bend_radius": 0.02}, progress=listener)
+    names, done, totals = zip(*told, strict=True)
+    assert set(names) == {"place the clips"}
+    assert list(done) == sorted(set(done))
+    assert done[0] == 0
+    assert set(totals) == {done[-1]}
+    rope.save(tmp_path)
+    (tmp_path / "poses.csv").write_text("end_x_m,end_y_m\n0.5,0.1\n0.4,0.0\n")
+    command = ["limits", str(tmp_path), str(tmp_path / "poses.csv"), "--limits", "bend_radius=0.02"]
+    assert main(command) == 0
+    assert "check the poses: " in capsys.readouterr().err
 
 
 def test_another_mesh_has_the_same_rest_curvature():

@@ -28,7 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "io": {*MECHANICS, "config"},
     "codegen": {*MECHANICS, "config", "io"},
     "export": {*MECHANICS, "io"},
-    "cable": {*MECHANICS, "config", "io", "codegen", "show", "export"},
+    "cable": {*MECHANICS, "config", "io", "codegen", "show", "export", "runtime"},
     "vision": set(),
     "sensing": {*MECHANICS, "vision"},
     "estimation": {*MECHANICS, "sensing"},

@@ -12,7 +12,8 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi import predict
-from dlo_casadi.cable.file import load, parameters_hash
+from dlo_casadi.cable.file import load
+from dlo_casadi.cable.saved import parameters_hash
 from dlo_casadi.cli import main
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import DloError, EquilibriumError

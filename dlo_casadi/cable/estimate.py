@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray, unit
+from dlo_casadi.cable.saved import write_parameters
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.config import Limits
 from dlo_casadi.config.values import MESH
@@ -20,7 +22,7 @@ from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.rod.chain import ELEMENTS, ELEMENTS_IN_SPACE
 from dlo_casadi.rod.node import Frame
-from dlo_casadi.show.text import plus_minus
+from dlo_casadi.show.text import html_table, plus_minus
 
 Value = TypeVar("Value")
 
@@ -61,6 +63,11 @@ class Estimate:
     at_bound: bool = False
     fixed: bool = False
 
+    @property
+    def stderr(self) -> float | None:
+        """`std` by the name that lmfit uses; None if the parameter was not estimated."""
+        return None if self.fixed else self.std
+
     def __str__(self) -> str:
         text = "unbounded" if math.isinf(self.value) else plus_minus(self.value, self.std)
         text = f"{text} {self.unit}".strip()
@@ -76,6 +83,25 @@ class Estimate:
 
     def __repr__(self) -> str:
         return f"<Estimate {self}>"
+
+
+class Estimates(Named[Estimate]):
+    """Parameters by name: a line each as text, a table in a notebook."""
+
+    def __repr__(self) -> str:
+        width = max(map(len, self), default=0)
+        return "\n".join(f"{name:{width}}  {found}" for name, found in self.items())
+
+    def _repr_html_(self) -> str:
+        rows = [(name, *_cells(found)) for name, found in self.items()]
+        return html_table("parameters", [("name", "value", "95 %", "remark"), *rows])
+
+
+def _cells(one: Estimate) -> tuple[str, str, str]:
+    """Value, interval and remark of an estimate, as its text has them."""
+    known, _, remark = str(one).partition(", ")
+    value, _, interval = known.partition(" (95 %: ")
+    return value, interval.rstrip(")"), remark
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +172,7 @@ class Metadata:
     explains : bool or None
         Whether the model explains the shapes it was fitted to; None where that was not judged.
     model_hash : str
-        Hash in the file; see `parameters_hash`.
+        Hash in the file; see `saved.parameters_hash`.
     edited : bool
         Whether the model has changed since the file was written.
     config : str
@@ -197,9 +223,9 @@ class EstimatedCable(CasadiCable):
         return self.model.cable.name
 
     @property
-    def params(self) -> dict[str, Estimate]:
+    def params(self) -> Estimates:
         """All parameters of the model by name, with their estimates."""
-        return Named(self.metadata.params)
+        return Estimates(self.metadata.params)
 
     @property
     def covariance(self) -> Covariance:
@@ -234,6 +260,22 @@ class EstimatedCable(CasadiCable):
             )
         model = self.model.with_mesh(self.model.n if n is None else int(n), element)
         return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
+
+    def save(self, path: str | PathLike[str]) -> Path:
+        """Write parameters.yaml, which `load` and the commands read; return its path.
+
+        Parameters
+        ----------
+        path : str or Path
+            A folder, which is made if need be, or the name of a file that ends in .yaml.
+
+        Raises
+        ------
+        DloError
+            If the cable has clips, which are of a pose, if the file cannot be written, or if
+            another file of its name is there.
+        """
+        return write_parameters(self.metadata.document, self.model, path)
 
     def compile(self, *, flags: Sequence[str] = ("-O2",), obstacles: int = 0) -> CompiledSolver:
         """The cable as C, compiled and loaded: thousands of shapes a second.

@@ -5,8 +5,6 @@ its text.
 """
 
 import difflib
-import hashlib
-import json
 import math
 import os
 import re
@@ -21,6 +19,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Covariance, Estimate, Metadata
 from dlo_casadi.cable.fitted_cable import FittedCable
+from dlo_casadi.cable.saved import FILE, SCHEMA, parameters_hash
 from dlo_casadi.config import Limits
 from dlo_casadi.config.document import Document
 from dlo_casadi.config.frozen import OpenSection
@@ -52,13 +51,9 @@ from dlo_casadi.model.pose_scatter import REST_CURVATURE, PoseScatter, sources_i
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame
 
-FILE = "parameters.yaml"
-SCHEMA = "dlo-parameters/1"
 # Largest file [bytes]: the covariance of 250 estimates, among them 128 rest coefficients in space,
 # has 250^2 numbers of 25 bytes; all else has less than a fifth of that.
 _LARGEST = 2_000_000
-# Keys on which a prediction depends, besides the values of the parameters.
-_MODEL_KEYS = ("cable", "boundary", "gravity", "element", "n", "n_rest", "effects", "state")
 # Tolerance of a value at its bound, relative to the bound or the parameter's scale: for rounding in
 # value = nominal + scale x, or exp(x), about 1e-14, and for the tolerance of solvers.
 _ROUNDING = 1e-9
@@ -428,17 +423,3 @@ def metadata_of(
         config=file.config,
         document=document,
     )
-
-
-def parameters_hash(document: Mapping[str, Any]) -> str:
-    """SHA-256 of everything that determines predictions, without bounds and standard deviations.
-
-    The file has it as `model_hash`. A generated solver has a separate hash: `codegen.solver_hash`.
-    """
-    content = {key: document.get(key) for key in _MODEL_KEYS}
-    content["values"] = {key: row["value"] for key, row in document["parameters"].items()}
-    content["coefficients"] = document["rest_curvature"]["coefficients"]
-    # 1 and 1.0 are the same model; keys that are not read may hold what JSON lacks, such as dates.
-    plain = json.dumps(content, default=str, skipkeys=True)
-    text = json.dumps(json.loads(plain, parse_int=float), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()

@@ -33,6 +33,7 @@ from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.export.targets import check_counts, samples_of, target_of, write_rods
 from dlo_casadi.model.clips import ClipLoad, clip_rows
 from dlo_casadi.model.contact import Contact, surfaces_at
+from dlo_casadi.runtime.progress import Progress
 from dlo_casadi.show.text import bend_radius, html_table
 
 # Number of points of a shape.
@@ -156,12 +157,13 @@ class FittedCable(EstimatedCable):
         limits: Asked = None,
         *,
         aim: Aim = "margin",
+        progress: Progress | None = None,
     ) -> Placing:
         """Find arc lengths and places of pinned clips that keep limits in several poses.
 
         Maximizes the smallest margin of all limits in all poses, or minimizes the largest force on
-        fixtures and clips within the limits. Shapes are the stable ones of lowest energy. The
-        optimum is local: the best of those found from several first guesses.
+        fixtures and clips within the limits. Shapes are the stable ones of lowest energy; the
+        optimum is the best local one of several first guesses.
 
         Parameters
         ----------
@@ -169,13 +171,13 @@ class FittedCable(EstimatedCable):
             Number of clips.
         poses : sequence of mapping
             End conditions in each pose, as keywords of `solve`: [{"end": (0.3, -0.1)}, ...].
-        within : ((d,), (d,)) [m]
-            Two corners of the region for clips: smallest and largest coordinates. For a wall both
-            corners share a coordinate.
+        within : ((d,), (d,)) [m], two corners of the region for clips
+            For a wall they share a coordinate.
         limits : Limits or mapping, optional
             As in `Shape.check`; by default the session's.
         aim : "margin" or "force"
             The quantity to optimize; "force" needs no limits.
+        progress : Progress, optional, as of `Session.fit`
 
         Raises
         ------
@@ -185,7 +187,7 @@ class FittedCable(EstimatedCable):
         EquilibriumError
             If the cable has no shape in one of the poses without clips.
         """
-        return placed(self, count, poses, within, limits, aim)
+        return placed(self, count, poses, within, limits, aim, progress)
 
     def export(
         self,

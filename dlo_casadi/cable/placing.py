@@ -36,6 +36,7 @@ from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.supports import SupportKind
+from dlo_casadi.runtime.progress import Progress, Step, nobody
 from dlo_casadi.show.text import vector
 
 Aim = Literal["margin", "force"]
@@ -57,6 +58,8 @@ SCATTER = 0.05
 PENALTY = 10.0
 # Rounds end when the resolved use of bends changes by less than this relative amount.
 SETTLED = 5e-3
+# Name of the work in its progress.
+WORK = "place the clips"
 _TRY = "within=((0.1, 0.0), (0.3, 0.2)) [m]: two opposite corners"
 
 
@@ -109,6 +112,7 @@ def placed(
     within: ArrayLike,
     limits: Asked,
     aim: Aim,
+    progress: Progress | None,
 ) -> Placing:
     """See `FittedCable.place`."""
     if aim not in get_args(Aim):
@@ -141,7 +145,8 @@ def placed(
     if aim == "margin" or limits is not None or known.limits.given:
         asked = asked_limits(between, limits)
     box = np.sort(region, axis=0) / cable.model.cable.length
-    return _Search(between, held, box, asked, aim).best()
+    step = nobody if progress is None else progress.step
+    return _Search(between, held, box, asked, aim, step).best()
 
 
 @dataclass(frozen=True)
@@ -174,6 +179,7 @@ class _Search:
     region: FloatArray
     limits: Limits
     aim: Aim
+    step: Step = nobody
 
     @cached_property
     def count(self) -> int:
@@ -286,7 +292,10 @@ class _Search:
         """The best result of all first guesses; raises an error if none keeps the limits."""
         scales, lost = np.ones((len(self.poses), len(self.bounded))), EquilibriumError("")
         trials: list[_Trial] = []
-        for z in self._guesses():
+        guesses = self._guesses()
+        parts = len(guesses) + STARTS
+        for k, z in enumerate(guesses):
+            self.step(WORK, k, parts)
             try:
                 trials.append(self._descended(self.solved_at(z, scales), scales, TRIED))
             except EquilibriumError as error:
@@ -297,7 +306,12 @@ class _Search:
             what = f"no shapes were found with {clips} in the region: {happened}"
             raise DloError(f"{what}\n  Try: fewer clips, another region, ends nearer to the start.")
         firsts = sorted(trials, key=lambda one: one.merit)[:STARTS]
-        best = min((self._improved(one, scales) for one in firsts), key=self._order)
+        found = []
+        for k, one in enumerate(firsts, start=len(guesses)):
+            self.step(WORK, k, parts)
+            found.append(self._improved(one, scales))
+        self.step(WORK, parts, parts)
+        best = min(found, key=self._order)
         if best.margin < 0:
             raise DloError(
                 f"no places of {clips} were found that keep the limits in "

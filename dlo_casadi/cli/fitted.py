@@ -14,6 +14,7 @@ from dlo_casadi.cli.common import (
     SCHEDULER,
     Counter,
     Page,
+    Watch,
     command,
     figure,
     jobs,
@@ -227,14 +228,17 @@ def limits(chosen: argparse.Namespace) -> None:
     cable, obstacles = load(chosen.parameters), _listed(chosen, "obstacles")
     checks: list[LimitCheck] = []
     lost: dict[str, str] = {}
-    for name, ends in listed_poses(cable.model, chosen.poses).items():
-        try:
-            shape = cable.solve(**ends, obstacles=obstacles)
-        except EquilibriumError as error:
-            lost[name] = error.message.partition("\n")[0]
-            continue
-        named = replace(shape, pose=replace(shape.pose, name=name))
-        checks += _checked(named, chosen)
+    poses = listed_poses(cable.model, chosen.poses)
+    with Watch(quiet=chosen.quiet) as watch:
+        for k, (name, ends) in enumerate(poses.items(), start=1):
+            try:
+                shape = cable.solve(**ends, obstacles=obstacles)
+            except EquilibriumError as error:
+                lost[name] = error.message.partition("\n")[0]
+            else:
+                named = replace(shape, pose=replace(shape.pose, name=name))
+                checks += _checked(named, chosen)
+            watch.step("check the poses", k, len(poses))
     if not checks:
         name, problem = next(iter(lost.items()))
         raise EquilibriumError(f"no limit is checked, no pose has a shape: {name}: {problem}")

@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,9 @@ def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",
 class CompiledSolver:
     """Equilibria in the plane and in space by compiled C: thousands of poses a second.
 
-    Methods that find shapes take `obstacles`; without them the model's own apply.
+    Methods that find shapes take `obstacles`; without them the model's own apply. A pickle or copy
+    holds what the C is made from: where it is unpickled, it is generated and compiled again, which
+    needs a compiler there. Processes that are forked share the loaded library.
 
     Parameters
     ----------
@@ -126,6 +129,7 @@ class CompiledSolver:
         obstacles: int = 0,
     ) -> None:
         self.model = model
+        self._remade = partial(CompiledSolver, flags=flags, obstacles=obstacles), (model, p, rest)
         self.source = generate(model, p, rest, obstacles=obstacles)
         self.most_obstacles = self.source.obstacles.most
         self.obstacles = self.source.obstacles.declared
@@ -138,6 +142,9 @@ class CompiledSolver:
             getattr(self._c, name).argtypes = [_TYPES[kind] for kind in kinds]
         self._records = records_of(model, self.most_obstacles)
         self.workspace = self.source.workspace
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._remade
 
     def __repr__(self) -> str:
         model = self.model

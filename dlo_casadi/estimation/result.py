@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.arrays import BoolArray, Brief, FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.problem import FIRST_ROUGHNESS, Priors, Problem
 from dlo_casadi.estimation.unknowns import (
@@ -30,8 +30,8 @@ from dlo_casadi.thresholds import LEAST_NOISE_DEGREES
 ROUGHNESSES = np.geomspace(1e-3, 30 * FIRST_ROUGHNESS, 40)
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, repr=False)
+class Fit(Brief):
     """Parameters that explain the measured poses best, and how well they are known.
 
     Parameters

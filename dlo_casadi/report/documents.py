@@ -15,8 +15,9 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, length_of
 from dlo_casadi.cable.estimate import Covariance, Estimate
-from dlo_casadi.cable.file import SCHEMA, metadata_of, parameters_hash
+from dlo_casadi.cable.file import metadata_of
 from dlo_casadi.cable.fitted_cable import FittedCable
+from dlo_casadi.cable.saved import SCHEMA, parameters_hash
 from dlo_casadi.config import Config, Limits, dump_yaml
 from dlo_casadi.config.values import AXES
 from dlo_casadi.effects import Effect, known_effect

@@ -260,6 +260,30 @@ def estimates_of(outcome: Outcome) -> dict[str, Estimate]:
     return known
 
 
+def _stage_lines(outcome: Outcome) -> list[str]:
+    """Errors and chi-square of all stages, aligned; `before` and `after` mark what is compared."""
+    head = ("stage", "", "fit", "cross-validated", "held out", "chi2 per dof")
+    keys = ("label", "mark", "fit", "validated", "held_out", "chi2")
+    table = [head, *(tuple(row[key] for key in keys) for row in stage_rows(outcome, "-"))]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    rows = ("  ".join(f"{x:{w}}" for x, w in zip(row, widths, strict=True)) for row in table)
+    return ["Errors by stage", *(f"  {row}".rstrip() for row in rows)]
+
+
+def _effect_lines(outcome: Outcome) -> list[str]:
+    """Added effects: p-value, cross-validated errors, and names of their parameters in `params`."""
+    lines = []
+    for one in outcome.effects:
+        both = (one.rmse_cross_validated_before, one.rmse_cross_validated_after)
+        before, after = (text.millimetres(x) for x in both)
+        chance = "" if one.p_value is None else f"p {one.p_value:.2g}, "
+        names = ", ".join(
+            name for name in estimates_of(outcome) if name.startswith(f"{one.label}.")
+        )
+        lines.append(f"  {one}: {chance}cross-validated {before} -> {after}; {names}")
+    return ["Added effects", *lines] if lines else []
+
+
 def summary_text(outcome: Outcome) -> str:
     """Errors, all parameters, strong correlations and warnings."""
     fit, names = outcome.fit, outcome.fit.named_covariance[0]
@@ -285,8 +309,11 @@ def summary_text(outcome: Outcome) -> str:
         f"  {poses} ({measurement.poses_held_out} held out), "
         f"{counted(measurement.points, 'point')}",
         *("  " + "  ".join(filter(None, row)) for row in error_rows(outcome)),
+        *_stage_lines(outcome),
+        *_effect_lines(outcome),
         f"Parameters{doubt}",
         *(f"  {name:{width}}  {found}" for name, found in shown.items()),
+        *("  " + "  ".join(filter(None, row)) for row in rest_rows(outcome)),
     ]
     if pairs:
         lines += [f"Correlations beyond {_STRONG}", *(said for _, said in sorted(pairs)[::-1])]

@@ -12,6 +12,7 @@ from dlo_casadi import vision
 from dlo_casadi.config import Config, DeclaredCamera, Images, Pose
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.io.points import MeasuredPoints, read_points
+from dlo_casadi.runtime.progress import Step, nobody
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.pixels import ViewInput, pixel_std, pixels_of
 from dlo_casadi.sensing.sensors import line_or_markers
@@ -22,14 +23,6 @@ READERS = 2
 # Points per line used by fits, errors and pictures. More points of a photograph would repeat their
 # neighbours' noise; other lines enter the fit as means of neighbours.
 MOST_POINTS = 240
-
-
-Step = Callable[[str, int, int], None]
-"""Told what is done, how much of it is done, and how much there is."""
-
-
-def nobody(*_: object) -> None:
-    """A `Step` that ignores the progress."""
 
 
 def read_session(config: Config, step: Step = nobody) -> tuple[Config, tuple[PoseInput, ...]]:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import Brief, FloatArray
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config, Pose
@@ -33,8 +33,8 @@ MASS = "mass"
 SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
 
 
-@dataclass(frozen=True)
-class RestCurvatureEstimate:
+@dataclass(frozen=True, repr=False)
+class RestCurvatureEstimate(Brief):
     """Rest curvature along the cable: s (M,) [m], value and standard deviation [1/m].
 
     (M,) in a plane; (2, M) in space, about the material axes y and z.
@@ -56,8 +56,8 @@ class ReadingErrors:
     moment: float | None = None
 
 
-@dataclass(frozen=True)
-class Stage:
+@dataclass(frozen=True, repr=False)
+class Stage(Brief):
     """One stage of the fit.
 
     Parameters
@@ -114,8 +114,8 @@ class Stage:
         return {name: found for name, x in self.shapes.items() if (found := x.measured_side)}
 
 
-@dataclass(frozen=True)
-class PoseInput:
+@dataclass(frozen=True, repr=False)
+class PoseInput(Brief):
     """One pose as it was measured.
 
     Parameters

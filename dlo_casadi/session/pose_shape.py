@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.arrays import BoolArray, Brief, FloatArray
 from dlo_casadi.equilibrium.pose import PoseBranch
 from dlo_casadi.equilibrium.spread import COVERED, Tipping
 
 
-@dataclass(frozen=True)
-class BranchShape:
+@dataclass(frozen=True, repr=False)
+class BranchShape(Brief):
     """The stable equilibrium in which a pose was measured, where it is not the predicted one.
 
     Parameters
@@ -41,8 +41,8 @@ class BranchShape:
         return f"branch: {self.branch}" if self.branch else None
 
 
-@dataclass(frozen=True)
-class EitherSide:
+@dataclass(frozen=True, repr=False)
+class EitherSide(Brief):
     """A pose on both sides on which its cable may hang, see `CableModel.tipped_by`.
 
     Parameters
@@ -65,8 +65,8 @@ class EitherSide:
         return near or self.other.rmse < self.predicted.rmse
 
 
-@dataclass(frozen=True)
-class PoseShape:
+@dataclass(frozen=True, repr=False)
+class PoseShape(Brief):
     """One pose in one stage.
 
     Parameters

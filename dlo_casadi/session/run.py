@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,21 +23,14 @@ from dlo_casadi.estimation.variances import SETTLED_MODES, SMOOTH_MODES
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess, one_thread, software
 from dlo_casadi.runtime.parallel import begin
+from dlo_casadi.runtime.progress import Progress, Step, nobody
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
-from dlo_casadi.session.measure import Step, measured_poses, nobody, read_session
+from dlo_casadi.session.measure import measured_poses, read_session
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, Stage, found_effects
 from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_parameters
-
-
-class Progress(Protocol):
-    """Receiver of a run's progress."""
-
-    def step(self, name: str, done: int, total: int) -> None:
-        """Report that `done` of `total` parts of the named work are finished."""
-
 
 TIMED = ("vision", "algorithm1", "batch", "diagnosis")
 

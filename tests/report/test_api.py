@@ -126,6 +126,53 @@ def test_a_result_is_kept_and_copied(result):
     assert str(pickle.loads(pickle.dumps(shape))) == str(shape)
 
 
+def test_what_a_result_holds_is_printed_in_a_line(result):
+    """A stage had 5,000 lines: arrays are shown by their shapes, many items by their number."""
+    stage = result.stages[-1]
+    shape = next(iter(stage.shapes.values()))
+    for one in (stage, shape, stage.rest_curvature, result.fit, result.poses[0], result.stages):
+        assert len(repr(one).splitlines()) == 1
+        assert len(repr(one)) < 2500
+    assert repr(stage).startswith(f"Stage(name='batch', rmse_fit={stage.rmse_fit:.4g}")
+    assert "parameters={bending_stiffness}" in repr(stage)
+    assert f"points=<array {result.poses[0].points.shape}>" in repr(result.poses[0])
+
+
+def test_a_summary_has_the_errors_of_all_stages_and_the_rest_curvature(result):
+    lines = [re.split(r"  +", line.strip()) for line in result.summary().splitlines()]
+    rows = {line[0]: line[1:] for line in lines}
+    last, first = result.stages[-1], result.stages[0]
+    assert rows["stage"] == ["fit", "cross-validated", "held out", "chi2 per dof"]
+    assert rows["initial guess"][:2] == ["before", f"{1e3 * first.rmse_fit:.3g} mm"]
+    after = [f"{1e3 * x:.3g} mm" for x in (last.rmse_fit, last.rmse_held_out)]
+    assert rows["declared model, fitted"] == [
+        *("after", after[0], "-", after[1], f"{last.chi2_per_dof:.3g}")
+    ]
+    value = last.rest_curvature.value
+    assert rows["rest curvature"][0] == f"{value.min():.3g} to {value.max():.3g} 1/m"
+
+
+def test_a_summary_has_added_effects_with_their_names_in_params(result):
+    label, value = "tether", dlo.Estimate(2.0, 0.1, "N/m")
+    added = dataclasses.replace(EFFECT, name=label, label=label, p_value=1e-9)
+    stage = dataclasses.replace(result.stages[-1], parameters={"tether.stiffness": value})
+    found = dataclasses.replace(result, effects=(added,), stages=(*result.stages[:-1], stage))
+    (line,) = (x for x in found.summary().splitlines() if x.startswith("  tether: p 1e-09, "))
+    assert line.endswith("; tether.stiffness")
+    assert "  tether.stiffness  " in found.summary()
+
+
+def test_params_are_a_table_in_a_notebook_and_have_the_names_of_lmfit(result):
+    html, text = result.params._repr_html_(), repr(result.params)
+    stiffness = result.params["bending_stiffness"]
+    value = f"{stiffness}".partition(" (95 %")[0]
+    assert f"<tr><td>bending_stiffness</td><td>{value}</td>" in html
+    assert html.count("<tr>") == 1 + len(result.params) == 1 + len(text.splitlines())
+    assert stiffness.stderr == stiffness.std
+    assert dataclasses.replace(stiffness, fixed=True).stderr is None
+    assert result.cable.params._repr_html_().count("<tr>") == 1 + len(result.cable.params)
+
+
 def test_a_notebook_gets_a_table_with_everything_escaped(result):
     cable = result.config.cable.changed(name="<script>&")
     shown = dataclasses.replace(result, config=result.config.changed(cable=cable))

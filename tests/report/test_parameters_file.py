@@ -12,7 +12,8 @@ import pytest
 from small_sessions import BENCH, CONFIGS, small
 
 from dlo_casadi.api import predict
-from dlo_casadi.cable.file import load, parameters_hash
+from dlo_casadi.cable.file import load
+from dlo_casadi.cable.saved import parameters_hash
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.effects import BendingSoftening, ImageDistortion, RestCurvatureDrift
 from dlo_casadi.errors import ConfigError
