@@ -99,6 +99,8 @@ READ = {
     f"model: Brown Conrady, coeffs: {TERMS}}}",
     "terms by their names": "{fx: 915, fy: 914, cx: 641.5, cy: 358.25, k1: -0.03, k2: 0.01, "
     "p1: 0.001, p2: -0.002}",
+    "messages of ROS as they are printed": "header: {frame_id: cam}\nbinning_x: 0\n"
+    f"distortion_model: plumb_bob\nD: {TERMS}\nK: {FLAT}\nR: []\n---\nD: {TERMS}\nK: {FLAT}\n---\n",
     "our own keys": f"{{matrix: {LISTS[0]}, distortion: {TERMS}}}",
     "a file that was saved on Windows": OPENCV.replace("\n", "\r\n"),
 }
@@ -137,13 +139,21 @@ def test_a_calibration_is_read_from_its_file(name, tmp_path):
     assert not any(camera.distortion[4:])
 
 
-@pytest.mark.parametrize("name", ["a file of ROS", "a file of Kalibr", "our own keys"])
+@pytest.mark.parametrize(
+    "name", ["a file of ROS", "a file of Kalibr", "OpenCV's JSON", "our own keys"]
+)
 def test_a_calibration_is_read_where_it_is_pasted(name, tmp_path):
     text = READ[name].removeprefix("cam0:\n")
     pasted = text if "\n" not in text else "\n" + re.sub(r"(?m)^(?=.)", " " * 6, text)
     camera = load_config(session(tmp_path, pasted)).experiment.measurement.camera
     assert camera.matrix == MATRIX
     assert camera.distortion[:4] == LENS[:4]
+
+
+def test_a_file_may_stand_below_its_key(tmp_path):
+    (tmp_path / "camera.yaml").write_text(ROS)
+    camera = load_config(session(tmp_path, "{file: camera.yaml}")).experiment.measurement.camera
+    assert camera.matrix == MATRIX
 
 
 FISHEYE = r"of a fisheye lens, which is not supported. Try: rectify the photographs first"

@@ -265,6 +265,19 @@ def test_named_poses_are_bodies(kind, take, tmp_path):
     assert found[name].values[:, :3] == pytest.approx(x[:, :3], abs=1e-9)
 
 
+def test_poses_of_several_frames_in_one_topic_are_several_bodies(take, tmp_path):
+    store = store_of()
+    messages = []
+    for k, t in enumerate(take.t):
+        for side, x in take.bodies.items():
+            message = replace(transforms(store, x, k, t), child_frame_id=side)
+            messages.append(("/vicon/transforms", t, message))
+    found = read_recording([bag(tmp_path, store, messages)]).of("body")
+    assert [*found] == ["vicon/transforms/start", "vicon/transforms/end"]
+    for side, stream in zip(take.bodies, found.values(), strict=True):
+        assert stream.values[:, :3] == pytest.approx(take.bodies[side][:, :3], abs=1e-9)
+
+
 def test_a_point_cloud_without_fields_is_a_cloud(tmp_path):
     store = store_of()
     kind, at = (
@@ -349,6 +362,19 @@ def test_a_time_code_is_no_coordinate(take, tmp_path):
     file.write_text("\n".join([*lines[:2], *(",".join(row) for row in cells[2:])]) + "\n")
     assert "TimeCode" in file.read_text()
     assert "10 markers" not in imported(tmp_path, [file, grippers])
+
+
+def test_frames_without_times_have_the_rate_of_the_export(take, tmp_path):
+    file = write_motive(take, tmp_path)[0][0]
+    exact = read_recording([file]).streams[0]
+    lines = [line.split(",") for line in file.read_text().splitlines()]
+    lines[6][1] = "Time Code"
+    for k, row in enumerate(lines[7:]):
+        row[1] = f"00:00:{k:02d}"
+    file.write_text("\n".join(",".join(row) for row in lines))
+    found = read_recording([file]).streams[0]
+    assert found.t == pytest.approx(exact.t, abs=1e-5)
+    assert found.values == pytest.approx(exact.values)
 
 
 def german(text):
@@ -466,6 +492,24 @@ def test_a_unit_is_for_the_files_that_name_none(take, tmp_path):
     assert any("hands.csv is in " in text for text in recording.assumptions)
 
 
+@pytest.mark.parametrize(
+    ("at", "byte", "said"),
+    [
+        (515, 0x56, r"take\.c3d: has the numbers of SGI .MIPS. computers, .*\n  Try: save it with"),
+        (1, 0x51, r"take\.c3d: is no C3D file: it begins with b'.*\n  Try: export"),
+    ],
+    ids=["processor", "mark"],
+)
+def test_a_c3d_file_that_is_not_read_is_told_in_our_words(at, byte, said, take, tmp_path):
+    files, _ = c3d(take, tmp_path)
+    content = bytearray(files[0].read_bytes())
+    content[at] = byte
+    files[0].write_bytes(content)
+    with pytest.raises(MeasurementError, match=f"(?s){said}") as told:
+        read_recording(files)
+    assert "issue" not in told.value.message
+
+
 def test_two_equal_labels_are_refused(take, tmp_path, capsys):
     def labels(names):
         return ["m03" if name == "m05" else name for name in names]
@@ -508,6 +552,21 @@ def test_exchanged_labels_of_one_pose_are_named(pair, take, tmp_path, capsys):
     told = refused(tmp_path, files, capsys, *ends)
     assert f"the labels of {names[0]} and {names[1]} are exchanged in pose 3 (" in told
     assert "Try: exchange the labels there" in told
+
+
+def test_several_labels_exchanged_in_one_pose_are_all_named(take):
+    """Two pairs in pose 2."""
+    order = order_of(take)
+    markers = {name: x.copy() for name, x in take.markers.items()}
+    for pose, i, j in ((2, 1, 3), (2, 6, 10)):
+        there = (take.t > 2.6 * (pose - 1) - 0.5) & (take.t < 2.6 * pose - 0.5)
+        for one, other in ((order[i], order[j]), (order[j], order[i])):
+            markers[one][there] = take.markers[other][there]
+    with pytest.raises(MeasurementError) as told:
+        make_session("loom", read_recording_of(replace(take, markers=markers)), Wishes())
+    for pose, i, j in ((2, 1, 3), (2, 6, 10)):
+        one, other = sorted((order[i], order[j]))
+        assert f"labels of {one} and {other} are exchanged in pose {pose} " in told.value.message
 
 
 @pytest.mark.parametrize(

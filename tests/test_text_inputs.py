@@ -160,6 +160,11 @@ WRONG = {
         "length: 0,6, mass: 0,05",
         "the decimal sign is a point; line 1: length: 0,6 means 0.6; line 1: mass: 0,05 means 0.05",
     ),
+    "the same digits twice": (
+        "length: 0.6, mass: 0.05, diameter: 0.005",
+        "length: 0,6, mass: 0,6, diameter: 0.005",
+        "line 1: length: 0,6 means 0.6; line 1: mass: 0,6 means 0.6",
+    ),
     "with an exponent": ("mass: 0.05", "mass: 5,0e-2", "line 1: mass: 5,0e-2 means 5.0e-2"),
     "in brackets": ("[0.0, -9.81]", "[0, -9,81]", r"line 3: \[0, -9,81\] means \[0, -9.81\], or 3"),
     "in brackets without blanks": (

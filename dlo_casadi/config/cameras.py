@@ -49,6 +49,8 @@ def camera_of(value: object, info: ValidationInfo) -> object:
     XML) or Kalibr (camchain). Raises ValueError if the camera has another model, or if the file
     holds no camera or several.
     """
+    if isinstance(value, Mapping) and {*value} == {"file"}:
+        value = value["file"]
     if isinstance(value, str | Path) and str(value) != "FILL_IN":
         path = (info.context or {}).get("folder", Path()) / value
         try:
@@ -70,6 +72,9 @@ def _read(path: Path) -> Mapping[str, Any]:
     # OpenCV's first line and its tags are no YAML 1.2.
     plain = re.sub(rb"\A%YAML:.*?$", b"", content, flags=re.MULTILINE)
     plain = re.sub(rb"!!opencv-[a-z-]+", b"", plain)
+    # A topic of ROS that is printed repeats itself, with --- below each message.
+    messages = [x for x in re.split(rb"(?m)^---[ \t\r]*$", plain) if x.strip()]
+    plain = messages[0] if messages else plain
     try:
         data = parsed_yaml(plain, path)
     except ConfigError as error:
@@ -120,12 +125,13 @@ def _converted(given: Mapping[Any, Any], in_file: bool) -> dict[Any, Any]:
     elif len(terms) >= 4:
         found["distortion"] = [given[key] for key in terms]
         used |= {*terms}
-    if in_file and "distortion" not in found:
+    foreign = in_file or bool(found and "matrix" not in called)
+    if foreign and "distortion" not in found:
         raise ValueError(
             f"holds no distortion; its keys are {', '.join(map(str, given))}. Try: `distortion: "
             "[]` in it if the photographs are rectified"
         )
-    if in_file:
+    if foreign:
         return found
     return found | {
         key: value

@@ -168,9 +168,9 @@ class Document(Source):
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             hint = " (indent with spaces)" if "'\\t'" in str(error.problem) else ""
-            hint = f". {BACKSLASH}" if "escape" in str(error.problem) else hint
+            said = f"{error.problem}{hint}" if "escape" not in str(error.problem) else BACKSLASH
             raise ConfigError(
-                f"not valid YAML: {error.problem}{hint}",
+                f"not valid YAML: {said}",
                 file=source,
                 line=None if mark is None else mark.line + 1,
             ) from None
@@ -285,9 +285,11 @@ def _inspect(root: yaml.Node, source: Path) -> None:
                 hint = f". {BACKSLASH}" if node.style == '"' else ""
                 raise refuse(f"{show(node.value)} holds {found[0]!r}, which is no text{hint}", node)
         elif isinstance(node, yaml.MappingNode):
-            split.update((node.start_mark.line + 1, said) for said in _split_numbers(node))
+            commas = [(node.start_mark.line + 1, said) for said in _split_numbers(node)]
+            split.update(commas)
             first: dict[str, int] = {}
-            for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            keys = [] if commas else [key for key, _ in node.value]
+            for key in (key for key in keys if isinstance(key, yaml.ScalarNode)):
                 if key.value in first:
                     text = f"occurs twice, first in line {first[key.value]}"
                     raise refuse(f"key {show(key.value)} {text}", key)

@@ -27,7 +27,7 @@ _ORIGIN = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 Rows = list[tuple[float, Any]]  # times [s] and values
 Sent = list[tuple[float, float, Any]]  # times of headers and of receipt [s], and values
 Links = dict[str, tuple[str, Rows]]  # frame -> its parent in TF, and its poses there
-Key = tuple[Kind, str, str, str]  # kind, name, topic, frame
+Key = tuple[Kind, str, str, str, str]  # kind, name, topic, frame, child frame
 
 
 def read_bag(path: Path, unit: str | None = None) -> Recording:
@@ -66,10 +66,10 @@ def read_bag(path: Path, unit: str | None = None) -> Recording:
     rows = {key: items for key, items in rows.items() if key[0] != "body" or key[1] not in links}
     for name in links:  # a frame is a body at its own origin, as often as what moves it most often
         times = max((links[below][1] for below in _chain(name, links)[:-1]), key=len)
-        rows["body", name, "tf", name] = [(t, _ORIGIN) for t, _ in times]
+        rows["body", name, "tf", name, ""] = [(t, _ORIGIN) for t, _ in times]
     sources = [
         _stream(kind, shown, frame, items)
-        for ((kind, _, _, frame), items), shown in zip(rows.items(), _shown(rows), strict=True)
+        for ((kind, _, _, frame, _), items), shown in zip(rows.items(), _shown(rows), strict=True)
     ]
     at_zero = Recording(tuple(x for x in sources if x.kind == "marker")).without_zeros()
     seen = [replace(x, values=scale * x.values) for x in at_zero.streams]
@@ -163,7 +163,7 @@ class _Bag:
             if item.row is None:
                 self.no_places.add(item.name)
                 continue
-            key = item.kind, item.name, topic, _frame(item.holder)
+            key = item.kind, item.name, topic, _frame(item.holder), item.child
             self.sent.setdefault(key, []).append((_time(item.holder), received, item.row))
 
     def _add(self, link: Any, received: float, static: bool) -> None:
@@ -257,13 +257,17 @@ def _trouble(path: Path, error: Exception) -> str | None:
 
 
 def _shown(keys: Collection[Key]) -> list[str]:
-    """Names of streams; with their topics where two topics have the same ones."""
-    topics: dict[tuple[Kind, str], set[str]] = {}
-    for kind, name, topic, _ in keys:
-        topics.setdefault((kind, name), set()).add(topic)
-    return [
-        name if len(topics[kind, name]) == 1 else f"{topic}/{name}" for kind, name, topic, _ in keys
-    ]
+    """Names of streams; with topics or moved frames where several have the same name."""
+    alike: dict[tuple[Kind, str], set[tuple[str, str]]] = {}
+    for kind, name, topic, _, child in keys:
+        alike.setdefault((kind, name), set()).add((topic, child))
+    shown = []
+    for kind, name, topic, _, child in keys:
+        others = alike[kind, name]
+        before = f"{topic}/" * (len({of for of, _ in others}) > 1)
+        after = f"/{child}" * (len({moved for _, moved in others}) > 1)
+        shown.append(f"{before}{name}{after}")
+    return shown
 
 
 def _time(message: Any) -> float:

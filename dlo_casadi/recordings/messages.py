@@ -47,6 +47,8 @@ class Item:
     """What has the header: the item or the message."""
     row: list[float] | None
     """As in `Stream.values`; None of a thing without a place, such as a line."""
+    child: str = ""
+    """Of a message with one pose, the frame that it moves: a topic may send those of several."""
     by_order: bool = False
     """Whether its place in a list is all that tells it from others."""
 
@@ -101,7 +103,8 @@ def items_of(message: Any, kind: str, topic: str) -> Iterator[Item]:
         yield from _listed([message], message, topic, markers=True)
         return
     if place := _pose_of(message):
-        yield Item("body" if len(place) > 3 else "marker", topic, message, place)
+        child = str(getattr(message, "child_frame_id", "")).strip("/")
+        yield Item("body" if len(place) > 3 else "marker", topic, message, place, child)
         return
     for field in fields(message):
         found = getattr(message, field.name)
@@ -149,7 +152,7 @@ def _listed(found: Sequence[Any], message: Any, topic: str, markers: bool) -> It
         holder = item if hasattr(item, "header") else message
         placed = not hasattr(item, "action") or item.type in _PLACED
         shown = (row if body else row[:3]) if placed else None
-        yield Item("body" if body else "marker", name, holder, shown, by_order)
+        yield Item("body" if body else "marker", name, holder, shown, by_order=by_order)
 
 
 def _number_of(item: Any) -> str:

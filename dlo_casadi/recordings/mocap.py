@@ -112,7 +112,11 @@ def _motive(rows: Rows, settings: Sequence[str], unit: str | None, file: str) ->
         raise MeasurementError(
             f"ends after {len(body)} of {counted(int(said), 'frame')}.\n  {_AGAIN}"
         )
-    t = checked_times(_numbers(body, [1], head)[:, 0], _places(body))
+    clock = [c for c, name in enumerate(head) if name.lower().startswith("time (")]
+    t = _numbers(body, clock[:1] or [0], head)[:, 0]
+    if not clock:
+        t = t / _rate_of(meta)
+    checked_times(t, _places(body))
     own, assumptions = length_unit(meta.get("Length Units", ""), unit, "m", file)
     streams = []
     for (label, name), at in _assets(named, quantities, head):
@@ -129,6 +133,14 @@ def _motive(rows: Rows, settings: Sequence[str], unit: str | None, file: str) ->
         values[:, :3] *= METRES[own]
         streams.append(Stream(name, _KINDS[label], t, values))
     return Recording(tuple(streams), (), tuple(assumptions), unit="" if assumptions else own)
+
+
+def _rate_of(meta: Mapping[str, str]) -> float:
+    """Frames a second of an export of Motive."""
+    rate = meta.get("Export Frame Rate", meta.get("Capture Frame Rate", "")).replace(",", ".")
+    if not (_is_number(rate) and 0.0 < float(rate) < np.inf):
+        raise MeasurementError(f"has no times, and {show(rate)} frames a second.\n  {_AGAIN}")
+    return float(rate)
 
 
 def _assets(
@@ -261,7 +273,26 @@ def _numbers(
         raise MeasurementError(f"{error}.\n  {_AGAIN}") from None
 
 
+_MIPS = b"\x56"
 _WHOLE = "Try: export the file again, whole."
+
+
+def _check_c3d(raw: bytes) -> None:
+    """Raise MeasurementError if this is no C3D file, or one with numbers that are not read.
+
+    Its first byte is the block of 512 bytes in which parameters begin, the second one 0x50; the
+    fourth byte of the parameters is the kind of processor.
+    """
+    if not raw:
+        raise MeasurementError(f"is empty.\n  {_WHOLE}")
+    if raw[1:2] != b"\x50":
+        raise MeasurementError(f"is no C3D file: it begins with {show(raw[:4])}.\n  {_WHOLE}")
+    at = 512 * (raw[0] - 1) + 3
+    if raw[at : at + 1] == _MIPS:
+        raise MeasurementError(
+            "has the numbers of SGI (MIPS) computers, which are not read.\n  Try: save it with "
+            "those of Intel in the program that has written it."
+        )
 
 
 def read_c3d(path: Path, unit: str | None = None) -> Recording:
@@ -280,11 +311,13 @@ def read_c3d(path: Path, unit: str | None = None) -> Recording:
     The C3D file format, www.c3d.org: POINT:Y_SCREEN is the axis that points up on a screen.
     """
     ezc3d = library("ezc3d", "recordings", "reading this file")
+    raw = path.read_bytes()
+    _check_c3d(raw)
     content = ezc3d.c3d(str(path))
     group = content["parameters"]["POINT"].items()
     point = {key: item["value"] for key, item in group if key != "__METADATA__"}
     places = content["data"]["points"][:3]
-    first, last = unpack_from("<HH", path.read_bytes(), 6)  # ezc3d alters its numbers
+    first, last = unpack_from("<HH", raw, 6)  # ezc3d alters its numbers
     declared = last - first + 1 if last < 65535 else 0
     if places.shape[2] < declared:
         raise MeasurementError(

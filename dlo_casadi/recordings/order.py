@@ -23,6 +23,7 @@ _SAMPLES = 50  # points of a spline between two markers, to compute its length: 
 # lines of sample sessions (5 to 20 markers) the right one leaves 0.02 in the median, 0.14 in 95 %;
 # the best of the others leaves 0.40 or more in 95 %.
 _EXPLAINED = 0.3
+_MOST = 3  # exchanges in one pose that are looked for, one after the other
 
 
 def in_order(
@@ -222,15 +223,22 @@ def _exchanged(knots: FloatArray) -> dict[tuple[int, int], list[int]] | None:
     off = np.nan_to_num(np.abs(chords - usual))
     found: dict[tuple[int, int], list[int]] = {}
     for k in np.flatnonzero(off.max(axis=1) > tolerance):
-        seen = np.flatnonzero(np.isfinite(by_pose[k]).all(axis=1))
+        points = by_pose[k].copy()
+        seen = np.flatnonzero(np.isfinite(points).all(axis=1))
         pairs = [*combinations(seen.tolist(), 2)]
-        trials = np.repeat(by_pose[k][None], len(pairs), axis=0)
-        for trial, (i, j) in zip(trials, pairs, strict=True):
-            trial[[i, j]] = trial[[j, i]]
-        left = np.nan_to_num(np.abs(steps(trials) - usual))
-        best = int(left.sum(axis=1).argmin())
-        explained = left[best].sum() < _EXPLAINED * off[k].sum()
-        if not explained or left[best].max() > tolerance:
+        made = []
+        for _ in range(_MOST):
+            trials = np.repeat(points[None], len(pairs), axis=0)
+            for trial, (i, j) in zip(trials, pairs, strict=True):
+                trial[[i, j]] = trial[[j, i]]
+            left = np.nan_to_num(np.abs(steps(trials) - usual))
+            best = int(left.sum(axis=1).argmin())
+            points = trials[best]
+            made.append(pairs[best])
+            if left[best].max() <= tolerance:
+                break
+        if left[best].max() > tolerance or left[best].sum() > _EXPLAINED * off[k].sum():
             return None
-        found.setdefault(pairs[best], []).append(int(k))
+        for pair in made:
+            found.setdefault(pair, []).append(int(k))
     return found
