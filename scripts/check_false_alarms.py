@@ -3,7 +3,7 @@
     python scripts/check_false_alarms.py [--sets 300] [--first 0] [--seed 0] [--jobs N]
                                          [--output FILE]
                                          [--scatter | [--space]
-                                         [--hidden | --random SOURCE | --table]]
+                                         [--hidden | --random SOURCE | --table | --strong EFFECT]]
 
 Each set takes the cable and the poses of a bench session, a new smooth rest curvature and
 stiffness, fixtures, length and scale drawn from their tolerances, and noise that is partly
@@ -19,10 +19,11 @@ With --space they are random cables between two grippers in space, with --hidden
 of which one or two effects are not declared, with both the same in space: see hidden_sets.py. With
 --random SOURCE the poses differ in a rest curvature, moments of pins, ... of their own instead, and
 it is counted how often that is named. With --table two poses to all touch a table that is not
-declared. Of hidden effects those count that the data show: that make the declared model less likely
-by e^15 when both are fitted from the truth. How often each is named, alone or among what cannot be
-told from it, is counted, how often a wrong one is, and how often a stiffness lies in its interval
-where all that is hidden shows and is named.
+declared; with --strong EFFECT that effect is hidden at a size far beyond the noise. Of hidden
+effects those count that the data show: that make the declared model less likely by e^15 when both
+are fitted from the truth. How often each is named, alone or among what cannot be told from it, is
+counted, how often a wrong one is, and how often a stiffness lies in its interval where all that is
+hidden shows and is named.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from harness import options, run
-from hidden_sets import LINE, RANDOM_SIZES, Simulated, about_axis, simulated
+from hidden_sets import LINE, RANDOM_SIZES, STRONG, Simulated, about_axis, simulated
 from simulated import random_session
 
 import dlo_casadi as dlo
@@ -142,16 +143,19 @@ def main() -> None:
     parser.add_argument("--hidden", action="store_true", help="one or two effects hidden in each")
     parser.add_argument("--random", default="", choices=RANDOM_SIZES, help="of each pose's own")
     parser.add_argument("--table", action="store_true", help="on a table that is not declared")
+    parser.add_argument("--strong", default="", choices=STRONG, help="hidden, and large")
+    parser.add_argument("--each", action="store_true", help="print every set, not only odd ones")
     args = parser.parse_args()
     kind, dimension = random_effects().get(args.random), 3 if args.space else 2
     if kind is not None and dimension not in kind.dimensions:
         where = "in space" if args.space else "in a plane"
         parser.error(f"--random {args.random} is not of cables {where}")
     sets = range(args.first, args.first + args.sets)
-    if args.plane or args.space or args.hidden or args.random or args.table:
+    if args.plane or args.space or args.hidden or args.random or args.table or args.strong:
         asked = {"space": args.space, "hide": args.hidden, "random": args.random}
-        work = partial(run_random, seed=args.seed, table=args.table, **asked)
-        run(work, sets, args, odd_set, summary=summary)
+        asked |= {"table": args.table, "strong": args.strong}
+        work = partial(run_random, seed=args.seed, **asked)
+        run(work, sets, args, partial(odd_set, every=args.each), summary=summary)
     else:
         work = partial(run_one, seed=args.seed, scatter=args.scatter)
         run(work, sets, args, wrong_set, summary=alarms_in)
@@ -162,9 +166,9 @@ def wrong_set(number: int, row: dict, _: float) -> str:
     return "" if row["right"] else f"  set {number}: {row}"
 
 
-def odd_set(number: int, row: dict, _: float) -> str:
-    """A random set in which anything is not as it should be."""
-    odd = row["missed"] or row["wrong"] or not all(row["inside"].values()) or row["worse"]
+def odd_set(number: int, row: dict, _: float, every: bool = False) -> str:
+    """A random set in which anything is not as it should be, or `every` one."""
+    odd = every or row["missed"] or row["wrong"] or not all(row["inside"].values()) or row["worse"]
     return f"  set {number}: {row}" if odd else ""
 
 
@@ -213,12 +217,18 @@ def summary(rows: list[dict]) -> str:
 
 
 def run_random(
-    index: int, seed: int, space: bool, hide: bool, random: str = "", table: bool = False
+    index: int,
+    seed: int,
+    space: bool,
+    hide: bool,
+    random: str = "",
+    table: bool = False,
+    strong: str = "",
 ) -> dict:
     """Simulate and fit one random session, and say what was found of its truth."""
     generator = generator_of(seed, index)
     count = 1 + index % 2 if hide else 0
-    found = simulated(generator, 3 if space else 2, count, random, table)
+    found = simulated(generator, 3 if space else 2, count, random, table, strong)
     begin = time.process_time()
     row = {"hidden": found.hidden, "refused": "", "wrong": [], "inside": {}, "worse": False}
     try:
@@ -239,7 +249,9 @@ def run_random(
         sizes = [one.std for one in (own, *own.rivals) if one.source == random]
         row["std_over_true"] = float(sum(sizes) / found.values[f"random.{random}"])
     named = [{item.name, *item.indistinguishable_from} for item in result.effects]
-    row["verdict"] = result.verdict
+    row["verdict"], row["steps"] = result.verdict, result.work.steps
+    row["scatter"] = (own.source, own.std) if own.std else ()
+    row["held_out"] = result.stages[-1].rmse_held_out_measured_branch
     row["named"] = [sorted(names) for names in named]
     row["missed"] += [name for name in row["shown"] if not any(name in names for names in named)]
     row["wrong"] = [sorted(names) for names in named if not names & set(found.hidden)]
@@ -248,6 +260,8 @@ def run_random(
     true = about_axis(found.values, angle.value) if angle else found.values
     for name in ("bending_stiffness", "torsional_stiffness"):
         own = last.parameters.get(name)
+        if own is not None:
+            row.setdefault("over_true", {})[name] = float(own.value / true[name])
         if own is not None and last.explains:
             row["inside"][name] = within(own.interval_95, true[name])
     for stage in result.stages:

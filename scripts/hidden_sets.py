@@ -52,12 +52,23 @@ RANDOM_SIZES = {
     "length_error": lambda length: 0.008 * length,
 }
 
+# Effects that may be hidden at a size that moves the cable by far more than the noise; length of a
+# stiff section, as a share of the cable's.
+STRONG, SECTION = ("bending_softening", "stiff_section"), 0.12
+
 # Ends that show what differs from pose to pose in the plane. Between two clamps a smooth rest
 # curvature of that size moves a cable by 0.1 mm: its mean and slope do not bend a beam there.
 SHOWN_BY = {"rest_curvature": "pinned", "pin_moment": "pinned", "clamp_angle": "clamped"}
 
 
-def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Generator) -> Values:
+def _sizes(
+    name: str,
+    cable: CableData,
+    typical: float,
+    generator: np.random.Generator,
+    *,
+    strong: bool = False,
+) -> Values:
     """Parameters of an effect, drawn; `typical` [1/m] is the cable's curvature."""
     length, weight = cable.length, 9.81 * cable.mass
     axes = cable.axes
@@ -89,7 +100,14 @@ def _sizes(name: str, cable: CableData, typical: float, generator: np.random.Gen
         ),
         "mass_error": lambda: {"factor": 1 + signed(0.05, 0.4)},
         "stiffness_gradient": lambda: {"slope": signed(0.1, 0.6)},
-        "bending_softening": lambda: {"softness": 1 / (generator.uniform(0.5, 2.0) * typical)},
+        "bending_softening": lambda: {
+            "softness": 1 / (generator.uniform(0.5, 1.0 if strong else 2.0) * typical)
+        },
+        "stiff_section": lambda: {
+            "start": place - SECTION / 2 * length,
+            "end": place + SECTION / 2 * length,
+            "factor": spread(3.0, 8.0),
+        },
         "bending_anisotropy": lambda: {"ratio": spread(1.3, 4.0), "angle": signed(0.0, 1.4)},
         "axial_stretch": lambda: {"compliance": spread(0.003, 0.03) / weight},
         "length_error": lambda: {"length_difference": signed(0.004, 0.02) * length},
@@ -156,20 +174,27 @@ def simulated(
     count: int,
     random: str = "",
     table: bool = False,
+    strong: str = "",
 ) -> Simulated:
     """A random session with `count` hidden effects, in the plane (2) or in space (3).
 
     `random`: what differs from pose to pose, see `PoseScatter`; nothing by default. `table`: two
-    fitted poses to all that hang low enough touch a level plane.
+    fitted poses to all that hang low enough touch a level plane. `strong`: one of STRONG that is
+    hidden between two clamps.
     """
     while True:
-        found = _tried(generator, dimension, count, random, table)
+        found = _tried(generator, dimension, count, random, table, strong)
         if found is not None:
             return found
 
 
 def _tried(
-    generator: np.random.Generator, dimension: int, count: int, random: str, table: bool
+    generator: np.random.Generator,
+    dimension: int,
+    count: int,
+    random: str,
+    table: bool,
+    strong: str,
 ) -> Simulated | None:
     """As `simulated`; None where the poses have no stable equilibria."""
     length, mass = generator.uniform(0.5, 1.0), generator.uniform(0.03, 0.12)
@@ -182,16 +207,17 @@ def _tried(
         cable = CableData(length, mass, 0.006, bending * off, torsional_stiffness=torsion * off)
     held = "clamped" if dimension == 3 or generator.random() < 0.5 else "pinned"
     if dimension == 2:
-        held = SHOWN_BY.get(random, held)
+        held = "clamped" if strong else SHOWN_BY.get(random, held)
     chosen = [name for name in HIDDEN[dimension] if held == "clamped" or "clamp" not in name]
     hidden = tuple(str(x) for x in generator.choice(chosen, count, replace=False))
+    hidden = (strong,) if strong else hidden
     gravity = (0.0, -9.81) if dimension == 2 else (0.0, 0.0, -9.81)
     elements = ELEMENTS[dimension] * (FINER_ON_TABLES if table else 1)
     model = CableModel(cable, elements, start=held, end=held, gravity=gravity)
     values = {"bending_stiffness": bending, "torsional_stiffness": torsion}
     for name in hidden:
         model = model.with_effect(EFFECTS[name]())
-        sizes = _sizes(name, cable, 4.0 / length, generator)
+        sizes = _sizes(name, cable, 4.0 / length, generator, strong=bool(strong))
         values |= {f"{name}.{key}": value for key, value in sizes.items()}
     values = about_axis(values)
     p = model.nominal.copy()

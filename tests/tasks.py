@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_info
 
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.runtime.parallel import generator_of
+from dlo_casadi.runtime.work import part, spend, spent
 
 
 def square(x):
@@ -58,3 +59,9 @@ def kill_elsewhere(pid):
 
 def broken(x):
     raise ZeroDivisionError("oops")
+
+
+def work(steps):
+    with part("fits"):
+        spend(steps)
+    return spent()

@@ -31,7 +31,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cable": {*MECHANICS, "config", "io", "codegen", "show", "export", "runtime"},
     "vision": set(),
     "sensing": {*MECHANICS, "vision"},
-    "estimation": {*MECHANICS, "sensing"},
+    "estimation": {*MECHANICS, "sensing", "runtime"},
     "paper": {*MECHANICS, "sensing"},
     "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
 }

@@ -22,6 +22,9 @@ DIAGNOSIS = ("config", "verdict", "effects", "candidates", "unexplained", "next_
 # little); one if other processes cannot be started.
 PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
 SESSION_JOBS = jobs(1 if multiprocessing.current_process().daemon else min(2, PROCESSORS))
+VERBOSE = option(
+    "--verbose", action="store_true", help="also print what took how long, in steps of the fits"
+)
 NO_DIAGNOSIS = option(
     "--no-diagnosis", action="store_true", help="do not search for missing effects"
 )
@@ -37,6 +40,7 @@ NO_DIAGNOSIS = option(
     ),
     SESSION_JOBS,
     NO_DIAGNOSIS,
+    VERBOSE,
     codes="on 2 and 130 earlier results are kept",
     json="print report.json instead of tables",
 )
@@ -59,6 +63,7 @@ def fit(chosen: argparse.Namespace) -> None:
     CONFIG,
     option("--output", type=Path, metavar="DIR", help="write the results there"),
     SESSION_JOBS,
+    VERBOSE,
 )
 def diagnose(chosen: argparse.Namespace) -> None:
     """Fit a cable and search for what the declared model lacks, whether or not the
@@ -83,7 +88,7 @@ def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
         begin(executor, os.getpid)
         # These imports take as long as those of the other process, which run in parallel.
         from dlo_casadi.report.documents import report_dict
-        from dlo_casadi.report.terminal import candidate_table, print_summary
+        from dlo_casadi.report.terminal import candidate_table, print_summary, work_table
         from dlo_casadi.report.writer import ResultsFolder
         from dlo_casadi.session import run_session
 
@@ -103,6 +108,8 @@ def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
     print_summary(page, outcome)
     if keys:
         page.print(candidate_table(outcome))
+    if chosen.verbose:
+        page.print(work_table(outcome))
     if output is not None:
         page.say(f"Results: {output}")
 

@@ -35,6 +35,7 @@ from dlo_casadi.estimation.fit import explains
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import NO_INFORMATION, Values
 from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Number of stretches into which the arc of a single pose is cut.
@@ -124,6 +125,7 @@ class CrossValidation:
         return float(stdtr(len(gap) - 1, -t))
 
 
+@accounted_as("left-out poses")
 def cross_validate(fit: Fit) -> CrossValidation:
     """Leave each fit pose out once (of a single pose, each stretch of its arc).
 

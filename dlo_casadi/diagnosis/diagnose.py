@@ -39,6 +39,7 @@ from dlo_casadi.estimation.repeats import enough_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.runtime.executors import InProcess
+from dlo_casadi.runtime.work import Bound, accounted_as
 from dlo_casadi.thresholds import (
     EVIDENCE_APART,
     LARGER_OF_TWO,
@@ -47,6 +48,8 @@ from dlo_casadi.thresholds import (
     SIGNIFICANCE,
 )
 
+# Steps of a diagnosis after which no search, no further effect and no further pair is begun.
+DIAGNOSIS_STEPS = 4000
 RAN_AWAY = "its fit ran away: no noise can be estimated from it"
 
 
@@ -84,7 +87,8 @@ def diagnose(
         Maximum number of elements to which the search may refine the mesh; by default none. Found
         effects are tested on up to FINEST_MESH elements.
     """
-    trials = Trials(fit, center, exclude, significance, executor or InProcess(), finest)
+    given = fit, center, exclude, significance, executor or InProcess(), finest
+    trials = Trials(*given, bound=Bound(DIAGNOSIS_STEPS))
     return Search(trials, max_effects, step).diagnosis()
 
 
@@ -110,6 +114,11 @@ class Search:
         """Whether an unknown force may have a cause: in one pose a force fits as well as any."""
         return len(self.declared.problem.used) > 1 and self.max_effects > 0
 
+    @property
+    def goes_on(self) -> bool:
+        """Whether another search may begin."""
+        return self.several and not self.trials.bound.met
+
     def diagnosis(self) -> Diagnosis:
         """Result of the search, without effects that explain too little."""
         trials, force = self.trials, None
@@ -120,7 +129,8 @@ class Search:
         if near is not None:
             return self.beginning_with(declared=near).diagnosis()
         found = self._searched()
-        near = at_random_instead(fit, found, trials.finest) if misfit else None
+        again = misfit and self.goes_on
+        near = at_random_instead(fit, found, trials.finest) if again else None
         if near is not None:
             return self.beginning_with(declared=near).diagnosis()
         if found.unexplained:
@@ -142,6 +152,7 @@ class Search:
             structure_before=structure_of(fit, screening_degrees(fit)),
             unknown_force=force if found.unexplained else None,
             weight=None if found.unexplained else hidden_weight(found.fit, trials.exclude),
+            cut_off=trials.bound.met,
         )
 
     def _searched(self) -> Found:
@@ -159,16 +170,17 @@ class Search:
         if first is not None and first.added and not first.unexplained:
             return first
         found = self._forwards()
-        if self.several and found.fit.scatters and self.declared.scatters:
+        if self.goes_on and found.fit.scatters and self.declared.scatters:
             with suppress(EstimationError):
                 repeating = self.beginning_with(declared=as_repeating(self.declared))
                 if found.unexplained or repeating._may_gain(self.declared):
                     found = found.or_better(repeating._forwards(), EVIDENCE_APART)
         if may_be_far and (found.unexplained or bends_at_random(found.fit)):
-            found = found.or_better(first or of_shapes.run())
+            other = first or (of_shapes.run() if self.goes_on else None)
+            found = found.or_better(other)
         # If left-out poses are not even reached, refits may have started too far from the effect.
         lost = may_be_far and not found.unexplained and not self.trials.validation.complete
-        return self._or_causes(found)[0] if lost else found
+        return self._or_causes(found)[0] if lost and self.goes_on else found
 
     def _may_gain(self, scattering: Fit) -> bool:
         """Whether one or two scores promise a fair share of what the scatter gains."""
@@ -188,13 +200,15 @@ class Search:
         """
         found = (first := self.run()).or_better(self.of_simpler_effects(first))
         settled = self.beginning_with(declared=found.fit)
-        if not found.added and found.fit.noise.std < self.declared.noise.std:
+        met = self.trials.bound.met
+        if not (found.added or met) and found.fit.noise.std < self.declared.noise.std:
             with suppress(EstimationError):
                 best = min(p_values_of(settled.trials.first).values(), default=1.0)
                 if best <= self.trials.significance and (again := settled.run()).added:
                     return again
         return found
 
+    @accounted_as("searches")
     def run(self, force: UnknownForce | None = None) -> Found:
         """Add effects until the residual is noise or left-out data are predicted no better.
 
@@ -205,7 +219,7 @@ class Search:
         current, validation = trials.declared, trials.validation
         added: list[AddedEffect] = []
         ranked: list[Ranked] = []
-        while len(added) < self.max_effects:
+        while len(added) < self.max_effects and not (ranked and trials.bound.met):
             self.step("search for a missing effect", len(added), self.max_effects)
             if force is not None and not added:
                 tried = trials.tried_as_causes(force)
@@ -243,7 +257,7 @@ class Search:
 
         An effect of many parameters may stand for two effects of one parameter each.
         """
-        if not found.added or self.declared.noise.source == "misfit":
+        if not found.added or self.declared.noise.source == "misfit" or not self.goes_on:
             return None
         trials, winner = self.trials, found.added[0].candidate
         scores = {item.candidate.name: item.score for item in trials.first}
@@ -259,7 +273,7 @@ class Search:
         """The found effects, or causes of an unknown force if these are better; and the force."""
         start = self.declared if found.added else found.fit
         force = estimate_unknown_force(start, self.trials.executor)
-        causes = self.run(force) if force is not None and self.several else None
+        causes = self.run(force) if force is not None and self.goes_on else None
         return found.or_better(causes), force
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:

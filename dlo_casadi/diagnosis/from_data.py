@@ -35,6 +35,7 @@ from dlo_casadi.estimation.start import (
 from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import NEAR_LEADER
 
@@ -78,6 +79,7 @@ STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
 SAME_STIFFNESS = 0.1
 
 
+@accounted_as("relaxed model")
 def from_data(base: Fit) -> tuple[Fit, float]:
     """Relax an incomplete base at the measured shapes; the result is no equilibrium.
 
@@ -256,6 +258,7 @@ class RelaxedStart:
         """Names of its candidates."""
         return {x.candidate.name for x in (*self.beside, self.screened)}
 
+    @accounted_as("pairs")
     def and_second(
         self, softness: float, executor: Executor, listing: Listing
     ) -> list[RelaxedStart]:
@@ -298,6 +301,7 @@ def nearest(
     *,
     pairs: bool = True,
     least: float = np.inf,
+    bound: Bound = UNBOUNDED,
 ) -> Iterator[list[RelaxedStart]]:
     """Starts whose objective is close to the least one, best first; then those for a further try.
 
@@ -309,7 +313,7 @@ def nearest(
     A pair that comes within CLOSE_PAIR times REACHED, and leaves least so far, is returned at once.
     The first ones within REACHED are the last ones tried, one within SURELY_REACHED is the last.
     Pairs are returned if no single candidates are left to return, or if REACHED times their
-    objective is less than that of those.
+    objective is less than that of those. Once the `bound` is met no further pairs are tried.
     """
     expected = expected_left(near)
     noise, start = REACHED * expected, partial(RelaxedStart.of, near)
@@ -324,7 +328,7 @@ def nearest(
     own: dict[frozenset[str], RelaxedStart] = {}
     kept: list[RelaxedStart] = []
     firsts = sorted(alone, key=lambda x: x.left) if begun else []
-    while firsts and not (kept and kept[0].left < noise):
+    while firsts and not (bound.met or (kept and kept[0].left < noise)):
         for first in firsts[:FIRST]:
             ordered = sorted((*own.values(), *second(first)), key=lambda x: -x.left)
             own = {frozenset(x.names): x for x in ordered}

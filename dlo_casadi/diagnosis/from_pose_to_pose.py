@@ -14,6 +14,7 @@ from dlo_casadi.estimation.start import fit_from, relaxed
 from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.estimation.variances import pose_scatter_of, refine
 from dlo_casadi.model.pose_scatter import PoseScatter, sources_in
+from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Standard deviations of what is loose in each pose: of a place or a length, as a share of the
@@ -33,6 +34,7 @@ def bends_at_random(fit: Fit) -> bool:
     return scatter.std > 0 and any(one.bends for one in (scatter, *scatter.rivals))
 
 
+@accounted_as("loose poses")
 def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit | None:
     """Fit, started at relaxed shapes, in which something other than the shape at rest is random.
 
@@ -101,6 +103,7 @@ def at_random(fit: Fit) -> Fit | None:
     return None
 
 
+@accounted_as("random differences")
 def at_random_instead(misfit: Fit, found: Found, finest: int | None = None) -> Fit | None:
     """Refit of a misfit with a random effect, if that explains it as well as found effects do.
 

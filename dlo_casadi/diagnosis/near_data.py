@@ -39,6 +39,7 @@ from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.fit import explains, misfits
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
 from dlo_casadi.thresholds import REFITTED
 
 NOT_NEAR = "does not come near the measured shapes"
@@ -67,6 +68,7 @@ def near_data(
     listing: Listing,
     *,
     pairs: bool,
+    bound: Bound = UNBOUNDED,
 ) -> Tried:
     """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
 
@@ -75,7 +77,8 @@ def near_data(
     reaches the noise, all others are tried before any pair. If the best candidate does not explain
     the shapes, or only by a scatter, its end roll is searched again, then that of the next. If all
     fits misfit, too, pairs are tried even where a single candidate's start came close to the noise.
-    `relaxed`: the relaxed base and its softness, see `from_data`.
+    `relaxed`: the relaxed base and its softness, see `from_data`. `bound`: once it is met no pair
+    and no other end roll is tried.
     """
     near, softness = relaxed
     screened = screened_from_data(near, softness, listing(near))
@@ -101,9 +104,10 @@ def near_data(
     tried: list[Confirmed] = []
     far = dict.fromkeys((x.candidate.name for x in (*contacts, *likely[:REFITTED])), NOT_NEAR)
     for starts in nearest(
-        near, softness, singles, later, executor, listing, pairs=pairs, least=least
+        near, softness, singles, later, executor, listing, pairs=pairs, least=least, bound=bound
     ):
-        close, found = confirmed(base, starts[:REFITTED], executor, rolls=not explained)
+        rolls = not (explained or bound.met)
+        close, found = confirmed(base, starts[:REFITTED], executor, rolls=rolls)
         kept += close
         tried += found
         far |= {x.screened.candidate.name: LESS_NEAR for x in starts[len(close) : REFITTED]}
@@ -137,6 +141,7 @@ def _is_last(item: Confirmed) -> bool:
     return item.fit.noise.source != "misfit" and item.fit.chi2_per_dof < most
 
 
+@accounted_as("fits from the shapes")
 def confirmed(
     base: Fit, starts: Sequence[RelaxedStart], executor: Executor, *, rolls: bool
 ) -> tuple[list[RelaxedStart], list[Confirmed]]:

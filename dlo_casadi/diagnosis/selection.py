@@ -194,6 +194,8 @@ class Diagnosis(Found):
         If unexplained: the load that assumes no cause; None if no load fits.
     weight : HiddenWeight or None
         Hidden weight that the fit would not notice.
+    cut_off : bool
+        Whether the bound on its work was met, so that not everything was tried.
     """
 
     before: Fit
@@ -201,6 +203,7 @@ class Diagnosis(Found):
     structure_before: Structure
     unknown_force: UnknownForce | None
     weight: HiddenWeight | None
+    cut_off: bool = False
 
     @property
     def verdict(self) -> Verdict:

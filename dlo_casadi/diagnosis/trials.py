@@ -37,6 +37,7 @@ from dlo_casadi.estimation.repeats import different_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, settle
 from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
 from dlo_casadi.thresholds import DIFFERENT, REFITTED, WORTH
 
 
@@ -50,6 +51,8 @@ class Trials:
     significance: float
     executor: Executor
     finest: int | None = None
+    bound: Bound = UNBOUNDED
+    """Once it is met no further effect, pair or rival is tried."""
     from_shapes: bool = False
     """Whether the first candidates are tried at the measured shapes."""
     wider: Trials | None = None
@@ -88,6 +91,7 @@ class Trials:
         """All `candidates_of` a fit."""
         return candidates_of(current, self.center, self.exclude)
 
+    @accounted_as("scores")
     def screened(self, current: Fit, among: Collection[str] | None = None) -> list[Screened]:
         """Score tests of all candidates for a fit, or of those named, best first."""
         listed = [x for x in self.listed(current) if among is None or x.name in among]
@@ -98,6 +102,7 @@ class Trials:
         listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
         return refits.scored(current, listed, *given)
 
+    @accounted_as("candidates")
     def tried(self, current: Fit, *, pairs: bool) -> Tried:
         """Candidates screened and refitted beside the effects of a fit.
 
@@ -105,11 +110,13 @@ class Trials:
         """
         if self.starts_at_shapes(current):
             near = self.relaxed if current is self.declared else from_data(current)
-            return near_data(current, near, self.executor, self.listed, pairs=pairs)
+            given = current, near, self.executor, self.listed
+            return near_data(*given, pairs=pairs, bound=self.bound)
         screened = self.first if current is self.declared else self.screened(current)
         known = self.refitted if current is self.declared else {}
         return Tried(screened, p_values_of(screened), self.leading(current, screened, known))
 
+    @accounted_as("causes of a force")
     def tried_as_causes(self, force: UnknownForce) -> Tried:
         """Refits of all loads at one place that explain the forces, whatever their scores.
 
@@ -159,6 +166,7 @@ class Trials:
         tried = [x for item in worthy if (x := known[item.candidate.name]) is not None]
         return refits.loads_from_best(current, worthy, tried, self.executor)
 
+    @accounted_as("meshes")
     def fine(self, fit: Fit, finest: int | None = None) -> Fit:
         """A fit with effects on a sufficiently fine mesh, if the mesh may be refined."""
         if self.finest is None:
@@ -166,6 +174,7 @@ class Trials:
         return fine_enough(fit, fit.model.n, SETTLED_MODES, finest or self.finest)
 
 
+@accounted_as("fits without an effect")
 def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, list[AddedEffect]]:
     """Backward step: remove effects that later ones have made superfluous.
 
@@ -193,6 +202,8 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
             with suppress(EstimationError):  # else there is no fit without it
                 fit, instead = in_its_place(trials, settle(smaller), effect)
                 added = [x for item in added for x in (instead if item is effect else [item])]
+        elif trials.bound.met:
+            continue
         elif effect not in compared and (effect.rivals or not misfits(smaller)):
             fit, chosen = judged_again(trials, fit, smaller, effect)
             added = [chosen if item is effect else item for item in added]

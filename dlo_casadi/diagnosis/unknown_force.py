@@ -20,6 +20,7 @@ from dlo_casadi.estimation.start import SearchSettings, begin, fit_from, relaxed
 from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.parallel import map_in_order
+from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.thresholds import NORMAL_95
 
 # Number of places that remain after the scan and get a full fit.
@@ -58,6 +59,7 @@ class UnknownForce:
         return np.asarray(self.force_per_pose.mean(axis=0))
 
 
+@accounted_as("unknown force")
 def estimate_unknown_force(base: Fit, executor: Executor) -> UnknownForce | None:
     """Estimate an unexplained load as one force per pose at one place; None if none fits.
 

@@ -18,6 +18,7 @@ from dlo_casadi.estimation.unknowns import NO_INFORMATION, Normal, Point, Unknow
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import forces_on_other_mesh
+from dlo_casadi.runtime.work import Bound, accounted_as, spend
 
 # Longest step of a node along its derivative [rad]; beyond it the linearisation is poor.
 LONGEST_MOVE = 1.5
@@ -37,10 +38,13 @@ MISFIT_GAIN = 1e-2
 # A descent is hopeless if its minimum is predicted above a ceiling in this many steps in a row, or
 # if the remaining steps cannot reach the ceiling with the largest of the last STALLED gains.
 HOPELESS = 3
+# Maximum number of trial steps of a descent, per iteration that it may take.
+TRIALS = 3
 # Uphill steps allowed before backtracking; largest rise of the objective allowed.
 WATCHED, WORSE = 2, 3.0
 
 
+@accounted_as("fits")
 def descend(
     fit: Fit,
     steps: int = 40,
@@ -68,10 +72,11 @@ def descend(
     -------
     Fit
         The minimum, and whether it converged. A descent that stalls, is hopeless, runs out of
-        iterations, or finds no worthwhile step although the gradient promises one, has not. One
-        that ends by its `share` has, unless it is damped.
+        iterations or of trial steps, or finds no worthwhile step although the gradient promises
+        one, has not. One that ends by its `share` has, unless it is damped.
     """
     problem, damping, gains, above = fit.problem, 0.0, [np.inf] * STALLED, 0
+    bound = Bound(TRIALS * steps)
     normal = problem.step_equations(fit.point, fit.linearization)
     curvature = Curvature(np.zeros_like(normal.hessian))
     for done in range(1, steps + 1):
@@ -83,7 +88,7 @@ def descend(
             return Fit(problem, fit.point, converged=True)
         while trial is None:
             damping = max(10 * damping, FIRST_DAMPING)
-            if damping > 1e8 or model.promised(damping) < least:
+            if bound.met or damping > 1e8 or model.promised(damping) < least:
                 return Fit(problem, fit.point)
             trial = _ahead(fit, model, damping, limit)
         gains = [*gains[1:], fit.point.objective - trial.point.objective]
@@ -184,6 +189,7 @@ def _ahead(
 
 def _stepped(fit: Fit, normal: Normal, damping: float) -> Fit | None:
     """Fit after a damped step within reach; None if some pose loses its equilibrium."""
+    spend()
     problem, point = fit.problem, fit.point
     lower, upper = problem.unknowns.reach(point.theta)
     matrix = normal.damped(damping)

@@ -34,6 +34,7 @@ from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.model.contact import gap_per_force
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.band import Vector
+from dlo_casadi.runtime.work import accounted_as, spend
 
 # Softness of the balance [rad], from first to last. The first is twice the noise of the angles
 # between 12 markers of 0.3 mm on 1 m; the last leaves equilibria to Newton's method.
@@ -329,6 +330,7 @@ class Relaxation:
 
     # ---- solution ----------------------------------------------------------------------------
 
+    @accounted_as("relaxed fits")
     def solve(self, values: Values, fixed: BoolArray | None = None, steps: int = STEPS) -> Values:
         """Levenberg-Marquardt from any values.
 
@@ -336,6 +338,7 @@ class Relaxation:
         """
         damping, least = FIRST_DAMPING, self.objective(values)
         for _ in range(steps):
+            spend()
             found, reached, first = values, np.inf, damping
             linearized = self._scaled(self._linearized(values), values)
             for _ in range(REFUSED):

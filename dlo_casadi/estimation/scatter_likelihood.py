@@ -108,6 +108,8 @@ class ScatterLikelihood:
         Between the poses' shapes, root mean square.
     source : str
         What differs from pose to pose, see `PoseScatter`.
+    most : float
+        Largest size of the random part.
     """
 
     def __init__(
@@ -115,8 +117,9 @@ class ScatterLikelihood:
         samples: Sequence[ScatterSample],
         distances: FloatArray,
         source: str = REST_CURVATURE,
+        most: float = np.inf,
     ) -> None:
-        self.source = source
+        self.source, self.most = source, most
         self.m, self.modes = len(samples), samples[0].random.shape[1]
         self.count = sum(len(sample.e) for sample in samples)
         shared = np.concatenate([sample.shared for sample in samples])
@@ -230,7 +233,10 @@ class ScatterLikelihood:
             Exponent of a prior std^weight of the random part, which keeps it from zero.
         """
         sought = np.array([True, std, range_ is not None])
-        start = np.log([1.0, guess if std else guess * np.exp(_LOWEST), guess])
+        begun = min(guess, self.most)
+        start = np.log([1.0, begun if std else begun * np.exp(_LOWEST), guess])
+        low, high = start + sought * _LOWEST, start + sought * _HIGHEST
+        high[1] = min(high[1], np.log(self.most))
         prior = 2 * weight * np.array([0.0, 1.0, 0.0])
 
         def deviance(q: FloatArray) -> InformedDeviance:
@@ -239,7 +245,7 @@ class ScatterLikelihood:
             value = found.value - float(prior @ q)
             return replace(found, value=value, gradient=found.gradient - prior)
 
-        q, found = most_likely(deviance, start, start + sought * _LOWEST, start + sought * _HIGHEST)
+        q, found = most_likely(deviance, start, low, high)
         noise, size, systematic = (np.exp(q) * [1, 1, sought[2]]).tolist()
         known = max(found.information / 4, 1.0)
         return Variances(noise, size, systematic, found.value, known)

@@ -238,7 +238,7 @@ def _scatters_of(
             ScatterSample(e, white @ moved[k], own, shared)
             for k, (white, e, own, shared) in zip(kept, poses, strict=True)
         ]
-        likelihood = ScatterLikelihood(samples, distances, scatter.source)
+        likelihood = ScatterLikelihood(samples, distances, scatter.source, scatter.most(fit.model))
         found.append(estimate_pose_scatter(likelihood, sparse=sparse))
     return found
 

@@ -12,6 +12,10 @@ from dlo_casadi.model.cable_model import CableModel
 MODES = 8
 SMOOTHNESS = (0.5, 0.25, 0.12)
 REST_CURVATURE = "rest_curvature"
+# Largest standard deviation of a rest curvature that is one, in radians over the length: twice that
+# of the least repeatable cables measured, 0.3 1/m on 0.65 m. A scatter fits everything; larger ones
+# were the errors of fits that had been lost (0.44 and 0.66).
+MOST_BEND = 0.4
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,10 @@ class PoseScatter:
     def bends(self) -> bool:
         """Whether it bends the cable, so that a missing effect may look like it."""
         return self.source == REST_CURVATURE or self.of_moments
+
+    def most(self, model: CableModel) -> float:
+        """Largest `std` that counts as a scatter, see MOST_BEND."""
+        return MOST_BEND / model.cable.length if self.source == REST_CURVATURE else np.inf
 
     def unit(self, model: CableModel) -> str:
         """Unit of `std`."""

@@ -30,12 +30,21 @@ from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.report.words import all_warnings
 from dlo_casadi.runtime.executors import software
+from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.fitting import Declared
 from dlo_casadi.session.hypotheses import Suspicion
 from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage
 
 # Fields in report.json for a parameter of an added effect.
 _OF_EFFECT = ("value", "std", "unit")
+
+
+def _work(part: Part) -> list[dict[str, Any]]:
+    """What the parts of a run took: calls, steps of fits, seconds, and their own parts."""
+    return [
+        {"name": name, **fields_of(one, "calls", "steps", "seconds"), "parts": _work(one)}
+        for name, one in part.parts.items()
+    ]
 
 
 def report_dict(outcome: Outcome) -> dict[str, Any]:
@@ -51,7 +60,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
         "config_path": None if outcome.config.path is None else str(outcome.config.path),
         "versions": outcome.versions,
         "warnings": [*outcome.doubts, *all_warnings(outcome)],
-        "timing_s": outcome.timing,
+        "timing_s": {**outcome.timing, "parts": _work(outcome.work)},
         "measurement": {
             **fields_of(m, "kind", "poses_fit", "poses_held_out", "held_out_missing", "points"),
             **fields_of(m, "std", "std_source"),

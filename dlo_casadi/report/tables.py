@@ -9,6 +9,7 @@ from dlo_casadi.cable.estimate import Covariance, Estimate
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import counted
 from dlo_casadi.report import words
+from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.outcome import MASS, Outcome
 from dlo_casadi.show import text
 from dlo_casadi.show.text import html_table
@@ -223,12 +224,23 @@ def timing_rows(outcome: Outcome) -> list[tuple[str, str, str]]:
     # In space neither IPOPT nor the paper's loop runs.
     within = {"Algorithm 1": timing["algorithm1"], "IPOPT": timing["batch"]}
     parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in within.items() if seconds)
-    rows.append(("fits and predictions", max(total - read - search, 0.0), ""))
+    of_search = outcome.work.parts.get("diagnosis", Part()).steps
+    others = outcome.work.steps - of_search
+    left = max(total - read - search, 0.0)
+    rows.append(("fits and predictions", left, counted(others, "step") if others else ""))
     if search:
-        rows.append(("diagnosis", search, ""))
+        rows.append(("diagnosis", search, counted(of_search, "step") if of_search else ""))
     remark = "without imports and writing" + (f"; of it or beside it {parts}" if parts else "")
     rows.append(("total", total, remark))
     return [(name, f"{seconds:.2f}", remark) for name, seconds, remark in rows]
+
+
+def work_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
+    """What took how long in a run: part, indented, how often, steps of its fits, seconds."""
+    return [
+        ("  " * depth + name, str(one.calls), str(one.steps), f"{one.seconds:.2f}")
+        for depth, name, one in outcome.work.rows()
+    ]
 
 
 # ---- results as a notebook shows them: a few lines, or a small table -----------------------------

@@ -156,6 +156,14 @@ def _timing_table(outcome: Outcome) -> Table:
     return table
 
 
+def work_table(outcome: Outcome) -> Table:
+    """What took how long: parts of the run, steps of their fits, wall-clock time."""
+    table = plain_table("Work", ["part"], ["times", "steps", "seconds"])
+    for row in tables.work_rows(outcome):
+        table.add_row(*row)
+    return table
+
+
 # ---- one predicted pose ------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ from concurrent.futures import (
     ThreadPoolExecutor,
     wait,
 )
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from operator import call
@@ -26,6 +26,7 @@ import numpy as np
 from dlo_casadi.errors import DloError
 from dlo_casadi.runtime.executors import one_thread, worker_log
 from dlo_casadi.runtime.executors import open_executor as open_executor
+from dlo_casadi.runtime.work import Part, accounted, add
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -54,6 +55,8 @@ class Finished(Generic[Item, Result]):
         Exception of the function, or a `LostTaskError`.
     seconds : float
         Duration on the worker.
+    work : Part
+        What its fits took.
     """
 
     index: int
@@ -61,6 +64,7 @@ class Finished(Generic[Item, Result]):
     result: Result | None
     error: BaseException | None
     seconds: float
+    work: Part = field(default_factory=Part)
 
     @property
     def value(self) -> Result:
@@ -146,6 +150,7 @@ def map_as_completed(
         nonlocal failed
         done: Finished[Item, Result] = replace(task, item=item)
         failed += done.error is not None
+        add(task.work)
         durations.append(done.seconds)
         if progress is not None:
             left = _remaining(durations, total, workers_of(executor))
@@ -219,9 +224,11 @@ def begin(executor: Executor, function: Callable[..., Result], *args: Any) -> Ca
 
     def result() -> Result:
         try:
-            return (task(None) if begun is None else begun.result()).value
+            done = task(None) if begun is None else begun.result()
         except getattr(executor, "losses", BrokenExecutor):
-            return task(None).value
+            done = task(None)
+        add(done.work)
+        return done.value
 
     return result
 
@@ -256,7 +263,8 @@ def _run(
         begin = time.perf_counter()
         log.info("task %d begins: %.200r", index, item)
         try:
-            result = function(item)
+            with accounted() as work:
+                result = function(item)
         except Exception as error:
             log.info("task %d failed", index, exc_info=True)
             if multiprocessing.parent_process() is not None and not isinstance(error, DloError):
@@ -265,7 +273,7 @@ def _run(
         seconds = time.perf_counter() - begin
         if failure is None:
             log.info("task %d done in %.3f s", index, seconds)
-        return Finished(index, None, result, failure, seconds)
+        return Finished(index, None, result, failure, seconds, work)
 
 
 def _remaining(

@@ -23,6 +23,7 @@ from dlo_casadi.estimation.repeats import enough_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.rod.obstacles import Obstacle
+from dlo_casadi.runtime.work import Part
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 
@@ -365,6 +366,10 @@ class Outcome:
         A weight that the shapes cannot separate from stiffness.
     limits : tuple of LimitCheck
         Of all predicted poses, where the session declares limits.
+    cut_off : bool
+        Whether the diagnosis has met the bound on its work before everything was tried.
+    work : Part
+        What the parts of the run took, in steps and seconds.
     """
 
     config: Config
@@ -386,6 +391,8 @@ class Outcome:
     hidden_weight: HiddenWeight | None = None
     limits: tuple[LimitCheck, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
+    cut_off: bool = False
+    work: Part = field(default_factory=Part)
 
     @cached_property
     def repeatability(self) -> Repeatability:

@@ -19,6 +19,13 @@ from dlo_casadi.session.outliers import LEAST_POINTS, Outliers, outliers_of
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
 from dlo_casadi.thresholds import BEYOND_TOLERANCE, DIFFERENT, FIXTURES, UNSEEN
 
+CUT_OFF = (
+    "the diagnosis has met the bound on its work before everything was tried, as where several "
+    "things are missing that hide each other: the verdict is about what was found until then. Try: "
+    "declare what is known of the setup under model.effects or experiment.tolerances; "
+    "diagnosis.exclude for effects that cannot be"
+)
+
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:
     """Remarks of the camera step pose by pose, and poses that were not read at all.

@@ -24,6 +24,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.runtime.executors import InProcess, one_thread, software
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.runtime.progress import Progress, Step, nobody
+from dlo_casadi.runtime.work import accounted, accounted_as, add, part
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.measure import measured_poses, read_session
@@ -60,8 +61,11 @@ def run_session(
     begin(executor, software)  # meanwhile another process starts and imports what fits need
     config, inputs = read_session(config, step)
     try:
-        with one_thread():
-            return _Run(config, step, executor, began).outcome(inputs)
+        with one_thread(), accounted() as work:
+            outcome = _Run(config, step, executor, began).outcome(inputs)
+        add(work)
+        work.tell()
+        return replace(outcome, work=work)
     except DloError as error:
         error.poses = inputs  # for the page of a failure, which shows what was read
         raise
@@ -104,7 +108,8 @@ class _Run:
             warnings += remarks.left_out(outliers)
         others = config.estimation, declared.model, measured, n
         compared = begin(executor, fitting.simpler_fits, *others)
-        fit = fitting.fit_declared(config, declared, measured)
+        with part("declared model"):
+            fit = fitting.fit_declared(config, declared, measured)
         confirming = begin(executor, fitting.minimum_by_ipopt, fit)
         step("fit the declared model", 1, 1)
 
@@ -154,6 +159,7 @@ class _Run:
             )
         )
 
+    @accounted_as("diagnosis")
     def close_the_loop(
         self,
         declared: Fit,
@@ -223,6 +229,7 @@ class _Run:
             "structure": (diagnosis.structure_before, diagnosis.structure),
             "cross_validated": validated.rmse if told else None,
             "hidden_weight": diagnosis.weight,
+            "cut_off": diagnosis.cut_off,
         }
         return fit, found
 
@@ -246,6 +253,7 @@ def judged(outcome: Outcome) -> Outcome:
     poses = () if outcome.config.estimation.robust else outcome.poses
     said = remarks.fit_warnings(fit, outcome.mesh_error, declared, poses)
     said += remarks.worse_than_simpler(stages)
+    said += [remarks.CUT_OFF] if outcome.cut_off else []
     if outcome.hidden_weight is not None:
         said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))
     if verdict is not None:

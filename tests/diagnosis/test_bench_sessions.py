@@ -93,4 +93,6 @@ def test_every_stage_is_in_the_report_of_photographs(report):
     names = [item["name"] for item in found["stages"]]
     assert names == ["initial", "stiffness_only", "algorithm1", "batch", "closed"]
     assert found["measurement"]["std_source"] == "estimated"
-    assert all(np.isfinite(value) for value in found["timing_s"].values())
+    timed = found["timing_s"]
+    assert all(np.isfinite(value) for key, value in timed.items() if key != "parts")
+    assert {"declared model", "diagnosis"} <= {part["name"] for part in timed["parts"]}

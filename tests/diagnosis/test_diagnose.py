@@ -10,6 +10,7 @@ import pytest
 from hidden_sets import simulated
 
 from dlo_casadi.config import load_config
+from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, equivalents, setup_of
 from dlo_casadi.diagnosis.crossval import (
     CrossValidation,
@@ -26,6 +27,7 @@ from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.runtime.parallel import generator_of
+from dlo_casadi.runtime.work import accounted
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.measure import measured_poses, read_inputs
@@ -202,6 +204,16 @@ def test_ipopt_and_gauss_newton_reach_the_same_minimum(session):
     assert solution.objective == pytest.approx(fit.point.objective, rel=1e-6)
     scaled = np.sqrt(np.diag(fit.covariance))
     assert np.abs(solution.theta - fit.point.theta).max() < 0.05 * scaled.max()
+
+
+def test_nothing_is_begun_once_the_bound_is_met(fit, found, monkeypatch):
+    """What was found until then is the result, and it says that not everything was tried."""
+    monkeypatch.setattr(module, "DIAGNOSIS_STEPS", 0)
+    with accounted() as work:
+        cut = diagnose(fit, exclude=OTHERS)
+    assert (found.cut_off, cut.cut_off) == (False, True)
+    assert len(cut.added) <= 1
+    assert work.parts["searches"].calls == 1
 
 
 @pytest.mark.long

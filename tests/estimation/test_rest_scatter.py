@@ -84,6 +84,18 @@ def test_gradient_of_the_deviance_against_differences(systematic):
     np.testing.assert_allclose(at(np.zeros(3)).gradient, slopes, rtol=1e-6, atol=1e-6)
 
 
+def test_a_scatter_is_no_larger_than_that_of_cables():
+    """What fits that are lost leave is error, not scatter: it was 1.1 1/m on 0.6 m."""
+    samples, distances = session(1.1)
+    free, most = (ScatterLikelihood(samples, distances, most=most) for most in (np.inf, 0.5))
+    assert estimate_pose_scatter(free).scatter.std > 0.5
+    bounded = estimate_pose_scatter(most).scatter
+    assert bounded.std == pytest.approx(0.5, rel=1e-6)
+    small = ScatterLikelihood(*session(0.1), most=0.5)
+    own = estimate_pose_scatter(ScatterLikelihood(*session(0.1)))
+    assert estimate_pose_scatter(small).scatter.std == pytest.approx(own.scatter.std, rel=1e-3)
+
+
 def test_a_single_pose_has_no_systematic_part():
     samples, distances = session(0.1, rows=30)
     alone = ScatterLikelihood(samples[:1], distances[:1, :1]).deviance(1.3, 0.15, 0.2, 0.25, 0.3)

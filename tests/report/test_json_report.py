@@ -60,7 +60,11 @@ def test_every_key_of_the_schema_is_there(outcome):
 
     assert {key: type(value) for key, value in report.items()} == KEYS
     assert report["schema"] == "dlo-report/1"
-    assert set(report["timing_s"]) == {"vision", "algorithm1", "batch", "diagnosis", "total"}
+    timed = {"vision", "algorithm1", "batch", "diagnosis", "total", "parts"}
+    assert set(report["timing_s"]) == timed
+    assert [set(part) for part in report["timing_s"]["parts"]] == [
+        {"name", "calls", "steps", "seconds", "parts"} for _ in outcome.work.parts
+    ]
     assert set(report["measurement"]) == {
         "kind",
         "poses_fit",

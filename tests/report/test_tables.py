@@ -18,6 +18,7 @@ from dlo_casadi.report.tables import (
     rest_rows,
     summary_text,
     timing_rows,
+    work_rows,
 )
 from dlo_casadi.report.words import (
     all_warnings,
@@ -26,6 +27,7 @@ from dlo_casadi.report.words import (
     reading_text,
     structure_lines,
 )
+from dlo_casadi.runtime.work import Part
 
 WEIGHT = 0.2 * 9.81  # N, of short_clean
 NOISE = Structure(12.0, 9, 0.2, 1.3, -0.5, order_z=1.0, span_z=0.3, position_z=0.2, per_pose={})
@@ -84,9 +86,15 @@ def test_the_rest_curvature_has_its_range_and_its_mean_std(outcome):
 
 def test_parts_of_the_time_add_up(outcome):
     spent = {"vision": 1.0, "algorithm1": 2.0, "batch": 4.0, "diagnosis": 8.0, "total": 20.0}
-    rows = {
-        name: float(seconds) for name, seconds, _ in timing_rows(replace(outcome, timing=spent))
-    }
+    work = Part(1, 50, 19.0, {"diagnosis": Part(1, 30, 8.0, {"fits": Part(4, 30, 7.0)})})
+    told = replace(outcome, timing=spent, work=work)
+    rows = {name: float(seconds) for name, seconds, _ in timing_rows(told)}
+    remarks = {name: remark for name, _, remark in timing_rows(told)}
+    assert (remarks["fits and predictions"], remarks["diagnosis"]) == ("20 steps", "30 steps")
+    assert work_rows(told) == [
+        ("diagnosis", "1", "30", "8.00"),
+        ("  fits", "4", "30", "7.00"),
+    ]
     assert rows == {
         "reading the lines": 1.0,
         "fits and predictions": 11.0,
