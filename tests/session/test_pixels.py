@@ -138,8 +138,8 @@ def test_pixels_near_the_ends_and_beside_each_other_are_left_out():
     assert pixel_std([view]) == pytest.approx(0.05 * 1.2 / 1000)
     found = pixels_of(view, pixel_std([view]))
     u = found.pixels[:, 0] - 400.0
-    assert u.min() > 12.0
-    assert u.max() < count - 13.0
+    assert u.min() > 16.0
+    assert u.max() < count - 17.0
     np.testing.assert_allclose(np.diff(u), 8.0)
     np.testing.assert_allclose(found.weight, 1.0)
     assert found.correlation_length == pytest.approx(np.sqrt(2) * 4.0 * 1.2 / 1000)
