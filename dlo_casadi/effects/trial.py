@@ -111,7 +111,7 @@ class Trial:
 
     def _laws(self, params: _Params) -> Iterator[_Law]:
         d, cable, effect, sym = self.node.dimension, self.cable, self.effect, self._symbol
-        gravity = sym("gravity", self.setup.gravity)
+        gravity = ca.SX(ca.DM(self.setup.gravity))  # numbers, as in a model
         places = (np.linspace(0.0, 0.1, d), np.linspace(0.5, 0.2, d) * cable.length)
         if isinstance(effect, SectionLaw):
             cell = Cell(sym("low", 0.4), sym("width", 0.05), 0.05)
@@ -197,18 +197,15 @@ class Trial:
         names = ("value", "derivative", "second derivative")
         evaluated = ca.Function("trial", [geometry, numbers], [out, slope, second])
         for number in values:
-            for bend in _BENDS if method in ("of_bend", "tangent") else (None,):
-                at = np.concatenate(
-                    [x if bend is None or str(s[0]) != "square" else [bend] for s, x in self.given]
-                )
-                found = evaluated(at, list(number.values()))
+            for bend in _BENDS if method in ("of_bend", "tangent") else _BENDS[:1]:
+                at = [[bend] if str(s[0]) == "square" else x.tolist() for s, x in self.given]
+                flat = [x for column in at for x in column]
+                found = evaluated(flat, list(number.values()))
                 for name, result in zip(names[: 3 - (method == "tangent")], found, strict=False):
                     if not np.isfinite(result.full()).all():
                         self._refuse(where, name, number, bend)
 
-    def _refuse(
-        self, where: str, name: str, values: Mapping[str, float], bend: float | None
-    ) -> None:
+    def _refuse(self, where: str, name: str, values: Mapping[str, float], bend: float) -> None:
         place = ", ".join(f"{key} = {x:g}" for key, x in values.items())
         straight = " of a cable as at rest (square = 0)" if bend == 0.0 else ""
         meant = (
@@ -224,14 +221,16 @@ class Trial:
 def try_out(kind: type[Effect]) -> None:
     """Raise a Mistake if an effect fails in a setup to which it applies, in a plane or in space."""
     for d in kind.dimensions:
-        try:
-            for setup in _setups(d):
+        for setup in _setups(d):
+            try:
                 if _called(kind, "applies", setup):
                     Trial(kind, setup).run()
-        except Mistake as mistake:
-            alone = d == 3 and 2 in kind.dimensions
-            said = ", in space; or dimensions = (2,), if it is of a plane alone" * alone
-            raise Mistake(f"{mistake}{said}") from None
+            except Mistake as mistake:
+                said = ", in space; or dimensions = (2,), if it is of a plane alone"
+                said *= d == 3 and 2 in kind.dimensions
+                if not any(setup.gravity):
+                    said = ", without gravity: gravity itself, not its direction; or `impossible`"
+                raise Mistake(f"{mistake}{said}") from None
 
 
 def _setups(d: int) -> Iterator[Setup]:
@@ -252,6 +251,7 @@ def _setups(d: int) -> Iterator[Setup]:
         resting=-0.5,
     )
     yield plain
+    yield replace(plain, gravity=(0.0,) * d)
     yield seen
     yield replace(seen, start=SupportKind.CLAMPED, end=SupportKind.CLAMPED)
     yield replace(seen, start=SupportKind.CLAMPED, end=SupportKind.FREE)

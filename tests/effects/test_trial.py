@@ -35,7 +35,7 @@ class Frost(Load):
     declared: ClassVar = (Parameter("weight", "N/m", scale=0.1),)
 
     def resultant(self, s, gravity, cable, params):
-        return params["weight"] * (cable.length - s) * gravity / ca.norm_2(gravity)
+        return params["weight"] * (cable.length - s) * gravity / 9.81
 
 
 def own(base, **methods):
@@ -102,6 +102,13 @@ MISTAKES = {
     "a logarithm of nothing": (
         own(Frost, resultant=lambda self, s, gravity, cable, p: gravity * ca.log(p["weight"])),
         "the value of its resultant is not finite at weight = 0",
+    ),
+    "the direction of no gravity": (
+        own(
+            Frost,
+            resultant=lambda self, s, gravity, cable, p: p["weight"] * gravity / ca.norm_2(gravity),
+        ),
+        "the value of its resultant is not finite .*, without gravity: gravity itself, not its",
     ),
     "a plane of its own": (
         own(
