@@ -13,7 +13,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange
-from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
+from dlo_casadi.equilibrium.equilibrium import END_TOLERANCE, JOINT_BOUND
 from dlo_casadi.equilibrium.minima import (
     KEEPING_SIDE,
     TOLERANCE,
@@ -21,6 +21,7 @@ from dlo_casadi.equilibrium.minima import (
     descend_to_contact,
     size_of,
     stepped,
+    violation,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
@@ -183,8 +184,8 @@ class BatchEquilibrium:
             fresh = stale[active] | coupled
             force, matrix = self._linearized(here, active, fresh, matrix)
             try:
-                step = self._newton(force, matrix, active)
-                step = self._handed_on(here, matrix, step) if coupled else step
+                own = self._newton(force, matrix, active)
+                step = self._handed_on(here, matrix, own) if coupled else own
             except np.linalg.LinAlgError:
                 break
             size = size_of(self.model, step)
@@ -193,6 +194,10 @@ class BatchEquilibrium:
             there = stepped(here, *damped(self.model, step, size, last[active])).shapes
             now.x[active], now.lam[active] = there.x, there.lam
             done = _settled(size, last[active], tolerance, fresh)
+            # Of conditions that depend on each other a step leaves what they contradict.
+            ended, there = np.flatnonzero(done), active[done]
+            closed = matrix.subset(there).of_border(own.x[ended], own.y[ended])
+            done[ended] = violation(self.model, closed + force.y[ended]) <= END_TOLERANCE
             stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
             # A contact that starts or ends changes the matrix.
             stale[active] |= (size > NEAR) | bool(self.model.surfaces)

@@ -13,7 +13,7 @@ from dlo_casadi.rod.ends import reaction_rows
 
 # Largest angle between neighbouring headings (Eq. 8; joints only) [rad].
 JOINT_BOUND = np.pi / 2
-# Largest violation of an end condition [m or rad] of an accepted equilibrium.
+# Largest violation of an end condition of an accepted equilibrium [lengths or rad].
 END_TOLERANCE = 1e-8
 # Largest imbalance of an accepted equilibrium, relative to the tangent matrix.
 BALANCE = 1e-12

@@ -37,7 +37,9 @@ _HALF_ANGLE = (
     *(5.9998487866413575, 1.818549938733748, 0.45541329964829563, 3.159529741805951),
     *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
 )
-_FORWARD = np.array([1.0, 0.0, 0.0])
+_FORWARD, _NOWHERE = np.array([1.0, 0.0, 0.0]), np.zeros(3)
+# Chord over arc length below which both ends are at one place: its direction is rounding.
+ONE_POINT = 1e-12
 
 
 def _held(
@@ -264,14 +266,14 @@ def guessed_frames(
     if chord is None:
         bends = model.chain.curvatures(rest) * np.diff(model.chain.cells, axis=1).ravel()
         return _hanging_frames(u, clamps[0], down, bends)
-    along = chord / max(float(np.linalg.norm(chord)), 1e-12)
-    side = sagging(along, down)
+    along = chord_direction(chord, clamps, down)
+    side, ratio = sagging(along, down), float(np.linalg.norm(chord))
     found: list[FloatArray] = []
     others: list[FloatArray] = []
     aimed = turns = 0.0 if None in clamps else pose.turns
     for quarter in range(4):
         turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
-        free, roll = carried(u, arc_tangents(u, chord, turned), clamps)
+        free, roll = carried(u, arc_tangents(u, ratio, along, turned), clamps)
         roll = nearest_roll(roll, aimed)
         if turns and not found:
             aimed = roll / (2 * np.pi)
@@ -296,6 +298,21 @@ def smallest_turn(a: FloatArray, b: FloatArray) -> Rotation:
     return Rotation.from_quat(np.concatenate([axis, real], axis=-1))
 
 
+def chord_direction(chord: FloatArray, clamps: Turned, down: FloatArray) -> FloatArray:
+    """Unit vector (3,) from the start to the end of an arc; `chord` (3,) is relative to its length.
+
+    If both are at one place, the arc is a circle that leaves against this direction: it leaves or
+    arrives along a clamp, or hangs down, see `sagging`.
+    """
+    size = float(np.linalg.norm(chord))
+    if size > ONE_POINT:
+        return chord / size
+    for clamp in clamps:
+        if clamp is not None:
+            return np.asarray(-clamp.apply(_FORWARD))
+    return unit(sagging(down / np.linalg.norm(down), _NOWHERE)) if np.any(down) else _FORWARD
+
+
 def sagging(along: FloatArray, down: FloatArray) -> FloatArray:
     """Part (3,) of gravity across a unit vector; any vector across it if there is none."""
     side = down - (down @ along) * along
@@ -304,12 +321,13 @@ def sagging(along: FloatArray, down: FloatArray) -> FloatArray:
     return side
 
 
-def arc_tangents(u: FloatArray, chord: FloatArray, side: FloatArray) -> FloatArray:
-    """Tangents (k, 3) of the circular arc of length 1 over a chord (3,), bulging to a side (3,)."""
-    along = chord / max(float(np.linalg.norm(chord)), 1e-12)
-    across = side - (side @ along) * along
-    across = across / max(float(np.linalg.norm(across)), 1e-12)
-    angle = arc_half_angle(float(np.linalg.norm(chord)), 1.0) * (1 - 2 * u)
+def arc_tangents(u: FloatArray, chord: float, along: FloatArray, side: FloatArray) -> FloatArray:
+    """Tangents (k, 3) of the circular arc of length 1 over a chord, bulging to a side (3,).
+
+    `along` (3,): unit vector of the chord, see `chord_direction`.
+    """
+    across = unit(side - (side @ along) * along)
+    angle = arc_half_angle(chord, 1.0) * (1 - 2 * u)
     return np.cos(angle)[:, None] * along + np.sin(angle)[:, None] * across
 
 

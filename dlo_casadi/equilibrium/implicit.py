@@ -202,8 +202,9 @@ def chord(model: CableModel, rest: FloatArray) -> ca.Function:
         matrix[0, 0] += ca.mmax(ca.fabs(matrix))
     arguments: list[Any] = [x, lam, pose, p]
     matrix = detached(ca.Function("tangent", arguments, [matrix]))(*arguments)
+    # A singular matrix gives NaN, not an exception: `search` may find an equilibrium that swings.
     total = ca.MX.zeros(z.shape)
     for _ in range(2):
-        total -= ca.solve(matrix, force(total, *arguments), "qr")
+        total -= ca.solve(matrix, force(total, *arguments), "qr", {"eps": 0.0})
     longest = ca.mmax(ca.fabs(total[: count * node.increment]))
     return ca.Function("chord", arguments, [*after(total), longest])

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.equilibrium.equilibrium import END_TOLERANCE
 from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import DEPTH, gap_per_force
@@ -83,6 +84,18 @@ def turn_per_slip(model: CableModel) -> FloatArray:
     return slide * (_TURN / model.chain.length)
 
 
+def violation(model: CableModel, gaps: FloatArray) -> FloatArray:
+    """Largest violation (m,) of the conditions of ends, clips and contacts.
+
+    Distances are relative to the length, angles in rad. `gaps` (m, n_border, 1): of the border's
+    conditions. Where these depend on each other, a Newton step leaves what they contradict: it may
+    be short although an end is not where it is held.
+    """
+    kinds = np.array([*model.border_kinds.values()])
+    unit = np.where(kinds == "distance", 1 / model.chain.length, kinds == "angle")
+    return np.abs(gaps[..., 0] * unit).max(axis=1, initial=0.0)
+
+
 def size_of(model: CableModel, step: Vector) -> FloatArray:
     """Largest turn (m,) [rad] in a step of one column."""
     nodes = np.abs(step.x).max(axis=(1, 2, 3))
@@ -122,7 +135,7 @@ def descend(start: Assembly, max_iterations: int = 80) -> Minima:
         now.x[active], now.lam[active] = here.shapes.x, here.shapes.lam
         # A shift makes steps small even if forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
-        balanced[active[done]] = True
+        balanced[active[done]] = True  # the end conditions are checked below
         iterations[active[done]] = iteration + 1
         left = np.flatnonzero(~done & np.isfinite(size))
         active, here = active[left], here.subset(left)
@@ -132,6 +145,7 @@ def descend(start: Assembly, max_iterations: int = 80) -> Minima:
     total, force, matrix = end.balance()
     with np.errstate(invalid="ignore"):
         energy = total - end.work(force)
+    balanced &= violation(model, force.y) <= END_TOLERANCE
     there = np.flatnonzero(balanced)
     converged = np.zeros(m, dtype=bool)
     converged[there] = matrix.subset(there).negative() == wanted

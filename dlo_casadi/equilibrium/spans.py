@@ -20,8 +20,10 @@ from dlo_casadi.equilibrium.guesses import (
     arc_into_clamps,
     arc_tangents,
     bent_into,
+    chord_direction,
     downwards,
     fallen,
+    frame_rotation,
     frames_along,
     guessed_frames,
     guesses,
@@ -329,17 +331,17 @@ def _frames(
 def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatArray:
     """Tangents (k, 3) of the arc of a span, bent into its clamps."""
     down = np.array(model.gravity)
-    forward = np.eye(3)[0]
-    ends = [None if one is None else Rotation.from_quat(one).apply(forward) for one in span.frames]
+    clamps = frame_rotation(span.frames[0]), frame_rotation(span.frames[1])
+    ends = [None if one is None else one.apply(np.eye(3)[0]) for one in clamps]
     if span.chord is None:
         down = down / max(float(np.linalg.norm(down)), 1e-12)
         first = down if ends[0] is None else ends[0]
         fall = smallest_turn(first, down if np.any(down) else first).as_rotvec()
         return Rotation.from_rotvec(fallen(u)[:, None] * fall).apply(first)
-    along = span.chord / max(float(np.linalg.norm(span.chord)), 1e-12)
+    along = chord_direction(span.chord / span.length, clamps, down)
     turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(sagging(along, down))
-    axes = arc_tangents(u, span.chord / span.length, turned)
-    arc = arc_tangents(np.array([0.0, 1.0]), span.chord / span.length, turned)
+    over = float(np.linalg.norm(span.chord)) / span.length, along, turned
+    axes, arc = arc_tangents(u, *over), arc_tangents(np.array([0.0, 1.0]), *over)
     return np.asarray(bent_into(u, axes, arc, ends))
 
 

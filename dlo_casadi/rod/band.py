@@ -29,8 +29,12 @@ LEAST_PIVOT = 1e-8
 # Maximum number of steps of iterative refinement, and the relative residual at which they end.
 REFINEMENTS = 3
 RESIDUAL = 1e-13
-# Eigenvalues below this share of the largest entry count as zero: that is the rounding error.
+# Conditions whose eigenvalue is below this share depend on each other: that is the rounding error.
 ZERO_PIVOT = 1e-13
+# Eigenvalues below this share of the largest entry count as zero: the elimination cannot tell them
+# from zero where a pivot is that small. A cable without weight that may swing about its chord has
+# 1e-16, stable equilibria on 20 elements have 2.5e-4 to 2e-3; these fall with 1 / n^2.
+NEUTRAL = LEAST_PIVOT
 
 
 @dataclass(frozen=True)
@@ -179,6 +183,12 @@ class BandMatrix:
         across = self.columns.mT @ vector.x.reshape((m, rows, -1))
         return Vector(x, across + self.corner @ vector.y)
 
+    def of_border(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Rows (m, k, q) of the border in the products with x (m, n, b, q), y (m, k, q)."""
+        m, rows, k = *self.columns.shape[:2], y.shape[1]
+        across = self.columns.mT[:, :k] @ x.reshape((m, rows, x.shape[3]))
+        return np.asarray(across + self.corner[:, :k, :k] @ y)
+
     def dense(self) -> FloatArray:
         """Full matrices (m, n b + k, n b + k), without internal unknowns."""
         m, n, b, k = self.border.shape
@@ -211,11 +221,11 @@ class BandMatrix:
     def negative(self) -> IntArray:
         """Number of negative eigenvalues of each matrix (m,), border included.
 
-        Eigenvalues of A that are zero to rounding count as negative, so that a neutral shape does
-        not count as stable. The result is -1 if conditions in the border depend on each other.
+        Eigenvalues of A below NEUTRAL count as negative, so that a neutral shape does not count as
+        stable. The result is -1 if conditions in the border depend on each other.
         """
-        rounding = ZERO_PIVOT * self.scale[:, None, None, None] * np.eye(self.diagonal.shape[2])
-        return replace(self, diagonal=self.diagonal - rounding).factor().negative
+        least = NEUTRAL * self.scale[:, None, None, None] * np.eye(self.diagonal.shape[2])
+        return replace(self, diagonal=self.diagonal - least).factor().negative
 
 
 class BandFactor:
