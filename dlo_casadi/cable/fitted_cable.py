@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import CableCurve, EstimatedCable
-from dlo_casadi.cable.held import among, held_pose, reaction_texts, side_texts
+from dlo_casadi.cable.held import all_asked, among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.cable.placing import Aim, Placing, placed
-from dlo_casadi.config import Clip, Obstacle
+from dlo_casadi.config import Clip, Obstacle, Pose
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import Branch, HeldPose
@@ -60,7 +60,7 @@ class FittedCable(EstimatedCable):
 
     def solve(
         self,
-        end: ArrayLike | None = None,
+        end: ArrayLike | Pose | None = None,
         *,
         start: ArrayLike | None = None,
         start_heading: float | None = None,
@@ -81,8 +81,9 @@ class FittedCable(EstimatedCable):
 
         Parameters
         ----------
-        end : (d,) [m]
-            Where the end is held, d = 2 or 3 in space; None for a free end.
+        end : (d,) [m], or Pose
+            Where the end is held, d = 2 or 3 in space; None for a free end. Or all that holds the
+            cable, as for `CompiledSolver`; then only `obstacles` may stand beside it.
         start : (d,) [m], optional
             Where the start is held; by default the place shared by all poses of the session, or the
             origin.
@@ -119,8 +120,8 @@ class FittedCable(EstimatedCable):
         asked = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        beside = {"clips": clips, "over": over}
-        pose = held_pose(self.model, self.metadata.fixtures, asked | beside)
+        asked |= {"clips": clips, "over": over}
+        pose = held_pose(self.model, self.metadata.fixtures, all_asked(asked))
         held = self.with_clips([clip.kind for clip in pose.clips])
         if obstacles or over is not None:
             held = replace(held, **among(held.model, held.p, obstacles, over))

@@ -110,6 +110,26 @@ def among(
     return {"model": model, "p": np.where(moved.any(axis=0), model.nominal, p)}
 
 
+def all_asked(asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `FittedCable.solve`, by name, with those of a Pose in the place of the end.
+
+    Raises
+    ------
+    DloError
+        If other arguments stand beside the Pose.
+    """
+    pose = asked["end"]
+    if not isinstance(pose, Pose):
+        return dict(asked)
+    given = {key: value for key, value in asked.items() if key != "end"}
+    beside = [key for key in ("turns", "clips") if given.pop(key)]
+    beside += [key for key, value in given.items() if value is not None]
+    if beside:
+        said = ", ".join(beside)
+        raise DloError(f"solve(pose) beside {said}: a Pose has them.\n  Try: Pose(..., {said}).")
+    return {key: getattr(pose, key) for key in asked}
+
+
 def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, Any]) -> HeldPose:
     """End conditions, checked like those of a session and against the boundary.
 

@@ -21,6 +21,7 @@ from dlo_casadi.codegen.generate import Solver, generate
 from dlo_casadi.codegen.shapes import (
     QUANTITIES,
     STATUSES,
+    AnyObstacle,
     AnyPose,
     CompiledShape,
     Gap,
@@ -30,6 +31,7 @@ from dlo_casadi.codegen.shapes import (
     no_equilibrium,
     pose_table,
     records_of,
+    surfaces_of,
 )
 from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import DloError, EquilibriumError, counted
@@ -157,7 +159,7 @@ class CompiledSolver:
         *,
         warm: CompiledShape | None = None,
         throw: bool = True,
-        obstacles: Sequence[Obstacle] | None = None,
+        obstacles: Sequence[AnyObstacle] | None = None,
     ) -> CompiledShape:
         """Shape of the cable in one pose.
 
@@ -195,7 +197,7 @@ class CompiledSolver:
         pose: AnyPose,
         *,
         steps: int = 4,
-        obstacles: Sequence[Obstacle] | None = None,
+        obstacles: Sequence[AnyObstacle] | None = None,
     ) -> CompiledShape:
         """Shape in a nearby pose after at most `steps` Newton steps; check its `status`.
 
@@ -217,7 +219,7 @@ class CompiledSolver:
         poses: Poses,
         *,
         branch: Branch | None = None,
-        obstacles: Sequence[Obstacle] | None = None,
+        obstacles: Sequence[AnyObstacle] | None = None,
     ) -> tuple[Any, NDArray[np.intc]]:
         """Shapes of many independent poses.
 
@@ -250,7 +252,7 @@ class CompiledSolver:
         *,
         branch: Branch | None = None,
         warm: CompiledShape | None = None,
-        obstacles: Sequence[Obstacle] | None = None,
+        obstacles: Sequence[AnyObstacle] | None = None,
     ) -> ShapePath:
         """Shapes along a path, each one continued from the one before.
 
@@ -280,7 +282,7 @@ class CompiledSolver:
         shape: CompiledShape,
         pose: AnyPose,
         *,
-        obstacles: Sequence[Obstacle] | None = None,
+        obstacles: Sequence[AnyObstacle] | None = None,
     ) -> Slope:
         """Derivatives of a shape by the pose it was solved for.
 
@@ -301,7 +303,7 @@ class CompiledSolver:
         return Slope(**_values(out[0]))
 
     def clearance(
-        self, shape: CompiledShape, obstacles: Sequence[Obstacle], slope: Slope | None = None
+        self, shape: CompiledShape, obstacles: Sequence[AnyObstacle], slope: Slope | None = None
     ) -> Gap:
         """The place of the cable nearest to obstacles, and its distance from them.
 
@@ -335,7 +337,7 @@ class CompiledSolver:
         self,
         shape: CompiledShape,
         limits: Mapping[str, float],
-        obstacles: Sequence[Obstacle] = (),
+        obstacles: Sequence[AnyObstacle] = (),
         slope: Slope | None = None,
     ) -> dict[str, Usage]:
         """Use of each limit by a shape, keyed by QUANTITIES, the tightest one first.
@@ -384,16 +386,17 @@ class CompiledSolver:
         first = QUANTITIES[tightest[0]]
         return {first: found[first]} | found
 
-    def _table_of(self, obstacles: Sequence[Obstacle]) -> NDArray[Any]:
+    def _table_of(self, obstacles: Sequence[AnyObstacle]) -> NDArray[Any]:
         """Obstacles in the layout of dlo_obstacle."""
         if not isinstance(obstacles, Sequence):
             raise DloError(f"obstacles is a list, found {obstacles!r}\n  Try: [obstacle]")
         d = self.model.node.dimension
+        obstacles = surfaces_of(self.model, obstacles)
         for obstacle in obstacles:
             if not isinstance(obstacle, Obstacle):
                 raise DloError(
-                    f"a Capsule or a Plane belongs here, found {obstacle!r}\n"
-                    "  Try: dlo_casadi.codegen.Plane(point, normal)"
+                    f"an Obstacle belongs here, found {obstacle!r}\n"
+                    '  Try: dlo_casadi.Obstacle(kind="plane", point=..., normal=...)'
                 )
             if any(np.shape(place) != (d,) for place in row_of(obstacle)[1:3]):
                 raise DloError(
@@ -419,7 +422,9 @@ class CompiledSolver:
             out[name] = value
         return out
 
-    def _call(self, name: str, *arguments: Any, obstacles: Sequence[Obstacle] | None = None) -> int:
+    def _call(
+        self, name: str, *arguments: Any, obstacles: Sequence[AnyObstacle] | None = None
+    ) -> int:
         """Call the library and return its status; functions that solve get a workspace."""
         work = np.empty(self.workspace)
         given = [*arguments, work, work.size][: len(_ARGUMENTS[name])]

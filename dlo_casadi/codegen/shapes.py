@@ -7,14 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.config import Pose
+from dlo_casadi.config import Obstacle, Pose
+from dlo_casadi.config.supports import obstacle_problems
 from dlo_casadi.config.values import AXES
 from dlo_casadi.equilibrium.implicit import pose_size
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.ends import EndConditions
+from dlo_casadi.rod.obstacles import Obstacle as Surface
 
 # Same values as in the header.
 STATUSES = (
@@ -44,8 +45,9 @@ _HINTS = {
 }
 
 
-# A pose of a session, or only its ends.
+# A pose or obstacle of a session, or only its ends, its form.
 AnyPose = Pose | HeldPose
+AnyObstacle = Obstacle | Surface
 
 
 @dataclass(frozen=True)
@@ -376,12 +378,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     if kinds != model.clips:
         mine, others = (", ".join(x) or "none" for x in (kinds, model.clips))
         raise DloError(f"{said}the pose has the clips {mine}, the solver {others}")
-    clips = [
-        [clip.at or 0.0, *clip.place, *(_frame(clip, model) if model.clamped_between else ())]
-        for clip in pose.clips
-    ]
-    ends = EndConditions.size(model.node) + model.node.twists
-    return np.concatenate([numbers[:ends], *clips])
+    return pose.numbers
 
 
 def _told(value: object) -> str:
@@ -389,9 +386,18 @@ def _told(value: object) -> str:
     return "a CompiledShape" if isinstance(value, CompiledShape) else repr(value)
 
 
-def _frame(clip: HeldClip, model: CableModel) -> FloatArray:
-    """Frame (coordinates,) of a clip in the layout of dlo_clip; arbitrary if the cable may turn."""
-    return np.array(model.node.identity) if clip.frame is None else clip.frame
+def surfaces_of(model: CableModel, obstacles: Sequence[AnyObstacle]) -> list[Surface]:
+    """Obstacles as of a session, in the form of the statics; others are that already.
+
+    Raises DloError if one is impossible.
+    """
+    declared = [one for one in obstacles if isinstance(one, Obstacle)]
+    if wrong := [x.message for x in obstacle_problems(declared, model.gravity, [])]:
+        raise DloError("; ".join(wrong))
+    return [
+        one.surface(k) if isinstance(one, Obstacle) else one
+        for k, one in enumerate(obstacles, start=1)
+    ]
 
 
 def no_equilibrium(status: str, pose: AnyPose, length: float) -> str:

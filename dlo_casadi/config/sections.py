@@ -20,6 +20,7 @@ from pydantic import (
     model_validator,
 )
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.cable import Cable
 from dlo_casadi.config.document import dump_yaml, yaml_text
 from dlo_casadi.config.frozen import ConfigSection, Given, Numbers, Rows, Turned, entry, optional
@@ -162,6 +163,16 @@ class Pose(ConfigSection):
         found = {name: getattr(self, name) for name in REACTIONS}
         found |= {clip_force(k): clip.clip_force for k, clip in enumerate(self.clips, start=1)}
         return {name: value for name, value in found.items() if value is not None}
+
+    def vector(self) -> FloatArray:
+        """Return the pose as numbers, for `function`, `transcribe` and the generated C.
+
+        (6,) in a plane: start x, y, end x, y [m], start heading, end heading [rad]. (15,) in space:
+        start, end [m], their quaternions (x, y, z, w), turns. What is not given is 0, or (0, 0, 0,
+        1). Then for each clip its arc length and place [m] and, if one of them is clamped, its
+        heading or quaternion: see dlo_pose in the C header.
+        """
+        return self.held.numbers
 
     @property
     def held(self) -> HeldPose:

@@ -139,6 +139,20 @@ class HeldPose:
         return replace(self, end_orientation=tuple(float(x) for x in turned))
 
     @property
+    def numbers(self) -> FloatArray:
+        """The numbers of dlo_pose in the C header, in their order; 0 or identity where not held.
+
+        Start, end [m]; in a plane the headings of both [rad], in space their quaternions and the
+        turns; then of each clip its arc length and place [m] and, if one holds a direction, frames.
+        """
+        turns = [self.turns] if self.node.twists else []
+        held, clips = any(clip.kind.direction for clip in self.clips), []
+        for clip in self.clips:
+            frame = self.node.identity if clip.frame is None else clip.frame
+            clips += [clip.at or 0.0, *clip.place, *(frame if held else ())]
+        return np.array([*self.ends, *turns, *clips], dtype=float)
+
+    @property
     def vector(self) -> FloatArray:
         """The model's argument `pose`: the ends, the camera, see `effects.Viewpoint`, the clips.
 
@@ -147,3 +161,16 @@ class HeldPose:
         x, y, z = self.camera_center or (0.0, 0.0, np.inf)
         clips = (clip.vector(self.node) for clip in self.clips)
         return np.concatenate([self.ends, np.array([x, y, 1.0]) / z, *clips])
+
+
+def pose_numbers(pose: object) -> Any:
+    """The numbers of a pose that has them, as a session's; anything else as it is."""
+    if isinstance(pose, HeldPose):
+        return pose.numbers
+    vector = getattr(pose, "vector", None)
+    return vector() if callable(vector) else pose
+
+
+def pose_branch(pose: object, branch: Branch | None) -> Any:
+    """The branch asked for, else that of the pose if it has one."""
+    return getattr(pose, "branch", None) if branch is None else branch

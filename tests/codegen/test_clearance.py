@@ -82,7 +82,7 @@ def test_the_nearest_of_many_obstacles_is_told_and_a_cut_is_negative(space):
         space.clearance(shape, [])
     with pytest.raises(DloError, match="not_finite"):
         space.clearance(shape, [replace(BALL, radius=np.nan)])
-    with pytest.raises(DloError, match="a Capsule or a Plane belongs here, found 1"):
+    with pytest.raises(DloError, match="an Obstacle belongs here, found 1"):
         space.clearance(shape, [1])
     with pytest.raises(DloError, match="a CompiledShape of this solver belongs here, found None"):
         space.clearance(None, [BALL])
