@@ -43,6 +43,20 @@ def test_the_end_is_held_best_from_any_side_and_against_other_places():
     assert float(at["min_bend_radius"]) == pytest.approx(script.RADIUS, rel=1e-4)
 
 
+def test_the_cable_is_carried_past_the_ball(monkeypatch):
+    """Three poses instead of fifteen, on six elements: as clear of the ball as was asked."""
+    script = example("carry_past")
+    monkeypatch.setattr(script, "STEPS", 3)
+    known = script.cable(6)
+    ends, shapes, stats = script.carried(known)
+    assert stats["success"]
+    assert ends[2, 1] > script.STARTS[2] + 0.02  # straight on, the cable would touch
+    room = script.RADIUS + known.model.cable.diameter / 2 + script.CLEAR
+    for end, points in zip(ends.T, shapes, strict=True):
+        assert np.linalg.norm(points.T - script.CENTER, axis=1).min() > room - 1e-6
+        np.testing.assert_allclose(points[:, -1], end, atol=1e-7)
+
+
 def test_the_end_is_led_past_the_obstacles_with_less_pull_than_on_the_shortest_way():
     """Five poses instead of twenty, from the same first guess."""
     script = example("lead_the_end")

@@ -82,8 +82,7 @@ class FittedCable(EstimatedCable):
         Parameters
         ----------
         end : (d,) [m], or Pose
-            Where the end is held, d = 2 or 3 in space; None for a free end. Or all that holds the
-            cable, as for `CompiledSolver`; then only `obstacles` may stand beside it.
+            Where the end is held, d = 2 or 3 in space; None for a free end. Or a whole pose.
         start : (d,) [m], optional
             Where the start is held; by default the place shared by all poses of the session, or the
             origin.

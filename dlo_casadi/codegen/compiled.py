@@ -391,8 +391,7 @@ class CompiledSolver:
         if not isinstance(obstacles, Sequence):
             raise DloError(f"obstacles is a list, found {obstacles!r}\n  Try: [obstacle]")
         d = self.model.node.dimension
-        obstacles = surfaces_of(self.model, obstacles)
-        for obstacle in obstacles:
+        for obstacle in (obstacles := surfaces_of(self.model, obstacles)):
             if not isinstance(obstacle, Obstacle):
                 raise DloError(
                     f"an Obstacle belongs here, found {obstacle!r}\n"

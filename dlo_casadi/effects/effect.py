@@ -108,6 +108,8 @@ class Effect:
     as_deviation: ClassVar[Mapping[str, str]] = {}
     # Whether its parameters are moments per bending stiffness [1/m]; `energy` gets moments [N m].
     per_stiffness: ClassVar[bool] = False
+    # Number of the cable that its only parameter corrects, see `correction`; empty for none.
+    corrects: ClassVar[str] = ""
     # Whether tables of parameters list it while it is a nuisance.
     shown: ClassVar[bool] = True
     # Whether the effect applies in the plane (2), in space (3).

@@ -1,6 +1,6 @@
 """A cable that is longer or shorter than declared, or that stretches."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 
@@ -24,6 +24,7 @@ class LengthError(Kinematics):
     """
 
     name = "length_error"
+    corrects = "length"
     at_random = "a length of its own, by a standard deviation"
     tolerances: ClassVar = {"length_difference": "length"}
 
@@ -31,6 +32,11 @@ class LengthError(Kinematics):
         """Declare the difference."""
         length = cable.length
         return Parameter.symmetric(("length_difference",), "m", 0.002 * length, 0.3 * length)
+
+    @staticmethod
+    def correction(length: Any, cable: CableData) -> Any:
+        """Value of the parameter at a true length [m]."""
+        return length - cable.length
 
     def stretch(self, cable: CableData, params: Params) -> ca.SX:
         """Return true over declared length."""

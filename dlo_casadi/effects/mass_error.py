@@ -1,5 +1,7 @@
 """A cable that is heavier or lighter than declared."""
 
+from typing import Any
+
 import casadi as ca
 
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
@@ -24,12 +26,18 @@ class MassError(Load):
     """
 
     name = "mass_error"
+    corrects = "mass"
     declared = (Parameter("factor", nominal=1.0, scale=0.1, lower=0.2, upper=5.0),)
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
         """True if forces are measured and the cable has weight."""
         return super().applies(setup) and bool(setup.readings) and any(setup.gravity)
+
+    @staticmethod
+    def correction(mass: Any, cable: CableData) -> Any:
+        """Value of the parameter at a true mass [kg]."""
+        return mass / cable.mass
 
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Weight of the part beyond s, in addition to the declared one."""

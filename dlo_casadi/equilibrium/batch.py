@@ -195,8 +195,8 @@ class BatchEquilibrium:
             now.x[active], now.lam[active] = there.x, there.lam
             done = _settled(size, last[active], tolerance, fresh)
             # Of conditions that depend on each other a step leaves what they contradict.
-            ended, there = np.flatnonzero(done), active[done]
-            closed = matrix.subset(there).of_border(own.x[ended], own.y[ended])
+            ended = np.flatnonzero(done)
+            closed = matrix.subset(active[ended]).of_border(own.x[ended], own.y[ended])
             done[ended] = violation(self.model, closed + force.y[ended]) <= END_TOLERANCE
             stale[active] = ~(size < CONTRACTION * last[active]) & np.isfinite(last[active])
             # A contact that starts or ends changes the matrix.

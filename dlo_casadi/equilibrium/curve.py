@@ -16,6 +16,11 @@ _HERMITE = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [-3, 3, -2, -1], [2, -2, 1, 1]]
 _LINEAR = np.array([[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
 
 
+def interpolant(*, smooth: bool) -> FloatArray:
+    """Weights (4, 4) of both nodes, then of h dr/ds at both, by powers of u."""
+    return _HERMITE if smooth else _LINEAR
+
+
 @dataclass(frozen=True)
 class NodeCurve:
     """A curve given by its nodes and, for smooth elements, the derivatives dr/ds there.
@@ -58,7 +63,7 @@ class NodeCurve:
 
     @property
     def _table(self) -> FloatArray:
-        return _LINEAR if self.slopes is None else _HERMITE
+        return interpolant(smooth=self.slopes is not None)
 
     def _local(self, s: FloatArray) -> tuple[IntArray, FloatArray]:
         """Element index (K,) and the fraction (K,) of its length at s [m]."""

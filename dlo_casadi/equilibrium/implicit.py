@@ -31,7 +31,8 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import out_of_reach
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.whole_pose import PoseSymbols, balance, tangent
+from dlo_casadi.model.pose_system import pose_rows
+from dlo_casadi.model.whole_pose import PoseSymbols, tangent
 from dlo_casadi.rod.ends import EndConditions
 
 # Number of equilibria that a search caches: an optimiser asks for value, gradient, Hessian.
@@ -64,7 +65,7 @@ def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None
 
 
 def symbols_of(
-    model: CableModel, rest: FloatArray, x: Any, multipliers: Any, pose: Any, p: Any
+    model: CableModel, x: Any, multipliers: Any, pose: Any, p: Any, rest: Any
 ) -> PoseSymbols:
     """Arguments of the expressions of a pose; `pose` as in dlo_pose, quaternions of any length."""
     d, c = model.node.dimension, model.node.coordinates
@@ -80,7 +81,7 @@ def symbols_of(
     camera = ca.MX.zeros(model.n_pose - EndConditions.size(model.node))
     full = ca.vertcat(start, end, *frames, camera)
     still = ca.DM.zeros(len(model.deviation_names))
-    return PoseSymbols(ca.vec(x), multipliers, p, ca.DM(rest), full, still)
+    return PoseSymbols(ca.vec(x), multipliers, p, rest, full, still)
 
 
 def search_sizes(model: CableModel) -> list[tuple[int, int]]:
@@ -90,59 +91,59 @@ def search_sizes(model: CableModel) -> list[tuple[int, int]]:
 
 
 class _SearchCallback(ca.Callback):
-    """(pose, p) -> (x, multipliers, status, 1 or NaN)."""
+    """(pose, p, rest) -> (x, multipliers, status, 1 or NaN)."""
 
-    def __init__(self, model: CableModel, rest: FloatArray, branch: Branch | None) -> None:
+    def __init__(self, model: CableModel, branch: Branch | None) -> None:
         super().__init__()
-        self.model, self.rest, self.branch = model, rest, branch
+        self.model, self.branch = model, branch
         self._found = lru_cache(maxsize=KEPT)(self._find)
         self._sizes = search_sizes(model)
         self.construct("equilibrium")
 
     def get_n_in(self) -> int:
-        return 2
+        return 3
 
     def get_n_out(self) -> int:
         return len(self._sizes)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense((pose_size(self.model), len(self.model.names))[i], 1)
+        sizes = (pose_size(self.model), len(self.model.names), self.model.chain.n_rests)
+        return ca.Sparsity.dense(sizes[i], 1)
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
         return ca.Sparsity.dense(*self._sizes[i])
 
     def eval(self, given: Sequence[ca.DM]) -> list[ca.DM]:
-        pose, p = (np.array(part).ravel() for part in given)
-        return self._found(pose.tobytes(), p.tobytes())
+        return self._found(*(np.array(part).ravel().tobytes() for part in given))
 
-    def _find(self, pose: bytes, p: bytes) -> list[ca.DM]:
-        found = self._solved(np.frombuffer(pose), np.frombuffer(p))
+    def _find(self, *given: bytes) -> list[ca.DM]:
+        found = self._solved(*map(np.frombuffer, given))
         if isinstance(found, Equilibrium):
             multipliers = found.multipliers[self.model.are_multipliers]
             return [ca.DM(found.x.T), ca.DM(multipliers), ca.DM(0), ca.DM(1)]
         none = [ca.DM.nan(*size) for size in self._sizes]
         return [*none[:2], ca.DM(found), none[3]]
 
-    def _solved(self, numbers: FloatArray, p: FloatArray) -> Equilibrium | int:
+    def _solved(self, numbers: FloatArray, p: FloatArray, rest: FloatArray) -> Equilibrium | int:
         """The stable equilibrium of a pose, or the number of the reason that there is none."""
         model, pose = self.model, pose_of(self.model, numbers, self.branch)
-        if not np.all(np.isfinite([*pose.vector, pose.turns, *p])):
+        if not np.all(np.isfinite([*pose.vector, pose.turns, *p, *rest])):
             return 3
         if np.any(model.node.excess(np.array(pose.frames)) < -0.5):
             return 6
         if out_of_reach(model, p, pose) is not None:
             return 1
         try:
-            found = solve_equilibrium(model, p, self.rest, pose)
+            found = solve_equilibrium(model, p, rest, pose)
         except EquilibriumError:
             return 2
         return found if found.stable else 4
 
 
 @cache
-def search_of(model: CableModel, rest: bytes, branch: Branch | None) -> _SearchCallback:
+def search_of(model: CableModel, branch: Branch | None) -> _SearchCallback:
     """Search node, kept until the process ends: graphs that contain it do not keep it alive."""
-    return _SearchCallback(model, np.frombuffer(rest), branch)
+    return _SearchCallback(model, branch)
 
 
 def detached(function: ca.Function) -> ca.Function:
@@ -159,31 +160,45 @@ def detached(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), given, function.call(given), options)
 
 
-def border_of(model: CableModel, rest: FloatArray) -> ca.Function:
-    """(x, multipliers (n_multipliers,), pose, p) -> (n_border,): places of springs put in.
+class Numbers:
+    """Parameters p and rest strains (MX) of a function: those that vary are its arguments.
+
+    `given`: what varies, outside of the function. `inside`: both, as the function sees them.
+    """
+
+    def __init__(self, p: Any, rest: Any) -> None:
+        both = {"p": p, "rest": rest}
+        varying = {name: x for name, x in both.items() if not x.is_constant()}
+        self.given: list[Any] = [*varying.values()]
+        self.symbols: list[Any] = [ca.MX.sym(name, x.numel()) for name, x in varying.items()]
+        self.inside = {**both, **dict(zip(varying, self.symbols, strict=True))}
+
+
+def border_of(model: CableModel, numbers: Numbers) -> ca.Function:
+    """(x, multipliers (n_multipliers,), pose, ...) -> (n_border,): places of springs put in.
 
     A spring's place y has the condition r(s) - y = 0: with y = 0 this is y. Without derivatives.
     """
     x = ca.MX.sym("x", model.node.coordinates, model.chain.n_nodes)
     found, pose = ca.MX.sym("multipliers", model.n_multipliers), ca.MX.sym("pose", pose_size(model))
-    p, border = ca.MX.sym("p", len(model.names)), ca.MX.zeros(model.n_border)
+    border = ca.MX.zeros(model.n_border)
     border[np.flatnonzero(model.are_multipliers).tolist()] = found
     if model.n_springs:
-        rows = balance(model, symbols_of(model, rest, x, border, pose, p))[-model.n_border :]
+        rows = pose_rows(model, symbols_of(model, x, border, pose, **numbers.inside)).conditions
         pulls = [row for rows_of_one in model.pulls[: model.n_springs] for row in rows_of_one]
         border[[row - model.node.dimension for row in pulls]] = rows[pulls]
-    return detached(ca.Function("border", [x, found, pose, p], [border]))
+    return detached(ca.Function("border", [x, found, pose, *numbers.symbols], [border]))
 
 
-def chord(model: CableModel, rest: FloatArray) -> ca.Function:
-    """(x, multipliers, pose, p) -> (x, multipliers) after two chord steps, see the module.
+def chord(model: CableModel, numbers: Numbers) -> ca.Function:
+    """(x, multipliers, pose, ...) -> (x, multipliers) after two chord steps, see the module.
 
     A further output is the longest step of a node [rad]: zero at an equilibrium.
     """
     node, count, k = model.node, model.chain.n_nodes, model.n_border
     x = ca.MX.sym("x", node.coordinates, count)
     lam, pose = ca.MX.sym("multipliers", k), ca.MX.sym("pose", pose_size(model))
-    p, z = ca.MX.sym("p", len(model.names)), ca.MX.sym("z", count * node.increment + k)
+    z, rest = ca.MX.sym("z", count * node.increment + k), numbers.inside["rest"]
     one, step = ca.SX.sym("one", node.coordinates), ca.SX.sym("step", node.increment)
     moved = ca.Function("moved", [one, step], [node.moved(one, step)])
 
@@ -191,16 +206,14 @@ def chord(model: CableModel, rest: FloatArray) -> ca.Function:
         steps, more = ca.vertsplit(z, [0, count * node.increment, z.numel()])
         return moved(x, ca.reshape(steps, node.increment, count)), lam + more
 
-    force = ca.Function(
-        "imbalance",
-        [z, x, lam, pose, p],
-        [balance(model, symbols_of(model, rest, *after(z), pose, p))],
-    )
-    matrix = tangent(model, symbols_of(model, rest, x, lam, pose, p))
-    if model.may_spin and not rest.any():
-        # The cable may roll freely about its axis: block this for the first node.
-        matrix[0, 0] += ca.mmax(ca.fabs(matrix))
-    arguments: list[Any] = [x, lam, pose, p]
+    rows = pose_rows(model, symbols_of(model, *after(z), pose, **numbers.inside))
+    arguments: list[Any] = [x, lam, pose, *numbers.symbols]
+    forces = ca.vertcat(ca.vec(rows.balance), rows.conditions)
+    force = ca.Function("imbalance", [z, *arguments], [forces])
+    matrix = tangent(model, symbols_of(model, x, lam, pose, **numbers.inside))
+    if model.may_spin:
+        # A cable that is straight at rest may roll about its axis: block this for the first node.
+        matrix[0, 0] += ca.if_else(ca.sumsqr(rest) == 0, ca.mmax(ca.fabs(matrix)), 0)
     matrix = detached(ca.Function("tangent", arguments, [matrix]))(*arguments)
     # A singular matrix gives NaN, not an exception: `search` may find an equilibrium that swings.
     total = ca.MX.zeros(z.shape)

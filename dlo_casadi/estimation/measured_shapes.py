@@ -10,7 +10,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import BoundaryEffect, Kinematics, MeasurementEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
-from dlo_casadi.equilibrium.guesses import line_nodes
+from dlo_casadi.equilibrium.measured_line import line_nodes
 from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.model.assembly import Shapes, Tangents

@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
 from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
-from dlo_casadi.equilibrium.guesses import line_nodes
+from dlo_casadi.equilibrium.measured_line import line_nodes
 from dlo_casadi.equilibrium.pose import HeldPose, PoseBranch
 from dlo_casadi.equilibrium.solve import (
     continued,

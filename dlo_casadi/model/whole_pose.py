@@ -70,7 +70,7 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
     """
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
-    energy, gradient, _ = functions.at_ends(*_end_arguments(model, s))
+    energy, gradient, _ = functions.at_ends(*end_arguments(model, s))
     segments = _segment_arguments(model, s, clamped)
     own, reached = functions.compact("segment_potential")(*segments, inner)
     energy = sum(ca.horzsplit(own), start=energy)
@@ -94,7 +94,7 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
 def balance(model: CableModel, s: PoseSymbols) -> Any:
     """Gradient of the Lagrangian by increments and multipliers: force balance, then conditions."""
     b, functions = model.node.increment, functions_of(model)
-    ends = functions.end_slope(*_end_arguments(model, s))
+    ends = functions.end_slope(*end_arguments(model, s))
     gradient = functions.compact("segment_slope")(*_segment_arguments(model, s))
     none = ca.DM.zeros(b)
     rows = ca.horzcat(none, gradient[b : 2 * b, :]) + ca.horzcat(gradient[:b, :], none)
@@ -108,7 +108,7 @@ def tangent(model: CableModel, s: PoseSymbols) -> Any:
     """Hessian of the Lagrangian by increments and multipliers: the derivative of `balance`."""
     b, count, functions = model.node.increment, model.chain.n_nodes, functions_of(model)
     *_, segments = functions.compact("segment")(*_segment_arguments(model, s))
-    *_, ends = functions.at_ends(*_end_arguments(model, s))
+    *_, ends = functions.at_ends(*end_arguments(model, s))
     # Unknowns of each block: those of two nodes, and the border. A segment after the last node is
     # possible; its entries for a next node are left out.
     first = np.append(np.arange(model.chain.n_segments), 0)
@@ -124,36 +124,6 @@ def tangent(model: CableModel, s: PoseSymbols) -> Any:
     )
     total = added @ ca.vec(ca.horzcat(segments, ends))
     return ca.reshape(total, size, size)[kept, kept]
-
-
-@dataclass(frozen=True)
-class ShapeExpressions:
-    """Expressions of a pose that balances.
-
-    `energy` [J], `points` (dimension, n + 1) [m] from start to end, `forces` (dimension, 2) [N] and
-    `moments` (increment, 2) [N m] on both holders, `strains` (strains, n_cells) [1/m].
-    """
-
-    energy: Any
-    points: Any
-    forces: Any
-    moments: Any
-    strains: Any
-
-
-def shape(model: CableModel, s: PoseSymbols) -> ShapeExpressions:
-    """True shape and reactions. The energy is the Lagrangian, equal if the conditions hold."""
-    layout, count, functions = model.chain.layout, model.n + 1, functions_of(model)
-    energy, advance, strains = functions.compact("segment_shape")(*_segment_arguments(model, s))
-    ends, forces, moments = functions.end_shape(*_end_arguments(model, s))
-    steps = ca.horzcat(s.pose[: model.node.dimension], advance[:, layout.advancing.tolist()])
-    return ShapeExpressions(
-        energy=ca.sum2(energy) + ends,
-        points=steps @ ca.sparsify(ca.DM(np.triu(np.ones((count, count))))),
-        forces=forces,
-        moments=moments,
-        strains=strains[:, layout.bends.tolist()],
-    )
 
 
 def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
@@ -172,7 +142,7 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
 
 def readings(model: CableModel, s: PoseSymbols) -> ca.SX:
     """Wrench measurements (n_reactions,) [N, N m] of sensors, see `ends.reaction_rows`."""
-    return functions_of(model).readings(*_end_arguments(model, s))
+    return functions_of(model).readings(*end_arguments(model, s))
 
 
 def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
@@ -181,7 +151,8 @@ def rest_after(model: CableModel, s: PoseSymbols) -> ca.SX:
     return ca.vec(after[:, model.chain.layout.bends.tolist()].T)
 
 
-def _end_arguments(model: CableModel, s: PoseSymbols) -> list[Any]:
+def end_arguments(model: CableModel, s: PoseSymbols) -> list[Any]:
+    """Arguments of the functions of both ends."""
     c = model.node.coordinates
     both = ca.vertcat(s.x[:c], s.x[s.x.numel() - c :])
     return [both, s.lam, s.p, s.pose, s.deviation]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.config import dump_yaml, load_config
-from dlo_casadi.equilibrium.guesses import line_nodes
+from dlo_casadi.equilibrium.measured_line import line_nodes
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import write_points
 from dlo_casadi.session.clamps import wrong_directions
