@@ -144,6 +144,10 @@ SHORTER = 0.06
 # leave less than the first value. Missing effects left up to 0.0083 in four sessions in space; only
 # beyond the second value does a fit refuse a session.
 UNEXPLAINED, BEYOND_EFFECTS = 2e-3, 0.01
+# Correlation of residuals of neighbouring points below which a quick fit leaves noise alone: three
+# standard errors of 100 points. A tether that lifts a cable is not gravity upwards: of 16 simulated
+# sessions with a strap or tether two seemed to show such a weight, with correlations above 0.9.
+NEIGHBOURS_ALIKE = 0.3
 # Largest excess of the distance of neighbouring markers over the cable between them, in cable
 # lengths: room for five times a noise of 3 mm of both on a cable of 1 m.
 STRETCHED = FITS / 2
@@ -159,6 +163,10 @@ TURNED = 0.3
 FITTED_READINGS = 4
 # Distance of an interpretation relative to the best one's, within which the likelier one is chosen.
 READ_OTHERWISE = 1.5
+# Distance of readings without shapes from a straight cable's of any stiffness, over their size,
+# beyond which other ways to read them are tried: simulated cables with rest curvatures of 1 1/m
+# left 0.05 (plane) and 0.15 (space), with another sign, unit or frame 0.7 and more.
+READ_ALONE = 0.3
 # Largest factor by which a mass may be wrong: the bound of `mass_error`.
 READ_SCALE = 5.0
 # Largest ratio of a factor to that of a unit: the nearest two units are 2.54 apart, above 1.25^2.
@@ -174,6 +182,9 @@ HEADING_OFF, HEADING_NEAR = 1.0, 0.5
 # Distance from a declared value, in its tolerances, beyond which a fit warns: by chance one in a
 # million. A length declared 0.1 m too long for 0.8 m ended 19 tolerances away.
 BEYOND_TOLERANCE = 5.0
+# Error of a fit pose over the median of all poses beyond which it is named: of ten poses, one with
+# five times the others' error makes the RMS 1.8 times theirs.
+FAR_OFF = 5.0
 # Normal score of residual structure beyond which it is reported: one in 370 by chance.
 NOTABLE = 3.0
 # Distance of a clamp from where both sides have equal energy, in standard deviations, within which

@@ -1,11 +1,11 @@
 """What wrench measurements tell, on sessions simulated by this toolkit's own model.
 
-    python scripts/check_readings.py [--sets 4] [--tables clean mass loads clamps] [--jobs N]
-        [--figure power.png]
+    python scripts/check_readings.py [--sets 4] [--tables clean mass loads clamps plane space]
+        [--jobs N] [--figure power.png]
 
 The cable and the poses of configs/cable.yaml, 0.3 mm of white noise, fixtures and sensors off by
-draws from their tolerances; forces of 15 mN and moments of 1 mN m of noise. Four tables, the last
-two also as a figure:
+draws from their tolerances; forces of 15 mN and moments of 1 mN m of noise. The tables, loads and
+clamps also as a figure:
 
 - clean: readings of the end's force on three poses, nothing hidden: false alarms of the diagnosis,
   and how often intervals of EI hold the truth;
@@ -13,7 +13,10 @@ two also as a figure:
 - loads: a lumped mass against point_force, by the number of poses with readings of the end's force:
   twice the log evidence of the right model over the wrong one;
 - clamps: a pin with a stiff spring against a clamp at another angle, the same, with readings of
-  force and moment at the start.
+  force and moment at the start;
+- plane, space: ten poses between clamps with readings of the end's force and moment alone, and no
+  shape; a cable curved at rest, gripped at any roll, with a first guess of EI off by up to a factor
+  of thirty; noise declared in every other set: how often intervals of EI and GJ hold the truth.
 
 A dead weight is a dead force: no reading of forces tells a lumped mass from a point force along
 gravity.
@@ -32,8 +35,10 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from simulated import random_session
 
+import dlo_casadi as dlo
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.effects import EFFECTS
@@ -49,7 +54,8 @@ from dlo_casadi.show.style import BLUE, GREY, VERMILLION, save_figure, styled
 
 ROOT = Path(__file__).resolve().parent.parent
 STD, FORCE_STD, MOMENT_STD = 3e-4, 0.015, 1e-3  # m, N, N m
-TABLES = ("clean", "mass", "loads", "clamps")
+TABLES = ("clean", "mass", "loads", "clamps", "plane", "space")
+ALONE = {"plane": 2, "space": 3}  # tables of readings alone: number of dimensions
 NUMBERS = (0, 1, 3, 6, 12)  # of poses with wrench measurements
 MASS, POSITION = 0.03, 0.3  # kg, m: of the lumped mass
 STIFFNESS, HEADING = 1500.0, 0.35  # N m/rad, rad: of the spring at the start
@@ -204,6 +210,59 @@ def told(generator, hidden, wrong: str, readings, number: int, held: str, other:
     return {"number": number, "gain": gains[right] - gains[wrong]}
 
 
+def alone(generator, d: int, declared: bool) -> dict:
+    """Ten poses between clamps with readings of the end alone: errors and intervals of EI, GJ."""
+    length, mass, ends = 0.8, 0.05, ("clamped", "clamped")
+    true = mass * 9.81 * length**2 * generator.uniform(0.05, 0.4)
+    values = {"torsional_stiffness": true * generator.uniform(0.5, 0.9)} if d == 3 else {}
+    guess = true * 10 ** generator.uniform(-1.5, 1.5)
+    cable = dlo.Cable(length=length, mass=mass, diameter=0.006, bending_stiffness=guess)
+    noise = {"force_std": FORCE_STD, "moment_std": MOMENT_STD} if declared else {}
+    while True:
+        poses = [_held_pose(generator, d, length) for _ in range(10)]
+        gravity = (0.0,) * (d - 1) + (-9.81,)
+        session = dlo.Session(cable, poses, gravity=gravity, boundary=ends, **noise)
+        found = declared_model(session)
+        model = found.model.with_mesh(40)
+        seen = random_session(session, model, true, generator, 0.1, values, found.tolerances)
+        if seen is not None:
+            break
+    measured = []
+    for pose, one in zip(session.experiment.poses, seen, strict=True):
+        item = MeasuredPose(pose.held).with_readings(pose.readings)
+        read = {
+            name: felt
+            + (MOMENT_STD if "moment" in name else FORCE_STD) * generator.standard_normal(len(felt))
+            for name, (_, felt) in item.readings_beside(one).items()
+        }
+        measured.append(MeasuredPose(pose.held).with_readings(read))
+    fit = fit_declared(session, declared_model(session), measured)
+    truth = {"bending_stiffness": true, **values}
+    return {
+        name: {
+            "error": fit.value(name) / truth[name] - 1,
+            "std": fit.std(name) / truth[name],
+            "inside": inside(interval, truth[name]),
+            "identifiable": interval.identifiable,
+        }
+        for name, interval in profile_intervals(fit).items()
+    } | {"declared": declared, "chi2": fit.chi2_per_dof, "failed": fit.failed}
+
+
+def _held_pose(generator, d: int, length: float) -> dlo.Pose:
+    """Ends at random, their clamps within half a radian (std) of the chord; readings to fill in."""
+    end = length * np.array([generator.uniform(0.35, 0.8), *generator.uniform(-0.3, 0.3, d - 1)])
+    held = {}
+    for side in ("start", "end"):
+        if d == 2:
+            held[f"{side}_heading"] = float(generator.normal(0, 0.5))
+        else:
+            turn = Rotation.from_rotvec(generator.normal(0, 0.5, 3))
+            held[f"{side}_orientation"] = turn.as_quat()
+    read = {"end_force": (1.0,) * d, "end_moment": 1.0 if d == 2 else (1.0,) * 3}
+    return dlo.Pose((0.0,) * d, end, **held, **read)
+
+
 # Starts of fits of effects that have no derivative by their place or heading at the nominal value.
 START = {
     "lumped_mass": {"lumped_mass.mass": 0.02, "lumped_mass.position": POSITION},
@@ -235,6 +294,9 @@ def run_one(index: int, seed: int, tables: tuple[str, ...]) -> dict:
     for table, power in (("loads", loads), ("clamps", clamps)):
         if table in tables:  # the same cable for each number
             rows[table] = [power(generator_of(seed, index), number) for number in NUMBERS]
+    for table, d in ALONE.items():
+        if table in tables:
+            rows[table] = alone(generator_of(seed, index), d, declared=index % 2 == 0)
     return rows | {"seconds": time.perf_counter() - begin}
 
 
@@ -304,6 +366,19 @@ def print_tables(rows: list[dict]) -> None:
             f"mass unknown: {what} off by {rms:.2%} RMS, {worst:.2%} at most, inside "
             f"{share(known, f'{what}_inside')}"
         )
+    for table in ALONE:
+        sets = [row[table] for row in rows if table in row]
+        for name in ("bending_stiffness", "torsional_stiffness"):
+            known = [one[name] for one in sets if name in one]
+            if not known:
+                continue
+            scores = [one["error"] / one["std"] for one in known]
+            print(
+                f"readings alone, {table}: {name} inside {share(known, 'inside')} "
+                f"({np.mean([one['inside'] for one in known]):.0%}), identifiable in "
+                f"{share(known, 'identifiable')}, std {np.median([x['std'] for x in known]):.2%} "
+                f"(median), error over std {np.sqrt(np.mean(np.square(scores))):.2f} RMS"
+            )
     for table, what in RIVALS.items():
         if table not in rows[0]:
             continue

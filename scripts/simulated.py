@@ -12,7 +12,7 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import CableModel, Tolerances
 
 # Waves of the rest curvature along the cable.
 WAVES = 4
@@ -25,6 +25,7 @@ def random_session(
     generator: np.random.Generator,
     curvature: float,
     hidden: Mapping[str, float] | None = None,
+    tolerances: Tolerances | None = None,
 ) -> list[Observed] | None:
     """Measurements of each pose; None if one has no stable equilibrium.
 
@@ -37,6 +38,9 @@ def random_session(
         Standard deviation of each wave of the rest curvature, over the length.
     hidden : mapping, optional
         Values of other parameters by their qualified names.
+    tolerances : Tolerances, optional
+        Those within which all fixtures are off, clamps included; by default only the ends are, by
+        the configuration's tolerance.
     """
     p = model.nominal.copy()
     p[0] = stiffness
@@ -48,13 +52,27 @@ def random_session(
     length = model.cable.length
     places = model.chain.cells.mean(axis=1) / length
     waves: NDArray[np.floating] = np.cos(np.pi * np.arange(WAVES)[:, None] * places)
-    rest = generator.normal(0, curvature, WAVES) @ waves * 2 * np.pi / length
+    node = model.node
+    rest = np.concatenate(
+        [
+            generator.normal(0, curvature, WAVES) @ waves * 2 * np.pi / length
+            if name in node.curvatures
+            else np.zeros(len(places))
+            for name in node.strains
+        ]
+    )
     poses = [pose.held for pose in config.experiment.poses]
     found = [item for item in predict_poses(model, p, rest, poses) if item is not None]
     if len(found) < len(poses) or not all(item.equilibrium.stable for item in found):
         return None
     deviation = np.zeros((len(poses), len(model.deviation_names)))
-    deviation[:, :2] = config.experiment.tolerances.end * generator.standard_normal((len(poses), 2))
+    if tolerances is None:
+        off = generator.standard_normal((len(poses), 2))
+        deviation[:, :2] = config.experiment.tolerances.end * off
+    else:
+        std = tolerances.deviation(model)
+        used = np.isfinite(std) & np.isin(model.deviation_names, model.deviations)
+        deviation[:, used] = std[used] * generator.standard_normal((len(poses), used.sum()))
     shapes = Shapes(
         np.array([item.equilibrium.x for item in found]),
         np.array([item.equilibrium.multipliers for item in found]),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+import dlo_casadi as dlo
 from dlo_casadi.config import (
     Centerlines,
     Config,
@@ -364,8 +365,8 @@ def test_unknown_and_repeated_effects_are_named_with_their_line(tmp_path, option
         (YOUNG, "bending_stiffness: 1e308", 6, "1e.308 N m.2: 1e-12 to 1e.09 N m.2 is possible"),
         (YOUNG, "youngs_modulus: 1e300", 6, "is possible for EI = E pi d.4 / 64"),
         ("-9.81", "-1e30", 8, "gravity: 1e.30 m/s.2: 0 to 10000 m/s.2 is possible"),
-        ("3e-4", "1e-12", 10, "std: 1e-12 m: 1e-07 to 0.8 m is possible; without it"),
-        ("3e-4", "1e30", 10, "std: 1e.30 m: 1e-07 to 0.8 m is possible"),
+        ("3e-4", "1e-12", 10, "std: 1e-12 m: 1e-07 to 0.04 m is possible .*; without it"),
+        ("3e-4", "1e30", 10, "std: 1e.30 m: 1e-07 to 0.04 m is possible"),
         ("[0, 0]", "[0, 1e308]", 12, "start: 1e.308 m: -1000 to 1000 m is possible"),
     ],
 )
@@ -720,7 +721,7 @@ def test_reference_points_are_two(tmp_path):
         ("4.55e8", "455", "youngs_modulus 455 Pa is softer than any cable"),
         ("length: 0.8", "length: 81", "81 m long, but its ends are never more than 0.5"),
         ("-9.81", "-9810", "gravity is 9810 m/s"),
-        ("3e-4", "0.3", "std 0.3 m is large"),
+        ("3e-4", "0.02", "std 0.02 m is large"),
     ],
 )
 def test_what_looks_odd_is_a_warning(tmp_path, old, new, warning):
@@ -830,3 +831,33 @@ def test_a_mass_that_is_not_declared_takes_a_reading(tmp_path):
         read_at(tmp_path, "end_force: [1, -2]", unknown, ("b.csv", "bb.csv"))
     with pytest.raises(ConfigError, match="without gravity nothing depends on it"):
         read_at(tmp_path, "end_force: [1, -2]", unknown, ("[0, -9.81]", "[0, 0]"))
+
+
+@pytest.mark.parametrize(("std", "meant"), [("0.3", "0.0003"), ("0.05", "5e-05")])
+def test_noise_in_millimetres_is_refused_at_once(tmp_path, std, meant):
+    text = f"std: {std} m: 1e-07 to 0.04 m is possible for a cable of 0.8 m: units are SI, did you "
+    with pytest.raises(ConfigError, match=rf"line 10: .*{text}mean {meant}\?"):
+        load(tmp_path, ("3e-4", std))
+
+
+def session_of_readings(d, **noise):
+    """Three poses with forces of about 0.5 N and moments of about 5 mN m, as arguments."""
+    cable = dlo.Cable(length=0.8, mass=0.05, diameter=0.006, bending_stiffness=0.01)
+    points = np.linspace([0.0] * d, [0.5] + [0.0] * (d - 1), 4)
+    read = {"end_force": (0.5, -0.4, 0.3)[:d], "end_moment": 0.005 if d == 2 else (0.005,) * 3}
+    poses = [dlo.Pose((0,) * d, points[-1], points=points, **read) for _ in range(3)]
+    pins = ("pinned", "pinned")
+    return dlo.Session(cable, poses, gravity=(0,) * (d - 1) + (-9.81,), boundary=pins, **noise)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_noise_of_readings_beyond_the_readings_is_refused(d):
+    """Noise adds to a reading: readings far below their noise contradict it."""
+    session_of_readings(d, force_std=0.5, moment_std=0.005)
+    text = r"force_std: 10 N, but the readings of a force are 0\.4\d? N RMS .* did you mean 0.01\?"
+    with pytest.raises(ConfigError, match=text):
+        session_of_readings(d, force_std=10.0)
+    with pytest.raises(ConfigError, match="moment_std: 1 N m, but the readings of a moment are 0"):
+        session_of_readings(d, moment_std=1.0)
+    with pytest.raises(ConfigError, match=r"std: 0.3 m: .* did you mean 0.0003"):
+        session_of_readings(d, std=0.3)

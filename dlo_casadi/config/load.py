@@ -16,6 +16,7 @@ from dlo_casadi.config.cable import Cable
 from dlo_casadi.config.document import BACKSLASH, Document
 from dlo_casadi.config.effects import without_values, wrong_effects, wrong_limits
 from dlo_casadi.config.frozen import plain
+from dlo_casadi.config.noise import impossible_noise
 from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.problems import (
     Arguments,
@@ -87,7 +88,8 @@ def checked_config(source: Source) -> Config:
         *_contradictions(config.experiment, config.cable.length),
         *_weightless(config),
         *wrong_effects(config),
-        *_impossible_values(config.experiment, config.cable.length),
+        *impossible_noise(config.experiment, config.cable.length),
+        *_impossible_tolerances(config.experiment, config.cable.length),
         *obstacle_problems(
             config.experiment.obstacles,
             config.experiment.gravity,
@@ -205,8 +207,6 @@ def any_photographs(poses: object) -> bool:
 # Names of results add up to forty characters to a pose's name; file systems allow 255 bytes.
 _LONGEST_NAME = 200
 
-# Lower limit: a fifth of green light's wavelength, beyond any camera. Upper: the cable's length.
-_FINEST_STD = 1.0e-7
 # Interferometers resolve a nanometre over a metre.
 _FINEST_TOLERANCE = 1.0e-9
 
@@ -422,12 +422,8 @@ def _oddities(config: Config) -> Iterator[str]:
             yield f"{key} is not used, the {key.partition('_')[0]} is pinned: {', '.join(given)}"
 
 
-def _impossible_values(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
-    """Find noise and tolerances that are impossible for a cable of that length [m]."""
-    std = experiment.measurement.std
-    if std is not None and std not in (possible := Range(_FINEST_STD, length, "m")):
-        text = f"std: {possible.complaint(std)}; without it, it is estimated from the data"
-        yield ConfigProblem(("experiment", "measurement", "std"), text)
+def _impossible_tolerances(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:
+    """Find tolerances that are impossible for a cable of that length [m]."""
     # A tolerance must fit within its bounds; otherwise the bounds decide instead.
     torsional_stiffness = 1.0 if experiment.in_space else None
     cable = CableData(length, 1.0, 1.0, 1.0, torsional_stiffness=torsional_stiffness)

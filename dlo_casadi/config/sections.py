@@ -82,6 +82,8 @@ _TOLD_APART = re.compile(r"(.*[0-9])[-_. ]?[A-Za-z]+")
 class Pose(ConfigSection):
     """One shape: where the ends were held, and the file, the files or the points that show it.
 
+    Without these it has readings of forces and moments alone.
+
     From Python `start` and `end` may stand without their names: `Pose(start, end, points=...)`.
     Numbers may be arrays or CasADi's DM, and a quaternion SciPy's Rotation.
     """
@@ -138,6 +140,11 @@ class Pose(ConfigSection):
     def paths(self) -> tuple[Path, ...]:
         """All its files."""
         return self.files if self.file is None else (self.file,)
+
+    @property
+    def shown(self) -> bool:
+        """Whether a file or points show its shape; otherwise it has readings alone."""
+        return bool(self.paths) or self.points is not None
 
     @property
     def shown_by(self) -> str:
@@ -283,9 +290,9 @@ class Experiment(ConfigSection):
         """Refuse a pose without any measurement; name poses without a file by their number."""
         text = (
             "'file' is missing: a photograph or CSV; or files: [a.jpg, b.jpg] of photographs; or "
-            "points: [[x, y], ...]"
+            "points: [[x, y], ...]; or readings alone, such as end_force: [fx, fy]"
         )
-        if nothing := [k for k, x in enumerate(poses) if not x.paths and x.points is None]:
+        if nothing := [k for k, x in enumerate(poses) if not (x.shown or x.readings)]:
             raise Contradiction(*(ConfigProblem((k,), text) for k in nothing))
         return tuple(
             pose if pose.name else pose.changed(name=f"pose_{k:02d}")

@@ -277,6 +277,15 @@ class Repeats:
         alike = np.broadcast_to(self.uncertainty.repeat_std * np.eye(d), (len(s), d, d))
         return curve, np.concatenate([curve.moved(s, change.curve), alike], axis=2)
 
+    @property
+    def reading_std(self) -> FloatArray:
+        """Standard deviation (n_reactions,) [N, N m] between new repeats of each reading.
+
+        Without the noise of the sensors; in the order of `ends.reaction_rows`.
+        """
+        here = self._batch.at(self._shapes, self.held.p, self.held.rest)
+        return np.asarray(np.linalg.norm(here.readings_along(self.along)[0], axis=1))
+
     def tipping(self, other: Equilibrium) -> Tipping:
         """Tipping of the pose, from the equilibrium on its other side.
 

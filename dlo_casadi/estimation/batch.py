@@ -62,7 +62,7 @@ def solve_batch(problem: Problem, start: Point) -> tuple[Point, float]:
         theta, shapes, residual = nlp.solve(point)
         moved = problem.evaluate(Values(theta, shapes, point.projections))
         shift = max(
-            float(np.abs(new - old).max())
+            float(np.abs(new - old).max(initial=0.0))
             for new, old in zip(moved.projections, point.projections, strict=True)
         )
         point = moved

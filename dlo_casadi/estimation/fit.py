@@ -14,6 +14,7 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import MISFIT_GAIN, descend, on_other_mesh, refit
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem
+from dlo_casadi.estimation.readings_alone import minimum_of_readings
 from dlo_casadi.estimation.repeats import enough_poses, with_repeats
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import SearchSettings, begin, fit_from, weighed
@@ -124,6 +125,13 @@ def fit_model(
 
 
 def _minimum(problem: Problem, theta: FloatArray) -> Fit:
+    """Minimum near the measured shapes; poses with readings alone begin at their predictions."""
+    if all(item.has_points for item in problem.fit_poses):
+        return _near_shapes(problem, theta)
+    return minimum_of_readings(problem, theta, _near_shapes)
+
+
+def _near_shapes(problem: Problem, theta: FloatArray) -> Fit:
     """Minimum near the measured shapes.
 
     In space the search uses a larger standard deviation of the points: if an effect is missing,
@@ -278,10 +286,26 @@ def fine_enough(fit: Fit, n: int, modes: int = SMOOTH_MODES, finest: int = FINES
     return known
 
 
+def compared_std(fit: Fit) -> float:
+    """Standard deviation [m] of the compared data: of points, or of means of several points.
+
+    Of readings alone the displacement of an end that changes one by its noise: a clamped end
+    needs 12 EI / L^3 per metre, and has 6 EI / L^2 more moment.
+    """
+    noise, items = fit.noise, fit.problem.fit_poses
+    if not fit.has_points:
+        length, stiffness, own = fit.model.cable.length, float(fit.p[0]), noise.readings
+        each = {"force": own.force * length / 12, "moment": own.moment / 6}
+        kinds = {str(kind) for item in items for kind in item.kinds}
+        return min(each[kind] for kind in kinds) * length**2 / stiffness
+    white = float(np.median(np.concatenate([item.relative_white for item in items])))
+    return noise.std * float(np.sqrt((1 - noise.share) * white**2 + noise.share))
+
+
 def allowed_mesh_error(fit: Fit) -> float:
     """Mesh error [m] that is far below the noise, or far below the remaining misfit."""
     left = LACKING_SHARE if fit.beyond_noise else MESH_SHARE
-    return max(MESH_SHARE * fit.compared_std, left * fit.residual_rms)
+    return max(MESH_SHARE * compared_std(fit), left * fit.residual_rms)
 
 
 # ---- a plane of unknown height on which cables rest: what their shapes share ---------------------

@@ -91,19 +91,24 @@ def _along(
         item = measured[j].traced
         pose = item.pose.rolled(roll)
         pose = pose if turns is None else replace(pose, turns=turns[j])
-        along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
-    fitted = [measured[j] for j in used]
+        if item.has_points:  # of readings alone it stays the first guess
+            along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
+    seen = [j for j in used if measured[j].has_points]
+    fitted = [measured[j] for j in seen]
     wrenches = any(item.reactions for item in fitted if not item.has_line)
     equilibria = BatchEquilibrium(model, [item.pose for item in measured], wrenches=wrenches)
-    shapes, projections, cost = _kinematics(equilibria, np.array(p), fitted, used, along, roll)
+    if not seen:
+        return along, [np.zeros(0) for _ in used]
+    shapes, projections, cost = _kinematics(equilibria, np.array(p), fitted, seen, along, roll)
     alone = [k for k, item in enumerate(fitted) if not item.has_line]
     if alone:
         # One photograph cannot distinguish a bend towards the camera from one away from it.
-        others, places, costs = _kinematics(equilibria, np.array(p), fitted, used, predicted, roll)
+        others, places, costs = _kinematics(equilibria, np.array(p), fitted, seen, predicted, roll)
         for k in alone:
             if costs[k] < cost[k]:
-                shapes.x[used[k]], projections[k] = others.x[used[k]], places[k]
-    return shapes.x, projections
+                shapes.x[seen[k]], projections[k] = others.x[seen[k]], places[k]
+    places_of = dict(zip(seen, projections, strict=True))
+    return shapes.x, [places_of.get(j, np.zeros(0)) for j in used]
 
 
 def _kinematics(

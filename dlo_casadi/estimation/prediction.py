@@ -232,7 +232,7 @@ def measured_elsewhere(
     for j, (item, known) in enumerate(zip(measured, predictions, strict=True)):
         ways = [x for k, x in zip(of, solved, strict=True) if k == j and x is not None]
         stable = [x for x in ways if x.equilibrium.stable]
-        if not (item.readable and known is not None and stable):
+        if not (item.has_points and known is not None and stable):
             out.append(None)
             continue
         found = stable[int(np.argmin([_square(x, item) for x in stable]))]
@@ -243,7 +243,7 @@ def measured_elsewhere(
 
 def _along_line(model: CableModel, p: FloatArray, line: MeasuredPose) -> list[FloatArray | None]:
     """Nodes along a measured line; in space between two clamps, one for each way of twist."""
-    if not line.readable:
+    if not line.has_points:
         return [None]
     pose = line.pose
     if END_ROLL in model.names:
@@ -318,9 +318,11 @@ def noise_distance(measured: Sequence[MeasuredPose], std: float) -> float:
     """RMS distance [m] of all measured points from the true curve, by noise of one coordinate.
 
     For white noise sqrt(d - 1) `std` [m] for a line, which is compared across its tangent, and
-    sqrt(d) `std` for markers.
+    sqrt(d) `std` for markers. Zero without points.
     """
-    found = [item.noise_distances for item in measured if item.readable]
+    found = [item.noise_distances for item in measured if item.has_points]
+    if not found:
+        return 0.0
     return std * float(np.sqrt((np.concatenate(found) ** 2).mean()))
 
 
@@ -335,7 +337,7 @@ def rms_distance(
     """
     squares = []
     for prediction, item in zip(predictions, measured, strict=True):
-        if item.held_out is not held_out or not item.readable:
+        if item.held_out is not held_out or not item.has_points:
             continue
         if prediction is None:
             return None

@@ -149,8 +149,8 @@ def with_repeats(
 
 def _groups(measured: Sequence[MeasuredPose], model: CableModel) -> list[list[MeasuredPose]]:
     """Measured lines of fit poses that were held in the same way, two or more each."""
-    groups = [group for group in _held_alike(measured, model) if len(group) > 1]
-    return [[item.traced for item in group] for group in groups]
+    groups = ([x.traced for x in group if x.has_points] for group in _held_alike(measured, model))
+    return [group for group in groups if len(group) > 1]
 
 
 def _held_alike(measured: Sequence[MeasuredPose], model: CableModel) -> list[list[MeasuredPose]]:

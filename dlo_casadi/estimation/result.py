@@ -267,23 +267,25 @@ class Fit(Brief):
         """`chi2_per_dof` with the noise of the points, even if the fit weighs by its misfit."""
         return self.chi2_per_dof * (self.noise.std / self.noise.of_points.std) ** 2
 
+    @property
+    def has_points(self) -> bool:
+        """Whether any fitted pose has points; otherwise all have readings alone."""
+        return self._n_points > 0
+
     @cached_property
     def residual_rms(self) -> float:
-        """Root mean square residual of the fitted points [m]."""
+        """Root mean square residual of the fitted points [m]; zero without points."""
+        if not self.has_points:
+            return 0.0
         rows = [raw[on] for raw, on in zip(self.linearization.raw, self._on_points, strict=True)]
         return float(np.sqrt((np.concatenate(rows) ** 2).mean()))
 
     def _rms_of_points(self, squares: Sequence[FloatArray]) -> float:
-        """Root mean square [m] over the points, given each pose's squared residuals (R_j,)."""
+        """Root mean square [m] over points, given squared residuals (R_j,); zero without points."""
+        if not self.has_points:
+            return 0.0
         rows = [square[on] for square, on in zip(squares, self._on_points, strict=True)]
         return float(np.sqrt(np.concatenate(rows).sum() / self._n_points))
-
-    @property
-    def compared_std(self) -> float:
-        """Standard deviation [m] of the compared data: of points, or of means of several points."""
-        noise, items = self.noise, self.problem.fit_poses
-        white = float(np.median(np.concatenate([item.relative_white for item in items])))
-        return noise.std * float(np.sqrt((1 - noise.share) * white**2 + noise.share))
 
     @cached_property
     def fixture_error(self) -> float:

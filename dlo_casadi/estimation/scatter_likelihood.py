@@ -133,7 +133,8 @@ class ScatterLikelihood:
         both = zip(samples, blocks, strict=True)
         columns = [np.column_stack([one.random, x, one.e]) for one, x in both]
         self.products = np.array([a.T @ a for a in columns])
-        self.own, turns = np.linalg.eigh(np.array([one.own.T @ one.own for one in samples]))
+        own, turns = np.linalg.eigh(np.array([one.own.T @ one.own for one in samples]))
+        self.own = np.maximum(own, 0.0)  # rounding makes some of them negative
         crossed = [one.own.T @ a for one, a in zip(samples, columns, strict=True)]
         self.crossed = turns.swapaxes(1, 2) @ np.array(crossed)
         self.distances = distances

@@ -10,16 +10,21 @@ from scipy.optimize import minimize_scalar
 
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, stacked
 from dlo_casadi.estimation.start import SearchSettings
+from dlo_casadi.estimation.variances import first_reading_noise
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
 
 # Steps per decade of the first search.
 _PER_DECADE = 3
+# Decades to both sides of the prior searched by readings alone: no shape starts a search nearby.
+READ_DECADES = 3
 LEAST_POINTS = 10
 # Degree and maximum number of parts of the measured curve. Its curvature is a cubic spline of eight
 # coefficients; of fewer if the curve has fewer than two points per coefficient.
@@ -35,24 +40,33 @@ class StiffnessFit:
 
     EI: float
     log_std: float
-    rms: float
 
 
-def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> StiffnessFit:
+def fit_stiffness(
+    model: CableModel, measured: Sequence[MeasuredPose], readings: ReadingNoise | None = None
+) -> StiffnessFit:
     """Least squares of the distances of all fit points over EI, the cable straight at rest.
 
-    The equilibria are followed from the prior stiffness along the decades, each on the branch of
-    the prediction there, or on that on which the pose was measured.
+    If no fit pose has points, of the errors of readings over their noise. The equilibria are
+    followed from the prior stiffness along the decades, each on the branch of the prediction there,
+    or on that on which the pose was measured.
     """
     used = [item for item in measured if item.readable and not item.held_out]
-    equilibria = BatchEquilibrium(model, [item.pose for item in used], wrenches=False)
+    seen = [item for item in used if item.has_points]
+    alone, used = not seen, seen or used
+    equilibria = BatchEquilibrium(model, [item.pose for item in used], wrenches=alone)
     rest = np.zeros(model.chain.n_rests)
-    n_points = sum(len(item.traced.points) for item in used)
+    noise = replace(NoiseModel(1.0), readings=readings or first_reading_noise(model))
     # Several squares for each marker, and for each point of a line in space.
-    compared = (item.traced if item.has_line else item for item in used)
-    n_squares = sum(int(item.on_points.sum()) for item in compared)
+    compared = [item.traced if item.has_line else item for item in used]
+    n_squares = sum(int((item.on_points | alone).sum()) for item in compared)
+
+    def off(item: MeasuredPose, seen: Observed) -> FloatArray:
+        """Distances of points [m], or errors of readings over their noise."""
+        return item.misread(seen, noise) if alone else item.distances(seen.curve)
 
     stiff, search = model.stiffness_indices, SearchSettings.of(model)
+    decades = READ_DECADES if alone else search.decades
 
     def at(log_ei: float) -> FloatArray:
         # Torsional stiffness is changed by the same factor as bending stiffness.
@@ -70,12 +84,12 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
         )
         moved, converged = equilibria.solve(start, at(log_ei), rest)
         if not converged.all() or not equilibria.stable(moved, at(log_ei), rest).all():
-            cold = _cold(model, at(log_ei), rest, used) if search.predicts else None
+            cold = _cold(model, at(log_ei), rest, used) if search.predicts or alone else None
             if cold is None:
                 return shapes, np.inf
             moved = cold
         total = sum(
-            float((item.distances(seen.curve) ** 2).sum())
+            float((off(item, seen) ** 2).sum())
             for seen, item in zip(equilibria.seen(moved, at(log_ei), rest), used, strict=True)
         )
         return moved, total
@@ -89,13 +103,13 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     step = np.log(10) / _PER_DECADE
     for direction in (1, -1):
         shapes = first
-        for k in range(search.decades * _PER_DECADE + 1):
+        for k in range(decades * _PER_DECADE + 1):
             log_ei = prior + direction * k * step
             shapes, total = follow(shapes, log_ei - direction * min(k, 1) * step, log_ei)
             grid[log_ei] = (shapes, total)
     best = min(grid, key=lambda q: grid[q][1])
     if not np.isfinite(grid[best][1]):
-        return StiffnessFit(float(np.exp(best)), float("inf"), float("inf"))
+        return StiffnessFit(float(np.exp(best)), float("inf"))
     # Some poses may have left their measured branch on the way.
     near = _cold(model, at(best), rest, used) or grid[best][0]
 
@@ -114,7 +128,7 @@ def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> Stiffn
     bend = (cost(log_ei + width) - 2 * total + cost(log_ei - width)) / width**2
     variance = total / max(n_squares - 1, 1)
     log_std = float(np.sqrt(2 * variance / bend)) if bend > 0 else float("inf")
-    return StiffnessFit(float(np.exp(log_ei)), log_std, float(np.sqrt(total / n_points)))
+    return StiffnessFit(float(np.exp(log_ei)), log_std)
 
 
 def _cold(

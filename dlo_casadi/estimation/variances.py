@@ -99,8 +99,10 @@ def contradicted(fit: Fit) -> bool:
     """Whether the points scatter more than their declared noise.
 
     Only the white part of the residuals counts, beside all that the shapes may do: the error of
-    an incomplete model is smooth along the cable.
+    an incomplete model is smooth along the cable. Readings alone do not.
     """
+    if not fit.has_points:
+        return False
     samples = _noise_samples(fit, SMOOTH_MODES)
     if not tell_of_noise(samples, SCATTERED_DEGREES):
         return False
@@ -131,6 +133,12 @@ def errors_of(
         If there are hardly more points than unknowns that they determine.
     """
     noise, together, length = fit.noise, False, fit.model.cable.length
+    if not fit.has_points:
+        # A few numbers of each pose do not tell their noise from a scatter of the cable.
+        own = reading_noise_of(fit)
+        declared = own.force_known and own.moment_known
+        dof = np.inf if declared else fit.degrees_of_freedom
+        return replace(noise, readings=own, slow_dof=dof), PoseScatter()
     if estimated:
         for count in range(modes, -1, -1):
             samples = _noise_samples(fit, count)
@@ -149,12 +157,18 @@ def errors_of(
 
 
 def first_reading_noise(
-    model: CableModel, force: float | None = None, moment: float | None = None
+    model: CableModel,
+    force: float | None = None,
+    moment: float | None = None,
+    stiffness: float | None = None,
 ) -> ReadingNoise:
     """Noise of forces [N] and moments [N m]: as declared, else a first guess.
 
     FIRST_FORCE times the forces of such a cable as it hangs and bends; lever arm: length / 10.
+    `stiffness` [N m^2]: bending stiffness; the first guess by default.
     """
+    if stiffness is not None:
+        model = replace(model, cable=replace(model.cable, bending_stiffness=stiffness))
     guess = FIRST_FORCE * model.force_scale
     return ReadingNoise(
         guess if force is None else force,
@@ -175,7 +189,8 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
     ----------
     MacKay, Neural Computation 4 (1992).
     """
-    own, guess = fit.noise.readings, first_reading_noise(fit.model)
+    own = fit.noise.readings
+    guess = first_reading_noise(fit.model, stiffness=float(fit.p[0]))
     kinds = np.concatenate([item.kinds for item in fit.problem.fit_poses])
     if (kinds == "point").all():
         return own
@@ -273,17 +288,19 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     bases, left_over = [], []
     scatter = problem.priors.pose_scatter
     rest = problem.moved_by(point, scatter)[0] if scatter.rest_std > 0 else None
-    kept = [item.on_points for item in problem.fit_poses]
-    raws = [raw[on] for raw, on in zip(lin.raw, kept, strict=True)]
-    ways = [rows[on] for rows, on in zip(lin.raw_directions, kept, strict=True)]
+    shown = [k for k, item in enumerate(problem.fit_poses) if item.has_points]
+    items = [problem.fit_poses[k] for k in shown]
+    kept = [item.on_points for item in items]
+    raws = [lin.raw[k][on] for k, on in zip(shown, kept, strict=True)]
+    ways = [lin.raw_directions[k][on] for k, on in zip(shown, kept, strict=True)]
+    places = [point.projections[k] for k in shown]
     scale = np.max([np.abs(x[:, :size]).max(axis=0) for x in ways], axis=0)
-    for k, (item, s) in enumerate(zip(problem.fit_poses, point.projections, strict=True)):
-        directions = ways[k]
+    for item, on, directions, s, k in zip(items, kept, ways, places, shown, strict=True):
         own = directions[:, size:] / np.maximum(np.abs(directions[:, size:]).max(axis=0), 1e-300)
         sines = smooth_modes(s, length, modes, not model.end.place)
-        slow = item.slow_rows(sines)[kept[k]]
+        slow = item.slow_rows(sines)[on]
         if rest is not None:
-            way = rest[k][kept[k]]
+            way = rest[k][on]
             slow = np.concatenate([slow, way / np.abs(way).max()], axis=1)
         basis, values, _ = np.linalg.svd(np.concatenate([own, slow], axis=1), full_matrices=False)
         basis = basis[:, values > 1e-3 * values.max(initial=0.0)]
@@ -293,7 +310,7 @@ def _noise_samples(fit: Fit, modes: int) -> list[NoiseSample]:
     # A direction already among the poses' own ones takes no further degree of freedom.
     left, values, _ = np.linalg.svd(np.concatenate(left_over), full_matrices=False)
     blocks = np.split(left[:, values > 1e-6], np.cumsum([len(raw) for raw in raws])[:-1])
-    rows = zip(problem.fit_poses, raws, point.projections, bases, blocks, strict=True)
+    rows = zip(items, raws, places, bases, blocks, strict=True)
     return [
         NoiseSample(e[at], s[on], x.weight, own[at], block[at], x.correlation_length, x.count)
         for item, e, s, own, block in rows

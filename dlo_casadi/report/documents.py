@@ -122,9 +122,10 @@ def _stage(stage: Stage, outcome: Outcome) -> dict[str, Any]:
         unknown = {"bending_stiffness": Estimate(math.nan, math.nan, "N m^2")}
         stage = replace(stage, parameters=unknown, rest_curvature=nothing)
     rest = stage.rest_curvature
-    curvature: dict[str, Any] = {"s": rest.s, "value": rest.value, "std": rest.std}
+    known = rest.known
+    curvature: dict[str, Any] = {"s": rest.s, "value": known[0], "std": known[1]}
     if rest.value.ndim > 1:  # in space one row per material axis
-        about = zip(("k_y", "k_z"), rest.value, rest.std, strict=True)
+        about = zip(("k_y", "k_z"), *known, strict=True)
         own = {axis: {"value": value, "std": std} for axis, value, std in about}
         curvature = {"s": rest.s, **own}
     kept = ("value", "std", "unit", "interval_95", "identifiable")
@@ -175,7 +176,8 @@ def check_dict(
     left_out = [f"{item.name}: {item.reason}" for item in config.skipped if item.name not in known]
     mistakes = [*(item.message for item in found), *left_out, *unread]
     warnings = list(config.warnings)
-    if any(item.readable for item in inputs) and not any(len(item.points) for item in inputs):
+    seen = [item for item in inputs if item.readable and not item.unseen]
+    if seen and not any(len(item.points) for item in seen):
         warnings.append(
             "no pose has a line in space, so lengths and fixtures are compared with nothing. Try: "
             "two or more photographs of each pose; camera.matrix, which `dlo calibrate` finds."

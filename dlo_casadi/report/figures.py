@@ -42,10 +42,11 @@ def figures_of(outcome: Outcome) -> dict[str, Figure]:
     """Figures of errors, residuals, parameters and findings by name; empty ones are left out."""
     last, end = outcome.stages[-1], outcome.config.experiment.boundary.end
     with_shapes = any(stage.shapes for stage in outcome.stages)
+    with_points = outcome.measurement.points > 0
     wanted: list[tuple[str, object, Callable[[Outcome], Figure | None]]] = [
-        ("errors", True, errors_figure),
-        ("pose_errors", with_shapes, pose_errors_figure),
-        ("residuals", with_shapes, residuals_figure),
+        ("errors", with_points, errors_figure),
+        ("pose_errors", with_points and with_shapes, pose_errors_figure),
+        ("residuals", with_points and with_shapes, residuals_figure),
         ("rest_curvature", with_shapes, rest_curvature_figure),
         ("readings", outcome.measurement.readings and last.shapes, readings_figure),
         ("candidates", outcome.candidates, candidates_figure),
@@ -78,6 +79,7 @@ def errors_figure(outcome: Outcome) -> Figure:
     """Errors of all stages as points on a logarithmic axis, with the error due to noise alone."""
     validated = words.cross_validated(outcome)
     floor = outcome.measurement.noise_distance
+    assert floor is not None  # drawn only where there are points
     shown = ["fit", *["cross-validated"] * bool(validated)]
     shown += ["held out"] * bool(outcome.measurement.poses_held_out)
     rows: list[tuple[float, str, float | None]] = []
@@ -122,6 +124,7 @@ def errors_figure(outcome: Outcome) -> Figure:
 def pose_errors_figure(outcome: Outcome) -> Figure:
     """Error of every pose, before and after; the page can highlight one row."""
     floor = outcome.measurement.noise_distance
+    assert floor is not None  # drawn only where there are points
     looks = {"before": ("^", style.ORANGE), "after": ("o", style.BLUE)}
     stages = [(stage, label, *looks[kind]) for kind, label, stage in compared(outcome)]
     height = 1.6 + 0.2 * len(stages) + 0.22 * max(3, len(outcome.poses))
@@ -191,6 +194,7 @@ def residuals_figure(outcome: Outcome) -> Figure:
     found = compared(outcome)
     panels = [(*item, *way) for item in found for way in ways]
     noise = outcome.measurement.std
+    assert noise is not None  # drawn only where there are points
     said = f"residuals, noise std {millimetres(noise)} ({outcome.measurement.std_source})"
     with canvas.chart(outcome, said, 1.4 + 1.9 * len(panels), len(panels)) as (drawing, grid):
         for axes, (kind, label, stage, way, direction) in zip(grid, panels, strict=True):

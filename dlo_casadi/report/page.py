@@ -87,17 +87,22 @@ def tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         after = shown[-1].stage
         stiffness = after.parameters.get("bending_stiffness")
         if stiffness is not None:
-            value, interval, remark = tables.describe(stiffness, after.explains)
+            value, interval, remark = tables.describe(
+                stiffness, after.explains, words.seen(outcome)
+            )
             rows.append(("bending stiffness", value, f"95 %: {interval}" if interval else remark))
         role, key = "held-out poses", "rmse_held_out"
         if after.rmse_held_out is None:
             role, key = "fit poses", "rmse_fit"
         was = [f"{x.label}: {millimetres(getattr(x.stage, key), NOTHING)}" for x in shown[:-1]]
         now = millimetres(getattr(after, key), NOTHING)
-        rows.append((f"error, {role}", now, "".join(was)))
-    rows.append(
-        (words.NOISE_ALONE, millimetres(m.noise_distance), f"of the points, {m.std_source}")
-    )
+        if m.points:
+            rows.append((f"error, {role}", now, "".join(was)))
+        else:
+            rows += [(*row, "RMS difference") for row in tables.error_rows(outcome)]
+    if m.points:
+        source = f"of the points, {m.std_source}"
+        rows.append((words.NOISE_ALONE, millimetres(m.noise_distance), source))
     lost = f"; {len(m.held_out_missing)} held out were not measured" if m.held_out_missing else ""
     count = f"{m.poses_fit} + {m.poses_held_out}"
     return [*rows, ("poses", count, f"to fit + held out to check{lost}")]

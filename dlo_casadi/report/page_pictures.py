@@ -339,7 +339,7 @@ def _picture(
     what = "Photograph" if behind.photograph else "Drawing of the board"
     what = f"{'Drawing in space' if behind.room else what}, pose {pose.name}"
     if not len(pose.points):
-        alt = f"{what}: no cable was measured."
+        alt = f"{what}: {'readings alone' if pose.unseen else 'no cable was measured'}."
     elif last is None or last.rmse is None:
         alt = f"{what}, with the measured line."
     else:

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Covariance, Estimate
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import counted
 from dlo_casadi.report import words
 from dlo_casadi.runtime.work import Part
-from dlo_casadi.session.outcome import MASS, Outcome
+from dlo_casadi.session.outcome import MASS, Outcome, ReadingErrors
 from dlo_casadi.show import text
 from dlo_casadi.show.text import html_table
 
@@ -19,17 +20,21 @@ _STRONG = 0.9
 # A row of the tables of parameters: name, value, 95 % interval, remark.
 Row = tuple[str, str, str, str]
 NO_FIT = "of a model that does not fit"
+NOTHING = "-"
 
 
-def describe(estimate: Estimate, explains: bool | None = None) -> tuple[str, str, str]:
+def describe(
+    estimate: Estimate, explains: bool | None = None, seen: str = "shapes"
+) -> tuple[str, str, str]:
     """Value, interval and remark; no number where the data do not determine one.
 
-    `explains`: of the stage; a model that does not fit gets neither std nor interval.
+    `explains`: of the stage; a model that does not fit gets neither std nor interval. `seen`: what
+    was measured, see `words.seen`.
     """
     if explains is False:
         return (f"{estimate.value:.4g}{_after(estimate.unit)}", "", NO_FIT)
     if estimate.identifiable is False:
-        return (unidentified(estimate), "", "not identifiable from these shapes")
+        return (unidentified(estimate), "", f"not identifiable from these {seen}")
     unit, interval = _after(estimate.unit), ""
     if estimate.interval_95 is not None:
         ends = ("unbounded" if x is None else f"{x:.4g}" for x in estimate.interval_95)
@@ -52,7 +57,8 @@ def unidentified(estimate: Estimate) -> str:
 def fitted_rows(outcome: Outcome) -> list[Row]:
     """Parameters of the last stage."""
     stage = outcome.stages[-1]
-    return [(name, *describe(x, stage.explains)) for name, x in stage.parameters.items()]
+    seen = words.seen(outcome)
+    return [(name, *describe(x, stage.explains, seen)) for name, x in stage.parameters.items()]
 
 
 def rest_rows(outcome: Outcome) -> list[Row]:
@@ -63,16 +69,21 @@ def rest_rows(outcome: Outcome) -> list[Row]:
     if not rest.value.size:
         return []
     names = [f"rest curvature{name and f' k_{name}'}" for name in words.directions(outcome)]
-    parts = zip(names, np.atleast_2d(rest.value), np.atleast_2d(rest.std), strict=True)
-    return [
-        (
-            name,
-            f"{value.min():.3g} to {value.max():.3g} 1/m",
-            "",
-            f"std {std.mean():.2g} 1/m on average",
-        )
-        for name, value, std in parts
-    ]
+    parts = zip(names, *(np.atleast_2d(known) for known in rest.known), strict=True)
+    return [(name, *_rest_words(value, std, outcome)) for name, value, std in parts]
+
+
+def _rest_words(value: FloatArray, std: FloatArray, outcome: Outcome) -> tuple[str, str, str]:
+    """Range, no interval, and remark on a rest curvature (M,), NaN where it is not determined."""
+    known = np.isfinite(value)
+    seen = f"not determined by these {words.seen(outcome)}"
+    if not known.any():
+        return "unknown", "", seen
+    low, high = value[known].min(), value[known].max()
+    remark = f"std {std[known].mean():.2g} 1/m on average"
+    if not known.all():
+        remark += f"; {1 - known.mean():.0%} of it {seen}"
+    return f"{low:.3g} to {high:.3g} 1/m", "", remark
 
 
 def nuisance_rows(outcome: Outcome) -> list[Row]:
@@ -115,7 +126,7 @@ def footnotes(outcome: Outcome) -> list[str]:
     if stiffness is not None and stiffness.identifiable is False:
         bound = unidentified(stiffness)
         known = f"EI {bound}" if bound[0] in "<>" else f"EI: {bound}"
-        lines.append(f"{known}, not identifiable from these shapes.")
+        lines.append(f"{known}, not identifiable from these {words.seen(outcome)}.")
         poses = (
             "poses in which weight and stiffness compete more (ends close together), or hang a "
             "known weight on the cable and declare it under model.effects."
@@ -138,8 +149,8 @@ def footnotes(outcome: Outcome) -> list[str]:
         )
     if twisting is not None and twisting.identifiable is False:
         lines.append(
-            "GJ is not identifiable from these shapes. Try: poses that twist the cable, with the "
-            "end clamp rolled by up to half a turn."
+            f"GJ is not identifiable from these {words.seen(outcome)}. Try: poses that twist the "
+            "cable, with the end clamp rolled by up to half a turn."
         )
     return lines
 
@@ -183,6 +194,9 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
     rows = []
     for stage in outcome.stages:
         own = row(words.label_of(stage, outcome), stage.note, stage.rmse_fit, stage.rmse_held_out)
+        if not outcome.measurement.points:
+            own["fit"] = newtons(stage.readings_fit, nothing)
+            own["held_out"] = newtons(stage.readings_held_out, nothing)
         own["mark"] = marks.get(stage.name, "")
         own["held_out"] += words.predicted_share(outcome, stage)
         own["validated"] = text.millimetres(validated.get(stage.name), nothing)
@@ -196,9 +210,20 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
     return rows
 
 
+def newtons(errors: ReadingErrors, nothing: str = NOTHING) -> str:
+    """Errors of forces and moments that were measured."""
+    found = ((errors.force, "N"), (errors.moment, "N m"))
+    return ", ".join(f"{value:.2g} {unit}" for value, unit in found if value is not None) or nothing
+
+
 def error_rows(outcome: Outcome) -> list[tuple[str, str]]:
     """RMS distance of the measured points from the last stage's shapes, and that of noise."""
     stage, m = outcome.stages[-1], outcome.measurement
+    if not m.points:
+        errors = (("fit", stage.readings_fit), ("held out", stage.readings_held_out))
+        found = [(f"readings, {role}", newtons(known)) for role, known in errors]
+        missing = [("held out, not measured", ", ".join(m.held_out_missing))]
+        return [row for row in (*found, *missing) if row[1] not in ("", NOTHING)]
     rows = [("error of the fit", text.millimetres(stage.rmse_fit))]
     if stage.rmse_held_out is not None:
         share = words.predicted_share(outcome, stage)
@@ -252,9 +277,11 @@ def outcome_text(outcome: Outcome) -> str:
     lines[0] = f"{outcome.config.cable.name}: {lines[0]}"
     for row in (*fitted_rows(outcome), *error_rows(outcome)):
         lines.append("  " + "  ".join(filter(None, row)))
-    warnings = len(words.all_warnings(outcome))
-    if warnings:
-        lines.append(f"  {counted(warnings, 'warning')}: see .warnings")
+    lines += [f"  warning: {said}" for said in outcome.serious]
+    others = len(words.all_warnings(outcome)) - len(outcome.serious)
+    if others:
+        more = "further " * bool(outcome.serious)
+        lines.append(f"  {counted(others, f'{more}warning')}: see .warnings")
     return "\n".join(lines)
 
 
@@ -318,8 +345,7 @@ def summary_text(outcome: Outcome) -> str:
     lines = [
         f"{outcome.config.cable.name}: {verdict}",
         *more,
-        f"  {poses} ({measurement.poses_held_out} held out), "
-        f"{counted(measurement.points, 'point')}",
+        f"  {poses} ({measurement.poses_held_out} held out), {words.counted_data(measurement)}",
         *("  " + "  ".join(filter(None, row)) for row in error_rows(outcome)),
         *_stage_lines(outcome),
         *_effect_lines(outcome),

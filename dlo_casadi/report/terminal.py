@@ -13,7 +13,7 @@ from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config
 from dlo_casadi.errors import counted
 from dlo_casadi.report import tables, words
-from dlo_casadi.session.outcome import Outcome, ReadingErrors
+from dlo_casadi.session.outcome import Outcome
 from dlo_casadi.show.text import millimetres
 
 # Columns of a check's table: key of a pose's row, and how its value is written.
@@ -78,13 +78,17 @@ def print_summary(console: Console, outcome: Outcome) -> None:
 def _heading(outcome: Outcome) -> Text:
     m = outcome.measurement
     noise = f"noise std {millimetres(m.std)} ({m.std_source})"
+    if not m.points:
+        stds = ((m.force_std, "N"), (m.moment_std, "N m"))
+        noise = ", ".join(f"{std:.2g} {unit}" for std, unit in stds if std is not None)
+        noise = f"noise std of readings {noise}"
     if m.correlation_length > 0:
         noise += f", correlated over {millimetres(m.correlation_length)}"
     missing = len(m.held_out_missing)
     declared = f" of {m.poses_held_out + missing}" if missing else ""
     text = (
         f"{counted(m.poses_fit, 'fit pose')}, {m.poses_held_out}{declared} held out, "
-        f"{counted(m.points, 'point')}; {noise}; {words.mesh_text(outcome)}"
+        f"{words.counted_data(m)}; {noise}; {words.mesh_text(outcome)}"
     )
     return Text.assemble((outcome.config.cable.name, "bold"), ": ", text)
 
@@ -112,23 +116,23 @@ def _error_table(outcome: Outcome) -> Table:
     if not words.cross_validated(outcome):
         del columns["validated"]
     title = "Distance of the measured points from the predicted shape, RMS"
+    alone = not outcome.measurement.points
+    if alone:
+        title = "Difference of the readings from the predicted ones, RMS"
     table = plain_table(title, ["stage"], list(columns.values()))
     for row in tables.stage_rows(outcome, "-"):
         table.add_row(row["label"], *(row[column] for column in columns))
+    if alone:
+        return table
     if outcome.measurement.readings:
         last = outcome.stages[-1]
-        cells = {"fit": _newtons(last.readings_fit), "held_out": _newtons(last.readings_held_out)}
+        both = {"fit": last.readings_fit, "held_out": last.readings_held_out}
+        cells = {role: tables.newtons(errors) for role, errors in both.items()}
         table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
     table.add_section()
     floor = millimetres(outcome.measurement.noise_distance)
     table.add_row(f"{words.NOISE_ALONE} ({outcome.measurement.std_source})", floor)
     return table
-
-
-def _newtons(errors: ReadingErrors) -> str:
-    """Errors of forces and moments that were measured."""
-    found = ((errors.force, "N"), (errors.moment, "N m"))
-    return ", ".join(f"{value:.2g} {unit}" for value, unit in found if value is not None) or "-"
 
 
 def candidate_table(outcome: Outcome) -> Table:

@@ -8,7 +8,15 @@ from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextPose, NextRe
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted
-from dlo_casadi.session.outcome import FoundEffect, Outcome, PoseInput, Stage, StageName
+from dlo_casadi.session.outcome import (
+    FoundEffect,
+    MeasurementSummary,
+    Outcome,
+    PoseInput,
+    ReadingErrors,
+    Stage,
+    StageName,
+)
 from dlo_casadi.session.pose_shape import EitherSide
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import NOTABLE
@@ -42,9 +50,21 @@ def score_text(score: float) -> str:
     return f"{score:,.0f}" if score >= 100 or score < 0.01 else f"{score:.2g}"
 
 
+def seen(outcome: Outcome) -> str:
+    """What was measured: shapes, or readings alone."""
+    return "shapes" if outcome.measurement.points else "readings"
+
+
+def counted_data(measurement: MeasurementSummary) -> str:
+    """Number of points; without any, of readings."""
+    if measurement.points:
+        return counted(measurement.points, "point")
+    return counted(measurement.readings, "reading")
+
+
 def missing(pose: PoseInput) -> str:
     """Why a pose has no predicted shape to compare with."""
-    return "no equilibrium" if len(pose.points) else "not read"
+    return "no equilibrium" if pose.readable else "not read"
 
 
 # ---- stages ------------------------------------------------------------------------------------
@@ -117,17 +137,31 @@ def all_warnings(outcome: Outcome) -> list[str]:
     Algorithm 1 is a baseline: where it does not apply, its row says so and no warning is given.
     """
     lines = list(outcome.warnings)
-    held_out = outcome.measurement.poses_held_out > 0
     for stage in outcome.stages:
         if stage.name == "algorithm1" and not stage.shapes:
             continue
-        if stage.rmse_fit is None or (held_out and stage.rmse_held_out is None):
+        of_fit = stage.rmse_fit, stage.readings_fit
+        of_held_out = stage.rmse_held_out, stage.readings_held_out
+        missing = [
+            (points and rmse is None) or (alone and readings == ReadingErrors())
+            for (points, alone), (rmse, readings) in (
+                (_measured_by(outcome, "fit"), of_fit),
+                (_measured_by(outcome, "held_out"), of_held_out),
+            )
+        ]
+        if any(missing):
             lines.append(f"stage {stage.name}: {stage.note or 'some poses could not be predicted'}")
     for key, estimate in outcome.stages[-1].parameters.items():
         if estimate.at_bound:
             value = f"{estimate.value:.4g} {estimate.unit}".strip()
             lines.append(f"{key} sits on a bound of what physics permits: {value}")
     return lines
+
+
+def _measured_by(outcome: Outcome, role: str) -> tuple[bool, bool]:
+    """Whether poses of a role were measured by points, and by readings alone."""
+    found = [pose for pose in outcome.poses if pose.role == role and pose.readable]
+    return any(not pose.unseen for pose in found), any(pose.unseen for pose in found)
 
 
 # ---- findings ----------------------------------------------------------------------------------
@@ -202,7 +236,8 @@ def conclusion_of(outcome: Outcome) -> Conclusion:
     if outcome.effects:
         said = f"The declared model lacked {names}; with it the residual is noise."
         return Conclusion("effect found", said)
-    return Conclusion("complete", "The declared model explains the shapes down to their noise.")
+    said = f"The declared model explains the {seen(outcome)} down to their noise."
+    return Conclusion("complete", said)
 
 
 def _either_side(name: str, found: EitherSide) -> str:
@@ -290,7 +325,7 @@ def finding_of(outcome: Outcome, row: Ranked) -> tuple[str, str]:
     if row.reason:
         return "", row.reason
     if row.rmse_cross_validated is None:
-        return "", "not refitted"
+        return "", "not refitted" if outcome.measurement.points else "not needed"
     if outcome.verdict == "unexplained":
         return "", "withdrawn: it leaves the residual unexplained"
     return "", "withdrawn: not needed beside what was added later"

@@ -11,7 +11,10 @@ class Progress(Protocol):
     """Receiver of the progress of long work."""
 
     def step(self, name: str, done: int, total: int) -> None:
-        """Report that `done` of `total` parts of the named work are finished."""
+        """Report that `done` of `total` parts of the named work are finished.
+
+        With a method `warn` (texts) besides, likely mistakes are told before the fits.
+        """
 
 
 def nobody(*_: object) -> None:

@@ -25,7 +25,7 @@ class MeasuredPose:
     pose : HeldPose
         End conditions as declared.
     sensors : tuple of Sensor
-        Those of points first; empty if the pose could not be read.
+        Those of points first; empty if the pose could not be read. A pose may have readings alone.
     held_out : bool
         Whether the pose is kept for the final test.
     line : Centerline or Markers, optional
@@ -57,11 +57,8 @@ class MeasuredPose:
         return cls(pose, (line_or_markers(points, weight, s),), held_out)
 
     def with_readings(self, readings: Mapping[str, Sequence[float]]) -> Self:
-        """The same pose with wrench measurements, named as in `ends.reaction_rows`.
-
-        An unreadable pose is returned unchanged.
-        """
-        if not readings or not self.readable:
+        """The same pose with wrench measurements, named as in `ends.reaction_rows`."""
+        if not readings:
             return self
         known = {name: np.array(value, dtype=float) for name, value in readings.items()}
         wrench = Wrench(known, self.pose.node, len(self.pose.clips))
@@ -73,9 +70,14 @@ class MeasuredPose:
         return len(self.sensors) > 0
 
     @property
+    def has_points(self) -> bool:
+        """Whether any sensor shows its shape; otherwise it has readings alone, or nothing."""
+        return len(self.points) > 0
+
+    @property
     def has_line(self) -> bool:
         """Whether there are measured points in the frame of the poses, not only pixels."""
-        return self.readable and (self.line is None or len(self.line.points) > 0)
+        return self.has_points and (self.line is None or len(self.line.points) > 0)
 
     @cached_property
     def traced(self) -> "MeasuredPose":
@@ -222,6 +224,8 @@ class MeasuredPose:
 
     def misses(self, curve: NodeCurve) -> FloatArray:
         """Norm (K,) [m] of the residuals of each point."""
+        if not self.has_points:
+            return np.zeros(0)
         seen, places = Observed(curve, np.zeros(0)), self.nearest(curve)
         rows = [sensor.residual(seen, places[points]) for sensor, points, _ in self.slices]
         return np.sqrt(np.bincount(self.point_of, np.concatenate(rows) ** 2))

@@ -1,4 +1,4 @@
-"""Find mistakes about clamps: their declared directions, and readings of their force sensors."""
+"""Find mistakes about clamps: their declared directions."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,29 +11,19 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
 from dlo_casadi.errors import counted
 from dlo_casadi.session.hypotheses import (
-    NEAR_AXES,
     Hypothesis,
     ReadSession,
     Suspicion,
     axes_of,
-    exchanges,
     likeliest,
     listed,
-    read_as,
 )
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.thresholds import (
     FITS,
-    FITTED_READINGS,
     HEADING_NEAR,
     HEADING_OFF,
-    MISREAD,
-    MUCH_BETTER,
     NEARLY_ALL,
-    READ_OTHERWISE,
-    READ_SCALE,
-    TURNED,
-    UNSEEN,
 )
 
 # A full turn [rad] with room for rounding; a declared heading beyond it needs a line that turns.
@@ -70,15 +60,6 @@ _MEANT: Mapping[str, Mapping[str, Callable[[Any], Any]]] = {
 _RULE = {
     "heading": "headings in radians, counter-clockwise from x, along the cable",
     "orientation": "unit quaternions [qx, qy, qz, qw], x along the cable; start and end exchanged",
-}
-_UNLIKE = (
-    "{} is {:.0%} off what the shapes need, and no other way to read it is near. Try: the fixture, "
-    "axes and sign of its sensor. A large effect that the model lacks could look the same."
-)
-# Possible units of sensor readings, relative to newtons and newton metres.
-_UNITS: Mapping[str, Mapping[str, float]] = {
-    "force": {"grams-force": 101.97, "kilograms-force": 0.10197, "millinewtons": 1e3},
-    "moment": {"N mm": 1e3, "N cm": 1e2, "kgf cm": 10.197},
 }
 
 
@@ -237,166 +218,3 @@ def _pieces(points: FloatArray, step: float) -> FloatArray:
         if np.linalg.norm(points[k] - points[kept[-1]]) >= step:
             kept.append(k)
     return np.asarray(np.diff(points[kept], axis=0))
-
-
-# ---- readings -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ComparedReading:
-    """One kind of reading on one side of the cable, of m poses.
-
-    Parameters
-    ----------
-    name : str
-        As in a configuration, such as end_force.
-    measured, model : (m, c) [N] or [N m]
-        Readings, and the values that the shapes need; known only up to the mass.
-    frames : (m, d, d) or None
-        Axes of the clamp in the world, as columns; None at a pin.
-    forces : (m, d) or None [N]
-        Only for moments: the model's forces on the same side.
-    std : float [N] or [N m]
-        Of one component: noise and a constant offset, as far as they are declared.
-    """
-
-    name: str
-    measured: FloatArray
-    model: FloatArray
-    frames: FloatArray | None = None
-    forces: FloatArray | None = None
-    std: float = 0.0
-
-    @property
-    def noise(self) -> float:
-        """Noise of the readings relative to their size."""
-        size = np.sqrt(np.mean(self.measured**2))
-        return self.std / max(float(size), 1e-300)
-
-    def misfit(self, measured: FloatArray) -> float:
-        """Distance from the nearest multiple of the model, relative to the size of the readings."""
-        size = float((measured**2).sum() * (self.model**2).sum())
-        along = max(float((measured * self.model).sum()), 0.0) / np.sqrt(max(size, 1e-300))
-        return float(np.sqrt(max(1 - along**2, 0.0)))
-
-
-def misread(readings: Sequence[ComparedReading], *, sized: bool = True) -> tuple[Suspicion, ...]:
-    """Readings that were taken in another way than declared: the likeliest way for each.
-
-    `sized`: whether the shapes determine stiffness over weight; if not, only the ratio of forces to
-    moments is checked.
-    """
-    found, scales = [], {}
-    for one in readings:
-        if len(one.measured) * one.measured.shape[1] < 3 or not one.model.any():
-            continue
-        own, rows = one.misfit(one.measured), one.measured
-        if MISREAD < own < UNSEEN * one.noise:
-            continue
-        if own > MISREAD:
-            # A general rotation or lever arm fits at least as well as its special cases.
-            meant = likeliest(_otherwise(one), one.misfit, MUCH_BETTER * own, READ_OTHERWISE)
-            if meant is None:
-                found += [Suspicion(_UNLIKE.format(one.name, own), False)] * (own > TURNED)
-                continue
-            (said, rows, certain), left = meant
-            text = f"{one.name} is {own:.0%} off what the shapes need, but {left:.0%} {said}"
-            found.append(Suspicion(text, certain))
-        scales[one.name] = float((rows * one.model).sum() / (one.model**2).sum())
-    # Forces in a known other unit count in newtons.
-    forces = [
-        scale / _UNITS["force"].get(_unit_of(name, scale) if sized else "", 1.0)
-        for name, scale in scales.items()
-        if name.endswith("force")
-    ]
-    beside = float(np.median(forces)) if forces else 1.0
-    for name, scale in scales.items():
-        if name.endswith("moment") and forces:
-            found += _other_unit(name, scale / beside, "forces")
-        elif sized:
-            found += _other_unit(name, scale, "mass")
-    return tuple(found)
-
-
-def _otherwise(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
-    """Other interpretations of the readings, the likely ones first."""
-    a, (count, size) = one.measured, one.measured.shape
-    turned = "with the other sign. Try: what the cable does to the fixture, not the fixture to it."
-    yield Hypothesis(turned, -a)
-    if one.frames is not None and size > 1:
-        world = np.einsum("mij,mj->mi", one.frames, a)
-        text = "once turned from the clamp's axes into the world's"
-        yield Hypothesis(
-            f"{text}. Try: world axes, R f with the clamp's frame R of each pose.", world
-        )
-        yield Hypothesis(
-            f"{text}, with the other sign. Try: -R f, with the clamp's frame R.", -world
-        )
-    # Forces of few poses are nearly parallel: a fitted rotation or lever arm explains any error.
-    if count < FITTED_READINGS:
-        return
-    # The hypothesis must also halve the misfit caused by effects: a real effect leaves no doubt.
-    yield from (way for way in _fitted(one) if one.misfit(way.meant) < MISREAD)
-
-
-def _fitted(one: ComparedReading) -> Iterator[Hypothesis[FloatArray]]:
-    """Interpretations with parameters that are fitted to what the shapes need."""
-    a, size = one.measured, one.measured.shape[1]
-    if one.forces is not None:
-        yield from _about_elsewhere(one, one.forces)
-    if size > 1:
-        for axes in exchanges(size)[1:]:
-            text = f"once read as ({read_as(axes)}). Try: the axes of start and end."
-            if not np.array_equal(axes, -np.eye(size)):  # the other sign
-                yield Hypothesis(text, a @ axes.T, one.misfit(a) > TURNED)
-        u, _, v = np.linalg.svd(a.T @ one.model)
-        hand = np.diag([*np.ones(size - 1), np.sign(np.linalg.det(u @ v))])
-        turn, whole = (u @ hand @ v).T, np.eye(3)
-        if min(np.linalg.norm(turn - axes) for axes in exchanges(size)[1:]) < NEAR_AXES:
-            return
-        whole[:size, :size] = turn
-        vector = Rotation.from_matrix(whole).as_rotvec()
-        angle = np.degrees(np.linalg.norm(vector) if size > 2 else vector[2])
-        text = f"once all are turned by {angle:.0f} degrees. Try: the axes of start and end."
-        yield Hypothesis(text, a @ turn.T, one.misfit(a) > TURNED)
-
-
-def _about_elsewhere(one: ComparedReading, forces: FloatArray) -> Iterator[Hypothesis[FloatArray]]:
-    """Moments about a point fixed to the clamp, by least squares: M + (fixture - point) x F.
-
-    Point and scale are found together: the equations are linear in both.
-    """
-    m, d = forces.shape
-    frames = np.broadcast_to(np.eye(d), (m, d, d)) if one.frames is None else one.frames
-    # Cross products; in a plane only the component normal to it.
-    space = [np.pad(x, ((0, 0), (0, 3 - d))) for x in (*np.moveaxis(frames, 2, 0), forces)]
-    arms = np.stack([np.cross(axis, space[-1])[:, -one.model.shape[1] :] for axis in space[:d]], 2)
-    columns = np.concatenate([one.model[..., None], arms], axis=2).reshape(-1, 1 + d)
-    scale, *arm = np.linalg.lstsq(columns, one.measured.ravel(), rcond=None)[0]
-    if scale <= 0:
-        return
-    told = listed(-1e3 * np.array(arm) / scale, ".3g")
-    axes = "of the clamp" if one.frames is not None else "of gravity's frame"
-    yield Hypothesis(
-        f"once taken about a point ({told}) mm from the fixture along the axes {axes}, where the "
-        "sensor may be. Try: moments about the fixture, M + (sensor - fixture) x F.",
-        one.measured - arms @ np.array(arm),
-    )
-
-
-def _unit_of(name: str, scale: float) -> str:
-    """The unit that a scale of readings is near; empty if there is none."""
-    units = _UNITS[name.split("_")[-1]]
-    unit = min(units, key=lambda one: abs(np.log(scale / units[one])))
-    return unit if 0.5 < scale / units[unit] < 2.0 else ""
-
-
-def _other_unit(name: str, scale: float, beside: str) -> Iterator[Suspicion]:
-    """A scale of readings that no mass explains; of moments beside the forces, if there are any."""
-    if 1 / READ_SCALE < scale < READ_SCALE:
-        return
-    cure = ". Try: N and N m."
-    if unit := _unit_of(name, scale):
-        cure = f": in {unit}? Try: divide by {_UNITS[name.split('_')[-1]][unit]:g}."
-    text = f"{name} is {scale:.3g} times what shapes and {beside} need{cure}"
-    yield Suspicion(text, bool(unit))

@@ -196,10 +196,10 @@ def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) ->
 
     All poses share one rest curvature: each place with a marker gives one number per direction
     across the cable. A clamp's heading, known within its tolerance, uses one of them, except for
-    the first two. Lines show all places.
+    the first two. Lines show all places; readings alone depend on all of it, and none is resolved.
     """
-    fitted = [item for item in measured if item.readable and not item.held_out]
-    if not all(sensor.marked for item in fitted for sensor in item.sensors):
+    fitted = [item for item in measured if item.has_points and not item.held_out]
+    if not fitted or not all(sensor.marked for item in fitted for sensor in item.sensors):
         return REST_COEFFICIENTS
     places = np.sort(np.concatenate([item.places(np.inf) for item in fitted]))
     count = 1 + int((np.diff(places) > SAME_PLACE * places[-1]).sum())
@@ -329,6 +329,9 @@ def _not_applicable(
         return "switched off"
     if not applies(model):
         return "the paper's loop needs a plane and two pinned ends, without clips or obstacles"
+    used = [item for item in measured if item.readable and not item.held_out]
+    if not all(item.has_points for item in used):
+        return "the paper's loop needs lines along the cable, not readings alone"
     sensors = [sensor for item in measured for sensor in item.sensors]
     if any(sensor.marked and sensor.per_point for sensor in sensors):
         return "the paper's loop needs lines along the cable, not single markers"

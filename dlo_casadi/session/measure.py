@@ -23,6 +23,8 @@ READERS = 2
 # Points per line used by fits, errors and pictures. More points of a photograph would repeat their
 # neighbours' noise; other lines enter the fit as means of neighbours.
 MOST_POINTS = 240
+# Distance [m] within which a point repeats the number of a fixture: the digits of a printed file.
+COPIED = 1e-6
 
 
 def read_session(config: Config, step: Step = nobody) -> tuple[Config, tuple[PoseInput, ...]]:
@@ -54,10 +56,22 @@ def _read(config: Config, pose: Pose) -> PoseInput:
     try:
         if pose.name in skipped:
             raise MeasurementError(skipped[pose.name])
-        return _reader(config, pose)(config, pose)
+        return _without_copies(config, pose, _reader(config, pose)(config, pose))
     except MeasurementError as error:
         said = error.message.removeprefix(f"{pose.name}: ")  # a photograph may have the pose's name
         return PoseInput.unread(config, pose, said)
+
+
+def _without_copies(config: Config, pose: Pose, read: PoseInput) -> PoseInput:
+    """A pose with readings alone if its points only repeat its fixtures, which show no shape."""
+    ends = np.array([place for place in (pose.start, pose.end) if place is not None])
+    if not pose.readings or not len(read.points) or read.views:
+        return read
+    away = np.linalg.norm(read.points[:, None] - ends[None], axis=2).min(axis=1)
+    if away.max() > COPIED:
+        return read
+    said = "its points are those of its fixtures and show no shape: it has readings alone"
+    return replace(_read_nothing(config, pose), messages=(said,))
 
 
 def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[MeasuredPose, ...]:
@@ -90,7 +104,7 @@ def _measured(pose: Pose, item: PoseInput, std: float) -> MeasuredPose:
         seen = MeasuredPose(held, (means,), held_out, line_or_markers(item.points, s=item.s))
     else:
         seen = MeasuredPose.of_points(held, item.points, item.weight, held_out, item.s)
-    return seen.with_readings(pose.readings)
+    return seen.with_readings(pose.readings) if item.readable else seen
 
 
 def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
@@ -110,11 +124,17 @@ def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
 
 
 def _reader(config: Config, pose: Pose) -> Callable[[Config, Pose], PoseInput]:
+    if not pose.shown:
+        return _read_nothing
     if pose.points is not None:
         return _read_points
     if config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv":
         return _read_csv
     return _read_views if config.experiment.in_space else _read_image
+
+
+def _read_nothing(config: Config, pose: Pose) -> PoseInput:
+    return replace(PoseInput.unread(config, pose), unseen=True)
 
 
 def _read_csv(config: Config, pose: Pose) -> PoseInput:
@@ -207,7 +227,7 @@ def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
     of its photographs can be read.
     """
     reader = _reader(config, pose)
-    if reader in (_read_csv, _read_points):
+    if reader in (_read_csv, _read_points, _read_nothing):
         return {}
     cable = _held(config, pose)
     drawn: dict[str, np.ndarray] = {}

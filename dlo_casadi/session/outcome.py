@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dlo_casadi.arrays import Brief, FloatArray
+from dlo_casadi.arrays import BoolArray, Brief, FloatArray
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config, Pose
@@ -38,12 +38,20 @@ SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
 class RestCurvatureEstimate(Brief):
     """Rest curvature along the cable: s (M,) [m], value and standard deviation [1/m].
 
-    (M,) in a plane; (2, M) in space, about the material axes y and z.
+    (M,) in a plane; (2, M) in space, about the material axes y and z. `determined`: where the
+    measurements more than halve the variance that the prior alone leaves; elsewhere it is unknown.
     """
 
     s: FloatArray
     value: FloatArray
     std: FloatArray
+    determined: BoolArray | None = None
+
+    @property
+    def known(self) -> tuple[FloatArray, FloatArray]:
+        """Value and standard deviation, NaN where they are not determined."""
+        kept = np.ones_like(self.value, bool) if self.determined is None else self.determined
+        return np.where(kept, self.value, np.nan), np.where(kept, self.std, np.nan)
 
 
 @dataclass(frozen=True)
@@ -157,6 +165,8 @@ class PoseInput(Brief):
     views : tuple of ViewInput
         Usable photographs of a cable in space; `points` is the line that they show together, empty
         where fewer than two agree.
+    unseen : bool
+        Whether it has readings of forces and moments alone, and no points.
     """
 
     name: str
@@ -177,6 +187,7 @@ class PoseInput(Brief):
     s: FloatArray | None = None
     means: MeasuredPoints | None = None
     views: tuple[ViewInput, ...] = ()
+    unseen: bool = False
 
     @classmethod
     def unread(cls, config: Config, pose: Pose | PoseInput, problem: str = "") -> PoseInput:
@@ -187,7 +198,7 @@ class PoseInput(Brief):
     @property
     def readable(self) -> bool:
         """Whether there is anything to compare with."""
-        return len(self.points) > 0 or len(self.views) > 0
+        return len(self.points) > 0 or len(self.views) > 0 or self.unseen
 
 
 @dataclass(frozen=True)
@@ -197,13 +208,13 @@ class MeasurementSummary:
     Parameters
     ----------
     poses_fit, poses_held_out : int
-        Poses with a measured line.
+        Poses with a measured line or readings.
     held_out_missing : tuple of str
-        Held-out poses without a measured line: no error includes them.
+        Held-out poses without either: no error includes them.
     points : int
     std, correlation_length : float [m]
-        Of the noise of one coordinate of a point.
-    noise_distance : float [m]
+        Of the noise of one coordinate of a point; the std is None without points.
+    noise_distance : float or None [m]
         RMS distance of the points from the predicted shapes that is due to this noise alone.
     readings : int
         Number of forces and moments on the fixtures, held-out poses included.
@@ -215,10 +226,10 @@ class MeasurementSummary:
     poses_fit: int
     poses_held_out: int
     points: int
-    std: float
+    std: float | None
     std_source: Literal["declared", "estimated"]
     correlation_length: float
-    noise_distance: float
+    noise_distance: float | None
     readings: int = 0
     force_std: float | None = None
     moment_std: float | None = None
@@ -346,6 +357,8 @@ class Outcome:
     doubts : tuple of str
         Why the last stage's numbers are unreliable, see `doubts_of`; with doubts no verdict is
         `complete` or `effect_found`.
+    serious : tuple of str
+        Those of the warnings that question the session itself: likely mistakes, poses far off.
     effects : tuple of FoundEffect
         Effects added to the declared model.
     candidates : tuple of Ranked
@@ -382,6 +395,7 @@ class Outcome:
     verdict: Verdict | None = None
     doubts: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    serious: tuple[str, ...] = ()
     effects: tuple[FoundEffect, ...] = ()
     candidates: tuple[Ranked, ...] = ()
     unexplained: UnknownForce | None = None

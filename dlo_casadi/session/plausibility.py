@@ -1,8 +1,9 @@
 """Compare what was read with what is declared: the list of questions, and those about shapes.
 
 A question compares the session with hypotheses on what the user may have meant. Questions about
-units, frames and the order of files are in `ends`, those about directions and readings in
-`clamps`. This file has those that quick fits of a few poses decide: exchanged ends, and gravity.
+units, frames and the order of files are in `ends`, those about directions in `clamps`, those about
+readings in `readings`. This file has two more that quick fits of a few poses decide: exchanged
+ends, and gravity.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,17 +15,12 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, Pose
-from dlo_casadi.errors import EstimationError, MeasurementError, counted
-from dlo_casadi.estimation.fit import fit_model
-from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
-from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.rod.supports import SupportKind
-from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.clamps import ComparedReading, misread, wrong_directions
+from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS
+from dlo_casadi.session.clamps import wrong_directions
 from dlo_casadi.session.clips import wrong_clips
+from dlo_casadi.session.coarse_fit import POSES, Coarse, coarse_fit
 from dlo_casadi.session.ends import ENDS, POINTS
-from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import (
     Hypothesis,
     ReadSession,
@@ -34,16 +30,16 @@ from dlo_casadi.session.hypotheses import (
     listed,
     named,
     shown_pull,
-    spread,
 )
 from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.readings import wrong_readings, wrong_without_shapes
 from dlo_casadi.thresholds import (
     BEYOND_EFFECTS,
-    CONTRADICTS,
     EVIDENCE_APART,
     FITS,
     HEADING_OFF,
     MUCH_BETTER,
+    NEIGHBOURS_ALIKE,
     UNEXPLAINED,
 )
 
@@ -51,15 +47,10 @@ NEVERTHELESS = (
     "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless, in "
     'Python estimation={"plausibility": False}.'
 )
-# Per comparison: poses, points of a line, elements of the mesh, rest curvature coefficients.
-_POSES, _POINTS, _MESH, _REST = 8, 24, 12, 4
 # Poses that decide whether ends are exchanged: two of them show a misfit of a twentieth of L. Poses
 # that decide on gravity: in 60 simulated sessions in space five named a wrong one in 28, eight in
 # 25, both doubted the right one in 5 or 6; five take 0.63 of the time.
 _FEW, _HANGING = 2, 5
-# Largest relative standard deviation at which stiffness over weight counts as known: wrong units,
-# a factor of five or more, are then recognised.
-_SIZED = 0.5
 # Gravity on Earth [m/s^2].
 EARTH = 9.81
 # What is exchanged -> the pose's keys.
@@ -124,7 +115,8 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
     session = ReadSession(config, tuple(item for item in inputs if len(item.points)))
     found: tuple[Suspicion, ...] = ()
     if not session.lines.names:
-        return found
+        alone = [item.name for item in inputs if item.unseen]
+        return wrong_without_shapes(config, alone) if alone else found
     for questions in QUESTIONS:
         for alternatives in questions:
             found += next(filter(None, (ask(session) for ask in alternatives)), ())
@@ -134,25 +126,7 @@ def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspic
     return found
 
 
-# ---- fits ---------------------------------------------------------------------------------------
-
-
-class Coarse(NamedTuple):
-    """A quick fit of the declared cable, its effects kept, to a few poses.
-
-    Parameters
-    ----------
-    fit : Fit or None
-        None where no equilibria were found near the shapes.
-    rms : float [m]
-        RMS residual; without a fit the distance at which ends count as contradicting a pose.
-    weight : bool
-        Whether the shapes determine stiffness over weight, or there is no weight.
-    """
-
-    fit: Fit | None
-    rms: float
-    weight: bool
+# ---- comparisons ---------------------------------------------------------------------------------
 
 
 class Comparison(NamedTuple):
@@ -188,9 +162,16 @@ class Comparison(NamedTuple):
 
     @property
     def certain(self) -> bool:
-        """Whether it is clearly better and explains the shapes, which no missing effect does."""
+        """Whether no missing effect could be meant instead.
+
+        The hypothesis is clearly better and explains shapes that are farther off than effects
+        leave them; or only it shows a weight, and nothing but noise is left.
+        """
         own, other = self.own.rms / self.length, self.other.rms / self.length
-        return self.better and own > BEYOND_EFFECTS and other < UNEXPLAINED
+        if other >= UNEXPLAINED:
+            return False
+        noise_alone = self.other.correlation < NEIGHBOURS_ALIKE
+        return (self.better and own > BEYOND_EFFECTS) or (self.shows_weight and noise_alone)
 
     @property
     def shows_weight(self) -> bool:
@@ -198,15 +179,16 @@ class Comparison(NamedTuple):
 
         If gravity points the wrong way, the best fit is a cable too stiff to show any weight.
         """
-        (fit, other, weight), own = self.other, self.own
-        if fit is None or not weight or own.weight or other > BEYOND_EFFECTS * self.length:
+        own, other = self.own, self.other
+        if other.fit is None or not other.weight or own.weight:
             return False
         # Difference in log likelihood of two models with equally many unknowns.
-        return bool(fit.problem.n_residuals * np.log(own.rms / other) > EVIDENCE_APART)
+        evidence = other.fit.problem.n_residuals * np.log(own.rms / other.rms)
+        return bool(other.rms < BEYOND_EFFECTS * self.length and evidence > EVIDENCE_APART)
 
 
 def compare(
-    session: ReadSession, hypotheses: Sequence[Hypothesis[ReadSession]], most: int = _POSES
+    session: ReadSession, hypotheses: Sequence[Hypothesis[ReadSession]], most: int = POSES
 ) -> Comparison | None:
     """Fit the declared session, then hypotheses until one explains everything; return the best.
 
@@ -223,78 +205,6 @@ def compare(
         if tried[-1].certain:
             break
     return min(tried, key=lambda found: found.other.rms)
-
-
-def coarse_fit(session: ReadSession, most: int = _POSES) -> Coarse:
-    """Quick fit of at most `most` poses, evenly spaced, held-out ones included.
-
-    Declared effects keep their declared values; one that changes from pose to pose is left out.
-    """
-    measured, length = [], session.config.cable.length
-    for k in spread(len(session.read), most):
-        item = session.read[k]
-        kept = spread(len(item.points), _POINTS)
-        s = None if item.s is None else item.s[kept]
-        pose = session.declared[item.name].held
-        measured.append(MeasuredPose.of_points(pose, item.points[kept], s=s))
-    declared = declared_model(session.config, known=True)
-    # A set depends on the poses between those that are fitted here.
-    effects = tuple(x for x in declared.model.effects if x.kind != "state")
-    model = replace(declared.model, effects=effects, priors={}, n=_MESH, n_rest=_REST)
-    given = dict(zip(declared.model.names, declared.start, strict=True))
-    try:
-        fit = fit_model(
-            model,
-            measured,
-            Tolerances(),
-            UNEXPLAINED * length,
-            free=replace(model, effects=()).names,
-            values=np.array([given[name] for name in model.names]),
-            refined=False,
-        )
-    except EstimationError:
-        return Coarse(None, CONTRADICTS * length, False)
-    known = fit.std(BENDING_STIFFNESS) < _SIZED * fit.value(BENDING_STIFFNESS)
-    return Coarse(fit, fit.residual_rms, bool(known) or not any(model.gravity))
-
-
-def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
-    """Readings compared with the forces that the shapes need, by a coarse fit of some poses."""
-    fitted = [item for item in session.read if item.role == "fit" and not item.views]
-    fitted = [item for item in fitted if session.declared[item.name].readings]
-    shown = [fitted[k] for k in spread(len(fitted), _POSES)]
-    if not shown:
-        return ()
-    fit, _, sized = coarse_fit(replace(session, read=tuple(shown)))
-    if fit is None:
-        return ()
-    felt = fit.problem.equilibria.readings(*fit.problem.state(fit.point))
-    rows = reaction_rows(fit.model.node, len(fit.model.clips))
-    measurement, known = session.config.experiment.measurement, session.config.experiment.tolerances
-    stds = {
-        "force": np.hypot(measurement.force_std or 0.0, known.force_bias),
-        "moment": np.hypot(measurement.moment_std or 0.0, known.moment_bias),
-    }
-    compared = []
-    for name, at in rows.items():
-        side, _, kind = name.rpartition("_")
-        poses = [session.declared[item.name] for item in shown]
-        own = [k for k, pose in enumerate(poses) if name in pose.readings]
-        if not own:
-            continue
-        held = getattr(fit.model, side, SupportKind.FREE).direction
-        forces = felt[own, rows[f"{side}_force"]]
-        compared.append(
-            ComparedReading(
-                name,
-                np.array([poses[k].readings[name] for k in own]),
-                felt[own, at],
-                np.array([clamp_axes(poses[k], side) for k in own]) if held else None,
-                forces if kind == "moment" else None,
-                float(stds[kind]),
-            )
-        )
-    return misread(compared, sized=sized)
 
 
 # ---- exchanged ends -----------------------------------------------------------------------------

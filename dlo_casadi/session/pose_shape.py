@@ -89,6 +89,9 @@ class PoseShape(Brief):
     readings : mapping
         Forces [N] and moments [N m] that were measured on the fixtures, by name: measured values,
         and predicted ones as a sensor would show them.
+    reading_std : mapping
+        By the same names: standard deviation of the difference that noise, fixtures and parameters
+        let expect; empty if it was not computed.
     spread : (M,) or (M, 2) or None [m]
         Standard deviation of the next repeat across the curve, like the residual; None if it was
         not computed.
@@ -126,8 +129,19 @@ class PoseShape(Brief):
     missed: FloatArray | None = None
     expected: FloatArray | None = None
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    reading_std: Mapping[str, FloatArray] = field(default_factory=dict)
     clips: tuple[Mapping[str, Any], ...] = ()
     contacts: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def misread(self) -> float:
+        """RMS error of the readings over what is expected; zero if there are none."""
+        off = [
+            (known - model) / std
+            for name, std in self.reading_std.items()
+            for known, model in [self.readings[name]]
+        ]
+        return float(np.sqrt(np.mean(np.concatenate(off) ** 2))) if off else 0.0
 
     def inside_band(self, length: float, noise: float) -> BoolArray:
         """Whether each measured point (K,) lies in its 90 % band, which includes noise."""

@@ -17,7 +17,7 @@ from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.outliers import LEAST_POINTS, Outliers, outliers_of
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
-from dlo_casadi.thresholds import BEYOND_TOLERANCE, DIFFERENT, FIXTURES, UNSEEN
+from dlo_casadi.thresholds import BEYOND_TOLERANCE, DIFFERENT, FAR_OFF, FIXTURES, UNSEEN
 
 CUT_OFF = (
     "the diagnosis has met the bound on its work before everything was tried, as where several "
@@ -211,7 +211,26 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
                 f"{_energy({name: other})}; {_cure({name: other})}"
             )
         lines.append(text)
+    lines += _misread(stage, poses)
     return (*lines, *_nothing_predicted(stages))
+
+
+def _misread(stage: Stage, poses: Sequence[PoseInput]) -> Iterator[str]:
+    """Report poses with readings alone whose readings are farther off than all that is expected."""
+    for role, said in (("fit", "fit poses"), ("held_out", "held-out poses")):
+        off = {
+            pose.name: stage.shapes[pose.name].misread
+            for pose in poses
+            if pose.role == role and pose.unseen and pose.name in stage.shapes
+        }
+        if not off or np.sqrt(np.mean(np.square([*off.values()]))) <= UNSEEN:
+            continue
+        worst = sorted((name for name in off if off[name] > UNSEEN), key=lambda name: -off[name])
+        named = ", ".join(f"{name} {off[name]:.2g} times" for name in worst)
+        yield (
+            f"the readings of {said} are predicted farther off than noise, fixtures and parameters "
+            f"let expect: {named}"
+        )
 
 
 def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
@@ -230,6 +249,28 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
         f"is another one than the measured one, {1e3 * off:.3g} mm RMS off, and stage "
         f"{nearest.name} comes nearer, {1e3 * other:.3g} mm. Try: are start and end of the poses "
         "exchanged, or headings off by a turn?"
+    ]
+
+
+def far_off(stage: Stage, poses: Sequence[PoseInput], told: Sequence[str] = ()) -> list[str]:
+    """Fit poses far more off their prediction than the others, which rule an RMS over all.
+
+    Not those that a text of `told` names.
+    """
+    if stage.name not in ("batch", "closed"):
+        return []
+    rmse = {name: x.rmse for name, x in stage.shapes.items() if x.rmse is not None}
+    usual = float(np.median([*rmse.values()])) if len(rmse) > 2 else np.inf
+    fitted = [pose.name for pose in poses if pose.role == "fit"]
+    bad = [name for name in fitted if rmse.get(name, 0.0) > FAR_OFF * usual]
+    bad = [name for name in bad if not any(name in text for text in told)]
+    if not bad:
+        return []
+    each = ", ".join(f"{name} {1e3 * rmse[name]:.3g} mm" for name in bad)
+    return [
+        f"predicted far more off their points than the other poses ({1e3 * usual:.2g} mm, median): "
+        f"{each}; the error of the fit is mostly theirs. Try: look at their points and ends, at "
+        "what the cable touched there, at `branch` or `turns`; or leave them out and fit again"
     ]
 
 

@@ -57,12 +57,13 @@ def run_session(
     """
     began = time.perf_counter()
     step = nobody if progress is None else progress.step
+    warn = getattr(progress, "warn", nobody)
     executor = executor or InProcess()
     begin(executor, software)  # meanwhile another process starts and imports what fits need
     config, inputs = read_session(config, step)
     try:
         with one_thread(), accounted() as work:
-            outcome = _Run(config, step, executor, began).outcome(inputs)
+            outcome = _Run(config, step, warn, executor, began).outcome(inputs)
         add(work)
         work.tell()
         return replace(outcome, work=work)
@@ -81,6 +82,7 @@ class _Run:
 
     config: Config
     step: Step
+    warn: Callable[[Sequence[str]], None]
     executor: Executor
     began: float
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED, 0.0))
@@ -89,6 +91,7 @@ class _Run:
         """Fit and report a session whose poses have been read; raises as `run_session` does."""
         config, step, executor = self.config, self.step, self.executor
         inputs, odd = without_implausible(config, inputs)
+        self.warn(odd)
         measured = measured_poses(config, inputs)
         self.seconds["vision"] = time.perf_counter() - self.began
         warnings = [*config.warnings, *remarks.reading_warnings(inputs, config.skipped), *odd]
@@ -153,6 +156,7 @@ class _Run:
                 timing={**self.seconds, "total": time.perf_counter() - self.began},
                 fit=fit,
                 warnings=tuple(warnings),
+                serious=tuple(odd),
                 versions=software(),
                 limits=checked_limits(config.limits, fit, [item.pose for item in measured]),
                 **found,
@@ -218,12 +222,19 @@ class _Run:
             stages.append(own)
         diagnosis = replace(diagnosis, fit=fit)
         validated = diagnosis.validation
-        told = validated.complete and not diagnosis.added
+        told = validated.complete and not diagnosis.added and fit.has_points
+        effects, ranked = found_effects(diagnosis), diagnosis.ranked
+        if not fit.has_points:  # errors of readings have no length
+            effects = tuple(
+                replace(x, rmse_cross_validated_before=None, rmse_cross_validated_after=None)
+                for x in effects
+            )
+            ranked = tuple(replace(row, rmse_cross_validated=None) for row in ranked)
         self.seconds["diagnosis"] = time.perf_counter() - began
         found = {
             "verdict": diagnosis.verdict,
-            "effects": found_effects(diagnosis),
-            "candidates": diagnosis.ranked,
+            "effects": effects,
+            "candidates": ranked,
             "unexplained": diagnosis.unknown_force,
             "next_pose": next_pose,
             "structure": (diagnosis.structure_before, diagnosis.structure),
@@ -254,6 +265,9 @@ def judged(outcome: Outcome) -> Outcome:
     said = remarks.fit_warnings(fit, outcome.mesh_error, declared, poses)
     said += remarks.worse_than_simpler(stages)
     said += [remarks.CUT_OFF] if outcome.cut_off else []
+    told = (*doubts, *remarks.branch_warnings(stages))
+    far = remarks.far_off(stages[-1], outcome.poses, told)
+    said += far
     if outcome.hidden_weight is not None:
         said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))
     if verdict is not None:
@@ -264,6 +278,7 @@ def judged(outcome: Outcome) -> Outcome:
         verdict=verdict,
         stages=stages,
         doubts=doubts,
+        serious=(*outcome.serious, *far),
         warnings=(*outcome.warnings, *said, *remarks.branch_warnings(stages)),
     )
 
@@ -287,16 +302,16 @@ def _summary(
     readable = [item for item in measured if item.readable]
     readings = [name for item in readable for name in item.reactions]
     kinds, points = {name.split("_")[-1] for name in readings}, fit.noise.of_points
-    noise = points.readings
+    noise, shown = points.readings, any(item.has_points for item in readable)
     return MeasurementSummary(
         kind=config.experiment.measurement.kind,
         poses_fit=sum(not item.held_out for item in readable),
         poses_held_out=sum(item.held_out for item in readable),
         points=sum(len(item.points) for item in readable),
-        std=points.std,
+        std=points.std if shown else None,
         std_source="declared" if points.source == "declared" else "estimated",
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
-        noise_distance=noise_distance(measured, points.std),
+        noise_distance=noise_distance(measured, points.std) if shown else None,
         readings=len(readings),
         force_std=noise.force if "force" in kinds else None,
         moment_std=noise.moment if "moment" in kinds else None,

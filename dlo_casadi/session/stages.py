@@ -32,6 +32,7 @@ from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
 from dlo_casadi.model.clips import clip_rows
 from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
+from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Frame
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import MASS, ReadingErrors, RestCurvatureEstimate, Stage, StageName
@@ -56,7 +57,7 @@ def pose_shape(
         gap = item.traced.points - curve.at(s)
     return PoseShape(
         curve.at(np.linspace(0.0, curve.length, _CURVE_POINTS)),
-        _rmse(prediction, item) if item.readable else None,
+        _rmse(prediction, item) if item.has_points else None,
         s,
         gap,
         _across(prediction, s, gap),
@@ -197,7 +198,22 @@ class _Model:
             spread=spread_across(curve, places, moved[: len(places)]).squeeze(),
             expected=expected,
             missed=missed,
+            reading_std=self._reading_std(item, repeats),
         )
+
+    def _reading_std(self, item: MeasuredPose, repeats: Repeats) -> dict[str, FloatArray]:
+        """Expected standard deviations of the errors of a pose's readings, by name."""
+        if not item.reactions or self.fit is None:
+            return {}
+        noise = self.fit.noise.readings
+        rows = reaction_rows(self.model.node, len(item.pose.clips))
+        std = repeats.reading_std
+        return {
+            name: np.hypot(
+                std[rows[name]], noise.moment if name.endswith("moment") else noise.force
+            )
+            for name in item.reactions
+        }
 
     def _either_side(
         self,
@@ -207,7 +223,7 @@ class _Model:
         repeats: Repeats,
     ) -> EitherSide | None:
         """A held-out pose on both sides, see `EitherSide`; None where there is only one."""
-        if not (item.held_out and item.readable):
+        if not (item.held_out and item.has_points):
             return None
         if measured is not None and measured.other_side:
             other: Prediction | None = measured.prediction
@@ -393,4 +409,8 @@ def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
     variance = np.einsum("ik,kl,il->i", scaled, fit.marginal_covariance[tail, tail], scaled)
     std = np.sqrt(np.maximum(variance, 0))
     value = basis @ fit.coefficients
-    return RestCurvatureEstimate(s, *np.reshape([value, std], (2, axes, len(s))).squeeze())
+    own = np.linalg.pinv(fit.problem.precision[tail, tail], hermitian=True)
+    before = np.einsum("ik,kl,il->i", scaled, own, scaled) * fit.inflation**2
+    determined = np.reshape(2 * variance < before, (axes, len(s))).squeeze()
+    values, stds = np.reshape([value, std], (2, axes, len(s))).squeeze()
+    return RestCurvatureEstimate(s, values, stds, determined)

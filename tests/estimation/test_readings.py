@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import ConfigError, MeasurementError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.estimation.variances import reading_noise_of
+from dlo_casadi.estimation.variances import first_reading_noise, reading_noise_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Tangents
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.clips import HeldClip
@@ -226,7 +226,7 @@ def test_noise_and_bias_of_readings_are_estimated():
     # A first guess counts as one component, what the unknowns explain as none.
     kinds = np.concatenate([item.kinds for item in measured])
     raw, taken = np.concatenate(fit.linearization.raw), np.concatenate(fit.leverages)
-    guess, own = 0.01 * fit.model.force_scale, kinds == "force"
+    guess, own = first_reading_noise(fit.model, stiffness=fit.p[0]).force, kinds == "force"
     assert taken[own].sum() > 1
     known = (np.sum(raw[own] ** 2) + guess**2) / (np.sum(1 - taken[own]) + 1)
     assert reading_noise_of(fit).force == pytest.approx(np.sqrt(known), rel=1e-9)

@@ -12,7 +12,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.session import plausibility
+from dlo_casadi.session import coarse_fit, plausibility
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.hypotheses import ReadSession, load_over_stiffness, shown_pull
 from dlo_casadi.session.measure import read_inputs
@@ -69,7 +69,7 @@ def test_a_curved_cable_between_ball_joints_is_no_mistake(curved, monkeypatch):
     load = load_over_stiffness([(item.points, item.s) for item in curved[1]])
     assert load[2] > 0.5 * np.linalg.norm(load), "upwards: rest curvature is taken for weight"
     assert shown_pull(ReadSession(*curved))[2] < 0
-    monkeypatch.setattr(plausibility, "fit_model", None)
+    monkeypatch.setattr(coarse_fit, "fit_model", None)
     assert plausibility.find_suspicions(*curved) == ()
 
 

@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import dlo_casadi as dlo
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
-from dlo_casadi.session.clamps import ComparedReading, misread
 from dlo_casadi.session.fitting import declared_model, straight
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
+from dlo_casadi.session.readings import ComparedReading, misread
 
 ROOT = Path(__file__).parents[2]
 CABLE = CableData(0.8, 0.2, 0.012, 0.04)
@@ -130,7 +131,7 @@ def test_a_moment_in_another_unit_where_shapes_leave_the_stiffness_open(read, sc
         ComparedReading("end_moment", 1e3 * scale * moment, moment, axes, force),
     ]
     (found,) = misread(readings, sized=False)
-    assert "1e+03 times what shapes and forces need: in N mm?" in found.message
+    assert "1e+03 times what shapes and end_force need: in N mm?" in found.message
 
 
 def test_moments_beside_forces_in_another_unit_are_no_mistake(read):
@@ -208,3 +209,61 @@ def test_a_session_whose_readings_have_the_other_sign():
     experiment = config.experiment.changed(poses=poses)
     said = find_suspicions(config.changed(experiment=experiment), inputs)
     assert any("end_force" in x.message and "other sign" in x.message for x in said), said
+
+
+def on_a_table(d: int, guess: float, read=lambda name, value: value):
+    """Four poses of a curved cable without weight, and its readings; first guess of EI off."""
+    rng, ends = np.random.default_rng(3), ("clamped", "clamped")
+    sizes = {"length": 0.6, "mass": 0.03, "diameter": 0.005}
+    true = dlo.known_cable(
+        dlo.Cable(**sizes, bending_stiffness=0.01, torsional_stiffness=0.007),
+        gravity=(0,) * d,
+        boundary=ends,
+        rest_curvature=rng.normal(0, 1.5, (2, 4) if d == 3 else 4),
+        model={"n": 20},
+    )
+    poses = []
+    for _ in range(4):
+        held = {"end": 0.6 * np.array([rng.uniform(0.4, 0.8), *rng.uniform(-0.2, 0.2, d - 1)])}
+        for side in ("start", "end"):
+            if d == 2:
+                held[f"{side}_heading"] = float(rng.normal(0, 0.5))
+            else:
+                turn = Rotation.from_rotvec(rng.normal(0, 0.3, 3))
+                held[f"{side}_orientation"] = turn.as_quat()
+        shape = true.solve(**held)
+        points = shape.points[2:-2] + rng.normal(0, 3e-4, shape.points[2:-2].shape)
+        felt = {name: read(name, getattr(shape, name)) for name in ("end_force", "end_moment")}
+        poses.append(dlo.Pose((0,) * d, points=points, **held, **felt))
+    cable = dlo.Cable(**sizes, bending_stiffness=0.01 * guess)
+    session = dlo.Session(cable, poses, gravity=(0,) * d, boundary=ends)
+    return find_suspicions(session, read_inputs(session))
+
+
+@pytest.mark.parametrize(("d", "guess"), [(2, 0.1), (2, 5.0), (2, 100.0), (3, 10.0)])
+def test_without_weight_the_first_guess_of_the_stiffness_sizes_no_reading(d, guess):
+    assert on_a_table(d, guess) == ()
+
+
+def test_without_weight_readings_are_judged_beside_each_other():
+    """A factor between forces and moments, which no stiffness explains; either may be wrong."""
+    (found,) = on_a_table(2, 5.0, lambda name, x: x * 0.10197 if name == "end_force" else x)
+    assert "times what shapes and end_force need: in kgf cm?" in found.message
+    assert "Or end_force in kilograms-force? Try: divide end_force by 0.10197." in found.message
+    assert found.certain
+    signs = on_a_table(2, 5.0, lambda _, x: -x)
+    assert ["with the other sign" in item.message for item in signs] == [True, True]
+
+
+def test_what_shapes_leave_uncertain_is_free():
+    """A constant rest curvature adds a constant to moments between clamps without weight."""
+    rng = np.random.default_rng(0)
+    model, constant = rng.normal(size=(6, 1)), np.ones((6, 1))
+    one = ComparedReading("end_moment", 3 * model + 2.0, model)
+    assert misread([one], sized=False)
+    assert misread([replace(one, uncertain=constant[..., None])], sized=False) == ()
+    turned = replace(one, measured=-one.measured, uncertain=constant[..., None])
+    assert "with the other sign" in misread([turned], sized=False)[0].message
+    # Nothing is judged of what the shapes leave open altogether.
+    every = rng.normal(size=(6, 1, 9))
+    assert misread([replace(one, uncertain=every)], sized=False) == ()
