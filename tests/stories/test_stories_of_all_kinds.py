@@ -1,6 +1,7 @@
 """Stories in space, and of photographs, recordings and many sessions."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -35,7 +36,8 @@ def test_two_grippers_in_space_with_markers_and_a_wrench_sensor(tmp_path):
 def test_a_recording_becomes_a_session_that_tells_the_truth(tmp_path):
     """Motion capture in millimetres, y up, whose grippers have a clock of their own."""
     story = Story(*files_of(DATA / "grippers"), tmp_path / "results")
-    take = rendered(DATA / "grippers" / "session.yaml", rate=25.0)
+    # More than half of the time in a pose: clocks that are not aligned lose poses.
+    take = replace(rendered(DATA / "grippers" / "session.yaml", rate=25.0), offset=0.88)
     files, options = write_motive(take, tmp_path)
     cable = ["--mass", 0.03, "--diameter", 0.004, "--bending-stiffness", 0.025]
     dlo("import", *files, "--output", tmp_path / "take", *options, *cable, "--quiet")
