@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
 
 from dlo_casadi.config import load_config
+from dlo_casadi.config.supports import Clip
 from dlo_casadi.effects import (
     CableData,
     ClipAngle,
@@ -564,6 +565,13 @@ def test_a_session_with_clips(tmp_path):
     assert [clip.name for clip in experiment.poses[0].held.clips] == ["first", "clip_2"]
 
 
+def test_a_clamped_clip_whose_roll_is_free_is_a_swivel():
+    held = {"at": 0.3, "place": (0.2, 0.1, 0.0), "orientation": (0.0, 0.0, 0.0, 1.0)}
+    swivel = Clip(kind="swivel", **held).held(1)
+    assert Clip(kind="clamped", roll="free", **held).held(1) == swivel
+    assert swivel.kind == "swivel"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -572,6 +580,7 @@ def test_a_session_with_clips(tmp_path):
         ("kind: eyelet", "kind: eyelet, at: 0.5", "clip_2: eyelet clips have no at"),
         ("kind: eyelet", "kind: pinned, at: 0.2", "at 0.2 m follows 0.3 m: clips stand in the"),
         ("kind: pinned", "kind: clamped", "first: a clamped clip needs its heading"),
+        ("kind: pinned", "kind: swivel, heading: 0.1", "first: swivel is of a cable in space"),
         ("place: [0.45, 0.0]", "place: [0.45, 0.0, 0]", r"clip_2: place: \[x, y\] belongs here"),
         ("kind: eyelet", "name: first, kind: eyelet", "two clips are called first"),
         ("place: [0.25, 0.05]", "place: [0.3, 0.2]", "first are 0.3606 m apart, with 0.3 m of"),

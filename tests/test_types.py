@@ -29,7 +29,7 @@ import dlo_casadi as dlo
 rope = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
 line = np.array([[0.0, 0.0], [0.1, -0.1], [0.3, -0.1]])
 level = Rotation.identity()
-saddle = dlo.Clip(kind="clamped", at=0.3, place=(0, 0.1, 0), orientation=level, roll="free")
+saddle = dlo.Clip(kind="swivel", at=0.3, place=(0, 0.1, 0), orientation=level)
 poses = [
     dlo.Pose((0, 0), [0.5, 0.1], points=line, role="held_out"),
     dlo.Pose(np.zeros(2), ca.DM([0.4, 0.0]), points=line.tolist(), at=[0.0, 0.1, 0.3]),

@@ -116,7 +116,7 @@ class FittedCable(EstimatedCable):
         DloError
             If the ends are not held as the cable's boundary requires, or are not finite numbers.
         """
-        asked = {"start": start, "end": end, "turns": turns, "branch": branch}
+        asked: dict[str, Any] = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         asked |= {"clips": clips, "over": over}

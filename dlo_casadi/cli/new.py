@@ -11,10 +11,10 @@ from pathlib import Path
 import dlo_casadi
 from dlo_casadi.cli.common import Page, command, one_of, option
 from dlo_casadi.config.load import IMAGE_ENDINGS
-from dlo_casadi.config.supports import KINDS
 from dlo_casadi.config.template import Kind, schema_text, template, to_fill_in
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
+from dlo_casadi.rod.supports import CLIPS
 
 
 @command(
@@ -28,7 +28,7 @@ from dlo_casadi.io.files import write_file
         "--clips",
         nargs="+",
         default=(),
-        choices=KINDS,
+        choices=CLIPS,
         help="what holds it between its ends, in the order along the cable",
     ),
     json="print what was written as JSON",

@@ -23,12 +23,10 @@ from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 from dlo_casadi.rod.supports import CLIPS, ENDS, STARTS, SupportKind
 
-# Kinds of clips that a configuration may declare.
-KINDS = tuple(kind for kind in CLIPS if kind.roll or not kind.direction)
 # What type checkers accept as the kind of a start, an end, a clip.
 _Start: TypeAlias = SupportKind | Literal["pinned", "clamped"]
 _End: TypeAlias = SupportKind | Literal["pinned", "clamped", "free"]
-_Clip: TypeAlias = SupportKind | Literal["pinned", "clamped", "eyelet"]
+_Clip: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "eyelet"]
 
 
 class Boundary(ConfigSection):
@@ -67,9 +65,10 @@ class Clip(ConfigSection):
 
     name: Name = ""
     """What to call the clip; clip_1, clip_2, ... when absent."""
-    kind: Given[Annotated[SupportKind, one_of(KINDS)], _Clip] = entry()
+    kind: Given[Annotated[SupportKind, one_of(CLIPS)], _Clip] = entry()
     """pinned (holds the cable at `at`, it may turn), clamped (a saddle: holds its direction and
-    roll, too) or eyelet (the cable slides through without friction)."""
+    roll, too), swivel (in space: a saddle in which the cable may roll about its axis) or eyelet
+    (the cable slides through without friction)."""
     at: NonNegative | None = None
     """Arc length from the start at which it holds the cable [m]; an eyelet has none."""
     place: Given[Place, Numbers] = entry()
@@ -80,7 +79,8 @@ class Clip(ConfigSection):
     """Frame of a clamped clip in space, a quaternion [qx, qy, qz, qw]; x forward along the
     cable."""
     roll: Literal["held", "free"] = "held"
-    """In space: whether a clamped clip holds the roll of the cable about its axis."""
+    """In space: whether a clamped clip holds the roll of the cable about its axis; with roll: free
+    it is a swivel."""
     clip_force: Given[Force | None, Numbers | None] = entry(default=None)
     """Force [N] that the cable exerts on the clip, where it was measured, as start_force."""
 
@@ -110,7 +110,7 @@ def clip_problems(clips: Sequence[Clip], length: float, axes: int) -> Iterator[t
         if len(clip.place) != axes:
             yield f"{called}: place: {own.place} belongs here", k
         if clamped and getattr(clip, own.direction) is None:
-            yield f"{called}: a clamped clip needs its {own.direction} {own.unit}", k
+            yield f"{called}: a {clip.kind} clip needs its {own.direction} {own.unit}", k
         if getattr(clip, other.direction) is not None:
             yield f"{called}: {other.direction} is of a cable in {other.where}", k
         if not clamped and getattr(clip, own.direction) is not None:
@@ -119,6 +119,9 @@ def clip_problems(clips: Sequence[Clip], length: float, axes: int) -> Iterator[t
             yield f"{called}: clip_force: {own.force} belongs here", k
         if clip.roll != "held" and not (clamped and own is AXES[3]):
             yield f"{called}: roll: free is of a clamped clip in space", k
+        elif clamped and not clip.kind.roll and own is not AXES[3]:
+            text = "is of a cable in space; in a plane nothing rolls. Try: kind: clamped"
+            yield f"{called}: {clip.kind} {text}", k
         if (clip.at is None) != clip.kind.slides:
             how = "no at: the cable slides through" if clip.at is not None else "at [m]"
             yield f"{called}: {clip.kind} clips have {how}", k

@@ -91,7 +91,7 @@ def clip_rows(clips: Sequence[HeldClip], loads: Sequence[ClipLoad]) -> list[dict
     return [
         {
             "name": clip.name,
-            "kind": str(SupportKind.CLAMPED if clip.kind.direction else clip.kind),
+            "kind": str(clip.kind),
             "at": load.at,
             "force": load.force.tolist(),
             "moment": load.moment.tolist(),

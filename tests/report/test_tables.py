@@ -27,6 +27,7 @@ from dlo_casadi.report.words import (
     reading_text,
     structure_lines,
 )
+from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.runtime.work import Part
 
 WEIGHT = 0.2 * 9.81  # N, of short_clean
@@ -125,8 +126,8 @@ def test_a_stage_that_lost_poses_is_a_warning(outcome):
 
 
 def test_nothing_lifts_a_free_tip(outcome):
-    boundary = outcome.config.experiment.boundary.changed(end="free")
-    free = outcome.config.changed(experiment={"boundary": {"end": "free"}})
+    boundary = outcome.config.experiment.boundary.changed(end=SupportKind.FREE)
+    free = outcome.config.changed(experiment={"boundary": {"end": SupportKind.FREE}})
     assert free.experiment.boundary == boundary
     for force, config, told in (
         ((0.0, 1.0), free, True),
