@@ -5,19 +5,21 @@
     python scripts/check_matrix.py --only space-markers --keep FOLDER
 
 Start {pinned, clamped} x end {pinned, clamped, free} x {plane, space} x {lines, markers,
-photographs, rendered} x rest {straight, curved} x {unread, read: with readings of force and moment}
-x {one, two, nine} poses x {once, again: one pose taken again}, all that a configuration admits.
-FILTER is levels joined by dashes: `space-nine` is every kind with both; --pairwise takes few kinds
-in which every two levels meet.
+photographs, rendered} x rest {straight, bowed: hardly curved, curved} x {unread, read: with
+readings of force and moment} x {one, two, nine} poses x {once, again: one pose taken again}, all
+that a configuration admits. FILTER is levels joined by dashes: `space-nine` is every kind with
+both; --pairwise takes few kinds in which every two levels meet, and every way to hold a cable each
+rest.
 
 Each session is drawn from this toolkit's own model with nothing hidden: a fine mesh, noise,
 fixtures and sensors off by draws from their tolerances. It goes through `dlo check`, a fit with
 diagnosis, all files of results, terminal and notebook, `dlo predict` from the written results, and
 the generated C, compiled, which must give Python's prediction to 1e-6 of the length. One line for
 each: verdict, whether the 95 and the 99 % interval hold the true EI, seconds, what went wrong; at
-the end tracebacks, half-written files, clean sessions that were refused or accused, EI outside of
-its 99 % interval, and runs of more than three times the median time of their kind. A session
-depends on the seed and its kind alone. The exit status is 1 if anything but time is listed.
+the end tracebacks, half-written files, clean sessions that were refused or accused, fits with an
+unstable pose, EI outside of its 99 % interval, and runs of more than three times the median
+time of their kind. A session depends on the seed and its kind alone. The exit status is 1 if
+anything but time is listed.
 
 A session takes some ten seconds, with photographs of nine poses a minute.
 """
@@ -86,6 +88,7 @@ class Row:
     traceback: str = ""
     halves: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
+    unstable: list[str] = field(default_factory=list)
 
     @property
     def accused(self) -> bool:
@@ -100,6 +103,7 @@ class Row:
         line = f"{self.name}: {self.verdict} {found}".rstrip()
         more = [f"refused: {self.refused}"] * bool(self.refused) + self.halves
         more += [self.traceback] * bool(self.traceback)
+        more += [f"not stable: {', '.join(self.unstable)}"] * bool(self.unstable)
         if self.verdict == "unexplained":
             more += self.doubts
         return "\n    ".join([f"{line} | {intervals} | {self.seconds:.1f} s", *more])
@@ -147,6 +151,8 @@ def take_through(session: Session, results: Path, row: Row) -> None:
     row.verdict = str(result.verdict)
     row.added = [effect.name for effect in result.effects]
     row.doubts = list(result.doubts)
+    fitted = zip(result.fit.problem.measured, result.fit.stable, strict=True)
+    row.unstable = [item.pose.name for item, stable in fitted if not stable]
     judge_stiffness(result, session.stiffness, row)
     result.write(results)
     row.halves = list(missing_files(results, session, result))
@@ -278,6 +284,7 @@ def summary(rows: Sequence[Row]) -> list[str]:
         "left half of the results": [row.name for row in rows if row.halves],
         "clean and refused": [row.name for row in rows if row.refused],
         "clean and accused": [f"{row.name} ({row.verdict})" for row in rows if row.accused],
+        "with a pose whose equilibrium is not stable": [r.name for r in rows if r.unstable],
         "with EI outside of its 99 % interval": [r.name for r in rows if r.inside_99 is False],
         f"slower than {SLOW:g} times the median of their kind": slow,
     }
@@ -308,7 +315,7 @@ def main() -> int:
     work = partial(run_cell, size=FULL, seed=args.seed, keep=args.keep)
     found = run(work, cells, args, lambda cell, row, seconds: row.text())
     print(*summary(found), sep="\n")
-    bad = any(r.traceback or r.halves or r.refused or r.accused for r in found)
+    bad = any(r.traceback or r.halves or r.refused or r.accused or r.unstable for r in found)
     return int(bad or any(row.inside_99 is False for row in found))
 
 

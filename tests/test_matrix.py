@@ -15,8 +15,16 @@ def pairs(cells):
 
 def test_few_cells_hold_all_pairs_that_a_configuration_admits():
     assert pairs(pairwise()) == pairs(CELLS)
-    assert len(pairwise()) < 20
+    assert len(pairwise()) < 40
     assert all(admitted(cell) for cell in CELLS)
+
+
+def test_few_cells_hold_every_way_to_hold_a_cable_with_every_rest():
+    def supports(cells):
+        return {(cell.start, cell.end, cell.frame, cell.rest) for cell in cells}
+
+    assert supports(pairwise()) == supports(CELLS)
+    assert ("pinned", "pinned", "space", "bowed") in supports(pairwise())
 
 
 def cells():
@@ -37,6 +45,7 @@ def test_a_clean_session_goes_all_the_way(cell, tmp_path):
     assert not row.halves
     assert not row.refused
     assert not row.accused, row.text()
+    assert not row.unstable
     assert row.inside_99
 
 
@@ -48,11 +57,13 @@ def test_what_is_wrong_is_told(monkeypatch, tmp_path):
         Row("pinned-free-plane-lines-straight-read-one-once", "unexplained", seconds=4.0),
         Row("pinned-free-plane-lines-straight-read-one-again", refused="no", seconds=1.0),
         Row("clamped-free-plane-lines-curved-read-one-once", "complete", inside_99=False),
+        Row("pinned-pinned-space-lines-bowed-read-one-once", "complete", unstable=["pose_01"]),
     ]
     told = "\n".join(summary(rows))
     assert "1 clean and refused\n  pinned-free-plane-lines-straight-read-one-again" in told
     assert "1 clean and accused\n  pinned-free-plane-lines-straight-read-one-once" in told
     assert "1 with EI outside of its 99 % interval\n  clamped-free" in told
+    assert "1 with a pose whose equilibrium is not stable\n  pinned-pinned-space" in told
     assert "1 slower than 3 times the median of their kind\n  pinned-free" in told
 
     monkeypatch.setattr("check_matrix.dlo.fit", lambda path: 1 / 0)

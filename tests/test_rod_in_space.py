@@ -436,6 +436,65 @@ def test_a_cable_bent_against_its_rest_shape_is_no_minimum():
 
 
 @pytest.mark.parametrize("effects", [(), (EFFECTS["rest_curvature_drift"](),)])
+def test_no_pose_of_a_fit_stays_at_a_saddle(effects):
+    """Rolled against its rest shape it turns about itself; a state carries that to later poses."""
+    cable = CableData(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
+    hung = CableModel(cable, 12, gravity=DOWN, effects=effects)
+    poses = [HeldPose((0.0, 0.0, 0.0), end) for end in ((0.56, 0.0, 0.0), (0.5, 0.2, 0.1))]
+    rest = np.zeros(hung.chain.n_rests)
+    rest[hung.chain.n_cells : 2 * hung.chain.n_cells] = 0.5
+    lower = [solve_equilibrium(hung, hung.nominal, rest, pose) for pose in poses]
+    x, lam = (np.array([getattr(eq, key) for eq in lower]) for key in ("x", "multipliers"))
+    rolled = (Rotation.from_quat(x[0]) * Rotation.from_rotvec([np.pi, 0.0, 0.0])).as_quat()
+    x[0] = same_sign(rolled)
+    batch = BatchEquilibrium(hung, poses)
+    start = Shapes.declared(x, lam), hung.nominal, rest
+    saddles, converged = batch.solve(*start)
+    assert converged.all()
+    assert list(batch.stable(saddles, hung.nominal, rest)) == [False, True]
+    found, converged = batch.solve_or_descend(*start)
+    assert converged.all()
+    assert batch.stable(found, hung.nominal, rest).all()
+    there = batch.at(found, hung.nominal, rest).energy()
+    np.testing.assert_allclose(there, [eq.energy for eq in lower], rtol=1e-9)
+
+
+def test_a_swing_that_costs_nothing_is_no_saddle():
+    """Without weight nothing holds the swing about the chord: the shape is kept, to the digit."""
+    cable = CableData(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
+    floating = CableModel(cable, 12, gravity=(0.0, 0.0, 0.0))
+    held, rest = HeldPose((0.0, 0.0, 0.0), (0.5, 0.0, 0.1)), np.zeros(floating.chain.n_rests)
+    rest[floating.chain.n_cells : 2 * floating.chain.n_cells] = 1.0
+    found = solve_equilibrium(floating, floating.nominal, rest, held)
+    batch = BatchEquilibrium(floating, [held])
+    start = Shapes.declared(found.x[None], found.multipliers[None]), floating.nominal, rest
+    assert not batch.stable(*start).any()  # neutral
+    kept, converged = batch.solve_or_descend(*start)
+    assert converged.all()
+    np.testing.assert_allclose(kept.x, start[0].x, atol=1e-7)
+
+
+def test_a_planar_cable_leaves_the_second_mode_of_buckling():
+    """Between two pins a straight weightless rod is at a saddle as an S, at a minimum as a C."""
+    rod = CableModel(CableData(LENGTH, 0.06, 0.008, EI), 24, gravity=(0.0, 0.0))
+    held, rest = HeldPose((0.0, 0.0), (0.7, 0.0)), np.zeros(rod.chain.n_rests)
+    headings = 0.75 * np.cos(4 * np.pi * rod.chain.places / LENGTH / 2)
+    found = solve_equilibrium(rod, rod.nominal, rest, held)
+    batch = BatchEquilibrium(rod, [held])
+    for side in (1, -1):
+        start = batch.start_shapes(side * headings[None, :, None])
+        force = -EI * (2 * np.pi / LENGTH) ** 2  # Euler's load of the second mode
+        start = replace(start, lam=np.array([[force, 0.0]])), rod.nominal, rest
+        saddle, converged = batch.solve(*start)
+        assert converged.all()
+        assert not batch.stable(saddle, rod.nominal, rest).any()
+        lower, converged = batch.solve_or_descend(*start)
+        assert converged.all()
+        energy = batch.at(lower, rod.nominal, rest).energy()
+        assert energy == pytest.approx([found.energy], rel=1e-6)
+
+
+@pytest.mark.parametrize("effects", [(), (EFFECTS["rest_curvature_drift"](),)])
 def test_a_lost_pose_is_minimised_also_if_the_cable_takes_a_set(effects):
     """With the rest curvature before each pose given, poses do not depend on each other."""
     flat = replace(model(10), n_rest=0, effects=effects)

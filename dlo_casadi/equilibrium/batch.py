@@ -17,8 +17,10 @@ from dlo_casadi.equilibrium.equilibrium import END_TOLERANCE, JOINT_BOUND
 from dlo_casadi.equilibrium.minima import (
     KEEPING_SIDE,
     TOLERANCE,
+    at_saddles,
     damped,
     descend_to_contact,
+    leave_saddles,
     size_of,
     stepped,
     violation,
@@ -43,6 +45,8 @@ NEAR = 0.1
 SOFT_DEPTH = 1e-4
 # Maximum number of iterations of a descent to a minimum: poses of a session in space took 7 to 23.
 DOWNHILL = 40
+# Maximum number of times that saddles are left: once, unless a state couples the poses.
+SADDLES = 3
 
 
 class BatchEquilibrium:
@@ -216,21 +220,32 @@ class BatchEquilibrium:
     def solve_or_descend(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any
     ) -> tuple[Shapes, BoolArray]:
-        """As `solve`, but for lost poses the energy is minimised from their start.
+        """As `solve`, but lost poses descend from their start, and no pose stays at a saddle.
 
-        Newton's method alone loses one pose in ten when frames have far to rotate. If a state
-        couples the poses, a lost one stays lost.
+        Newton's method alone loses one pose in ten when frames have far to rotate, and ends at
+        saddles: a cable between ball joints, rolled about its own axis against its rest curvature.
+        No cable stays there. If a state couples the poses, a lost one stays lost.
         """
         now, converged = self.solve(shapes, p, rest, **options)
-        lost = np.flatnonzero(~converged)
-        if not len(lost) or self._coupled(rest):
-            return now, converged
-        start = self.at(shapes, p, rest).subset(lost)
-        found = descend_to_contact(start, KEEPING_SIDE, DOWNHILL)
-        kept = lost[found.converged]
-        now.x[kept] = found.shapes.x[found.converged]
-        now.lam[kept] = found.shapes.lam[found.converged]
-        converged[kept] = True
+        coupled, lost = self._coupled(rest), np.flatnonzero(~converged)
+        if len(lost) and not coupled:
+            start = self.at(shapes, p, rest).subset(lost)
+            found = descend_to_contact(start, KEEPING_SIDE, DOWNHILL)
+            _take(now, lost[found.converged], found.shapes.subset(found.converged))
+            converged[lost] = found.converged
+        for _ in range(SADDLES if converged.any() else 0):
+            balanced = np.flatnonzero(converged)
+            here = self.at(now, p, rest).subset(balanced)
+            falling = at_saddles(here)
+            if not falling.any():
+                break
+            found = leave_saddles(here.subset(falling), DOWNHILL)
+            _take(now, balanced[falling], found.shapes)
+            converged[balanced[falling]] = found.converged
+            if coupled:  # other shapes leave another rest curvature to later poses
+                now, converged = self.solve(now, p, rest, **options)
+        else:
+            converged[:] = False
         return now, converged
 
     @staticmethod
@@ -418,6 +433,11 @@ class BatchEquilibrium:
             return np.asarray(minimum)
         bends = np.abs(np.diff(shapes.x[..., 0], axis=1))
         return np.asarray(minimum & (bends.max(axis=1) < JOINT_BOUND))
+
+
+def _take(shapes: Shapes, index: IntArray, found: Shapes) -> None:
+    """Write nodes and multipliers found for some poses."""
+    shapes.x[index], shapes.lam[index] = found.x, found.lam
 
 
 def _settled(size: FloatArray, last: FloatArray, tolerance: float, fresh: BoolArray) -> BoolArray:

@@ -24,7 +24,7 @@ from dlo_casadi.equilibrium.equilibrium import END_TOLERANCE
 from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import DEPTH, gap_per_force
-from dlo_casadi.rod.band import BandFactor, BandMatrix, Vector
+from dlo_casadi.rod.band import NEUTRAL, BandFactor, BandMatrix, Vector
 from dlo_casadi.rod.obstacles import bars_of
 
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
@@ -56,6 +56,9 @@ SHORTER, SAME_SIZE = 0.5, 0.75
 SHORTENED = 6
 # Depth [lengths] of a node in hard obstacles above which there is no room for the cable.
 NO_ROOM = 1e-6
+# Number of inverse iterations for the direction in which the energy falls: stiff ones vanish in the
+# first, and of the others any mixture in which the energy falls will do.
+MIXED = 8
 
 
 class Minima(NamedTuple):
@@ -171,6 +174,33 @@ def descend_to_contact(
             softer = descend(soft, STEPS_WHILE_SOFT).shapes
             shapes.x[rows], shapes.lam[rows] = softer.x, softer.lam
     return _hardened(replace(start, shapes=shapes), depths[-1], max_iterations, HALVINGS)
+
+
+def at_saddles(here: Assembly) -> BoolArray:
+    """Whether the energy falls in some direction from each of m balanced shapes."""
+    wanted = here.model.n_multipliers
+    return np.asarray(here.balance()[2].negative(below=-NEUTRAL) > wanted)
+
+
+def leave_saddles(start: Assembly, max_iterations: int = 80) -> Minima:
+    """Minima below saddles: of both sides of the direction in which the energy falls, the lower.
+
+    `start`: balanced shapes of which each is a saddle.
+    """
+    model, (_, force, matrix) = start.model, start.balance()
+    m, still = len(start.shapes.x), Vector(0 * force.x, 0 * force.y)
+    factor, _ = _convex(matrix, model.n_multipliers, np.zeros(m), turn_per_slip(model))
+    step = replace(still, x=still.x + np.random.default_rng(0).standard_normal(still.x.shape[1:]))
+    for _ in range(MIXED):
+        way = factor.solve(replace(still, x=step.x)).x
+        step = replace(still, x=way / np.abs(way).max(axis=(1, 2, 3), keepdims=True))
+    size = np.full(2 * m, 1 / LONGEST_STEP)
+    both = Vector(*(np.concatenate([part, -part]) for part in (step.x, step.y)))
+    sides = stepped(start.subset(np.tile(np.arange(m), 2)), both, size)
+    found = descend_to_contact(sides, KEEPING_SIDE, max_iterations)
+    energy = np.where(found.converged, found.energy, np.inf).reshape(2, m)
+    lower = np.arange(m) + m * (energy[1] < energy[0])
+    return Minima(found.shapes.subset(lower), *(part[lower] for part in found[1:]))
 
 
 def _hardened(start: Assembly, softer: float, max_iterations: int, halvings: int) -> Minima:

@@ -218,13 +218,14 @@ class BandMatrix:
         """Eliminate the nodes."""
         return BandFactor(self)
 
-    def negative(self) -> IntArray:
+    def negative(self, below: float = NEUTRAL) -> IntArray:
         """Number of negative eigenvalues of each matrix (m,), border included.
 
-        Eigenvalues of A below NEUTRAL count as negative, so that a neutral shape does not count as
-        stable. The result is -1 if conditions in the border depend on each other.
+        Eigenvalues of A up to `below` times its scale count as negative: by default neutral ones,
+        so that a neutral shape does not count as stable. The result is -1 if conditions in the
+        border depend on each other.
         """
-        least = NEUTRAL * self.scale[:, None, None, None] * np.eye(self.diagonal.shape[2])
+        least = below * self.scale[:, None, None, None] * np.eye(self.diagonal.shape[2])
         return replace(self, diagonal=self.diagonal - least).factor().negative
 
 

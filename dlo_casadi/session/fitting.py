@@ -211,8 +211,8 @@ def carried_coefficients(model: CableModel, measured: Sequence[MeasuredPose]) ->
 class Minimum(NamedTuple):
     """Minimum of the batch NLP found by IPOPT, and its time [s].
 
-    None where IPOPT fails. In space it is not `searched` for: third derivatives of all elements
-    would take IPOPT minutes per run.
+    None where IPOPT fails, or ends where a pose has no stable equilibrium. In space it is not
+    `searched` for: third derivatives of all elements would take IPOPT minutes per run.
     """
 
     point: Point | None = None
@@ -226,7 +226,9 @@ def minimum_by_ipopt(fit: Fit) -> Minimum:
         return Minimum(searched=False)
     began = time.perf_counter()
     try:
-        point = solve_batch(fit.problem, fit.point)[0]
+        found = solve_batch(fit.problem, fit.point)[0]
+        stable = replace(fit, point=found).stable.all()  # IPOPT does not ask for it
+        point = found if stable else fit.problem.balanced(found)
     except EstimationError:
         point = None
     return Minimum(point, time.perf_counter() - began)

@@ -31,7 +31,7 @@ LEVELS = (
     ("pinned", "clamped", "free"),
     ("plane", "space"),
     ("lines", "markers", "photographs"),
-    ("straight", "curved"),
+    ("straight", "bowed", "curved"),
     ("unread", "read"),
     ("one", "two", "nine"),
     ("once", "again"),
@@ -59,13 +59,21 @@ def cost(cell: Cell) -> float:
     return POSES[cell.poses] * pictures * (_SPACE if cell.frame == "space" else 1)
 
 
-def covering(cells: Sequence[Cell], levels: int) -> tuple[Cell, ...]:
+def covering(
+    cells: Sequence[Cell], levels: int, together: Sequence[Sequence[str]] = ()
+) -> tuple[Cell, ...]:
     """Few of the cells in which every so many levels of different factors that meet in any meet.
 
-    Greedily: each next one has the most that are new, less what its time counts for.
+    Greedily: each next one has the most that are new, less what its time counts for. `together`:
+    names of factors of which all combinations are to occur, too.
     """
-    sets = {cell: frozenset(combinations(enumerate(cell), levels)) for cell in cells}
-    missing = frozenset().union(*sets.values())
+
+    def parts(cell: Cell) -> set[tuple[tuple[str, str], ...]]:
+        own = {tuple((name, getattr(cell, name)) for name in names) for names in together}
+        return own | set(combinations(zip(cell._fields, cell, strict=True), levels))
+
+    sets = {cell: parts(cell) for cell in cells}
+    missing = set().union(*sets.values())
     chosen: list[Cell] = []
     while missing:
         new = {cell: len(own & missing) for cell, own in sets.items() if own & missing}
@@ -76,5 +84,9 @@ def covering(cells: Sequence[Cell], levels: int) -> tuple[Cell, ...]:
 
 
 def pairwise() -> tuple[Cell, ...]:
-    """Few cells in which every two levels of different factors meet."""
-    return covering(CELLS, 2)
+    """Few cells in which every two levels of different factors meet, and every support each rest.
+
+    What holds a cable and its rest shape decide together which equilibria are stable: start, end
+    and frame count as one factor there.
+    """
+    return covering(CELLS, 2, [("start", "end", "frame", "rest")])
