@@ -165,13 +165,25 @@ class Comparison(NamedTuple):
         """Whether no missing effect could be meant instead.
 
         The hypothesis is clearly better and explains shapes that are farther off than effects
-        leave them; or only it shows a weight, and nothing but noise is left.
+        leave them; or it is the opposite gravity, only it shows a weight, and noise alone is left.
         """
         own, other = self.own.rms / self.length, self.other.rms / self.length
         if other >= UNEXPLAINED:
             return False
+        if self.better and own > BEYOND_EFFECTS:
+            return True
         noise_alone = self.other.correlation < NEIGHBOURS_ALIKE
-        return (self.better and own > BEYOND_EFFECTS) or (self.shows_weight and noise_alone)
+        return self.upside_down and self.shows_weight and noise_alone
+
+    @property
+    def upside_down(self) -> bool:
+        """Whether the hypothesis is the opposite gravity.
+
+        Gravity across the declared one may be that of a cable that is curved at rest.
+        """
+        if self.own.fit is None or self.other.fit is None:
+            return False
+        return np.allclose(self.own.fit.model.gravity, -np.array(self.other.fit.model.gravity))
 
     @property
     def shows_weight(self) -> bool:

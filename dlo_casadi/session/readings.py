@@ -265,10 +265,15 @@ class ComparedReading:
 
     @property
     def judgeable(self) -> bool:
-        """Whether anything is left to judge: three numbers, and more of the model than doubts."""
-        known = float(np.linalg.norm(self.judged(self.model)))
+        """Whether anything is left to judge: three numbers, more of model and readings than doubts.
+
+        Readings that lie where the shapes hardly determine them fit with a scale of zero.
+        """
         enough = self.model.size - self._free.shape[1] >= 3
-        return enough and known > MISREAD * float(np.linalg.norm(self.model))
+        return enough and all(
+            np.linalg.norm(self.judged(x)) > MISREAD * np.linalg.norm(x)
+            for x in (self.model, self.measured)
+        )
 
     def misfit(self, measured: FloatArray) -> float:
         """Distance from the nearest multiple of the model, relative to the size of the readings."""

@@ -13,7 +13,7 @@ from dlo_casadi.report import figures
 from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.scene import Plane, Room, next_marks, pull_marks, upright
-from dlo_casadi.report.terminal import _newtons
+from dlo_casadi.report.tables import newtons
 from dlo_casadi.session.outcome import ReadingErrors
 from dlo_casadi.session.pose_shape import BranchShape
 
@@ -105,7 +105,7 @@ def test_sizes_of_forces_stand_below_a_room(in_room):
 
 
 def test_forces_come_before_moments():
-    assert _newtons(ReadingErrors(force=0.5, moment=0.02)) == "0.5 N, 0.02 N m"
+    assert newtons(ReadingErrors(force=0.5, moment=0.02)) == "0.5 N, 0.02 N m"
 
 
 def test_findings_of_a_diagnosis_are_in_the_report(outcome):

@@ -7,6 +7,7 @@ from dlo_casadi.config import dump_yaml, load_config
 from dlo_casadi.equilibrium.measured_line import line_nodes
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import write_points
+from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.session.clamps import wrong_directions
 from dlo_casadi.session.ends import single_poses
 from dlo_casadi.session.fitting import declared_model
@@ -88,7 +89,7 @@ def test_the_heading_of_a_pinned_side_is_not_used(tmp_path):
 
     config, inputs = session(tmp_path, change)
     assert wrong_directions(ReadSession(config, inputs))
-    boundary = config.experiment.boundary.changed(start="pinned")
+    boundary = config.experiment.boundary.changed(start=SupportKind.PINNED)
     experiment = config.experiment.changed(boundary=boundary)
     assert wrong_directions(ReadSession(config.changed(experiment=experiment), inputs)) == ()
 
@@ -101,7 +102,7 @@ def test_behind_a_pinned_start_full_turns_mean_nothing(turns, tmp_path):
         pose["end_heading"] += 2 * np.pi * turns * (k > 0)
 
     config, inputs = session(tmp_path, change)
-    boundary = config.experiment.boundary.changed(start="pinned")
+    boundary = config.experiment.boundary.changed(start=SupportKind.PINNED)
     experiment = config.experiment.changed(boundary=boundary)
     bare = config.changed(experiment=experiment)
     assert wrong_directions(ReadSession(bare, inputs)) == ()
