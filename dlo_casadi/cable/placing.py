@@ -112,7 +112,7 @@ def placed(
     within: ArrayLike,
     limits: Asked,
     aim: Aim,
-    progress: Progress | None,
+    progress: Progress | None = None,
 ) -> Placing:
     """See `FittedCable.place`."""
     if aim not in get_args(Aim):

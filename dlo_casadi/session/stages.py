@@ -397,7 +397,10 @@ def _at_bound(fit: Fit, name: str) -> bool:
 
 
 def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
-    """Rest curvature along the cable with its standard deviation."""
+    """Rest curvature along the cable with its standard deviation.
+
+    Without any points, which places the readings determine.
+    """
     model, unknowns = fit.model, fit.problem.unknowns
     s = np.linspace(0.0, model.cable.length, _REST_POINTS)
     if unknowns.n_rest == 0:
@@ -409,8 +412,10 @@ def rest_curvature_of(fit: Fit) -> RestCurvatureEstimate:
     variance = np.einsum("ik,kl,il->i", scaled, fit.marginal_covariance[tail, tail], scaled)
     std = np.sqrt(np.maximum(variance, 0))
     value = basis @ fit.coefficients
+    values, stds = np.reshape([value, std], (2, axes, len(s))).squeeze()
+    if any(item.has_points for item in fit.problem.fit_poses):
+        return RestCurvatureEstimate(s, values, stds)
     own = np.linalg.pinv(fit.problem.precision[tail, tail], hermitian=True)
     before = np.einsum("ik,kl,il->i", scaled, own, scaled) * fit.inflation**2
     determined = np.reshape(2 * variance < before, (axes, len(s))).squeeze()
-    values, stds = np.reshape([value, std], (2, axes, len(s))).squeeze()
     return RestCurvatureEstimate(s, values, stds, determined)

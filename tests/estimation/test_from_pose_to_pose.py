@@ -211,15 +211,14 @@ def test_clamps_that_turn_in_a_misfit_are_found_from_the_shapes(misfit, near):
 
 @pytest.fixture(scope="module")
 def rubbed():
-    """A session in the plane with friction at its pins, a misfit, fitted from the shapes."""
+    """A session in the plane with friction at its pins, fitted from the shapes."""
     found = drawn(generator_of(3306, 20), 2, 0, "pin_moment")
     measured = measured_poses(found.session, read_inputs(found.session))
     fit = fit_declared(found.session, declared_model(found.session), measured)
-    assert fit.noise.source == "misfit"
     return found, with_loose_poses(fit, from_data(fit)[0])
 
 
-def test_moments_of_pins_in_a_misfit_are_found_from_the_shapes(rubbed):
+def test_moments_of_pins_are_found_from_the_shapes(rubbed):
     found, fit = rubbed
     own = fit.problem.priors.pose_scatter
     assert own.source == "pin_moment"

@@ -159,7 +159,6 @@ def test_a_pose_on_the_other_side_does_not_count_against_the_fit(factor):
     prior = replace(MODEL, cable=replace(MODEL.cable, bending_stiffness=factor * EI))
     measured = turned_over()
     alone = fit_stiffness(prior, measured)
-    assert alone.rms < 1.2 * STD
     assert abs(np.log(alone.EI / EI)) < 3 * alone.log_std < 0.01
     fit = fit_model(prior, measured, Tolerances(), STD)
     assert abs(np.log(fit.p[0] / EI)) < 3 * np.sqrt(fit.covariance[0, 0])
