@@ -75,7 +75,7 @@ def test_the_std_of_the_stiffness_alone_is_that_of_every_coordinate_of_a_marker(
 def test_the_interval_of_the_stiffness_alone_spans_a_factor_of_ten_at_most(session, log_std, known):
     """exp(2 x 1.96 x 0.5874) is ten."""
     _, model, measured = session
-    found = StiffnessFit(0.02, log_std, 1e-3)
+    found = StiffnessFit(0.02, log_std)
     stage = stiffness_stage(straight(model).with_mesh(10), measured[:1], found)
     estimate = stage.parameters["bending_stiffness"]
     assert (estimate.value, estimate.std) == (0.02, pytest.approx(0.02 * log_std))
