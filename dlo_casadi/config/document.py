@@ -11,7 +11,7 @@ from typing import Any, Self
 import yaml
 
 from dlo_casadi.config.problems import Place, Source, did_you_mean, show
-from dlo_casadi.errors import ConfigError
+from dlo_casadi.errors import ConfigError, counted
 
 # Largest file [bytes]: PyYAML reads it in five seconds. A session of a thousand poses has 80,000.
 _LARGEST = 500_000
@@ -256,7 +256,7 @@ def _split_list(items: Sequence[yaml.Node]) -> Iterator[str]:
     for item, joined in zip(items[1:], tight, strict=True):
         found += f"{',' if joined else ', '}{item.value}"
         meant += f"{'.' if joined else ', '}{item.value}"
-    yield f"[{found}] means [{meant}], or {len(items)} numbers with a blank behind each comma"
+    yield f"[{found}] means [{meant}], or {counted(len(items), 'number')} with a blank behind each comma"
 
 
 def _too_deep() -> str:
