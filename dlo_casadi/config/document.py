@@ -256,7 +256,8 @@ def _split_list(items: Sequence[yaml.Node]) -> Iterator[str]:
     for item, joined in zip(items[1:], tight, strict=True):
         found += f"{',' if joined else ', '}{item.value}"
         meant += f"{'.' if joined else ', '}{item.value}"
-    yield f"[{found}] means [{meant}], or {counted(len(items), 'number')} with a blank behind each comma"
+    several = counted(len(items), "number")
+    yield f"[{found}] means [{meant}], or {several} with a blank behind each comma"
 
 
 def _too_deep() -> str:
