@@ -231,7 +231,7 @@ class BatchEquilibrium:
         if len(lost) and not coupled:
             start = self.at(shapes, p, rest).subset(lost)
             found = descend_to_contact(start, KEEPING_SIDE, DOWNHILL)
-            _take(now, lost[found.converged], found.shapes.subset(found.converged))
+            now = now.replaced(lost[found.converged], found.shapes.subset(found.converged))
             converged[lost] = found.converged
         for _ in range(SADDLES if converged.any() else 0):
             balanced = np.flatnonzero(converged)
@@ -240,7 +240,7 @@ class BatchEquilibrium:
             if not falling.any():
                 break
             found = leave_saddles(here.subset(falling), DOWNHILL)
-            _take(now, balanced[falling], found.shapes)
+            now = now.replaced(balanced[falling], found.shapes)
             converged[balanced[falling]] = found.converged
             if coupled:  # other shapes leave another rest curvature to later poses
                 now, converged = self.solve(now, p, rest, **options)
@@ -433,11 +433,6 @@ class BatchEquilibrium:
             return np.asarray(minimum)
         bends = np.abs(np.diff(shapes.x[..., 0], axis=1))
         return np.asarray(minimum & (bends.max(axis=1) < JOINT_BOUND))
-
-
-def _take(shapes: Shapes, index: IntArray, found: Shapes) -> None:
-    """Write nodes and multipliers found for some poses."""
-    shapes.x[index], shapes.lam[index] = found.x, found.lam
 
 
 def _settled(size: FloatArray, last: FloatArray, tolerance: float, fresh: BoolArray) -> BoolArray:
