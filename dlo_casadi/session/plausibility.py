@@ -173,7 +173,7 @@ class Comparison(NamedTuple):
         if self.better and own > BEYOND_EFFECTS:
             return True
         noise_alone = self.other.correlation < NEIGHBOURS_ALIKE
-        return self.upside_down and self.shows_weight and noise_alone
+        return self.shows_weight and self.upside_down and noise_alone
 
     @property
     def upside_down(self) -> bool:
