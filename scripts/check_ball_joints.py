@@ -1,7 +1,7 @@
 """Clean sessions of cables in space whose rest shape and twist are hard to tell, from another rod.
 
     python scripts/check_ball_joints.py [--count 40] [--first 0] [--seed 0] [--jobs N]
-        [--wires] [--keep FOLDER]
+        [--wires] [--keep FOLDER] [--output FILE]
 
 Each session is a cable between two ball joints, curved at rest about both axes by 0.2 to 1.5 over
 its length: seven fitted poses and two held out, markers and lines in turn, 0.3 mm of white noise,
@@ -19,7 +19,6 @@ is not complete or has an unstable pose; of a wire, if a pose is unstable.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -32,6 +31,7 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from harness import options, run
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from straight_segments import Ends, SegmentRod
@@ -39,7 +39,7 @@ from straight_segments import Ends, SegmentRod
 import dlo_casadi as dlo
 from dlo_casadi.config import dump_yaml
 from dlo_casadi.io.points import write_points
-from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.runtime.parallel import generator_of
 
 FloatArray = NDArray[np.floating]
 
@@ -183,7 +183,7 @@ def write(
     (folder / "session.yaml").write_text(dump_yaml(document), encoding="utf-8")
 
 
-def run(index: int, seed: int, wires: bool, keep: Path) -> Row:
+def fitted(index: int, seed: int, wires: bool, keep: Path) -> Row:
     """Simulate and fit one session."""
     folder = keep / f"{'wire' if wires else 'balls'}_{index:02d}"
     folder.mkdir(parents=True, exist_ok=True)
@@ -209,22 +209,18 @@ def run(index: int, seed: int, wires: bool, keep: Path) -> Row:
 
 def main() -> int:
     """Print the table and its counts."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=40)
-    parser.add_argument("--first", type=int, default=0, help="number of the first session")
-    parser.add_argument("--seed", type=int, default=0)
+    count = 40, "number of sessions"
+    parser = options(__doc__, count=count, first=True, seed=0, jobs=True, output=True)
     parser.add_argument("--wires", action="store_true", help="twisted wires between two clamps")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="sessions stay there")
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
-    args = parser.parse_args()
-    rows: list[Row] = []
+    chosen = parser.parse_args()
     print(TITLE, flush=True)
-    with tempfile.TemporaryDirectory() as folder, open_executor(args.jobs) as executor:
-        keep = args.keep or Path(folder)
-        work = partial(run, seed=args.seed, wires=args.wires, keep=keep)
-        for done in map_as_completed(executor, work, range(args.first, args.first + args.count)):
-            rows.append(done.value)
-            print(done.value.text, flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        work = partial(
+            fitted, seed=chosen.seed, wires=chosen.wires, keep=chosen.keep or Path(folder)
+        )
+        cases = range(chosen.first, chosen.first + chosen.count)
+        rows = run(work, cases, chosen, lambda case, row, seconds: row.text)
     complete = sum(row.verdict == "complete" for row in rows)
     stable = sum(not row.unstable for row in rows)
     over = [row.held_out / row.noise for row in rows if row.held_out is not None]
@@ -233,7 +229,7 @@ def main() -> int:
         f"in {sum(row.inside for row in rows)}"
         + (f", held out {np.median(over):.2f} x noise, at most {max(over):.2f}" if over else "")
     )
-    return int(stable < len(rows) or (not args.wires and complete < len(rows)))
+    return int(stable < len(rows) or (not chosen.wires and complete < len(rows)))
 
 
 if __name__ == "__main__":
