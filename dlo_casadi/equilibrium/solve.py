@@ -141,6 +141,26 @@ def solve_equilibria(
     return [error or found[j] for j, error in enumerate(errors)]
 
 
+def all_equilibria(
+    model: CableModel, p: FloatArray, rest: FloatArray, poses: Sequence[HeldPose]
+) -> list[list[Equilibrium]]:
+    """All stable equilibria of each pose that its first guesses lead to.
+
+    If a pose names its branch, turns or sides, or has no stable equilibrium, the one that
+    `solve_equilibrium` returns; none where that is an error.
+    """
+    found: list[list[Equilibrium]] = [[] for _ in poses]
+    asked = [j for j, pose in enumerate(poses) if not out_of_reach(model, p, pose)]
+    reached = _PoseSearch(model, p, rest).reached([poses[j] for j in asked], [None] * len(asked))
+    for j, minima in zip(asked, reached, strict=True):
+        chosen = _chosen(model, poses[j], None, minima)
+        if isinstance(chosen, Equilibrium):
+            named = poses[j].branch or poses[j].turns or named_sides(model, poses[j])
+            stable = [eq for eq in minima if eq.stable and not named]
+            found[j] = [stable[k] for k in _distinct(model, [eq.x for eq in stable])] or [chosen]
+    return found
+
+
 def ways_of(model: CableModel, pose: HeldPose) -> list[HeldPose]:
     """Copies of a pose, one for each branch or direction of twist it may name; ccw first."""
     named = [replace(pose, branch=name) for name in SIGNS if name in pose.node.branches]
@@ -178,10 +198,8 @@ def _chosen(
     if start is None and found and (asked := named_sides(model, pose)):
         passing = on_named_sides(model, pose, np.array([eq.points for eq in found]))
         if not passing.any():
-            said = " and ".join(
-                f"{'over' if over else 'under'} {bar.name}" for bar, _, over in asked
-            )
-            what = f"no equilibrium found in which the cable passes {said}, {where}"
+            said = [f"{'over' if over else 'under'} {bar.name}" for bar, _, over in asked]
+            what = f"no equilibrium found in which the cable passes {' and '.join(said)}, {where}"
             hint = "the other side (over), a longer cable, or a finer mesh (model.n)."
             return no_equilibrium(pose, what, hint)
         found = [eq for eq, kept in zip(found, passing, strict=True) if kept]

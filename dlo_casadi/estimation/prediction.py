@@ -14,6 +14,7 @@ from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
 from dlo_casadi.equilibrium.measured_line import line_nodes
 from dlo_casadi.equilibrium.pose import HeldPose, PoseBranch
 from dlo_casadi.equilibrium.solve import (
+    all_equilibria,
     continued,
     solve_after,
     solve_equilibria,
@@ -88,6 +89,22 @@ def predict_each(
     found = [eq for eq in solved if isinstance(eq, Equilibrium)]
     seen = dict(zip(kept, _seen(model, p, rest, [poses[j] for j in kept], found), strict=True))
     return [seen.get(j) for j in range(len(poses))]
+
+
+def predict_every(
+    model: CableModel, p: FloatArray, rest: FloatArray, poses: Sequence[HeldPose]
+) -> list[list[Prediction]]:
+    """All stable equilibria of each pose, see `all_equilibria`.
+
+    If a pose leaves its mark on the next one, or continues the one before, only that which
+    `predict_poses` returns.
+    """
+    if model.has_state or any(pose.branch == "previous" for pose in poses):
+        return [[one] if one else [] for one in predict_poses(model, p, rest, poses)]
+    found = all_equilibria(model, p, rest, poses)
+    of = [j for j, equilibria in enumerate(found) for _ in equilibria]
+    seen = _seen(model, p, rest, [poses[j] for j in of], [eq for each in found for eq in each])
+    return [[one for k, one in zip(of, seen, strict=True) if k == j] for j in range(len(poses))]
 
 
 def predict_poses(

@@ -1,10 +1,12 @@
 """The start of a fit to poses with readings of forces and moments alone, which show no shape.
 
-Such a pose begins at the equilibrium that is predicted from its ends. The unknowns begin at the
-minimum of the poses that have points; without any, at the stiffness with which a cable that is
-straight at rest explains the readings best, and at several rolls of its end. A pose may be
-predicted in another equilibrium than it was measured in as long as the unknowns are far off: poses
-whose readings stand out are predicted again by the fit of the others.
+Such a pose has several equilibria, and only its readings tell in which of them it was measured.
+Shapes and unknowns are found in turn: each pose takes that of all its equilibria which is nearest
+to its readings, then the unknowns move to their minimum, until no pose takes another one. At first
+readings count as noisy as the cable's forces are large, so that a pose in a wrong equilibrium
+hardly pulls the unknowns. They begin at the minimum of the poses that have points; without any, at
+the stiffness with which a cable that is straight at rest explains the readings best, and at several
+rolls of its end.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,24 +14,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.curve import Observed
+from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.measured_shapes import measured_shapes
-from dlo_casadi.estimation.prediction import predict_each, predict_poses
+from dlo_casadi.estimation.prediction import predict_every
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.start import APART, FOLLOWED, ROLLS, SearchSettings
+from dlo_casadi.estimation.start import FOLLOWED, ROLLS, SearchSettings
 from dlo_casadi.estimation.stiffness import fit_stiffness
-from dlo_casadi.estimation.unknowns import Point, Unknowns, Values
+from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.estimation.variances import first_reading_noise
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import END_ROLL
 
-# Rounds in which outlying poses are predicted again.
-ROUNDS = 3
-# Share of the poses that may stand out; if more do, nothing leads back to them.
-FEW = 0.5
+# Noise of the readings in the first search, relative to the forces in the cable.
+LOOSE = 1.0
+# Maximum number of times that poses take another equilibrium, at each noise.
+ROUNDS = 8
 
 
 def minimum_of_readings(
@@ -58,15 +62,15 @@ def minimum_of_readings(
     else:
         problem, theta = _by_stiffness(problem, theta)
         starts = [*_rolled(unknowns, theta)]
-    begun: list[Point] = []
-    unseen = np.array([not item.has_points for item in problem.measured])
+    begun: list[Fit] = []
+    loose = _loosened(problem, starts[0])
     for start in starts:
-        values = _predicted(problem, Values(start, *measured_shapes(problem)), unseen)
+        values = Values(start, *measured_shapes(problem))
         if near is not None:
             values = _with_shapes_of(near, problem, values)
-        problem = problem if problem.weights else problem.weighed(values)
-        point = problem.balanced(values)
-        begun += [] if point is None else [point]
+        loose = loose if loose.weights else loose.weighed(values)
+        fit = _alternated(loose, values, known=False)
+        begun += [] if fit is None else [fit]
     if not begun:
         names = [item.pose.name for item in problem.fit_poses if not item.has_points]
         raise EstimationError(
@@ -74,15 +78,11 @@ def minimum_of_readings(
             f"stiffness of {unknowns.p(starts[0])[0]:.3g} N m^2: {', '.join(names)}.\n"
             "  Try: check the units of mass, length and readings, and the ends of these poses."
         )
-    likely = sorted(begun, key=lambda point: point.objective)[:FOLLOWED]
-    found = [descend(Fit(problem, point), tolerance=NEARLY) for point in likely]
-    best = min(found, key=lambda fit: fit.point.objective)
-    for _ in range(ROUNDS):
-        other = _predicted_again(best)
-        if other is None or other.point.objective > best.point.objective - NEARLY:
-            break
-        best = other
-    return best
+    likely = sorted(begun, key=lambda fit: fit.point.objective)[:FOLLOWED]
+    problem = problem.weighed(likely[0].point)
+    found = [_alternated(problem, fit.point, known=True) for fit in likely]
+    best = min((fit for fit in found if fit), key=lambda fit: fit.point.objective, default=None)
+    return best or likely[0].reweighed(problem.noise)
 
 
 def _by_stiffness(problem: Problem, theta: FloatArray) -> tuple[Problem, FloatArray]:
@@ -109,24 +109,61 @@ def _rolled(unknowns: Unknowns, theta: FloatArray) -> Iterator[FloatArray]:
         yield rolled
 
 
-def _predicted(problem: Problem, values: Values, among: BoolArray) -> Values:
-    """Values with the poses `among` (m,) as predicted from their ends; those without stay."""
+def _loosened(problem: Problem, theta: FloatArray) -> Problem:
+    """The problem with a noise of its readings that is as large as the cable's forces."""
+    unknowns, own = problem.unknowns, problem.noise.readings
+    size = first_reading_noise(unknowns.model, stiffness=unknowns.p(theta)[0], share=LOOSE)
+    force, moment = max(own.force, size.force), max(own.moment, size.moment)
+    noise = replace(problem.noise, readings=replace(own, force=force, moment=moment))
+    return replace(problem, noise=noise, weights=None)
+
+
+def _alternated(problem: Problem, values: Values, known: bool) -> Fit | None:
+    """Minimum after poses and unknowns have moved in turn; None without equilibria to begin at.
+
+    `known`: whether the poses are in equilibria at these values.
+    """
+    best = None
+    for _ in range(ROUNDS):
+        values, moved = _nearest(problem, values, known or best is not None)
+        if best and not moved:
+            break
+        point = problem.balanced(values)
+        fit = None if point is None else descend(Fit(problem, point), tolerance=NEARLY)
+        if fit is None or (best and fit.point.objective > best.point.objective - NEARLY):
+            break
+        best, values = fit, fit.point
+    return best
+
+
+def _nearest(problem: Problem, values: Values, known: bool) -> tuple[Values, bool]:
+    """Values with poses of readings alone in the equilibria nearest to them; whether any moved.
+
+    `known`: whether they are in equilibria now, which they leave only for nearer others.
+    """
     model, (shapes, p, rest) = problem.unknowns.model, problem.state(values)
-    poses = [item.pose for item in problem.history]
-    wanted = [k for k, taken in zip(problem.indices, among, strict=True) if taken]
-    if model.has_state or any(pose.branch == "previous" for pose in poses):
-        found = predict_poses(model, p, rest, poses)
-        predictions = {k: found[k] for k in wanted}
-    else:
-        predictions = dict(
-            zip(wanted, predict_each(model, p, rest, [poses[k] for k in wanted]), strict=True)
-        )
+    if model.has_state and known:
+        return values, False
     x, lam, deviation = shapes.x.copy(), shapes.lam.copy(), shapes.deviation.copy()
-    for j, k in enumerate(problem.indices):
-        one = predictions.get(k)
-        if one is not None:
-            x[j], lam[j], deviation[j] = one.equilibrium.x, one.equilibrium.multipliers, 0.0
-    return replace(values, shapes=Shapes(x, lam, deviation))
+    every = predict_every(model, p, rest, [item.pose for item in problem.history])
+    own = ((problem.own_deviations(values) / problem.deviation_std) ** 2).sum(axis=1)
+    seen, moved = problem.observed(values), False
+    for k, (j, item) in enumerate(zip(problem.used, problem.fit_poses, strict=True)):
+        if item.has_points:
+            continue
+        least = _misread(problem, k, seen[j]) + float(own[k]) if known else np.inf
+        for other in every[problem.fitted[k]]:
+            left, eq = _misread(problem, k, other.seen), other.equilibrium
+            if left < least and not (known and model.node.same(eq.x, x[j], NEARBY)):
+                least, moved = left, True
+                x[j], lam[j], deviation[j] = eq.x, eq.multipliers, 0.0
+    return replace(values, shapes=Shapes(x, lam, deviation)), moved
+
+
+def _misread(problem: Problem, k: int, seen: Observed) -> float:
+    """Sum of squares that the readings of fitted pose k leave beside those predicted."""
+    residual = problem.fit_poses[k].residual(seen, np.zeros(0))
+    return float(((problem.whitening[k] @ residual) ** 2).sum())
 
 
 def _with_shapes_of(near: Fit, problem: Problem, values: Values) -> Values:
@@ -138,44 +175,3 @@ def _with_shapes_of(near: Fit, problem: Problem, values: Values) -> Values:
     for k, place in zip(near.problem.fitted, near.point.projections, strict=True):
         places[problem.fitted.index(k)] = place
     return replace(values, shapes=shapes, projections=places)
-
-
-def _outlying(fit: Fit) -> BoolArray:
-    """Which fitted poses (used,) with readings alone leave far more than most poses do."""
-    left = np.array([residual @ residual / len(residual) for residual in fit.point.residuals])
-    unseen = np.array([not item.has_points for item in fit.problem.fit_poses])
-    usual = float(np.quantile(left, 1 - FEW, method="lower"))
-    return np.asarray(unseen & (left > APART * max(1.0, usual)))
-
-
-def _predicted_again(fit: Fit) -> Fit | None:
-    """The minimum after outlying poses are predicted by a fit of the others; None without any.
-
-    Not where a pose leaves its mark on the next one.
-    """
-    problem, apart = fit.problem, _outlying(fit)
-    if problem.unknowns.model.has_state or not apart.any() or apart.all():
-        return None
-    index = np.array(problem.used)
-    led = _fitted_to(fit, np.flatnonzero(~apart))
-    values = replace(fit.point, theta=led.point.theta)
-    again = _predicted(problem, values, np.isin(np.arange(problem.equilibria.m), index[apart]))
-    shapes = again.shapes.replaced(index[~apart], led.point.shapes)
-    point = problem.balanced(replace(again, shapes=shapes))
-    return None if point is None else descend(Fit(problem, point), tolerance=NEARLY)
-
-
-def _fitted_to(fit: Fit, chosen: IntArray) -> Fit:
-    """The minimum of some of the fitted poses, from a fit of all."""
-    problem, point = fit.problem, fit.point
-    few = replace(
-        problem,
-        history=tuple(problem.fit_poses[k] for k in chosen),
-        weights=tuple(problem.whitening[k] for k in chosen),
-    )
-    values = Values(
-        point.theta,
-        point.shapes.subset(np.array([problem.used[k] for k in chosen])),
-        [point.projections[k] for k in chosen],
-    )
-    return descend(Fit(few, few.evaluate(values)), tolerance=NEARLY)

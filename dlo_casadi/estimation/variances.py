@@ -161,15 +161,16 @@ def first_reading_noise(
     force: float | None = None,
     moment: float | None = None,
     stiffness: float | None = None,
+    share: float = FIRST_FORCE,
 ) -> ReadingNoise:
     """Noise of forces [N] and moments [N m]: as declared, else a first guess.
 
-    FIRST_FORCE times the forces of such a cable as it hangs and bends; lever arm: length / 10.
+    `share` times the forces of such a cable as it hangs and bends; lever arm: length / 10.
     `stiffness` [N m^2]: bending stiffness; the first guess by default.
     """
     if stiffness is not None:
         model = replace(model, cable=replace(model.cable, bending_stiffness=stiffness))
-    guess = FIRST_FORCE * model.force_scale
+    guess = share * model.force_scale
     return ReadingNoise(
         guess if force is None else force,
         guess * model.cable.length / 10 if moment is None else moment,
