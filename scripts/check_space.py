@@ -10,7 +10,8 @@ anything is not as it should be.
 In space truth.yaml has `torsional_stiffness` [N m^2], too. Where there is a truth_shapes.npz of
 points along the true cables: how far the predicted shapes, fit and held out, are off them, and how
 far they would be with the true parameters and `rest` shape: that much is due to the places in which
-the ends are declared, which no fit can mend.
+the ends are declared, which no fit can mend. `rest`: `s` from 0 to the end, in metres or as a share
+of the length; `k_y`, `k_z` and, unless it is zero, `twist` [1/m].
 
 Rough sessions are those of cables in a plane that do not repeat. Their truth.yaml has
 `marker_noise` [m] of a coordinate, and `repeat_rms_all_m`, how far two repeats of a pose differ at
@@ -87,10 +88,15 @@ def effects(outcome: Outcome, truth: dict[str, Any]) -> tuple[str, bool]:
 
 
 def stiffness_cell(outcome: Outcome, name: str, exact: float) -> tuple[str, bool]:
-    """A stiffness with its interval, and whether the truth lies inside."""
-    found = outcome.stages[-1].parameters[name]
+    """A stiffness with its interval, and whether the truth lies inside.
+
+    The interval needs both ends, except that of GJ where an end of the cable may roll.
+    """
+    found, model = outcome.stages[-1].parameters[name], outcome.fit.model
     low, high = found.interval_95 or (None, None)
-    inside = low is not None and high is not None and low <= exact <= high
+    needed = name == "bending_stiffness" or (model.start.roll and model.end.roll)
+    bounded = low is not None and high is not None
+    inside = (bounded or not needed) and (low or 0.0) <= exact <= (high or np.inf)
     told = "unbounded" if low is None or high is None else f"{low:.4g} to {high:.4g}"
     return f"{found.value:.4g} ({told}; {exact:g})", inside
 
@@ -114,9 +120,11 @@ def off_truth(outcome: Outcome, truth: dict[str, Any], folder: Path) -> str:
     if "rest" not in truth or needed - set(values):
         return text
     p = np.array([values.get(name, x) for name, x in zip(model.names, model.nominal, strict=True)])
+    known = np.array(truth["rest"]["s"])
+    places = model.chain.cells.mean(axis=1) * known[-1] / model.cable.length
     rest = np.concatenate(
         [
-            CubicSpline(truth["rest"]["s"], truth["rest"][name])(model.chain.cells.mean(axis=1))
+            CubicSpline(known, truth["rest"].get(name, 0 * known))(places)
             for name in ("twist", "k_y", "k_z")
         ]
     )
