@@ -32,8 +32,8 @@ from dlo_casadi.report.words import all_warnings
 from dlo_casadi.runtime.executors import software
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.fitting import Declared
-from dlo_casadi.session.hypotheses import Suspicion
 from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage
+from dlo_casadi.session.questions import Suspicion
 
 # Fields in report.json for a parameter of an added effect.
 _OF_EFFECT = ("value", "std", "unit")

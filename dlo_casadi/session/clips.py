@@ -13,8 +13,9 @@ from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.config import Pose
 from dlo_casadi.model.clips import HeldClip, tangents
 from dlo_casadi.rod.node import Node
-from dlo_casadi.session.hypotheses import ReadSession, Suspicion
 from dlo_casadi.session.outcome import PoseInput
+from dlo_casadi.session.questions import Suspicion
+from dlo_casadi.session.read_session import ReadSession
 from dlo_casadi.thresholds import CONTRADICTS, FITS, HEADING_OFF, NEARLY_ALL
 
 

@@ -11,7 +11,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.hypotheses import ReadSession, spread
+from dlo_casadi.session.read_session import ReadSession, spread
 from dlo_casadi.thresholds import CONTRADICTS, UNEXPLAINED
 
 # Per comparison: poses; elements of the mesh, points of a line, rest curvature coefficients.

@@ -4,29 +4,24 @@ A wrong unit is a factor of a thousand in the lengths; with a mirrored axis the 
 they are mirrored back; with files in the wrong order the ends fit another pose.
 """
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
-from itertools import product
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.errors import counted
-from dlo_casadi.session.hypotheses import (
-    NEAR_AXES,
-    Hypothesis,
-    Lines,
-    ReadSession,
-    Suspicion,
-    T,
-    exchanges,
-    likeliest,
-    listed,
-    named,
-    overall,
+from dlo_casadi.session.axes import listed
+from dlo_casadi.session.lines import SEVERAL, Lines
+from dlo_casadi.session.mistakes import (
+    COUNTED,
+    FITTED_FRAMES,
+    FRAMES,
+    UNITS_OF_ENDS,
+    UNITS_OF_LENGTHS,
 )
+from dlo_casadi.session.questions import Alternatives, Suspicion
+from dlo_casadi.session.read_session import ReadSession
 from dlo_casadi.thresholds import (
     CONTRADICTS,
     FITS,
@@ -39,179 +34,58 @@ from dlo_casadi.thresholds import (
     TOO_LONG,
 )
 
-UNITS = {"millimetres": 1.0e-3, "centimetres": 1.0e-2, "inches": 0.0254}
-# Iterations of fitting a frame and then choosing which end of each line is the start.
-_FITS_OF_FRAME = 4
+# ---- units and frames ---------------------------------------------------------------------------
+
+
+def _far_from_one(ratio: FloatArray) -> float:
+    """Share of ratios that differ from one, up to a quarter."""
+    return float(1.0 - ((ratio > 1 / NEAR_UNIT) & (ratio < NEAR_UNIT)).mean())
+
+
+def _off_spans(lines: Lines) -> float:
+    declared, measured = lines.spans
+    return _far_from_one(declared / np.maximum(measured, 1e-12))
+
+
+def _off_fixtures(lines: Lines) -> float:
+    return lines.overall
+
+
+_FEW_OFF = 1 - NEARLY_ALL + 1e-9
+_LENGTHS = Alternatives(
+    UNITS_OF_LENGTHS, lambda lines: _far_from_one(lines.lengths / lines.length), enough=_FEW_OFF
+)
+_SPANS = Alternatives(UNITS_OF_ENDS, _off_spans, enough=_FEW_OFF)
+_COUNTED = Alternatives(COUNTED, _off_fixtures, FITS, FITS, MUCH_BETTER)
+_FRAMES = Alternatives(FRAMES, _off_fixtures, CONTRADICTS, FITS, MUCH_BETTER)
+_FITTED = Alternatives(FITTED_FRAMES, _off_fixtures, FITS, FITS, MUCH_BETTER, near=1.0)
 
 
 def wrong_units(session: ReadSession) -> tuple[Suspicion, ...]:
     """Lengths, or distances of the ends, that are off by the factor of a unit."""
-    lines, meant = session.lines, []
-    ratio, typical = lines.lengths / lines.length, float(np.median(lines.lengths))
-    for unit, size in UNITS.items():
-        points = (
-            f"the measured lines are {typical:.4g} m long (median), the cable {lines.length:.4g} "
-            f"m: the points look like {unit}. Try: write them in metres, as the header x_m,y_m "
-            "says."
-        )
-        length = (
-            f"the measured lines are {typical:.4g} m long (median), cable.length is "
-            f"{lines.length:.4g} m: it looks like {unit}. Try: cable.length: "
-            f"{lines.length * size:.6g}, and all lengths in metres."
-        )
-        meant += [Hypothesis(points, ratio * size), Hypothesis(length, ratio / size)]
-    declared, measured = (
-        np.linalg.norm(np.diff(ends, axis=1)[:, 0], axis=1)
-        for ends in (lines.declared, lines.measured)
-    )
-    apart = np.isfinite(declared) & (np.maximum(declared, measured) > CONTRADICTS * lines.length)
+    lines = session.lines
+    declared, measured = lines.spans
+    far = np.maximum(declared, measured) > CONTRADICTS * lines.length
+    apart = np.isfinite(declared) & far
     whole = np.mean(lines.gaps.max(axis=1) < FITS * lines.length) >= NEARLY_ALL
-    if apart.sum() > 1 and whole:
-        spans = declared[apart] / np.maximum(measured[apart], 1e-12)
-        for (unit, size), sign in product(UNITS.items(), (-1, 1)):
-            wrong = "start and end of all poses" if sign > 0 else "points and cable.length"
-            ends = (
-                f"the ends of the lines are {np.median(measured[apart]):.4g} m apart (median), "
-                f"start and end of their poses {np.median(declared[apart]):.4g} m: the factor of "
-                f"{unit}. Try: {wrong} in metres."
-            )
-            meant.append(Hypothesis(ends, spans * size**sign))
-
-    def far_from_one(ratio: FloatArray) -> float:
-        """Share of ratios that differ from one, up to a quarter."""
-        return float(1.0 - ((ratio > 1 / NEAR_UNIT) & (ratio < NEAR_UNIT)).mean())
-
-    found = likeliest(meant, far_from_one, 1 - NEARLY_ALL + 1e-9)
-    return () if found is None else (Suspicion(found[0].said, True),)
+    ends = [lines.of(apart)] * bool(apart.sum() > 1 and whole)
+    return _LENGTHS.suspicions([lines]) or _SPANS.suspicions(ends)
 
 
 def counted_from_the_end(session: ReadSession) -> tuple[Suspicion, ...]:
     """Markers that fit their fixtures if they are counted from the other end."""
-    lines = session.lines
-    if not lines.known.any():
-        return ()
-    turned = replace(lines, measured=lines.measured[:, ::-1], gaps=lines.gaps[:, ::-1])
-    said = (
-        "the markers are {own:.3g} m RMS from the declared start and end, but {left:.3g} m once "
-        "they are counted from the other end. Try: s_m from the start; or are start and end of "
-        "the poses exchanged?"
-    )
-
-    def misfit(one: Lines) -> float:
-        return overall(one.misfit(one.measured, one.declared)[one.known])
-
-    return _by_ends(lines, misfit(lines), [Hypothesis(said, turned)], misfit)
-
-
-def _by_ends(
-    lines: Lines,
-    own: float,
-    hypotheses: Iterable[Hypothesis[T]],
-    misfit: Callable[[T], float],
-    near: float = np.inf,
-    certain: bool = True,
-) -> tuple[Suspicion, ...]:
-    """Explanation of ends that are `own` cable lengths away from their fixtures."""
-    if own < FITS:
-        return ()
-    found = likeliest(hypotheses, misfit, min(FITS, MUCH_BETTER * own), near)
-    if found is None:
-        return ()
-    said = found[0].said.format(own=own * lines.length, left=found[1] * lines.length)
-    return (Suspicion(said, certain),)
+    known = session.lines.known
+    return _COUNTED.suspicions([session.lines.of(known)] * bool(known.any()))
 
 
 def wrong_frame(session: ReadSession) -> tuple[Suspicion, ...]:
     """Ends that fit all fixtures once all points are moved, rotated or mirrored together."""
     lines = session.lines
-    own = lines.overall(lines.measured)
-    several = len(lines.names) > 2  # with fewer lines some rotation and origin always fit
-    if own > CONTRADICTS and (
-        found := _by_ends(lines, own, _exchanged_axes(lines, several), lines.overall)
-    ):
-        return found
-    if not (several and np.all(np.isfinite(lines.declared))):
-        return ()
-    fitted = (_fitted(lines, axes) for axes in exchanges(lines.declared.shape[2]))
-    return _by_ends(lines, own, fitted, lines.overall, near=1.0, certain=own > CONTRADICTS)
+    fitted = [lines] * bool(len(lines.names) >= SEVERAL and np.all(np.isfinite(lines.declared)))
+    return _FRAMES.suspicions([lines]) or _FITTED.suspicions(fitted)
 
 
-def _exchanged_axes(lines: Lines, several: bool) -> Iterator[Hypothesis[FloatArray]]:
-    """Ends of the points from another origin, with other axes, and with both."""
-    shift = _shift(lines, lines.measured)
-    yield Hypothesis(
-        f"all lines lie ({listed(shift, '.4g')}) m away from their start and end. Try: measure "
-        "fixtures and lines from the same origin; subtract this from the points, or add it to "
-        "start and end.",
-        lines.measured - shift,
-    )
-    for moved, axes in product((False, True)[: 1 + several], exchanges(len(shift))[1:]):
-        turned, what = lines.measured @ axes.T, named(axes)
-        if moved:
-            shift = _shift(lines, turned)
-            turned, what = turned - shift, f"{what} and moved by ({listed(-shift, '.4g')}) m"
-        yield _in_frame(what, turned)
-
-
-def _in_frame(what: str, measured: FloatArray) -> Hypothesis[FloatArray]:
-    said = (
-        "the lines do not end at start and end of their poses ({own:.3g} m RMS), but do "
-        f"({{left:.3g}} m) with {what}. Try: points, start, end, orientations and gravity in one "
-        "frame, right-handed, in a plane x to the right and y up; in pictures rows count "
-        "downwards; a camera's points by its calibration."
-    )
-    return Hypothesis(said, measured)
-
-
-def _shift(lines: Lines, measured: FloatArray) -> FloatArray:
-    """Best translation (d,) [m], taken at the middle of both ends.
-
-    With a free end it is taken at the start, assumed to be the line's first point.
-    """
-    away = measured.mean(axis=1) - lines.declared.mean(axis=1)
-    away = np.where(np.isfinite(away), away, (measured - lines.declared)[:, 0])
-    return np.asarray(np.median(away, axis=0))
-
-
-def _fitted(lines: Lines, turn: FloatArray) -> Hypothesis[FloatArray]:
-    """Ends in the frame that fits best, from a first rotation (d, d).
-
-    Declared = rotation measured + translation, by least squares (Kabsch 1976). Its handedness is
-    that of the first rotation; the middle of both ends does not depend on the line's order.
-    """
-    d, hand = len(turn), np.sign(np.linalg.det(turn))
-    shift = np.median(lines.declared.mean(axis=1) - lines.measured.mean(axis=1) @ turn.T, axis=0)
-    for _ in range(_FITS_OF_FRAME):
-        moved = lines.measured @ turn.T + shift
-        given, other = (
-            np.linalg.norm(ends - lines.declared, axis=(1, 2)) for ends in (moved, moved[:, ::-1])
-        )
-        swapped = ~lines.known & (other < given)
-        source = np.where(swapped[:, None, None], lines.measured[:, ::-1], lines.measured)
-        source, goal = source.reshape(-1, d), lines.declared.reshape(-1, d)
-        centres = source.mean(axis=0), goal.mean(axis=0)
-        u, _, v = np.linalg.svd((goal - centres[1]).T @ (source - centres[0]))
-        turn = u @ np.diag([*np.ones(d - 1), hand * np.sign(np.linalg.det(u @ v))]) @ v
-        shift = centres[1] - turn @ centres[0]
-    return _in_frame(_described(turn, shift), lines.measured @ turn.T + shift)
-
-
-def _described(turn: FloatArray, shift: FloatArray) -> str:
-    """Describe a frame: by its exchanged axes, or by how far it is rotated and moved."""
-    d, moved = len(turn), f"moved by ({listed(shift, '.3g')}) m"
-    near = min(exchanges(d), key=lambda axes: float(np.linalg.norm(turn - axes)))
-    if np.linalg.norm(turn - near) < NEAR_AXES and not np.allclose(near, np.eye(d)):
-        return f"{named(near)} and {moved}"
-    hand = np.sign(np.linalg.det(turn))
-    # A mirrored axis is mirrored before the rotation: y in a plane, all axes in space.
-    mirror, whole = np.array([hand**d, hand, hand][:d]), np.eye(3)
-    whole[:d, :d] = turn * mirror
-    vector = Rotation.from_matrix(whole).as_rotvec()
-    angle = float(np.linalg.norm(vector))
-    return (
-        f"the points {'mirrored, ' if hand < 0 else ''}turned by {np.degrees(angle):.3g} degrees "
-        f"about ({listed(vector / max(angle, 1e-12), '.2g')}) and {moved}"
-    )
+# ---- order --------------------------------------------------------------------------------------
 
 
 def out_of_step(session: ReadSession) -> tuple[Suspicion, ...]:

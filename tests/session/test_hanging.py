@@ -12,10 +12,11 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.io.points import write_points
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.session import coarse_fit, plausibility
+from dlo_casadi.session import coarse_fit, compared_shapes, plausibility
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.hypotheses import ReadSession, load_over_stiffness, shown_pull
 from dlo_casadi.session.measure import read_inputs
+from dlo_casadi.session.pull import load_over_stiffness, shown_pull
+from dlo_casadi.session.read_session import ReadSession
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 LENGTH, STIFFNESS, NOISE = 0.8, 0.02, 3e-4  # m, N m^2, m
@@ -97,7 +98,7 @@ def test_lines_that_hang_although_gravity_is_zero():
 
 def test_what_is_seen_at_a_glance_refuses_nothing_that_a_fit_explains(curved, monkeypatch):
     """Were the pull that lines show upwards, the fit under the declared gravity would tell."""
-    monkeypatch.setattr(plausibility, "shown_pull", lambda _: np.array([0, 0, 1.0]))
+    monkeypatch.setattr(compared_shapes, "shown_pull", lambda _: np.array([0, 0, 1.0]))
     assert plausibility.find_suspicions(*curved) == ()
 
 
@@ -106,10 +107,10 @@ def test_a_strap_or_a_stiff_cable_is_doubted_but_not_refused():
 
     def left(rms):
         """A fit that leaves so much [m], or none, which counts as 50 mm of a metre."""
-        return plausibility.Coarse(rms, rms or 0.05, False)
+        return compared_shapes.Coarse(rms, rms or 0.05, False)
 
     def comparison(what, own, other):
-        return plausibility.Comparison(what, left(own), left(other), 1.0)
+        return compared_shapes.Comparison(what, left(own), left(other), 1.0)
 
     found = [
         comparison("", *both)

@@ -11,9 +11,9 @@ from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.session.clamps import wrong_directions
 from dlo_casadi.session.ends import single_poses
 from dlo_casadi.session.fitting import declared_model
-from dlo_casadi.session.hypotheses import ReadSession
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import without_implausible
+from dlo_casadi.session.read_session import ReadSession
 
 LENGTH = 0.8  # m
 BEGINS = (-1.1, -0.6, 0.2)  # rad, where the arcs begin

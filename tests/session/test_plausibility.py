@@ -9,6 +9,7 @@ import pytest
 
 import dlo_casadi as dlo
 from dlo_casadi.config import load_config
+from dlo_casadi.session.axes import exchanges, named
 from dlo_casadi.session.ends import (
     out_of_step,
     repeated,
@@ -17,9 +18,10 @@ from dlo_casadi.session.ends import (
     wrong_frame,
     wrong_units,
 )
-from dlo_casadi.session.hypotheses import Lines, ReadSession, exchanges, named
+from dlo_casadi.session.lines import Lines
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import QUESTIONS, find_suspicions
+from dlo_casadi.session.read_session import ReadSession
 
 ROOT = Path(__file__).parents[2]
 SESSIONS = [*ROOT.glob("tests/data/bench/*/session.yaml"), *ROOT.glob("configs/*.yaml")]

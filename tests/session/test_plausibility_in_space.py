@@ -9,9 +9,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.config import load_config
-from dlo_casadi.session.hypotheses import load_over_stiffness
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
+from dlo_casadi.session.pull import load_over_stiffness
 
 ROOT = Path(__file__).parents[2]
 TIP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # z up -> y up

@@ -14,10 +14,11 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.session.compared_readings import ComparedReading
 from dlo_casadi.session.fitting import declared_model, straight
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import find_suspicions
-from dlo_casadi.session.readings import ComparedReading, misread
+from dlo_casadi.session.readings import misread
 
 ROOT = Path(__file__).parents[2]
 CABLE = CableData(0.8, 0.2, 0.012, 0.04)

@@ -8,9 +8,9 @@ import numpy as np
 import dlo_casadi as dlo
 from dlo_casadi.report.tables import outcome_text
 from dlo_casadi.session import plausibility
-from dlo_casadi.session.hypotheses import Suspicion
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.outcome import Stage
+from dlo_casadi.session.questions import Suspicion
 from dlo_casadi.session.remarks import far_off
 
 PINS = ("pinned", "pinned")
