@@ -312,8 +312,8 @@ class _PlaneCase(Case):
         model, chain, kernels = self.model, self.model.chain, self.meshes["kernel"]
         count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
         # Each first guess starts one free descent, and one guided by springs in 15 stages; a
-        # descent takes 100 steps, and 6 more off saddles; each may land on obstacles, in 100. The
-        # template checks the number. The lowest stretches between saddles are joined in 10.
+        # descent takes 100 steps; each may land on obstacles, in 100. The template checks the
+        # number. The lowest stretches between saddles are joined in 10.
         guesses = 5 if model.start.turns and model.end.turns else 4
         held = 0
         if self.holds:
@@ -331,7 +331,7 @@ class _PlaneCase(Case):
             "HIGH": count - (model.end.direction and not gives[1]),
             # Elimination and solution take about 30 operations per node; the kernels run twice.
             "OPERATIONS": 2 * kernels.operations + 30 * count,
-            "STEPS": (1 + 16 * guesses) * (100 + 6) + 100 * landings + mixing,
+            "STEPS": (1 + 16 * guesses) * 100 + 100 * landings + mixing,
         }
 
 

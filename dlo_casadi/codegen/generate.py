@@ -269,8 +269,8 @@ def generate(
         for mark, value in _values(case, prefix, digest).items()
     }
     own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
-    first = ("common", case.name, "contact", "newton", "columns", own[0], "between", "landing")
-    sources = (*first, *own[1:], "shape", "clearance", "limits", "interface", "casadi")
+    first = ("common", case.name, "contact", "newton", "columns", own[0], "descent", "between")
+    sources = (*first, "landing", *own[1:], "shape", "clearance", "limits", "interface", "casadi")
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),
