@@ -12,11 +12,13 @@ from scipy.special import ellipe, ellipk
 from dlo_casadi.config import load_config
 from dlo_casadi.config.supports import Clip
 from dlo_casadi.effects import (
+    AxialStretch,
     CableData,
     ClipAngle,
     ClipOffset,
     ClipSlip,
     LengthError,
+    LumpedMass,
     RestCurvatureDrift,
 )
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
@@ -30,7 +32,8 @@ from dlo_casadi.equilibrium.spread import SolvedCable, tolerances_of
 from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clipped, HeldClip, clamped_nodes
+from dlo_casadi.model.clipped import Clipped
+from dlo_casadi.model.clips import HeldClip, clamped_nodes
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Frame, Heading
@@ -426,16 +429,7 @@ def test_effects_of_clips_and_their_derivatives(kind):
     elsewhere = replace(pose, clips=moved)
     same = solve_equilibrium(declared, model.nominal[:1], rest, elsewhere)
     assert eq.energy == pytest.approx(same.energy, rel=1e-12)
-    equilibria, step = BatchEquilibrium(model, [pose]), 1e-6
-    along = equilibria.directions(eq.shapes, p, rest, np.eye(6), np.zeros((20, 6)))
-    ((_, change),) = equilibria.observe(eq.shapes, p, rest, along)
-    for k in range(1, 6):
-        ends = []
-        for h in (step, -step):
-            there = solve_equilibrium(model, p + h * np.eye(6)[k], rest, pose, x_init=eq.x)
-            (seen,) = equilibria.seen(there.shapes, p + h * np.eye(6)[k], rest)
-            ends.append(seen.curve.numbers)
-        assert change.curve[..., k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
+    assert_derivatives(model, pose, p, rest, range(1, 6))
 
 
 @pytest.mark.parametrize("kind", ["plane", "clamped", "swivel"])
@@ -463,18 +457,56 @@ def test_a_turned_saddle_and_its_derivatives(kind):
     same = solve_equilibrium(declared, declared.nominal, rest, there)
     assert eq.energy == pytest.approx(same.energy, rel=1e-9)
     assert eq.clips[0].moment == pytest.approx(same.clips[0].moment, rel=1e-6, abs=1e-9)
-    equilibria, step = BatchEquilibrium(model, [pose]), 1e-6
-    along = equilibria.directions(eq.shapes, p, rest, np.eye(size), np.zeros((len(rest), size)))
-    ((_, change),) = equilibria.observe(eq.shapes, p, rest, along)
-    for k in range(first, size):
-        ends, lam = [], []
-        for h in (step, -step):
-            near = solve_equilibrium(model, p + h * np.eye(size)[k], rest, pose, x_init=eq.x)
-            (seen,) = equilibria.seen(near.shapes, p + h * np.eye(size)[k], rest)
-            ends.append(seen.curve.numbers)
-            lam.append(near.multipliers)
-        assert change.curve[..., k] == pytest.approx((ends[0] - ends[1]) / (2 * step), abs=1e-4)
-        assert along.lam[0, :, k] == pytest.approx((lam[0] - lam[1]) / (2 * step), abs=1e-4)
+    assert_derivatives(model, pose, p, rest, range(first, size))
+
+
+@pytest.mark.parametrize("space", [False, True])
+@pytest.mark.parametrize("kind", ["pinned", "clamped"])
+def test_derivatives_by_arc_lengths_beside_all_else(kind, space):
+    """A rest curvature, a stretch, a weight between clips, a table, a free end: all are felt."""
+    floor = Plane((0.0, 0.0, -0.12)[-2 - space :], (0.0, 0.0, 1.0)[-2 - space :])
+    clips = (IN_SPACE[0], HeldClip("pinned", (0.45, 0.12, 0.02), 0.54))
+    if not space:
+        clips = (HeldClip("clamped", (0.31, 0.05), 0.365, heading=0.3), *clips[1:])
+        clips = (clips[0], replace(clips[1], place=(0.45, 0.02)))
+    if kind == "pinned":
+        clips = tuple(
+            replace(clip, kind="pinned", orientation=None, heading=None) for clip in clips
+        )
+    cable = LOOM if space else CABLE
+    gravity = (0.0, 0.0, -9.81) if space else (0.0, -9.81)
+    effects = (AxialStretch(), LumpedMass(), ClipSlip(clip=0), ClipSlip(clip=1, label="other"))
+    kinds = tuple(clip.kind for clip in clips)
+    held = {"end": "free", "gravity": gravity, "obstacles": (floor,), "effects": effects}
+    model = CableModel(cable, n=16, n_rest=4, clips=kinds, **held)
+    p = model.nominal.copy()
+    first = model.names.index("axial_stretch.compliance")
+    p[first:] = [1e-3, 0.02, 0.41, 0.002, -0.003]
+    pose = HeldPose((0.0,) * (2 + space), clips=clips)
+    rest = model.rest_basis @ (0.3 * np.cos(np.arange(model.n_coefficients)))
+    assert solve_equilibrium(model, p, rest, pose).contacts
+    assert_derivatives(model, pose, p, rest, range(first + 3, first + 5))
+
+
+def assert_derivatives(model, pose, p, rest, columns):
+    """Derivatives of curve and border are those of equilibria of changed parameters."""
+    equilibria, size, h = BatchEquilibrium(model, [pose]), len(p), 2e-5
+    eq = solve_equilibrium(model, p, rest, pose)
+    shapes, _ = equilibria.solve(eq.shapes, p, rest, tolerance=1e-13)
+    along = equilibria.directions(shapes, p, rest, np.eye(size), np.zeros((len(rest), size)))
+    ((_, change),) = equilibria.observe(shapes, p, rest, along)
+    for k in columns:
+        rows = []
+        for step in (-2 * h, -h, h, 2 * h):
+            moved = p + step * np.eye(size)[k]
+            there, ok = equilibria.solve(shapes, moved, rest, tolerance=1e-13)
+            assert ok.all()
+            (seen,) = equilibria.seen(there, moved, rest)
+            rows.append(np.concatenate([seen.curve.numbers.ravel(), there.lam[0]]))
+        expected = (rows[0] - 8 * rows[1] + 8 * rows[2] - rows[3]) / (12 * h)
+        found = np.concatenate([change.curve[..., k].ravel(), along.lam[0, :, k]])
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, atol=1e-8 * scale, err_msg=model.names[k])
 
 
 SADDLE = HeldClip("clamped", (0.31, 0.05), 0.365, heading=0.3)  # 0.3 elements before a node

@@ -7,7 +7,8 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.pose import SIGNS, Branch
 from dlo_casadi.model.assembly import Assembly, Shapes
-from dlo_casadi.model.clips import ClipLoad, Clipped
+from dlo_casadi.model.clipped import Clipped
+from dlo_casadi.model.clips import ClipLoad
 from dlo_casadi.model.contact import Contact
 from dlo_casadi.rod.ends import reaction_rows
 

@@ -19,7 +19,7 @@ from dlo_casadi.equilibrium.pose import Branch, HeldPose, pose_branch, pose_numb
 from dlo_casadi.equilibrium.solve import continued, solve_equilibrium
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import Clipped
+from dlo_casadi.model.clipped import Clipped
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.pose_system import PoseRows, pose_rows
 from dlo_casadi.model.whole_pose import PoseSymbols, end_arguments

@@ -7,7 +7,7 @@ to the derivatives of both and of the measured curve.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -16,15 +16,14 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import ClipLoad, Clipped, clip_size, tangents
+from dlo_casadi.model.clipped import NONE, Clipped, by_axes
+from dlo_casadi.model.clips import ClipLoad, clip_size, tangents
 from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.stacked import Inputs, Mapped, Shapes, Tangents, Unheld, repeated
 from dlo_casadi.rod.band import BandMatrix, Vector
+from dlo_casadi.rod.element import LAYOUT_SIZE
 from dlo_casadi.rod.ends import reaction_rows
-
-# Step of differences by slips of clips, relative to the length, and by turns [rad].
-_STEP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,20 +94,28 @@ class Assembly:
 
         `lam` (m, n_segments, n_lam): forces; by default those of the shapes and contacts.
         """
-        model, shapes, clipped = self.model, self.shapes, self.clipped
-        count = model.chain.n_segments
-        if lam is None:
-            lam = self.touching.lam if self.touching else repeated(shapes.lam, count)
-        own = model.chain.rest_inside(self.given.rest[..., None])[..., 0]
-        if name != "segment_state":  # a state is of the even cells
-            own = clipped.rest(own[..., None])[..., 0]
-        p, deviation = (repeated(one, count) for one in (self.given.p, shapes.deviation))
-        both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
-        arguments = both, lam, p, own, table, deviation
+        model, clipped, arguments = self.model, self.clipped, self._arguments(name, lam)
         if not model.clips:
             return self._mapped(name)(*arguments)
-        unheld = Unheld.of(model, table)
+        unheld = Unheld.of(model, arguments[4], clipped.segments_at)
         return unheld.evaluated(name, self._mapped, arguments, 2 * model.node.increment)
+
+    def _arguments(self, name: str, lam: FloatArray | None = None) -> list[FloatArray]:
+        """Arguments (m, n_segments, ...) of a function of segments, see `_call_segments`."""
+        shapes, clipped, count = self.shapes, self.clipped, self.model.chain.n_segments
+        if lam is None:
+            lam = self.touching.lam if self.touching else repeated(shapes.lam, count)
+        own = self._rest_inside
+        if not name.startswith("segment_state"):  # a state is of the even cells
+            own = clipped.rest(own[..., None])[..., 0]
+        p, deviation = (repeated(one, count) for one in (self.given.p, shapes.deviation))
+        both = clipped.carried(self._both(shapes.x))
+        return [both, lam, p, own, clipped.segments(), deviation]
+
+    @property
+    def _rest_inside(self) -> FloatArray:
+        """Rest strains inside (m, n_segments, 3 strains) of even segments."""
+        return self.model.chain.rest_inside(self.given.rest[..., None])[..., 0]
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, from (m, n_nodes, k, ...)."""
@@ -160,17 +167,18 @@ class Assembly:
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         matrix = self._held(self._band(bend, end_bend))
         force = self._added(gradient, end_gradient)
-        self.clipped.hold(force, self.shapes.x, self._stiffness)
-        self.clipped.hold_matrix(matrix, self._stiffness)
+        self.clipped.hold(force, self._stiffness * self.clipped.gaps(self.shapes.x))
         if self.touching:
             total, force = self.touching.added(total, force, gradient)
             matrix = self.touching.matrix(matrix, bend)
+        self.clipped.hold_matrix(matrix, self._stiffness.ravel())
         return total, force, matrix
 
     @property
     def _stiffness(self) -> FloatArray:
-        """Bending stiffness (m,) [N m] of an element."""
-        return self.given.p[:, self.model.stiffness_indices[0]] / self.model.chain.h
+        """Bending stiffness (m, 1, 1, 1) [N m] of an element."""
+        own = self.given.p[:, self.model.stiffness_indices[0]] / self.model.chain.h
+        return np.asarray(own[:, None, None, None])
 
     def clip_loads(self) -> list[tuple[ClipLoad, ...]]:
         """What the cables do to their clips, for each of m poses."""
@@ -201,7 +209,7 @@ class Assembly:
     def imbalance(self) -> Vector:
         """Gradient of the Lagrangian by increments and multipliers, without its Hessian."""
         gradient, force = self._slope()
-        self.clipped.hold(force, self.shapes.x, self._stiffness)
+        self.clipped.hold(force, self._stiffness * self.clipped.gaps(self.shapes.x))
         if self.touching:
             _, force = self.touching.added(np.zeros(()), force, gradient)
         return force
@@ -239,14 +247,20 @@ class Assembly:
         `slopes`: the `balance_slopes` if they are known.
         """
         segments, ends = slopes or self.balance_slopes()
-        changed = self._by_numbers(segments, along)
-        total = self._added(changed, ends @ np.concatenate([along.p, along.deviation], axis=1))
+        changed = self._by_numbers(segments, along) + self._by_slips("segment_by_place", along.p)
+        at_ends = ends @ np.concatenate([along.p, along.deviation], axis=1)
+        turned = self._by_turns(along.p)
+        still: FloatArray | None = None
+        if turned.any():
+            _, gradient, bend = self._call_segments("segment")
+            changed += bend[..., : 2 * self.model.node.increment] @ self._both(turned)
+            still = by_axes(self._added(gradient, np.zeros_like(at_ends[..., :1])).x, turned)
+        total = self._added(changed, at_ends)
+        if still is not None:
+            total = replace(total, x=total.x + still)
         if self.touching:
             total = self.touching.along(total, changed, along.p)
-        self.clipped.hold(total, self.shapes.x, np.zeros(len(total.x)))
-        for rate, (more, less) in self._moved_clips(along.p):
-            change = more.imbalance() - less.imbalance()
-            total = total + Vector(change.x * rate[:, None, None], change.y * rate[:, None])
+        self.clipped.hold(total, -self._stiffness * turned)
         return total
 
     def _by_numbers(
@@ -260,21 +274,32 @@ class Assembly:
         total += blocks[..., n_r:] @ along.deviation[:, None]
         return np.asarray(total)
 
-    def _moved_clips(
-        self, p: FloatArray, *, turned: bool = True
-    ) -> Iterator[tuple[FloatArray, tuple[Assembly, Assembly]]]:
-        """Central differences by slips and turns of clips: rates (m, q), and both to evaluate.
+    def _by_slips(self, name: str, p: FloatArray) -> FloatArray:
+        """Change (m, n_segments, rows, q) of segments because their clips slip along the cable.
 
-        `p` (m, n_parameters, q): directions. Without `turned` those by slips alone.
+        `name`: of a derivative by rest and place; `p` (m, n_parameters, q): directions.
         """
-        slips, turns = functions_of(self.model).clip_slopes
-        for k in np.flatnonzero(slips.any(axis=0) | (turned & turns.any(axis=(0, 2)))):
-            step = _STEP * (self.model.chain.length if slips[:, k].any() else 1.0)
-            unit = step * np.eye(self.given.p.shape[1])[k]
-            both = (replace(self.given, p=p) for p in (self.given.p + unit, self.given.p - unit))
-            more, less = (replace(self, given=given) for given in both)
-            if p[:, k].any():
-                yield p[:, k] / (2 * step), (more, less)
+        rate, rows = self._slips(p), np.arange(len(p))[:, None]
+        count, total = self.model.chain.n_segments, NONE
+        for k in np.flatnonzero(rate.any(axis=(0, 2))).tolist():
+            here, change = self.clipped.slid(k, self._rest_inside)
+            if name.startswith("segment_state"):  # a state is of the even cells
+                change[..., : -LAYOUT_SIZE - len(self.model.clips)] = 0.0
+            arguments = (one[rows, here] for one in self._arguments(name))
+            (blocks,) = self._mapped(name)(*arguments)
+            if total is NONE:
+                total = np.zeros((len(p), count, blocks.shape[2], p.shape[2]))
+            total[rows, here] += (blocks @ change[..., None]) * rate[:, k, None, None]
+        return total
+
+    def _slips(self, p: FloatArray) -> FloatArray:
+        """Change (m, k, q) [m] of the arc lengths of clips along directions of the parameters."""
+        return np.asarray(functions_of(self.model).clip_slopes[0] @ p)
+
+    def _by_turns(self, p: FloatArray) -> FloatArray:
+        """Rotations (m, n_nodes, increment, q) of the nodes that clips hold, likewise."""
+        turns = functions_of(self.model).clip_slopes[1]
+        return self.clipped.turned(np.einsum("kpb,mpq->mkbq", turns, p))
 
     # ---- the curve ------------------------------------------------------------------------------
 
@@ -318,17 +343,17 @@ class Assembly:
         model, clipped, both = self.model, self.clipped, 2 * self.model.node.increment
         by_nodes, by_lam = np.split(by_moving, [both], axis=-1)
         lam = self.touching.lam_along(along.lam) if self.touching else along.lam[:, None]
-        x = clipped.free(along.x)  # frames of clips have moved in `_moved_clips`
+        x = clipped.free(along.x) + self._by_turns(along.p)
         steps: FloatArray = by_nodes @ self._both(x) + by_lam @ lam
         steps = self._by_numbers(by_others, along, steps)
+        steps += self._by_slips("segment_curve_by_place", along.p)
         start = np.zeros((len(steps), model.node.dimension, steps.shape[3]))
         places, rates = self._stations(steps, start)
         shape = (len(steps), model.chain.n + 1, both, steps.shape[3])
         own = x[:, model.chain.layout.stations].reshape(shape)
         moved = by_station @ np.concatenate([places, rates, own], axis=2)
         change = clipped.evenly(moved + by_p @ along.p[:, None])
-        for rate, (more, less) in self._moved_clips(along.p):
-            change = change + (more.curve() - less.curve())[..., None] * rate[:, None, None]
+        change += clipped.evenly_along(rows, self._slips(along.p))
         return clipped.evenly(rows)[..., 0], np.asarray(change)
 
     def reactions(self, name: str = "reactions") -> FloatArray:
@@ -374,17 +399,13 @@ class Assembly:
         The derivatives (m, n_rests, ...) are by both nodes (2b), by the cell's own rest strains
         (strains), by p (n_parameters), and by the pose's deviation (n_deviations).
         """
-        after, *by = self._cells_after()
+        after, *by = (self._stacked(part) for part in self._call_segments("segment_state"))
         m, n_p = self.given.p.shape
-        # Only saddles move the edges of cells.
-        every = self.model.clamped_between * np.broadcast_to(np.eye(n_p), (m, n_p, n_p))
-        for rate, (more, less) in self._moved_clips(every, turned=False):
-            by[2] = by[2] + (more._cells_after()[0] - less._cells_after()[0]) * rate[:, None]
+        if self.model.clamped_between:  # only saddles move the edges of cells
+            every = np.broadcast_to(np.eye(n_p), (m, n_p, n_p))
+            slipped = self._by_slips("segment_state_by_place", every)
+            by[2] = by[2] + (self._stacked(slipped) if slipped.any() else 0.0)
         return (after[..., 0], *by)
-
-    def _cells_after(self) -> list[FloatArray]:
-        """As `state_after`, with the derivatives by p at fixed edges of the cells."""
-        return [self._stacked(part) for part in self._call_segments("segment_state")]
 
     def rest_stays(self, slopes: tuple[FloatArray, ...]) -> bool:
         """Whether poses leave the rest curvature unchanged, to first order."""

@@ -9,18 +9,18 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import MeasurementEffect, StateEffect
+from dlo_casadi.model.cable_functions import CableFunctions
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.framed import SegmentNumbers, in_frame
 from dlo_casadi.model.lagrangian import MODELS, lagrangian_of
 from dlo_casadi.model.stacked import Mapped, simplified
-from dlo_casadi.rod.element import LAYOUT_SIZE, Cell, Segment
+from dlo_casadi.rod.element import LAYOUT_SIZE, Segment
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
 
 
-class Functions:
+class Functions(CableFunctions):
     """CasADi functions of one segment, of the ends and of one station of an `unmeshed` model.
 
     Parameters
@@ -30,8 +30,7 @@ class Functions:
     """
 
     def __init__(self, model: CableModel, unheld: bool = False) -> None:
-        self.model, self.terms = model, lagrangian_of(model, unheld)
-        self.node, self.kind = model.node, model.chain.kind
+        super().__init__(lagrangian_of(model, unheld))
         own, lam, place = self.terms, self.terms.lam, self.terms.place
         self._segment_arguments = [own.x, lam, own.p, own.rest_strains, place, own.deviation]
         self._end_arguments = [own.x, lam, own.p, own.pose, own.deviation]
@@ -42,6 +41,7 @@ class Functions:
         for row, s in self._sliding:
             self._by[row] = s
         self._numbers = ca.vertcat(own.p, own.rest_strains, own.deviation)
+        self._along = ca.vertcat(own.rest_strains, place)
         self._mapped: dict[str, Mapped] = {}
         self._compact: dict[str, ca.Function] = {}
 
@@ -195,15 +195,23 @@ class Functions:
     @cached_property
     def segment_sensitivity(self) -> ca.Function:
         """As `segment` -> derivative of the gradient by p, rest and deviation (2b + k, ...)."""
-        if self.kind.framed:
-            first, last, by_lam = self._framed.by_numbers(self._numbers)
-            turns = self._framed.node_turns
-            mixed = self._of_forces @ ca.vertcat(turns[0] @ first, turns[1] @ last, by_lam)
-            for row, _ in self._sliding:
-                mixed[row, :] = ca.jacobian(self._gradient[row], self._numbers)
-        else:
-            mixed = ca.jacobian(self._gradient, self._numbers)
-        return self._of_segment("segment_sensitivity", mixed)
+        return self._of_segment("segment_sensitivity", self._gradient_by(self._numbers))
+
+    @cached_property
+    def segment_by_place(self) -> ca.Function:
+        """As `segment` -> derivative of the gradient by rest and place (2b + k, ...)."""
+        return self._of_segment("segment_by_place", self._gradient_by(self._along))
+
+    def _gradient_by(self, numbers: ca.SX) -> ca.SX:
+        """Derivative (2b + k, a) of the gradient of a segment by other numbers (a,)."""
+        if not self.kind.framed:
+            return ca.jacobian(self._gradient, numbers)
+        first, last, by_lam = self._framed.by_numbers(numbers)
+        turns = self._framed.node_turns
+        mixed = self._of_forces @ ca.vertcat(turns[0] @ first, turns[1] @ last, by_lam)
+        for row, _ in self._sliding:
+            mixed[row, :] = ca.jacobian(self._gradient[row], numbers)
+        return mixed
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
@@ -233,18 +241,28 @@ class Functions:
     @cached_property
     def segment_curve_slopes(self) -> ca.Function:
         """As `segment` -> the same, derivatives by increments, lam, and by p, rest, deviation."""
-        by = (self._by, self._numbers)
         if self.kind.framed:
             # The advance is the derivative of the Lagrangian by the force on the end's holder.
             by_nodes = (self._of_forces @ self._about_nodes.hessian)[:, 6:9].T
             for row, s in self._sliding:
                 by_nodes[:, row] = ca.jacobian(self._about_nodes.by_lam[:3], s)
-            advance = [by_nodes, self._framed.by_numbers(self._numbers)[2][:3, :]]
-            ratio = [ca.jacobian(self._rates, one) for one in by]
-            blocks = [ca.vertcat(*pair) for pair in zip(advance, ratio, strict=True)]
+            moving = ca.vertcat(by_nodes, ca.jacobian(self._rates, self._by))
         else:
-            blocks = [ca.jacobian(self._advanced, one) for one in by]
+            moving = ca.jacobian(self._advanced, self._by)
+        blocks = moving, self._advanced_by(self._numbers)
         return self._of_segment("segment_curve_slopes", self._advanced, *blocks)
+
+    @cached_property
+    def segment_curve_by_place(self) -> ca.Function:
+        """As `segment_curve` -> its derivative by rest and place."""
+        return self._of_segment("segment_curve_by_place", self._advanced_by(self._along))
+
+    def _advanced_by(self, numbers: ca.SX) -> ca.SX:
+        """Derivative of `_advanced` by other numbers (a,)."""
+        if not self.kind.framed:
+            return ca.jacobian(self._advanced, numbers)
+        advance = self._framed.by_numbers(numbers)[2][:3, :]
+        return ca.vertcat(advance, ca.jacobian(self._rates, numbers))
 
     @cached_property
     def _seen(self) -> tuple[list[ca.SX], ca.SX, ca.SX]:
@@ -303,16 +321,26 @@ class Functions:
 
         The derivatives are by increments, rest, p and deviation.
         """
-        own = self.terms.rest_strains[::3]
-        strain, mean = self.kind.strain(self._plain), own
-        for effect, local in self.terms.effects_of(StateEffect):
-            mean = effect.next_rest(mean, strain, self.model.cable, local)
+        own, mean = self.terms.rest_strains[::3], self._mean_after
         rest = ca.SX.sym("mean", own.numel())
         mean = ca.substitute(mean, own, rest)
         by = (self.terms.delta, rest, self.terms.p, self.terms.deviation)
         slopes = [ca.jacobian(mean, symbols) for symbols in by]
         mean, *slopes = ca.substitute([mean, *slopes], [rest], [own])
         return self._of_segment("segment_state", mean, *slopes)
+
+    @cached_property
+    def segment_state_by_place(self) -> ca.Function:
+        """As `segment_state` -> derivative of the rest strains after the pose by rest and place."""
+        return self._of_segment("state_by_place", ca.jacobian(self._mean_after, self._along))
+
+    @property
+    def _mean_after(self) -> ca.SX:
+        """Rest strains of the cell after the pose."""
+        mean, strain = self.terms.rest_strains[::3], self.kind.strain(self._plain)
+        for effect, local in self.terms.effects_of(StateEffect):
+            mean = effect.next_rest(mean, strain, self.model.cable, local)
+        return mean
 
     @cached_property
     def _reactions(self) -> ca.SX:
@@ -368,65 +396,6 @@ class Functions:
         """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
         by = (self._by, self.terms.p, self.terms.deviation)
         return self._of_ends("reading_slopes", *(ca.jacobian(self._readings, one) for one in by))
-
-    @cached_property
-    def spring_places(self) -> ca.Function:
-        """(p) -> arc lengths (n_springs,) [m] of the springs on the cable."""
-        places = [spring.position for spring in self.terms.springs]
-        return ca.Function("spring_places", [self.terms.p], [ca.vertcat(ca.SX(0, 1), *places)])
-
-    @cached_property
-    def true_clips(self) -> ca.Function:
-        """(p, pose) -> true places (dimension, n_clips), arc lengths [m] and turns [rad] of clips.
-
-        The arc lengths are (n_clips,), those of eyelets zero. The turns (increment, n_clips) are of
-        clamped clips, from their declared frames, and mean nothing for others. A pose's own
-        deviations are excluded.
-        """
-        clips = self.terms.true_ends.clips
-        places = ca.horzcat(ca.SX(self.node.dimension, 0), *(clip.place for clip in clips))
-        at = ca.vertcat(ca.SX(0, 1), *(clip.at for clip in clips))
-        turns = ca.horzcat(ca.SX(self.node.increment, 0), *(clip.turn for clip in clips))
-        still = ca.SX.zeros(self.terms.deviation.shape)
-        outputs = ca.substitute([places, at, turns], [self.terms.deviation], [still])
-        return ca.Function("true_clips", [self.terms.p, self.terms.pose], outputs)
-
-    @cached_property
-    def clip_slopes(self) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of clips' arc lengths (n_clips, n_parameters) and turns, as numbers.
-
-        The turns' derivatives are (n_clips, n_parameters, increment).
-        """
-        p = self.terms.p
-        _, at, turns = self.true_clips(p, self.terms.pose)
-        slips, by_p = (np.array(ca.evalf(ca.jacobian(ca.vec(x), p))) for x in (at, turns))
-        return slips, by_p.reshape((-1, self.node.increment, p.numel())).swapaxes(1, 2)
-
-    @cached_property
-    def section_moment(self) -> ca.Function:
-        """(bend [1/m], p) -> moment [N m] of the section in the middle of the cable.
-
-        M = dW/dk of the energy W per length; in space about the material axis z.
-        """
-        bend, length = ca.SX.sym("bend"), self.model.cable.length
-        cell = Cell(ca.SX(0.499 * length), ca.SX(0.002 * length), 0.002 * length)
-        strain = ca.vertcat(ca.SX.zeros(len(self.node.strains) - 1), bend)
-        energy = self.terms.section.density(strain, cell)
-        return ca.Function("section_moment", [bend, self.terms.p], [ca.gradient(energy, bend)])
-
-    @cached_property
-    def bent_stiffness(self) -> ca.Function:
-        """(p) -> log of the bending stiffness M / k at one turn per length; its gradient by p."""
-        p, bend = self.terms.p, self.model.cable.curvature_scale
-        stiffness = ca.log(self.section_moment(bend, p) / bend)
-        return ca.Function("bent_stiffness", [p], [stiffness, ca.gradient(stiffness, p)])
-
-    @cached_property
-    def dead_load(self) -> ca.Function:
-        """(p) -> sum of the dead loads (dimension,) [N], excluding forces of single poses."""
-        still = ca.SX.zeros(len(self.model.deviation_names))
-        load = ca.substitute(self.terms.total_load, self.terms.deviation, still)
-        return ca.Function("dead_load", [self.terms.p], [ca.densify(load)])
 
 
 def functions_of(model: CableModel, unheld: bool = False) -> Functions:

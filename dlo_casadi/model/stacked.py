@@ -13,7 +13,6 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import BESIDE
 from dlo_casadi.rod.band import BandMatrix
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Frame, Heading
@@ -299,16 +298,14 @@ class Unheld:
     rows: IntArray
 
     @classmethod
-    def of(cls, model: CableModel, table: FloatArray) -> Unheld:
-        """Segments of a model with clips, from rows of `Clipped.segments`."""
+    def of(cls, model: CableModel, table: FloatArray, segments: IntArray) -> Unheld:
+        """Segments of a model with clips, from `Clipped.segments` and `Clipped.segments_at`."""
         width = table[..., 1:2] if model.clamped_between else model.chain.h
         share = (table[..., -len(model.clips) :] - table[..., :1]) / width
         nodes = [k for k, kind in enumerate(model.clips) if not kind.direction]
         end = model.end_pull or [-1] * model.node.dimension
-        # A clip at a node counts in one segment only: derivatives by its arc length are one-sided.
-        inside = np.maximum((share >= -BESIDE).sum(axis=1)[:, nodes] - 1, 0)
         rows = [end, *model.pulls[model.n_springs :]]
-        return cls((share > 0.5).astype(float), inside, np.array(rows))
+        return cls((share > 0.5).astype(float), segments[:, nodes], np.array(rows))
 
     def evaluated(
         self,

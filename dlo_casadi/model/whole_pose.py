@@ -11,7 +11,8 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import clip_size, moved_rest
+from dlo_casadi.model.clipped import moved_rest
+from dlo_casadi.model.clips import clip_size
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.node import conjugate, quaternion_product
