@@ -2,6 +2,7 @@
 
 from importlib import import_module
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 
@@ -16,6 +17,28 @@ def well_formed(text: str) -> str:
 def counted(number: int, noun: str, form: str = "d") -> str:
     """A number of things with a regular plural: 1 pose, 2 poses."""
     return f"{number:{form}} {noun}{'' if number == 1 else 's'}"
+
+
+class _Sentences(Formatter):
+    def format_field(self, value: Any, spec: str) -> str:
+        if spec.startswith("mm"):
+            return "-" if value is None else f"{1e3 * value:{spec[2:] or '.3g'}} mm"
+        if spec.startswith("# "):
+            return counted(value, spec[2:])
+        if isinstance(value, list | tuple):
+            return ", ".join(map(str, value))
+        return str(super().format_field(value, spec))
+
+
+def worded(template: str, /, **values: Any) -> str:
+    """Fill a template of a sentence: the rules of units and plurals.
+
+    `{off:mm}` is a length [m] in millimetres, with three digits or as in `{off:mm.2g}`, a dash for
+    None;
+    `{count:# pose}` a number of things, see `counted`; `{names}` the items of a list or tuple;
+    all else is as in `str.format`.
+    """
+    return _Sentences().format(template, **values)
 
 
 class DloError(Exception):

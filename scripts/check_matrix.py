@@ -59,7 +59,8 @@ from dlo_casadi.cli import main as command
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import student_95, threshold
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
-from dlo_casadi.report.terminal import candidate_table, print_summary
+from dlo_casadi.report.sections import print_summary
+from dlo_casadi.report.terminal import candidate_table
 from dlo_casadi.report.writer import OWNED
 from dlo_casadi.runtime.parallel import generator_of
 

@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from harness import options, run
 
 from dlo_casadi.config import load_config
-from dlo_casadi.report.documents import report_dict
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.session import run_session
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -518,7 +518,7 @@ def test_from_python_limits_are_a_mapping(fitted):
 
 def test_a_session_checks_its_poses_and_shows_where_they_are_tight(tmp_path):
     from dlo_casadi import Session, load
-    from dlo_casadi.report.documents import report_dict
+    from dlo_casadi.report.sections import report_dict
 
     path = BENCH / "session.yaml"
     session = yaml.safe_load(path.read_text().replace("file: ", f"file: {path.parent}/"))

@@ -17,8 +17,8 @@ import pytest
 import dlo_casadi as dlo
 from dlo_casadi.config import Config, dump_yaml, load_config, read_yaml
 from dlo_casadi.config.template import config_schema
-from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import configuration_text
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.report.writer import write_numbers
 
 SCHEMA = config_schema()

@@ -87,8 +87,8 @@ def _fit_and_show(chosen: argparse.Namespace, keys: Sequence[str] = ()) -> None:
     with open_executor(chosen.jobs, here=True, libraries=libraries) as executor:
         begin(executor, os.getpid)
         # These imports take as long as those of the other process, which run in parallel.
-        from dlo_casadi.report.documents import report_dict
-        from dlo_casadi.report.terminal import candidate_table, print_summary, work_table
+        from dlo_casadi.report.sections import print_summary, report_dict
+        from dlo_casadi.report.terminal import candidate_table, work_table
         from dlo_casadi.report.writer import ResultsFolder
         from dlo_casadi.session import run_session
 

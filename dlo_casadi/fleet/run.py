@@ -26,7 +26,7 @@ from dlo_casadi.fleet.rows import (
     write_table,
 )
 from dlo_casadi.io.files import make_folder, only_run, write_file
-from dlo_casadi.report.documents import report_dict
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.runtime.executors import worker_log
 from dlo_casadi.runtime.parallel import Tally, map_as_completed
 from dlo_casadi.session import run_session

@@ -1,11 +1,10 @@
 """Write what a run or a check has found for other programs.
 
-The files are report.json (schema "dlo-report/1") and parameters.yaml, a fitted cable that is
-complete enough to compute with.
+Parts of report.json (schema "dlo-report/1"), whose keys the `sections` give it, and
+parameters.yaml, a fitted cable that is complete enough to compute with.
 """
 
 import hashlib
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -28,85 +27,19 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.files import finite
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
-from dlo_casadi.report.words import all_warnings
 from dlo_casadi.runtime.executors import software
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.fitting import Declared
 from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage
 from dlo_casadi.session.questions import Suspicion
 
-# Fields in report.json for a parameter of an added effect.
-_OF_EFFECT = ("value", "std", "unit")
 
-
-def _work(part: Part) -> list[dict[str, Any]]:
+def work_list(part: Part) -> list[dict[str, Any]]:
     """What the parts of a run took: calls, steps of fits, seconds, and their own parts."""
     return [
-        {"name": name, **fields_of(one, "calls", "steps", "seconds"), "parts": _work(one)}
+        {"name": name, **fields_of(one, "calls", "steps", "seconds"), "parts": work_list(one)}
         for name, one in part.parts.items()
     ]
-
-
-def report_dict(outcome: Outcome) -> dict[str, Any]:
-    """All results of a run that a program may need, as plain data.
-
-    Every key of the schema is present; unknown values are None, never NaN.
-    """
-    m, load, proposal = outcome.measurement, outcome.unexplained, outcome.next_pose
-    repeats, model, weight = outcome.repeatability, outcome.fit.model, outcome.hidden_weight
-    document = {
-        "schema": "dlo-report/1",
-        "config": outcome.config.name,
-        "config_path": None if outcome.config.path is None else str(outcome.config.path),
-        "versions": outcome.versions,
-        "warnings": [*outcome.doubts, *all_warnings(outcome)],
-        "timing_s": {**outcome.timing, "parts": _work(outcome.work)},
-        "measurement": {
-            **fields_of(m, "kind", "poses_fit", "poses_held_out", "held_out_missing", "points"),
-            **fields_of(m, "std", "std_source"),
-            "correlation_length_m": m.correlation_length,
-            **fields_of(m, "readings", "force_std", "moment_std"),
-        },
-        "stages": [_stage(stage, outcome) for stage in outcome.stages],
-        "repeatability": {
-            "rest_curvature_std": outcome.fit.problem.priors.pose_scatter.rest_std,
-            "from_pose_to_pose": _scatter(outcome.fit),
-            "expected_spread_m": repeats.expected_spread,
-            "source": repeats.source,
-            "held_out_inside_90": outcome.inside_band,
-        },
-        "discretization": {**fields_of(model, "n", "element"), "error_m": outcome.mesh_error},
-        "effects": [
-            asdict(effect)
-            | {"parameters": {k: fields_of(x, *_OF_EFFECT) for k, x in effect.parameters.items()}}
-            for effect in outcome.effects
-        ],
-        "candidates": [asdict(row) | {"reason": row.reason or None} for row in outcome.candidates],
-        "verdict": outcome.verdict,
-        "either_side": {name: asdict(found) for name, found in outcome.either_side.items()},
-        "unexplained": load
-        and {
-            **fields_of(load, "force", "force_per_pose", "poses", "position"),
-            "interval_95": load.interval,
-        },
-        "next_pose": proposal
-        and {
-            **fields_of(proposal, "end", "separates"),
-            "expected_difference_m": proposal.difference,
-            "expected_difference_std": proposal.separation,
-            "reading": asdict(proposal.reading),
-        },
-        "structure": outcome.structure
-        and dict(zip(("before", "after"), map(asdict, outcome.structure), strict=True)),
-        "hidden_weight": weight and asdict(weight),
-        "limits": [check.as_dict() for check in outcome.limits],
-    }
-    return finite(document)
-
-
-def report_text(outcome: Outcome) -> str:
-    """The text of report.json."""
-    return json.dumps(report_dict(outcome), indent=1, allow_nan=False) + "\n"
 
 
 def fields_of(item: object, *names: str) -> dict[str, Any]:
@@ -114,7 +47,7 @@ def fields_of(item: object, *names: str) -> dict[str, Any]:
     return {name: getattr(item, name) for name in names}
 
 
-def _stage(stage: Stage, outcome: Outcome) -> dict[str, Any]:
+def stage_dict(stage: Stage, outcome: Outcome) -> dict[str, Any]:
     """One stage; all numbers are None where it does not apply."""
     held_out = asdict(outcome.held_out(stage)) if stage.parameters else None
     if not stage.parameters:
@@ -267,7 +200,7 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
     return document
 
 
-def _scatter(fit: Fit) -> dict[str, Any] | None:
+def scatter_dict(fit: Fit) -> dict[str, Any] | None:
     """What differs from pose to pose, and which sources cannot be distinguished from it."""
     found = fit.problem.priors.pose_scatter
     if not found.std or not found.shown:

@@ -1,17 +1,16 @@
-"""Tables for the terminal: findings, their accuracy, what remains unknown, and run time."""
+"""Tables for the terminal: candidates, work, a predicted pose, limits, a check."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from dlo_casadi.cable.fitted_cable import Shape
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config
-from dlo_casadi.errors import counted
 from dlo_casadi.report import tables, words
 from dlo_casadi.session.outcome import Outcome
 from dlo_casadi.show.text import millimetres
@@ -50,91 +49,6 @@ def plain_table(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -
 # ---- a run -------------------------------------------------------------------------------------
 
 
-def print_summary(console: Console, outcome: Outcome) -> None:
-    """Print everything that a user should see at the end of a run."""
-    warnings = [
-        Text.assemble(("warning: ", "bold yellow"), text) for text in words.all_warnings(outcome)
-    ]
-    blank = [Text("")] if warnings else []
-    console.print(
-        Group(
-            "",
-            _heading(outcome),
-            _parameter_table(outcome),
-            *(Text("  " + line) for line in tables.footnotes(outcome)),
-            "",
-            _error_table(outcome),
-            "",
-            *(Text(line) for line in words.verdict_lines(outcome)),
-            *([limits_table(outcome.config.cable.name, outcome.limits)] if outcome.limits else []),
-            *blank,
-            *warnings,
-            "",
-            _timing_table(outcome),
-        )
-    )
-
-
-def _heading(outcome: Outcome) -> Text:
-    m = outcome.measurement
-    noise = f"noise std {millimetres(m.std)} ({m.std_source})"
-    if not m.points:
-        stds = ((m.force_std, "N"), (m.moment_std, "N m"))
-        noise = ", ".join(f"{std:.2g} {unit}" for std, unit in stds if std is not None)
-        noise = f"noise std of readings {noise}"
-    if m.correlation_length > 0:
-        noise += f", correlated over {millimetres(m.correlation_length)}"
-    missing = len(m.held_out_missing)
-    declared = f" of {m.poses_held_out + missing}" if missing else ""
-    text = (
-        f"{counted(m.poses_fit, 'fit pose')}, {m.poses_held_out}{declared} held out, "
-        f"{words.counted_data(m)}; {noise}; {words.mesh_text(outcome)}"
-    )
-    return Text.assemble((outcome.config.cable.name, "bold"), ": ", text)
-
-
-def _parameter_table(outcome: Outcome) -> Table:
-    """Fitted parameters of the last stage with their units, and those that were kept fixed."""
-    table = plain_table(f"Parameters ({words.label_of(outcome.stages[-1], outcome)})", [])
-    for column in ("parameter", "value", "95 % interval", ""):
-        table.add_column(column, no_wrap=bool(column))
-    for row in (
-        *tables.fitted_rows(outcome),
-        *tables.rest_rows(outcome),
-        *tables.nuisance_rows(outcome),
-    ):
-        table.add_row(*row)
-    for row in tables.fixed_rows(outcome):
-        table.add_row(*row, style="dim")
-    return table
-
-
-def _error_table(outcome: Outcome) -> Table:
-    """Errors of the stages: fit, cross-validated, held out, chi-square, beside the noise."""
-    columns = {"fit": "fit", "validated": "cross-validated", "held_out": "held out"}
-    columns["chi2"] = "chi2/dof"
-    if not words.cross_validated(outcome):
-        del columns["validated"]
-    title = "Distance of the measured points from the predicted shape, RMS"
-    alone = not outcome.measurement.points
-    if alone:
-        title = "Difference of the readings from the predicted ones, RMS"
-    table = plain_table(title, ["stage"], list(columns.values()))
-    for row in tables.stage_rows(outcome, "-"):
-        table.add_row(row["label"], *(row[column] for column in columns))
-    if alone:
-        return table
-    if outcome.measurement.readings:
-        last = outcome.stages[-1]
-        both = {"fit": last.readings_fit, "held_out": last.readings_held_out}
-        cells = {role: tables.newtons(errors) for role, errors in both.items()}
-        table.add_row("  forces, moments", *(cells.get(column, "") for column in columns))
-    table.add_section()
-    floor = millimetres(outcome.measurement.noise_distance)
-    table.add_row(f"{words.NOISE_ALONE} ({outcome.measurement.std_source})", floor)
-    return table
-
-
 def candidate_table(outcome: Outcome) -> Table:
     """Every effect that was tried, in the order of `CANDIDATE_ORDER`."""
     numbers = ("score", "p-value", "cross-validated error")
@@ -145,18 +59,6 @@ def candidate_table(outcome: Outcome) -> Table:
         error = millimetres(row.rmse_cross_validated)
         finding = words.finding_of(outcome, row)[1]
         table.add_row(row.name, f"{row.score:.1f}", f"{row.p_value:.2g}", error, finding)
-    return table
-
-
-def _timing_table(outcome: Outcome) -> Table:
-    """Wall-clock time of the parts of the run."""
-    table = plain_table("Time", ["part"], ["seconds"])
-    table.add_column("")
-    *parts, total = tables.timing_rows(outcome)
-    for row in parts:
-        table.add_row(*row)
-    table.add_section()
-    table.add_row(*total)
     return table
 
 

@@ -1,15 +1,15 @@
 """The report in words: numbers, names of stages, and all sentences."""
 
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextPose, NextReading
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
-from dlo_casadi.errors import counted
+from dlo_casadi.errors import counted, worded
 from dlo_casadi.session.outcome import (
-    FoundEffect,
     MeasurementSummary,
     Outcome,
     PoseInput,
@@ -17,7 +17,7 @@ from dlo_casadi.session.outcome import (
     Stage,
     StageName,
 )
-from dlo_casadi.session.pose_shape import EitherSide
+from dlo_casadi.session.sentences import Sentence, Values, said_of
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import NOTABLE
 
@@ -34,6 +34,7 @@ STAGE_LABELS: dict[StageName, str] = {
     "batch": "declared model, fitted",
     "closed": "with added effects",
 }
+Found = Callable[[Outcome], Iterator[Values]]
 # What the residual may depend on, by the name of its normal score.
 DEPENDENCES = {
     "order_z": "the order of the poses",
@@ -53,6 +54,12 @@ def score_text(score: float) -> str:
 def seen(outcome: Outcome) -> str:
     """What was measured: shapes, or readings alone."""
     return "shapes" if outcome.measurement.points else "readings"
+
+
+def photographs_alone(outcome: Outcome) -> bool:
+    """Whether poses are shown by the photographs that were measured: in a plane."""
+    photographed = outcome.config.experiment.measurement.kind == "images"
+    return photographed and not any(pose.views for pose in outcome.poses)
 
 
 def counted_data(measurement: MeasurementSummary) -> str:
@@ -186,79 +193,108 @@ def verdict_lines(outcome: Outcome) -> list[str]:
 
 def details(outcome: Outcome) -> list[str]:
     """Findings beside the verdict."""
-    lines = [f"  {sentence(text)}." for text in outcome.doubts[1:]]
-    lines += [_either_side(name, found) for name, found in outcome.either_side.items()]
-    lines += structure_lines(outcome)
-    for effect in outcome.effects:
-        lines += _effect_lines(effect)
-    load, proposal = outcome.unexplained, outcome.next_pose
-    if load is not None:
-        low, high = load.interval
-        lines.append(
-            f"  Without naming a cause: as if pulled by {vector(load.force, '.3g', 'N')} on "
-            f"average at {load.position:.3f} m ({low:.3f} to {high:.3f} m) from the start."
-        )
-        experiment = outcome.config.experiment
-        if not experiment.boundary.end.place and np.dot(load.force, experiment.gravity) < 0:
-            lines.append(
-                "  Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or "
-                "another stiffness may stand behind it."
-            )
-    if proposal is not None:
-        lines.append(
-            f"  To tell {' from '.join(proposal.separates)}: hold the end at "
-            f"{vector(proposal.end, '.3f', 'm')}; {separation_text(proposal)}"
-        )
-        lines.append(f"  {reading_text(proposal.reading)}")
-    return lines
+    return [f"  {text}" for text in said_of(outcome, FINDINGS)]
 
 
 def conclusion_of(outcome: Outcome) -> Conclusion:
-    """Result of the diagnosis."""
-    if outcome.doubts:
-        word = "fit failed" if outcome.fit.failed else "unexplained"
-        return Conclusion(word, f"{sentence(outcome.doubts[0])}.")
-    if outcome.verdict is None:
-        return Conclusion("not diagnosed", "Nothing was looked for in the residual.")
-    names = " and ".join(map(str, outcome.effects))
-    if outcome.verdict == "unexplained":
-        after = outcome.structure[1] if outcome.structure else None
-        if names and after and after.p_value >= outcome.config.diagnosis.significance:
-            error = outcome.effects[-1].rmse_cross_validated_after
-            said = (
-                f"With {names} every pose is fitted, but one that is left out is predicted "
-                f"{millimetres(error)} off "
-                f"({NOISE_ALONE}: {millimetres(outcome.measurement.noise_distance)})."
-            )
-            return Conclusion("unexplained", said)
-        found = f" even with {names}" if names else ""
-        return Conclusion("unexplained", f"The residual is not noise{found}.")
-    if outcome.effects:
-        said = f"The declared model lacked {names}; with it the residual is noise."
-        return Conclusion("effect found", said)
-    said = f"The declared model explains the {seen(outcome)} down to their noise."
-    return Conclusion("complete", said)
+    """Result of the diagnosis: the first of `CONCLUSIONS` that applies."""
+    for word, row in CONCLUSIONS:
+        for text in said_of(outcome, [row]):
+            return Conclusion(word, text)
+    raise AssertionError("the last conclusion always applies")
 
 
-def _either_side(name: str, found: EitherSide) -> str:
-    """Describe a held-out pose on both of its sides, and what selects each."""
-    predicted, other, near = found.predicted, found.other, found.tipping
-    text = f"  {name} (held out): "
-    if near is not None:
-        text += (
-            f"its clamp is {near.angle:.2g} rad (known to {near.std:.2g} rad) from the angle at "
-            "which both ways to hang are equally low; "
-        )
-    return text + (
-        f"`{predicted.chosen_by or 'turns: 0'}` (predicted) {millimetres(predicted.rmse)} off, "
-        f"`{other.chosen_by}` {millimetres(other.rmse)} off."
-    )
+def _once(applies: Callable[[Outcome], object], **values: Callable[[Outcome], Any]) -> Found:
+    """Values of a sentence that is said once, where it applies."""
+
+    def found(outcome: Outcome) -> Iterator[Values]:
+        if applies(outcome):
+            yield {name: value(outcome) for name, value in values.items()}
+
+    return found
 
 
-def structure_lines(outcome: Outcome) -> list[str]:
+def _doubt(outcome: Outcome) -> str:
+    return sentence(outcome.doubts[0])
+
+
+def _names(outcome: Outcome) -> str:
+    return " and ".join(map(str, outcome.effects))
+
+
+def _unexplained(outcome: Outcome) -> bool:
+    return outcome.verdict == "unexplained"
+
+
+def _fitted_alone(outcome: Outcome) -> bool:
+    """Whether the residual is noise with added effects, but left-out poses are not predicted."""
+    after = outcome.structure[1] if outcome.structure else None
+    least = outcome.config.diagnosis.significance
+    noise = after is not None and after.p_value >= least
+    return _unexplained(outcome) and bool(outcome.effects) and noise
+
+
+CONCLUSIONS: tuple[tuple[str, Sentence[Outcome]], ...] = (
+    ("fit failed", Sentence("{doubt}.", _once(lambda x: x.doubts and x.fit.failed, doubt=_doubt))),
+    ("unexplained", Sentence("{doubt}.", _once(lambda x: x.doubts, doubt=_doubt))),
+    (
+        "not diagnosed",
+        Sentence("Nothing was looked for in the residual.", _once(lambda x: x.verdict is None)),
+    ),
+    (
+        "unexplained",
+        Sentence(
+            "With {names} every pose is fitted, but one that is left out is predicted {error:mm} "
+            f"off ({NOISE_ALONE}: {{floor:mm}}).",
+            _once(
+                _fitted_alone,
+                names=_names,
+                error=lambda x: x.effects[-1].rmse_cross_validated_after,
+                floor=lambda x: x.measurement.noise_distance,
+            ),
+        ),
+    ),
+    (
+        "unexplained",
+        Sentence(
+            "The residual is not noise even with {names}.",
+            _once(lambda x: _unexplained(x) and x.effects, names=_names),
+        ),
+    ),
+    ("unexplained", Sentence("The residual is not noise.", _once(_unexplained))),
+    (
+        "effect found",
+        Sentence(
+            "The declared model lacked {names}; with it the residual is noise.",
+            _once(lambda x: x.effects, names=_names),
+        ),
+    ),
+    (
+        "complete",
+        Sentence(
+            "The declared model explains the {seen} down to their noise.",
+            _once(lambda x: True, seen=seen),
+        ),
+    ),
+)
+
+
+def _other_doubts(outcome: Outcome) -> Iterator[Values]:
+    yield from ({"doubt": sentence(text)} for text in outcome.doubts[1:])
+
+
+def _either_side(outcome: Outcome) -> Iterator[Values]:
+    for name, found in outcome.either_side.items():
+        near = found.tipping
+        tipping = "" if near is None else worded(_TIPPING, near=near)
+        chosen = found.predicted.chosen_by or "turns: 0"
+        yield vars(found) | {"name": name, "tipping": tipping, "chosen": chosen}
+
+
+def _dependences(outcome: Outcome) -> Iterator[Values]:
     """Evidence that the declared model's residual is not noise."""
     if outcome.structure is None or outcome.verdict == "complete":
-        return []
+        return
     before, _ = outcome.structure
     where = "space" if outcome.config.experiment.in_space else "the plane"
     if outcome.measurement.kind == "images":
@@ -275,17 +311,73 @@ def structure_lines(outcome: Outcome) -> list[str]:
     if abs(before.runs_z) > NOTABLE:
         often, z = "less" if before.runs_z < 0 else "more", before.runs_z
         said.insert(0, f"changes its sign along the cable {often} often than noise (z = {z:+.1f})")
-    return [f"  The declared model's residual {', and '.join(said)}."] if said else []
+    if said:
+        yield {"what": ", and ".join(said)}
 
 
-def _effect_lines(effect: FoundEffect) -> list[str]:
-    values = [f"{name} {found}" for name, found in effect.parameters.items()]
-    line = f"  {effect}: {', '.join(values)}"
-    if effect.p_value is not None:
-        # It underflows: below the smallest double.
-        line += f" (p = {effect.p_value:.1g})" if effect.p_value > 0 else " (p < 1e-307)"
-    rivals = " or ".join(effect.indistinguishable_from)
-    return [line, *([f"    These data cannot tell it from {rivals}."] if rivals else [])]
+def _added(outcome: Outcome) -> Iterator[Values]:
+    for effect in outcome.effects:
+        values, chance = [f"{name} {found}" for name, found in effect.parameters.items()], ""
+        if effect.p_value is not None:
+            # It underflows: below the smallest double.
+            chance = f" (p = {effect.p_value:.1g})" if effect.p_value > 0 else " (p < 1e-307)"
+        yield {
+            "line": worded(
+                "{effect}: {values}{chance}", effect=effect, values=values, chance=chance
+            )
+        }
+        if rivals := " or ".join(effect.indistinguishable_from):
+            yield {"line": f"  These data cannot tell it from {rivals}."}
+
+
+def _pulled(outcome: Outcome) -> Iterator[Values]:
+    if (load := outcome.unexplained) is not None:
+        yield {"load": load, "force": vector(load.force, ".3g", "N")}
+
+
+def _lifted_tip(outcome: Outcome) -> bool:
+    load, experiment = outcome.unexplained, outcome.config.experiment
+    free = not experiment.boundary.end.place
+    return load is not None and free and bool(np.dot(load.force, experiment.gravity) < 0)
+
+
+def _proposed(outcome: Outcome) -> Iterator[Values]:
+    if (proposal := outcome.next_pose) is not None:
+        yield {
+            "rivals": " from ".join(proposal.separates),
+            "end": vector(proposal.end, ".3f", "m"),
+            "separation": separation_text(proposal),
+            "reading": reading_text(proposal.reading),
+        }
+
+
+_TIPPING = (
+    "its clamp is {near.angle:.2g} rad (known to {near.std:.2g} rad) from the angle at which both "
+    "ways to hang are equally low; "
+)
+RESIDUAL = Sentence("The declared model's residual {what}.", _dependences)
+FINDINGS: tuple[Sentence[Outcome], ...] = (
+    Sentence("{doubt}.", _other_doubts),
+    Sentence(
+        "{name} (held out): {tipping}`{chosen}` (predicted) {predicted.rmse:mm} off, "
+        "`{other.chosen_by}` {other.rmse:mm} off.",
+        _either_side,
+    ),
+    RESIDUAL,
+    Sentence("{line}", _added),
+    Sentence(
+        "Without naming a cause: as if pulled by {force} on average at {load.position:.3f} m "
+        "({load.interval[0]:.3f} to {load.interval[1]:.3f} m) from the start.",
+        _pulled,
+    ),
+    Sentence(
+        "Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or another "
+        "stiffness may stand behind it.",
+        _once(_lifted_tip),
+    ),
+    Sentence("To tell {rivals}: hold the end at {end}; {separation}", _proposed),
+    Sentence("{reading}", _proposed),
+)
 
 
 def separation_text(proposal: NextPose) -> str:

@@ -12,10 +12,11 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.io.files import FolderDraft, is_marked, make_folder, refuse_foreign, write_file
 from dlo_casadi.io.points import write_points, write_table
-from dlo_casadi.report.documents import parameters_text, report_text
+from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.report.figures import figures_of, write_figures
 from dlo_casadi.report.figures_poses import draw_poses, write_overlays
 from dlo_casadi.report.page import GENERATOR, failure_page, report_page
+from dlo_casadi.report.sections import report_text
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.session.outcome import Outcome

@@ -1,4 +1,4 @@
-"""Warnings to the user."""
+"""Doubts and warnings about poses and stages; those about a fit are in `fit_remarks`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -7,17 +7,13 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.diagnosis.selection import HiddenWeight
-from dlo_casadi.diagnosis.structure import alike, limiting_spread
 from dlo_casadi.equilibrium.pose import SIGNS
-from dlo_casadi.errors import counted
-from dlo_casadi.estimation.fit import allowed_mesh_error
-from dlo_casadi.estimation.prediction import noise_distance
+from dlo_casadi.errors import worded
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
-from dlo_casadi.session.outliers import LEAST_POINTS, Outliers, outliers_of
+from dlo_casadi.session.outliers import LEAST_POINTS, Outliers
 from dlo_casadi.session.pose_shape import BranchShape, PoseShape
-from dlo_casadi.thresholds import BEYOND_TOLERANCE, DIFFERENT, FAR_OFF, FIXTURES, UNSEEN
+from dlo_casadi.thresholds import FAR_OFF, UNSEEN
 
 CUT_OFF = (
     "the diagnosis has met the bound on its work before everything was tried, as where several "
@@ -42,8 +38,13 @@ def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]
     if missing:
         declared = len({item.name for item in inputs if item.role == "held_out"} | set(missing))
         lines.append(
-            f"held out and in no error, because there is no measured line: {', '.join(missing)}, "
-            f"{len(missing)} of {counted(declared, 'held-out pose')}"
+            worded(
+                "held out and in no error, because there is no measured line: {missing}, {count} "
+                "of {declared:# held-out pose}",
+                missing=missing,
+                count=len(missing),
+                declared=declared,
+            )
         )
     return lines
 
@@ -85,18 +86,23 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
     }
     lines = []
     for group in _by_choice(others):
-        predicted = max(stage.shapes[name].rmse or 0.0 for name in group)
-        measured = max(shape.rmse for shape in group.values())
-        lines.append(
-            f"stage {stage.name}: {', '.join(group)}: measured in another equilibrium than "
-            f"predicted, {_energy(group)}: the predicted one is up to {1e3 * predicted:.3g} mm "
-            f"off, the measured one {1e3 * measured:.3g} mm; {_cure(group)}"
+        said = worded(
+            "stage {stage}: {names}: measured in another equilibrium than predicted, {energy}: the "
+            "predicted one is up to {predicted:mm} off, the measured one {measured:mm}; {cure}",
+            stage=stage.name,
+            names=[*group],
+            energy=_energy(group),
+            predicted=max(stage.shapes[name].rmse or 0.0 for name in group),
+            measured=max(shape.rmse for shape in group.values()),
+            cure=_cure(group),
         )
         if undecided := [name for name in group if stage.shapes[name].undecided]:
-            lines[-1] += (
+            said += worded(
                 ". Fit, fixtures and scatter from pose to pose leave open which of the two is "
-                f"lower in {', '.join(undecided)}"
+                "lower in {names}",
+                names=undecided,
             )
+        lines.append(said)
     return lines + [
         f"stage {stage.name}: {', '.join(group)}: the cable hangs on another side than "
         f"predicted, {_energy(group)}; fit poses are compared where they hang, and a "
@@ -132,20 +138,24 @@ def weight_warning(weight: HiddenWeight, expected: float) -> str:
 
     `expected` [m]: distance of a pose from its prediction if the model is complete.
     """
-    low, high = weight.stiffness_95
-    text = (
-        f"an undeclared weight is not told from stiffness: up to {weight.mass:.2g} kg at "
-        f"{weight.position:.2f} m would fit as well as none, and bending_stiffness may then be "
-        f"{low:.3g} to {high:.3g} N m^2. To tell: weigh the cable with all that hangs on it, or "
-        f"measure the force on the start, which differs by up to {weight.force:.2g} N"
+    text = worded(
+        "an undeclared weight is not told from stiffness: up to {weight.mass:.2g} kg at "
+        "{weight.position:.2f} m would fit as well as none, and bending_stiffness may then be "
+        "{low:.3g} to {high:.3g} N m^2. To tell: weigh the cable with all that hangs on it, or "
+        "measure the force on the start, which differs by up to {weight.force:.2g} N",
+        weight=weight,
+        low=weight.stiffness_95[0],
+        high=weight.stiffness_95[1],
     )
     if weight.heading is None or weight.difference is None:
         return text
     far = weight.difference > UNSEEN * expected
-    return text + (
-        f"{', or add a pose: with' if far else '. No pose would tell: even with'} start_heading "
-        f"{weight.heading:.2f} the shapes differ by {1e3 * weight.difference:.2g} mm RMS, "
-        f"and a pose is measured {1e3 * expected:.2g} mm from its prediction"
+    return text + worded(
+        "{tells} start_heading {weight.heading:.2f} the shapes differ by {weight.difference:mm.2g} "
+        "RMS, and a pose is measured {expected:mm.2g} from its prediction",
+        tells=", or add a pose: with" if far else ". No pose would tell: even with",
+        weight=weight,
+        expected=expected,
     )
 
 
@@ -160,8 +170,12 @@ def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
     count = sum(len(shape.s) for shape in last.shapes.values())
     least = last.rmse_fit / (1 + 1 / np.sqrt(2 * max(count, 1)))
     return [
-        f"stage {stage.name} comes nearer to the fit poses than stage {last.name}: "
-        f"{1e3 * stage.rmse_fit:.4g} mm instead of {1e3 * last.rmse_fit:.4g} mm RMS"
+        worded(
+            "stage {near.name} comes nearer to the fit poses than stage {last.name}: "
+            "{near.rmse_fit:mm.4g} instead of {last.rmse_fit:mm.4g} RMS",
+            near=stage,
+            last=last,
+        )
         for stage in stages
         if stage.name in SIMPLER and stage.rmse_fit is not None and stage.rmse_fit < least
     ]
@@ -198,17 +212,26 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
         rms = {name: np.sqrt(both.mean(axis=1)) for name, both in errors.items()}
         bad = sorted((k for k in rms if rms[k][0] > UNSEEN * rms[k][1]), key=lambda k: -rms[k][0])
         worst, expected = rms[bad[0]]
-        text = (
-            f"{said} are predicted {1e3 * off:.3g} mm off, {1e3 * known:.3g} mm are what noise, "
-            "fixtures, parameters and the cable's scatter let expect: "
-            f"{', '.join(bad)}, at worst {1e3 * worst:.3g} mm instead of {1e3 * expected:.3g} mm"
+        text = worded(
+            "{said} are predicted {off:mm} off, {known:mm} are what noise, fixtures, parameters "
+            "and the cable's scatter let expect: {bad}, at worst {worst:mm} instead of "
+            "{expected:mm}",
+            said=said,
+            off=off,
+            known=known,
+            bad=bad,
+            worst=worst,
+            expected=expected,
         )
         elsewhere = {k: stage.other_branch[k] for k in bad if k in stage.other_branch}
         for name, other in elsewhere.items():
-            text += (
-                f". The predicted equilibrium in {name} is another one than the measured one, "
-                f"to which the model comes within {1e3 * other.rmse:.3g} mm and "
-                f"{_energy({name: other})}; {_cure({name: other})}"
+            text += worded(
+                ". The predicted equilibrium in {name} is another one than the measured one, to "
+                "which the model comes within {off:mm} and {energy}; {cure}",
+                name=name,
+                off=other.rmse,
+                energy=_energy({name: other}),
+                cure=_cure({name: other}),
             )
         lines.append(text)
     lines += _misread(stage, poses)
@@ -244,12 +267,12 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
     off, other = stage.rmse_fit or 0.0, nearest.rmse_fit or 0.0
     if off <= other:
         return []
-    return [
-        f"no pose is predicted from its ends: in all {len(shown)} the predicted equilibrium "
-        f"is another one than the measured one, {1e3 * off:.3g} mm RMS off, and stage "
-        f"{nearest.name} comes nearer, {1e3 * other:.3g} mm. Try: are start and end of the poses "
-        "exchanged, or headings off by a turn?"
-    ]
+    said = (
+        "no pose is predicted from its ends: in all {count} the predicted equilibrium is another "
+        "one than the measured one, {off:mm} RMS off, and stage {nearest.name} comes nearer, "
+        "{other:mm}. Try: are start and end of the poses exchanged, or headings off by a turn?"
+    )
+    return [worded(said, count=len(shown), off=off, nearest=nearest, other=other)]
 
 
 def far_off(stage: Stage, poses: Sequence[PoseInput], told: Sequence[str] = ()) -> list[str]:
@@ -266,12 +289,13 @@ def far_off(stage: Stage, poses: Sequence[PoseInput], told: Sequence[str] = ()) 
     bad = [name for name in bad if not any(name in text for text in told)]
     if not bad:
         return []
-    each = ", ".join(f"{name} {1e3 * rmse[name]:.3g} mm" for name in bad)
-    return [
-        f"predicted far more off their points than the other poses ({1e3 * usual:.2g} mm, median): "
-        f"{each}; the error of the fit is mostly theirs. Try: look at their points and ends, at "
-        "what the cable touched there, at `branch` or `turns`; or leave them out and fit again"
-    ]
+    said = (
+        "predicted far more off their points than the other poses ({usual:mm.2g}, median): {each}; "
+        "the error of the fit is mostly theirs. Try: look at their points and ends, at what the "
+        "cable touched there, at `branch` or `turns`; or leave them out and fit again"
+    )
+    each = [worded("{name} {off:mm}", name=name, off=rmse[name]) for name in bad]
+    return [worded(said, usual=usual, each=each)]
 
 
 def _judged(stage: Stage) -> set[str]:
@@ -298,139 +322,3 @@ def left_out(outliers: Outliers) -> list[str]:
             "outliers from an effect: all points are kept. Try: more points on each line"
         ]
     return [f"estimation.robust leaves out {outliers}"] if outliers.names else []
-
-
-def fit_warnings(
-    fit: Fit, error: float, declared: float | None = None, poses: Sequence[PoseInput] = ()
-) -> list[str]:
-    """Limits of what a fit can promise.
-
-    `error` [m]: of its mesh. `declared` [m]: noise of the points. `poses`: as they were measured,
-    those in which outliers are sought.
-    """
-    lines = []
-    points, floor = fit.noise.of_points, noise_distance(fit.problem.history, fit.noise.std)
-    if declared is not None and points.source == "estimated":
-        cure = f"Try: std: {points.std:.2g}, or no std"
-        if poses and (outliers := outliers_of(fit, poses)).names:
-            cure = f"There are {outliers}. Try: estimation: {{robust: true}}"
-        lines.append(
-            f"the points scatter more about any shape that a cable could take than measurement.std "
-            f"declares, {1e3 * declared:.2g} mm: their noise is estimated instead, "
-            f"{1e3 * points.std:.2g} mm. {cure}"
-        )
-    spread = limiting_spread(fit)
-    if spread is not None:
-        lines.append(
-            f"the same pose repeats only within {1e3 * spread:.2g} mm (each from the mean of the "
-            f"others), {_beside(fit, floor)}: repeatability limits any prediction"
-        )
-    if fit.noise.source == "misfit":
-        read = any(item.reactions for item in fit.problem.measured)
-        lines.append(
-            f"the model misses the points{' or readings' * read} by far more than their noise: the "
-            f"fit weighs the points as if that were {1e3 * fit.noise.std:.2g} mm"
-        )
-    rest = fit.problem.priors.pose_scatter
-    if rest.std > 0 and rest.shown:
-        lines.append(
-            "the cable does not come back to the same shape: two repeats of a pose would differ by "
-            f"{1e3 * np.sqrt(2) * fit.repeat_error:.2g} mm RMS beyond the noise "
-            f"({1e3 * np.sqrt(2) * floor:.2g} mm), as if each had {_own(rest, fit)}. "
-            "A model predicts their mean"
-        )
-    elif rest.std > 0:
-        lines.append(
-            "poses have too few points to tell whether the cable comes back to the same shape: "
-            f"intervals and bands include {_own(rest, fit)}"
-        )
-    if spread is not None or rest.std > 0:
-        lines += [
-            f"cannot be told apart in this session: {', '.join(group)}" for group in alike(fit)
-        ]
-    # Where ends differ at random beyond the tolerances, the line above has told by how much.
-    random = fit.problem.random_std[fit.problem.fixture_std > 0].any()
-    if len(fit.problem.used) > 1 and fit.fixture_error > FIXTURES * floor and not random:
-        apart = float(np.hypot(fit.fixture_error, floor))
-        lines.append(
-            f"fixtures may vary from pose to pose by about {_scatter(fit)}, as far as tolerances "
-            f"and data tell: a new pose is then measured {1e3 * apart:.2g} mm from its prediction, "
-            f"however good the model ({1e3 * floor:.2g} mm by noise alone). Try: measure the ends "
-            "in each pose, or smaller tolerances if they are known better"
-        )
-    lines += _beyond_tolerances(fit)
-    if not fit.converged and not fit.failed:
-        lines.append("the fit is slow: it stopped within a standard deviation of its minimum")
-    unstable = [
-        item.pose.name
-        for item, ok in zip(fit.problem.measured, fit.stable, strict=True)
-        if item.readable and not ok
-    ]
-    if unstable:
-        lines.append(f"not a stable equilibrium at the fitted parameters: {', '.join(unstable)}")
-    if not np.isfinite(error):
-        lines.append(
-            f"the fitted shapes cannot be followed to a mesh finer than "
-            f"{counted(fit.model.n, 'element')}: some pose is close to losing its stability"
-        )
-    elif error > allowed_mesh_error(fit):
-        lines.append(
-            f"the mesh of {counted(fit.model.n, 'element')} is off by {1e3 * error:.3g} mm, "
-            f"more than the {1e3 * allowed_mesh_error(fit):.2g} mm that noise or misfit hide: "
-            "model.n larger?"
-        )
-    return lines
-
-
-def _beyond_tolerances(fit: Fit) -> Iterator[str]:
-    """Declared values that the fit has moved by many of their tolerances."""
-    hidden = tuple(f"{effect.label}." for effect in fit.model.effects if not effect.shown)
-    for q in fit.model.parameters:
-        tolerance = fit.model.priors.get(q.name)
-        of_sensor = q.unit in ("N", "N m")  # its bias tells of wrong readings
-        if tolerance is None or (q.name.startswith(hidden) and not of_sensor):
-            continue
-        moved = fit.value(q.name) - q.nominal
-        if abs(moved) > BEYOND_TOLERANCE * tolerance:
-            unit = f" {q.unit}".rstrip()
-            yield (
-                f"{q.name} is {moved:.3g}{unit} from its declared value, "
-                f"{abs(moved) / tolerance:.0f} times its tolerance of {tolerance:g}{unit}: other "
-                "parameters may be wrong, too. Try: measure it again, or declare a larger tolerance"
-            )
-
-
-def _own(scatter: PoseScatter, fit: Fit) -> str:
-    """What differs from pose to pose, with its size, and what cannot be distinguished from it."""
-    each = []
-    for one in (scatter, *scatter.rivals):
-        std, unit = one.size(fit.model, float(fit.p[0]))
-        each.append(f"{one.words} of {std:.2g} {unit}")
-    return " or ".join(each)
-
-
-def _beside(fit: Fit, floor: float) -> str:
-    """Compare the noise, which alone gives a distance `floor` [m], with the repeats of a pose."""
-    std, length = 1e3 * fit.noise.std, 1e3 * fit.noise.length
-    if fit.noise.source == "repeats":
-        return (
-            f"which counts as noise of {std:.2g} mm, correlated over {length:.2g} mm of cable, in "
-            f"place of measurement.std. It would not with {DIFFERENT} poses or more that differ, "
-            "or with a declared rest_curvature_drift if the cable takes a set"
-        )
-    return f"noise alone gives {1e3 * floor:.2g} mm, and intervals from this session are too narrow"
-
-
-def _scatter(fit: Fit) -> str:
-    """Standard deviation of the fixtures' places about the declared ones."""
-    scatter = dict(zip(fit.model.deviation_names, fit.problem.priors.scatter, strict=True))
-    # All components of a position, or of a rotation, share one scatter.
-    place, turn = fit.model.node.axes[0], fit.model.node.turns[0]
-    parts = {
-        f"end_{place}": f"{1e3 * scatter[f'end_{place}']:.2g} mm at the end",
-        f"start_{turn}": f"{scatter[f'start_{turn}']:.2g} rad at the start clamp",
-        f"end_{turn}": f"{scatter[f'end_{turn}']:.2g} rad at the end clamp",
-    }
-    if fit.model.clips:
-        parts[f"clip_0_{place}"] = f"{1e3 * scatter[f'clip_0_{place}']:.2g} mm at the clips"
-    return ", ".join(parts[axis] for axis in fit.model.deviations if axis in parts)

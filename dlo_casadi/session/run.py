@@ -27,6 +27,7 @@ from dlo_casadi.runtime.progress import Progress, Step, nobody
 from dlo_casadi.runtime.work import accounted, accounted_as, add, part
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
+from dlo_casadi.session.fit_remarks import fit_warnings
 from dlo_casadi.session.measure import measured_poses, read_session
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, Stage, found_effects
 from dlo_casadi.session.outliers import outliers_of
@@ -262,7 +263,7 @@ def judged(outcome: Outcome) -> Outcome:
     declared = outcome.config.experiment.measurement.std
     # With `robust` the outliers have been sought, and are left out.
     poses = () if outcome.config.estimation.robust else outcome.poses
-    said = remarks.fit_warnings(fit, outcome.mesh_error, declared, poses)
+    said = fit_warnings(fit, outcome.mesh_error, declared, poses)
     said += remarks.worse_than_simpler(stages)
     said += [remarks.CUT_OFF] if outcome.cut_off else []
     told = (*doubts, *remarks.branch_warnings(stages))

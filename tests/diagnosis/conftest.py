@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from dlo_casadi.config import load_config
-from dlo_casadi.report.documents import report_dict
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.session import run_session
 
 ROOT = Path(__file__).resolve().parents[2]

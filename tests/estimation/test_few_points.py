@@ -21,8 +21,8 @@ from dlo_casadi.estimation.variances import _white_noise, contradicted
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.sensing.measured_pose import MeasuredPose
+from dlo_casadi.session.fit_remarks import fit_warnings
 from dlo_casadi.session.fitting import nuisances
-from dlo_casadi.session.remarks import fit_warnings
 
 EI = 0.09  # N m^2
 

@@ -15,7 +15,7 @@ from dlo_casadi.estimation.variances import first_reading_noise
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.session.remarks import fit_warnings
+from dlo_casadi.session.fit_remarks import fit_warnings
 
 NOISE = 5e-5
 MODEL = CableModel(CableData(0.6, 0.06, 0.008, 0.05), 10, n_rest=5)

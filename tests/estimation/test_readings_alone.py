@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 import dlo_casadi as dlo
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import all_equilibria, solve_equilibrium
-from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import report_page
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.report.tables import rest_rows
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.outcome import ReadingErrors

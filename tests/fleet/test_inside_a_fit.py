@@ -5,7 +5,7 @@ from tiny_sessions import write_session
 
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import EFFECTS
-from dlo_casadi.report.documents import report_dict
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.runtime.parallel import open_executor
 from dlo_casadi.session import run_session
 

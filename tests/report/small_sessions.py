@@ -5,6 +5,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from dlo_casadi.config import load_config
+from dlo_casadi.report.sections import SECTIONS
 
 BENCH = Path(__file__).parents[1] / "data" / "bench"
 # Charts of a page of which only the text is looked at.
@@ -20,6 +21,12 @@ BARE = {
     )
 }
 CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+def context(name, outcome):
+    """What the template of a section is filled with, beside what all share."""
+    (section,) = (one for one in SECTIONS if one.name == name)
+    return section.context(outcome)
 
 
 def small(name):

@@ -10,9 +10,9 @@ from test_page import PROPOSAL
 
 from dlo_casadi.arrays import chord_lengths
 from dlo_casadi.report import figures
-from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.scene import Plane, Room, next_marks, pull_marks, upright
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.report.tables import newtons
 from dlo_casadi.session.outcome import ReadingErrors
 from dlo_casadi.session.pose_shape import BranchShape

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_sessions import context
 
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.io.files import finite
-from dlo_casadi.report.documents import report_dict, report_text
-from dlo_casadi.report.page import page_data
+from dlo_casadi.report.sections import report_dict, report_text
 from dlo_casadi.report.words import all_warnings, verdict_lines
 from dlo_casadi.session.outcome import RestCurvatureEstimate, Stage
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
@@ -162,7 +162,7 @@ def test_a_held_out_pose_on_either_side_stands_beside_the_verdict(outcome):
     said = verdict_lines(found)
     other = f"{names[2]} (held out): `turns: 0` (predicted) 20 mm off, `turns: -0.5` 3.1 mm off."
     assert [line.strip() for line in said if "held out" in line] == [text, other]
-    assert text in page_data(found)["details"]
+    assert text in context("verdict", found)["details"]
     assert not any("turns" in line for line in all_warnings(found))
 
 

@@ -9,8 +9,8 @@ from test_terminal import said
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.report import figures
-from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.page import report_page
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.report.tables import outcome_html, outcome_text
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.show.style import BLACK

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_sessions import BARE
+from small_sessions import BARE, context
 from test_figures import CANDIDATES, EFFECT, LOAD, with_readings
 
 from dlo_casadi.cable.estimate import Estimate
@@ -19,16 +19,17 @@ from dlo_casadi.diagnosis.next_measurement import NextPose, NextReading
 from dlo_casadi.report import canvas, figures
 from dlo_casadi.report.page import (
     breakable,
-    candidate_rows,
     configuration_text,
-    meaning,
-    page_data,
-    parameter_rows,
     report_page,
-    symmetric_interval,
     units,
 )
 from dlo_casadi.report.page_pictures import PHOTOGRAPHS, photograph_of, pictures
+from dlo_casadi.report.page_tables import (
+    candidate_rows,
+    meaning,
+    parameter_rows,
+    symmetric_interval,
+)
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.tables import stage_rows
 from dlo_casadi.show import style
@@ -64,7 +65,7 @@ def diagnosed(outcome, **changes):
 
 
 def test_the_verdict_is_a_sentence(outcome):
-    data = page_data(diagnosed(outcome))
+    data = context("verdict", diagnosed(outcome))
     assert data["verdict_word"] == "Effect found"
     assert data["sentence"] == (
         "The declared model lacked lumped_mass; with it the residual is noise."
@@ -74,7 +75,7 @@ def test_the_verdict_is_a_sentence(outcome):
 
 def test_a_diagnosis_that_is_switched_off_is_no_verdict(outcome, page):
     assert outcome.verdict is None
-    data = page_data(outcome)
+    data = context("verdict", outcome)
     assert (data["verdict"], data["verdict_word"]) == ("off", "Not diagnosed")
     assert data["sentence"].startswith("Nothing was looked for")
     assert "What the declared model may lack" not in page

@@ -11,12 +11,11 @@ from small_sessions import BARE
 from test_figures import pull
 from test_page import PROPOSAL, diagnosed
 
-from dlo_casadi.report.documents import report_dict
 from dlo_casadi.report.figures import figures_of, write_figures
 from dlo_casadi.report.figures_poses import draw_poses, outcome_figure
 from dlo_casadi.report.page import report_page
 from dlo_casadi.report.scene import VIEWS, Room, scenes_of, seen, upright
-from dlo_casadi.report.terminal import print_summary
+from dlo_casadi.report.sections import print_summary, report_dict
 from dlo_casadi.session.fitting import confirmed, minimum_by_ipopt
 from dlo_casadi.show.style import arrow
 

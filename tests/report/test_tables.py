@@ -21,14 +21,15 @@ from dlo_casadi.report.tables import (
     work_rows,
 )
 from dlo_casadi.report.words import (
+    RESIDUAL,
     all_warnings,
     conclusion_of,
     details,
     reading_text,
-    structure_lines,
 )
 from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.runtime.work import Part
+from dlo_casadi.session.sentences import said_of
 
 WEIGHT = 0.2 * 9.81  # N, of short_clean
 NOISE = Structure(12.0, 9, 0.2, 1.3, -0.5, order_z=1.0, span_z=0.3, position_z=0.2, per_pose={})
@@ -163,9 +164,9 @@ def test_a_fit_that_predicts_no_pose_that_is_left_out_is_no_misfit(outcome):
 
 def test_scores_of_noise_are_not_told(outcome):
     found = replace(outcome, verdict="unexplained", structure=(NOISE, NOISE))
-    assert structure_lines(found) == []
+    assert said_of(found, [RESIDUAL]) == []
     found = replace(found, structure=(replace(NOISE, runs_z=9.0), NOISE))
-    (line,) = structure_lines(found)
+    (line,) = said_of(found, [RESIDUAL])
     assert line.strip() == (
         "The declared model's residual changes its sign along the cable more often than noise "
         "(z = +9.0)."

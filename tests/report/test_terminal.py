@@ -6,19 +6,20 @@ from io import StringIO
 import numpy as np
 import pytest
 from rich.console import Console
+from small_sessions import context
 from test_figures import EFFECT, LOAD
 from test_page import PROPOSAL
 
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
-from dlo_casadi.report.documents import report_dict
-from dlo_casadi.report.page import page_data
 from dlo_casadi.report.page_pictures import pictures
+from dlo_casadi.report.sections import print_summary, report_dict
 from dlo_casadi.report.tables import describe, stage_rows, unidentified
-from dlo_casadi.report.terminal import plain_table, print_summary
-from dlo_casadi.report.words import finding_of, separation_text, structure_lines
+from dlo_casadi.report.terminal import plain_table
+from dlo_casadi.report.words import RESIDUAL, finding_of, separation_text
 from dlo_casadi.session.pose_shape import BranchShape
+from dlo_casadi.session.sentences import said_of
 from dlo_casadi.show.text import plus_minus
 
 
@@ -185,8 +186,8 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
     found = replace(outcome, verdict="unexplained", doubts=(doubt,))
     assert f"Verdict: unexplained. F{doubt[1:]}." in said(found)
     assert report_dict(found)["warnings"][0] == doubt
-    assert page_data(found)["sentence"] == f"F{doubt[1:]}."
-    assert page_data(found)["verdict_word"] == "Unexplained"
+    assert context("verdict", found)["sentence"] == f"F{doubt[1:]}."
+    assert context("verdict", found)["verdict_word"] == "Unexplained"
 
     fit, problem = outcome.fit, outcome.fit.problem
     assert not replace(fit, converged=False).failed  # it is at its minimum
@@ -194,7 +195,7 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
     point = problem.balanced(replace(fit.point, theta=off))
     stopped = replace(found, fit=replace(fit, point=point, converged=False))
     assert "Verdict: fit failed. Fit poses" in said(stopped)
-    assert page_data(stopped)["verdict_word"] == "Fit failed"
+    assert context("verdict", stopped)["verdict_word"] == "Fit failed"
 
 
 def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcome):
@@ -212,16 +213,16 @@ def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcom
     found = replace(outcome, verdict="unexplained", structure=(before, before))
     photographs = replace(outcome.measurement, kind="images")
 
-    (line,) = structure_lines(found)
+    (line,) = said_of(found, [RESIDUAL])
     assert "changes its sign along the cable less often than noise (z = -9.0), and depends" in line
     assert "the order of the poses (z = +4.0)" in line
     assert "the distance of the ends (z < -7)" in line
     assert "the place in the plane (z > 7)" in line
-    (line,) = structure_lines(replace(found, measurement=photographs))
+    (line,) = said_of(replace(found, measurement=photographs), [RESIDUAL])
     assert "the place in the picture (z > 7)" in line
     experiment = found.config.experiment.changed(gravity=(0.0, 0.0, -9.81))
     in_space = found.config.changed(experiment=experiment)
-    (line,) = structure_lines(replace(found, config=in_space))
+    (line,) = said_of(replace(found, config=in_space), [RESIDUAL])
     assert "the place in space (z > 7)" in line
 
 

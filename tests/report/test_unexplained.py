@@ -3,12 +3,13 @@
 from dataclasses import replace
 
 import pytest
+from small_sessions import context
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cli import main
 from dlo_casadi.diagnosis.selection import Verdict
-from dlo_casadi.report.documents import parameters_text, report_dict
-from dlo_casadi.report.page import page_data
+from dlo_casadi.report.documents import parameters_text
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.report.tables import NO_FIT, fitted_rows, footnotes
 from dlo_casadi.session import run
 from dlo_casadi.session.outcome import Outcome
@@ -47,7 +48,9 @@ def test_tables_and_page_have_no_interval(unexplained):
         assert (interval, remark) == ("", NO_FIT), name
         assert "+" not in value.replace("e+", "")
     assert any("does not explain" in line for line in footnotes(unexplained))
-    fitted = [row for row in page_data(unexplained)["parameters"] if row["remark"] == NO_FIT]
+    fitted = [
+        row for row in context("parameters", unexplained)["parameters"] if row["remark"] == NO_FIT
+    ]
     assert fitted
     assert not any(row["interval"] for row in fitted)
 

@@ -13,8 +13,8 @@ from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.io.files import write_file
 from dlo_casadi.io.points import read_points
 from dlo_casadi.report import writer
-from dlo_casadi.report.documents import report_text
 from dlo_casadi.report.page import GENERATOR
+from dlo_casadi.report.sections import report_text
 from dlo_casadi.report.writer import OWNED, ResultsFolder
 from dlo_casadi.runtime.parallel import open_executor
 

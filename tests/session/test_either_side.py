@@ -16,7 +16,7 @@ from dlo_casadi.equilibrium.spread import Repeats, SolvedCable, Uncertainty, tip
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
-from dlo_casadi.report.documents import report_dict
+from dlo_casadi.report.sections import report_dict
 from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.session.remarks import doubts_of
 

@@ -10,8 +10,7 @@ from rich.console import Console
 from dlo_casadi.config import dump_yaml, load_config, read_yaml
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import read_points, write_points
-from dlo_casadi.report.documents import report_dict
-from dlo_casadi.report.terminal import print_summary
+from dlo_casadi.report.sections import print_summary, report_dict
 from dlo_casadi.session import run_session
 from dlo_casadi.session.measure import read_inputs
 from dlo_casadi.session.plausibility import without_implausible
