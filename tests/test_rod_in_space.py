@@ -13,7 +13,7 @@ from dlo_casadi.effects import EFFECTS, CableData, SectionLaw
 from dlo_casadi.effects.cable import Parameter
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import across
-from dlo_casadi.equilibrium.minima import descend
+from dlo_casadi.equilibrium.minima import at_saddles, descend
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError, EquilibriumError
@@ -435,9 +435,8 @@ def test_a_cable_bent_against_its_rest_shape_is_no_minimum():
     assert list(BatchEquilibrium(model, [pose]).stable(shapes, model.nominal, weak)) == [False]
 
 
-@pytest.mark.parametrize("effects", [(), (EFFECTS["rest_curvature_drift"](),)])
-def test_no_pose_of_a_fit_stays_at_a_saddle(effects):
-    """Rolled against its rest shape it turns about itself; a state carries that to later poses."""
+def rolled_against_its_rest_shape(effects):
+    """A model, two of its poses, the first one at a saddle, as a start, and lower equilibria."""
     cable = CableData(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
     hung = CableModel(cable, 12, gravity=DOWN, effects=effects)
     poses = [HeldPose((0.0, 0.0, 0.0), end) for end in ((0.56, 0.0, 0.0), (0.5, 0.2, 0.1))]
@@ -448,7 +447,14 @@ def test_no_pose_of_a_fit_stays_at_a_saddle(effects):
     rolled = (Rotation.from_quat(x[0]) * Rotation.from_rotvec([np.pi, 0.0, 0.0])).as_quat()
     x[0] = same_sign(rolled)
     batch = BatchEquilibrium(hung, poses)
-    start = Shapes.declared(x, lam), hung.nominal, rest
+    return hung, batch, (Shapes.declared(x, lam), hung.nominal, rest), lower
+
+
+@pytest.mark.parametrize("effects", [(), (EFFECTS["rest_curvature_drift"](),)])
+def test_no_pose_of_a_fit_stays_at_a_saddle(effects):
+    """Rolled against its rest shape it turns about itself; a state carries that to later poses."""
+    hung, batch, start, lower = rolled_against_its_rest_shape(effects)
+    rest = start[2]
     saddles, converged = batch.solve(*start)
     assert converged.all()
     assert list(batch.stable(saddles, hung.nominal, rest)) == [False, True]
@@ -457,6 +463,37 @@ def test_no_pose_of_a_fit_stays_at_a_saddle(effects):
     assert batch.stable(found, hung.nominal, rest).all()
     there = batch.at(found, hung.nominal, rest).energy()
     np.testing.assert_allclose(there, [eq.energy for eq in lower], rtol=1e-9)
+
+
+def test_a_saddle_is_left_for_a_shape_that_may_swing():
+    """Without weight the lower shape, whose rest curvature fits, swings about the chord freely."""
+    cable = CableData(LENGTH, 0.06, 0.008, EI, torsional_stiffness=GJ)
+    floating = CableModel(cable, 12, gravity=(0.0, 0.0, 0.0))
+    held = [HeldPose((0.0, 0.0, 0.0), end) for end in ((0.5, 0.0, 0.1), (0.4, 0.1, 0.0))]
+    rest = np.zeros(floating.chain.n_rests)
+    rest[floating.chain.n_cells : 2 * floating.chain.n_cells] = 1.0
+    lower = [solve_equilibrium(floating, floating.nominal, rest, pose) for pose in held]
+    x, lam = (np.array([getattr(eq, key) for eq in lower]) for key in ("x", "multipliers"))
+    about = Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    against = np.array([same_sign((Rotation.from_quat(one) * about).as_quat()) for one in x])
+    batch = BatchEquilibrium(floating, held)
+    start = Shapes.declared(against, lam), floating.nominal, rest
+    saddles, converged = batch.solve(*start)
+    assert converged.all()
+    assert at_saddles(batch.at(saddles, *start[1:]), converged).all()
+    found, converged = batch.solve_or_descend(*start)
+    assert converged.all()
+    there = batch.at(found, floating.nominal, rest)
+    assert not at_saddles(there, converged).any()
+    np.testing.assert_allclose(there.energy(), [eq.energy for eq in lower], rtol=1e-9)
+
+
+@pytest.mark.parametrize("effects", [(), (EFFECTS["rest_curvature_drift"](),)])
+def test_a_pose_that_cannot_leave_its_saddle_is_lost_alone(effects, monkeypatch):
+    """Unless a state hands its shape on to later poses."""
+    hung, batch, start, _ = rolled_against_its_rest_shape(effects)
+    monkeypatch.setattr("dlo_casadi.equilibrium.batch.DOWNHILL", 1)
+    assert list(batch.solve_or_descend(*start)[1]) == [False, not hung.has_state]
 
 
 def test_a_swing_that_costs_nothing_is_no_saddle():

@@ -54,6 +54,13 @@ def test_a_weightless_loop_ends_where_it_is_held(d, ends):
     assert found.energy == pytest.approx(shape.energy, rel=1e-6)
 
 
+@pytest.mark.parametrize("gap", [1e-9, 1e-6, 1e-3, -1e-3])
+def test_a_loop_between_clamps_that_nearly_touch_is_a_circle(gap):
+    """Also if the end is ahead of the start: then the loop closes by passing it."""
+    shape = rope(3, ("clamped",) * 2).solve((gap, 0.0, 0.0), **held(3, ("clamped",) * 2))
+    assert shape.energy == pytest.approx(2 * np.pi**2 * EI / LENGTH, rel=2e-3)
+
+
 def test_clamps_that_face_each_other_hold_a_loop_too():
     cable = rope(3, ("clamped", "clamped"))
     shape = cable.solve((0.0, 0.0, 0.0), **held(3, ("clamped",) * 2, last=(0.0, 0.0, 1.0, 0.0)))

@@ -20,6 +20,7 @@ from dlo_casadi.equilibrium.minima import (
     at_saddles,
     damped,
     descend_to_contact,
+    kept_by,
     leave_saddles,
     size_of,
     stepped,
@@ -45,7 +46,7 @@ NEAR = 0.1
 SOFT_DEPTH = 1e-4
 # Maximum number of iterations of a descent to a minimum: poses of a session in space took 7 to 23.
 DOWNHILL = 40
-# Maximum number of times that saddles are left: once, unless a state couples the poses.
+# Maximum number of times that saddles are left if a state couples the poses; else once.
 SADDLES = 3
 
 
@@ -231,21 +232,20 @@ class BatchEquilibrium:
         if len(lost) and not coupled:
             start = self.at(shapes, p, rest).subset(lost)
             found = descend_to_contact(start, KEEPING_SIDE, DOWNHILL)
-            now = now.replaced(lost[found.converged], found.shapes.subset(found.converged))
-            converged[lost] = found.converged
-        for _ in range(SADDLES if converged.any() else 0):
-            balanced = np.flatnonzero(converged)
-            here = self.at(now, p, rest).subset(balanced)
-            falling = at_saddles(here)
+            converged[lost] = kept = kept_by(start, found)
+            now = now.replaced(lost[kept], found.shapes.subset(kept))
+        for _ in range(SADDLES if coupled else 1):
+            here = self.at(now, p, rest)
+            falling = at_saddles(here, converged)
             if not falling.any():
                 break
-            found = leave_saddles(here.subset(falling), DOWNHILL)
-            now = now.replaced(balanced[falling], found.shapes)
-            converged[balanced[falling]] = found.converged
+            found = leave_saddles(here.subset(np.flatnonzero(falling)), DOWNHILL)
+            now = now.replaced(falling, found.shapes)
+            converged[falling] = found.converged
             if coupled:  # other shapes leave another rest curvature to later poses
                 now, converged = self.solve(now, p, rest, **options)
         else:
-            converged[:] = False
+            converged &= not (coupled and at_saddles(self.at(now, p, rest), converged).any())
         return now, converged
 
     @staticmethod

@@ -38,8 +38,10 @@ _HALF_ANGLE = (
     *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
 )
 _FORWARD, _NOWHERE = np.array([1.0, 0.0, 0.0]), np.zeros(3)
-# Chord over arc length below which both ends are at one place: its direction is rounding.
-ONE_POINT = 1e-12
+# Chord over arc length below which both ends count as at one place, so that its direction does not
+# matter: over a short chord ahead of a clamp the arc leaves against the clamp, and no guess of a
+# weightless cable led to the circle.
+ONE_POINT = 1e-2
 
 
 def _held(

@@ -176,16 +176,29 @@ def descend_to_contact(
     return _hardened(replace(start, shapes=shapes), depths[-1], max_iterations, HALVINGS)
 
 
-def at_saddles(here: Assembly) -> BoolArray:
-    """Whether the energy falls in some direction from each of m balanced shapes."""
-    wanted = here.model.n_multipliers
-    return np.asarray(here.balance()[2].negative(below=-NEUTRAL) > wanted)
+def at_saddles(here: Assembly, among: BoolArray) -> BoolArray:
+    """Whether, of m shapes, the energy falls in some direction from each of those `among` them.
+
+    `among` (m,): shapes that balance.
+    """
+    falling, wanted = among.copy(), here.model.n_multipliers
+    if among.any():
+        matrix = here.subset(np.flatnonzero(among)).balance()[2]
+        falling[among] = matrix.negative(below=-NEUTRAL) > wanted
+    return falling
+
+
+def kept_by(start: Assembly, found: Minima) -> BoolArray:
+    """Whether a cable stays in each of m shapes found from a start, be it a neutral one."""
+    there = replace(start, shapes=found.shapes)
+    return found.balanced & ~at_saddles(there, found.balanced)
 
 
 def leave_saddles(start: Assembly, max_iterations: int = 80) -> Minima:
-    """Minima below saddles: of both sides of the direction in which the energy falls, the lower.
+    """Shapes below saddles: of both sides of the direction in which the energy falls, the lower.
 
-    `start`: balanced shapes of which each is a saddle.
+    They have `converged` also if they are neutral. `start`: balanced shapes of which each is a
+    saddle.
     """
     model, (_, force, matrix) = start.model, start.balance()
     m, still = len(start.shapes.x), Vector(0 * force.x, 0 * force.y)
@@ -198,6 +211,7 @@ def leave_saddles(start: Assembly, max_iterations: int = 80) -> Minima:
     both = Vector(*(np.concatenate([part, -part]) for part in (step.x, step.y)))
     sides = stepped(start.subset(np.tile(np.arange(m), 2)), both, size)
     found = descend_to_contact(sides, KEEPING_SIDE, max_iterations)
+    found = found._replace(converged=kept_by(sides, found))
     energy = np.where(found.converged, found.energy, np.inf).reshape(2, m)
     lower = np.arange(m) + m * (energy[1] < energy[0])
     return Minima(found.shapes.subset(lower), *(part[lower] for part in found[1:]))
