@@ -8,6 +8,7 @@ from scipy.special import chdtr
 from dlo_casadi.config.problems import ConfigProblem
 from dlo_casadi.config.sections import Experiment
 from dlo_casadi.config.values import Range
+from dlo_casadi.rod.quantities import QUANTITIES, quantity_of
 
 # Lower limit of the noise of a point: a fifth of green light's wavelength, beyond any camera.
 _FINEST_STD = 1.0e-7
@@ -28,14 +29,15 @@ def impossible_noise(experiment: Experiment, length: float) -> Iterator[ConfigPr
         if (meant := std / 1e3) in possible and meant < std:
             text += f": units are SI, did you mean {meant:g}?"
         yield ConfigProblem((*at, "std"), f"{text}; without it, it is estimated from the data")
-    for kind, unit in (("force", "N"), ("moment", "N m")):
-        std = getattr(experiment.measurement, f"{kind}_std")
+    for quantity in QUANTITIES:
+        kind, unit, key = quantity.name, quantity.unit, quantity.std_key
+        std = getattr(experiment.measurement, key)
         # A zero may stand for what a pin cannot have; it was not measured.
         read = [
             x
             for pose in experiment.poses
             for name, values in pose.readings.items()
-            if name.endswith(kind)
+            if quantity_of(name) is quantity
             for x in np.atleast_1d(values)
             if x
         ]
@@ -45,9 +47,9 @@ def impossible_noise(experiment: Experiment, length: float) -> Iterator[ConfigPr
         if chdtr(len(read), np.sum(np.square(read)) / std**2) < _BY_CHANCE:
             rms = float(np.sqrt(np.mean(np.square(read))))
             text = (
-                f"{kind}_std: {std:g} {unit}, but the readings of a {kind} are {rms:.2g} {unit} RMS"
+                f"{key}: {std:g} {unit}, but the readings of a {kind} are {rms:.2g} {unit} RMS"
                 " in all, and noise alone would make them as large as its standard deviation"
             )
             if std / 1e3 < rms:
                 text += f": units are SI, did you mean {std / 1e3:g}?"
-            yield ConfigProblem((*at, f"{kind}_std"), f"{text}; without it, it is estimated")
+            yield ConfigProblem((*at, key), f"{text}; without it, it is estimated")

@@ -21,6 +21,7 @@ from dlo_casadi.estimation.prediction import Prediction, predict_each, predict_p
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.rod.quantities import quantity_of
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.thresholds import APART
 
@@ -250,10 +251,10 @@ def next_reading(fit: Fit, one: Observed, other: Observed) -> NextReading:
     tolerances, noise = fit.problem.priors.tolerances, fit.noise.readings
     found = []
     for name, at in reaction_rows(fit.model.node).items():
-        moment = name.endswith("moment")
-        std = noise.moment if moment else noise.force
+        quantity = quantity_of(name)
+        std = noise.of(quantity)
         known = [fit.std(own) for own in fit.model.names if f".{name}" in own]
-        bias = max(known, default=tolerances.moment_bias if moment else tolerances.force_bias)
+        bias = max(known, default=getattr(tolerances, quantity.bias_key))
         difference = float(np.linalg.norm(one.readings[at] - other.readings[at]))
         left = (difference / APART) ** 2 - bias**2
         times = int(np.ceil(std**2 / left)) if left > 0 else None

@@ -9,8 +9,7 @@ import casadi as ca
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint
 from dlo_casadi.rod.ends import REACTIONS, clip_force
-
-_KINDS = {"N": "force", "N m": "moment"}
+from dlo_casadi.rod.quantities import QUANTITIES, quantity_of
 
 
 @dataclass(frozen=True)
@@ -48,14 +47,13 @@ class SensorBias(MeasurementEffect):
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the components of what is measured."""
         force = 0.01 * 9.81 * cable.mass
-        turns = ("_x", "_y", "_z") if len(cable.axes) == 3 else ("",)
-        components = {"force": tuple(f"_{axis}" for axis in cable.axes), "moment": turns}
-        found = []
-        for name in self._measured:
-            kind = name.split("_")[-1]
-            unit, scale = ("N", force) if kind == "force" else ("N m", force * cable.length)
-            found += [Parameter(name + x, unit, scale=scale) for x in components[kind]]
-        return tuple(found)
+        return tuple(
+            Parameter("_".join(filter(None, (name, axis))), own.unit, scale=scale)
+            for name in self._measured
+            for own in (quantity_of(name),)
+            for scale in (own.scale(force, cable.length),)
+            for axis in own.components(cable.axes)
+        )
 
     @classmethod
     def applies(cls, setup: Setup) -> bool:
@@ -71,7 +69,7 @@ class SensorBias(MeasurementEffect):
 
     def prior(self, setup: Setup) -> dict[str, float]:
         """The tolerances force_bias and moment_bias."""
-        known = {unit: setup.tolerances.get(f"{kind}_bias") for unit, kind in _KINDS.items()}
+        known = {own.unit: setup.tolerances.get(own.bias_key) for own in QUANTITIES}
         stds = {q.name: known[q.unit] for q in self.parameters(setup.cable)}
         return {name: std for name, std in stds.items() if std is not None}
 

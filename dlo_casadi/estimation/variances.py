@@ -20,6 +20,7 @@ from dlo_casadi.estimation.scatter_likelihood import (
 from dlo_casadi.estimation.start import SearchSettings
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import MODES, PoseScatter, sources_in
+from dlo_casadi.rod.quantities import FORCE, MOMENT, QUANTITIES
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise, smooth_modes
 from dlo_casadi.sensing.noise_estimate import NoiseSample, estimate_noise, tell_of_noise
 from dlo_casadi.thresholds import SCATTER_APART, SCATTERED, SCATTERED_DEGREES
@@ -136,7 +137,7 @@ def errors_of(
     if not fit.has_points:
         # A few numbers of each pose do not tell their noise from a scatter of the cable.
         own = reading_noise_of(fit)
-        declared = own.force_known and own.moment_known
+        declared = all(own.known(x) for x in QUANTITIES)
         dof = np.inf if declared else fit.degrees_of_freedom
         return replace(noise, readings=own, slow_dof=dof), PoseScatter()
     if estimated:
@@ -171,9 +172,10 @@ def first_reading_noise(
     if stiffness is not None:
         model = replace(model, cable=replace(model.cable, bending_stiffness=stiffness))
     guess = share * model.force_scale
+    arm = model.cable.length / 10
     return ReadingNoise(
-        guess if force is None else force,
-        guess * model.cable.length / 10 if moment is None else moment,
+        FORCE.scale(guess, arm) if force is None else force,
+        MOMENT.scale(guess, arm) if moment is None else moment,
         force is not None,
         moment is not None,
     )
@@ -202,9 +204,8 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
         of = kinds == kind
         return float(np.sqrt((square[of].sum() + first**2) / (free[of].sum() + 1)))
 
-    force = own.force if own.force_known else std("force", guess.force)
-    moment = own.moment if own.moment_known else std("moment", guess.moment)
-    return replace(own, force=force, moment=moment)
+    unknown = [x for x in QUANTITIES if not own.known(x)]
+    return own.with_std({x: std(x.name, guess.of(x)) for x in unknown})
 
 
 def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:

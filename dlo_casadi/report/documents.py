@@ -27,6 +27,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.files import finite
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.runtime.executors import software
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.fitting import Declared
@@ -64,10 +65,14 @@ def stage_dict(stage: Stage, outcome: Outcome) -> dict[str, Any]:
     kept = ("value", "std", "unit", "interval_95", "identifiable")
     return {
         **fields_of(stage, "name", "explains", "rmse_fit", "rmse_held_out"),
-        "force_rmse_fit": stage.readings_fit.force,
-        "force_rmse_held_out": stage.readings_held_out.force,
-        "moment_rmse_fit": stage.readings_fit.moment,
-        "moment_rmse_held_out": stage.readings_held_out.moment,
+        **{
+            f"{quantity.name}_rmse_{role}": errors.of(quantity)
+            for quantity in QUANTITIES
+            for role, errors in (
+                ("fit", stage.readings_fit),
+                ("held_out", stage.readings_held_out),
+            )
+        },
         "readings": {
             pose: {
                 key: {"measured": known, "predicted": model}

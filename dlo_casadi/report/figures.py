@@ -267,7 +267,7 @@ def readings_figure(outcome: Outcome) -> Figure:
     said = f"readings, measured minus predicted ({words.label_of(stage, outcome)})"
     with canvas.chart(outcome, said, 0.9 + 2.4 * len(names), len(names), 8.5) as (drawing, grid):
         for axes, name in zip(grid, names, strict=True):
-            std, unit = outcome.measurement.std_of(name.split("_")[-1])
+            std, unit = outcome.measurement.std_of(name)
             axes.axhspan(-NORMAL_95, NORMAL_95, color=_BAND, zorder=0)
             axes.axhline(0, color=style.GREY, lw=0.8)
             for k, pose in enumerate(poses):

@@ -369,7 +369,7 @@ def _picture(
 def _readings(measurement: MeasurementSummary, shape: PoseShape) -> Iterator[tuple[str, str, str]]:
     """Each reading by name: difference from the predicted one, in units and relative to noise."""
     for name, (known, model) in shape.readings.items():
-        std, unit = measurement.std_of(name.split("_")[-1])
+        std, unit = measurement.std_of(name)
         off, size = float(np.linalg.norm(known - model)), float(np.linalg.norm(known))
         text = f"{size:.3g} {unit}, off by {off:.2g} {unit} ({off / std:.1f} std)"
         yield "force-read", name.replace("_", " "), text

@@ -25,6 +25,7 @@ from dlo_casadi.report.figures import figures_of
 from dlo_casadi.report.page_pictures import pictures, scene_pictures, view_pictures
 from dlo_casadi.report.page_tables import NOTHING, candidate_rows, parameter_rows, tiles
 from dlo_casadi.report.terminal import limits_table, plain_table
+from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.session.outcome import Outcome
 from dlo_casadi.show.text import millimetres
 
@@ -159,7 +160,7 @@ def _measured(outcome: Outcome) -> dict[str, Any]:
             **fields_of(m, "kind", "poses_fit", "poses_held_out", "held_out_missing", "points"),
             **fields_of(m, "std", "std_source"),
             "correlation_length_m": m.correlation_length,
-            **fields_of(m, "readings", "force_std", "moment_std"),
+            **fields_of(m, "readings", *(quantity.std_key for quantity in QUANTITIES)),
         },
         "stages": [documents.stage_dict(stage, outcome) for stage in outcome.stages],
     }
@@ -245,9 +246,7 @@ def _heading(outcome: Outcome) -> Text:
     m = outcome.measurement
     noise = f"noise std {millimetres(m.std)} ({m.std_source})"
     if not m.points:
-        stds = ((m.force_std, "N"), (m.moment_std, "N m"))
-        noise = ", ".join(f"{std:.2g} {unit}" for std, unit in stds if std is not None)
-        noise = f"noise std of readings {noise}"
+        noise = f"noise std of readings {m.reading_noise}"
     if m.correlation_length > 0:
         noise += f", correlated over {millimetres(m.correlation_length)}"
     missing = len(m.held_out_missing)

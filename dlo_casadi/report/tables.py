@@ -10,6 +10,7 @@ from dlo_casadi.cable.estimate import Covariance, Estimate
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import counted
 from dlo_casadi.report import words
+from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.outcome import MASS, Outcome, ReadingErrors
 from dlo_casadi.show import text
@@ -212,7 +213,7 @@ def stage_rows(outcome: Outcome, nothing: str) -> list[dict[str, str]]:
 
 def newtons(errors: ReadingErrors, nothing: str = NOTHING) -> str:
     """Errors of forces and moments that were measured."""
-    found = ((errors.force, "N"), (errors.moment, "N m"))
+    found = ((errors.of(x), x.unit) for x in QUANTITIES)
     return ", ".join(f"{value:.2g} {unit}" for value, unit in found if value is not None) or nothing
 
 

@@ -9,6 +9,7 @@ from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextPose, NextRe
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import counted, worded
+from dlo_casadi.rod.quantities import quantity_of
 from dlo_casadi.session.outcome import (
     MeasurementSummary,
     Outcome,
@@ -397,7 +398,7 @@ def separation_text(proposal: NextPose) -> str:
 
 def reading_text(reading: NextReading) -> str:
     """How a reading of force or moment in the proposed pose would separate rivals."""
-    unit, times = "N m" if reading.name.endswith("moment") else "N", reading.times
+    unit, times = quantity_of(reading.name).unit, reading.times
     text = (
         f"A reading of {reading.name} there differs by {reading.difference:.2g} {unit}, "
         f"{reading.separation:.2g} standard deviations of one: "

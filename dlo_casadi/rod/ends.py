@@ -7,6 +7,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from dlo_casadi.rod.node import Node, quaternion_product
+from dlo_casadi.rod.quantities import quantity_of
 
 # Forces and moments of the cable on the fixtures of its ends, in the order of `Assembly.reactions`.
 REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
@@ -23,7 +24,7 @@ def reaction_rows(node: type[Node], clips: int = 0) -> dict[str, slice]:
     Forces (dimension,) [N], moments (increment,) [N m].
     """
     names = (*REACTIONS, *map(clip_force, range(1, clips + 1)))
-    sizes = [node.increment if name.endswith("moment") else node.dimension for name in names]
+    sizes = [len(quantity_of(name).components(node.axes)) for name in names]
     edges = pairwise(accumulate(sizes, initial=0))
     return {name: slice(*both) for name, both in zip(names, edges, strict=True)}
 

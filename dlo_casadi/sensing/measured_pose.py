@@ -127,12 +127,11 @@ class MeasuredPose:
     @property
     def reactions(self) -> tuple[str, ...]:
         """Names of the measured forces and moments on the fixtures, see `ends.reaction_rows`."""
-        return tuple(name for x in self.sensors if isinstance(x, Wrench) for name in x.measured)
+        return tuple(name for x in self.sensors for name in x.read)
 
     def readings_beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Measured and predicted wrenches by name."""
-        found = (x.beside(seen) for x in self.sensors if isinstance(x, Wrench))
-        return {name: pair for parts in found for name, pair in parts.items()}
+        return {name: both for x in self.sensors for name, both in x.beside(seen).items()}
 
     @property
     def slices(self) -> list[tuple[Sensor, slice, slice]]:

@@ -8,14 +8,16 @@ correlated part is rough (exponential), once differentiable (Matern 3/2) or smoo
 exponential).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.rod.quantities import QUANTITIES, Quantity
 
 Kernel = Literal["exponential", "matern", "gaussian"]
 Count = FloatArray | float
@@ -54,6 +56,19 @@ class ReadingNoise:
     moment: float
     force_known: bool = False
     moment_known: bool = False
+
+    def of(self, quantity: Quantity) -> float:
+        """Standard deviation of one component of what is read."""
+        return float(getattr(self, quantity.name))
+
+    def known(self, quantity: Quantity) -> bool:
+        """Whether it is declared."""
+        return bool(getattr(self, f"{quantity.name}_known"))
+
+    def with_std(self, stds: Mapping[Quantity, float]) -> Self:
+        """The same with other standard deviations."""
+        changed: dict[str, Any] = {x.name: std for x, std in stds.items()}
+        return replace(self, **changed)
 
 
 @dataclass(frozen=True)
@@ -153,7 +168,7 @@ class NoiseModel:
 
         One for points, m/N for forces, 1/N for moments.
         """
-        own = {"point": self.std, "force": self.readings.force, "moment": self.readings.moment}
+        own = {"point": self.std} | {x.name: self.readings.of(x) for x in QUANTITIES}
         return self.std / np.array([own[kind] for kind in kinds])
 
     def doubted(self, std: float) -> "NoiseModel":
@@ -161,7 +176,7 @@ class NoiseModel:
         factor, own = std / self.std, self.readings
         if factor <= 1:
             return self
-        grown = replace(own, force=factor * own.force, moment=factor * own.moment)
+        grown = own.with_std({x: factor * own.of(x) for x in QUANTITIES})
         return NoiseModel(std, readings=grown)
 
     def whitening(

@@ -16,6 +16,7 @@ from dlo_casadi.equilibrium.curve import NodeCurve, Observed, ObservedChange, ac
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Node
+from dlo_casadi.rod.quantities import quantity_of
 from dlo_casadi.sensing.noise import Count, NoiseModel
 
 # Chord used for the direction of a measured line, as a share of its length: noise of 2 mm turns it
@@ -38,6 +39,8 @@ class Sensor(ABC):
         Whether the arc lengths of all its points are known.
     correlation_length : float [m]
         Length over which the otherwise white errors of points are correlated.
+    read : tuple of str
+        Names of the forces and moments that it reads, see `ends.reaction_rows`.
     count : (K,) or one number for all
         Number of measured points of which each point is the mean.
     """
@@ -46,6 +49,7 @@ class Sensor(ABC):
     weight: FloatArray
     marked = False
     correlation_length: float = 0.0
+    read: tuple[str, ...] = ()
     count: Count = 1.0
 
     @property
@@ -57,6 +61,10 @@ class Sensor(ABC):
     def kinds(self) -> NDArray[np.str_]:
         """Kind of each residual (R,): point [m], force [N] or moment [N m]."""
         return np.full(len(self.points) * self.per_point, "point")
+
+    def beside(self, seen: Observed) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Measured and predicted readings by name; none by default."""
+        return {}
 
     @property
     def together(self) -> FloatArray:
@@ -262,6 +270,11 @@ class Wrench(_Known):
     points, weight, s = np.zeros((0, 1)), np.zeros(0), np.zeros(0)
 
     @property
+    def read(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Names of what is measured."""
+        return tuple(self.measured)
+
+    @property
     def _rows(self) -> dict[str, slice]:
         """Slices of the measured components in the model's `readings`."""
         every = reaction_rows(self.node, self.clips)
@@ -275,7 +288,8 @@ class Wrench(_Known):
     def kinds(self) -> NDArray[np.str_]:
         """Kind of each residual (R,): a force or a moment."""
         rows = self._rows.items()
-        return np.concatenate([np.full(x.stop - x.start, name.split("_")[-1]) for name, x in rows])
+        found = [np.full(x.stop - x.start, quantity_of(name).name) for name, x in rows]
+        return np.concatenate(found)
 
     def components(self, curve: NodeCurve, places: FloatArray, moved: FloatArray) -> FloatArray:
         """Zeros (R, q): it measures no points."""

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.rod.quantities import Quantity, quantity_of
 from dlo_casadi.session.axes import NEAR_AXES, exchanges, listed
 from dlo_casadi.thresholds import FITTED_READINGS, MISREAD
 
@@ -37,9 +38,9 @@ class Readings:
     weightless: bool
 
     @property
-    def kind(self) -> str:
-        """What was read: force or moment."""
-        return self.names[0].split("_")[-1]
+    def quantity(self) -> Quantity:
+        """What was read."""
+        return quantity_of(self.names[0])
 
     @property
     def said(self) -> str:

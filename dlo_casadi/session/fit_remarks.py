@@ -12,6 +12,7 @@ from dlo_casadi.estimation.fit import allowed_mesh_error
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.sentences import Sentence, Values, said_of
@@ -150,7 +151,7 @@ def _beyond_tolerances(x: Judged) -> Iterator[Values]:
     hidden = tuple(f"{effect.label}." for effect in fit.model.effects if not effect.shown)
     for q in fit.model.parameters:
         tolerance = fit.model.priors.get(q.name)
-        of_sensor = q.unit in ("N", "N m")  # its bias tells of wrong readings
+        of_sensor = q.unit in {own.unit for own in QUANTITIES}  # its bias tells of wrong readings
         if tolerance is None or (q.name.startswith(hidden) and not of_sensor):
             continue
         moved = fit.value(q.name) - q.nominal

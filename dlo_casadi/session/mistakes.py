@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.rod.quantities import QUANTITIES, Quantity
 from dlo_casadi.session.axes import exchanges, named, read_as
 from dlo_casadi.session.compared_clamps import Clamps
 from dlo_casadi.session.compared_readings import ComparedReading, Readings
@@ -141,17 +142,12 @@ DIRECTIONS: tuple[Mistake[Clamps], ...] = (
 
 # ---- forces and moments -------------------------------------------------------------------------
 
-# Possible units of readings, relative to newtons and newton metres.
-READINGS_IN: dict[str, dict[str, float]] = {
-    "force": {"grams-force": 101.97, "kilograms-force": 0.10197, "millinewtons": 1e3},
-    "moment": {"N mm": 1e3, "N cm": 1e2, "kgf cm": 10.197},
-}
 _OTHER_SIGN = "with the other sign. Try: what the cable does to the fixture, not the fixture to it."
 _IN_WORLD = "once turned from the clamp's axes into the world's"
 
 
-def _in_unit(kind: str, size: float) -> Callable[[Readings], Readings | None]:
-    return lambda readings: readings.scaled(1 / size) if readings.kind == kind else None
+def _in_unit(quantity: Quantity, size: float) -> Callable[[Readings], Readings | None]:
+    return lambda readings: readings.scaled(1 / size) if readings.quantity is quantity else None
 
 
 def _with_axes(axes: FloatArray) -> Callable[[ComparedReading], ComparedReading | None]:
@@ -162,9 +158,9 @@ def _with_axes(axes: FloatArray) -> Callable[[ComparedReading], ComparedReading 
 READINGS_ALONE: tuple[Mistake[Readings], ...] = (
     Mistake(_OTHER_SIGN, lambda readings: readings.scaled(-1)),
     *(
-        Mistake(f"once they are taken as {unit}. Try: divide by {size:g}.", _in_unit(kind, size))
-        for kind, units in READINGS_IN.items()
-        for unit, size in units.items()
+        Mistake(f"once they are taken as {unit}. Try: divide by {size:g}.", _in_unit(own, size))
+        for own in QUANTITIES
+        for unit, size in own.others.items()
     ),
     Mistake(
         f"{_IN_WORLD}. Try: world axes, R f with the clamp's frame R.",

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
@@ -15,16 +14,17 @@ from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config, Pose
 from dlo_casadi.diagnosis.next_measurement import NextPose
-from dlo_casadi.diagnosis.selection import Diagnosis, HiddenWeight, Ranked, Verdict
+from dlo_casadi.diagnosis.selection import HiddenWeight, Ranked, Verdict
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
-from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.repeats import enough_poses, repeatability
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.rod.obstacles import Obstacle
+from dlo_casadi.rod.quantities import QUANTITIES, Quantity, quantity_of
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.sensing.pixels import ViewInput
+from dlo_casadi.session.found_effects import FoundEffect
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
@@ -63,6 +63,10 @@ class ReadingErrors:
 
     force: float | None = None
     moment: float | None = None
+
+    def of(self, quantity: Quantity) -> float | None:
+        """That of one kind of reading."""
+        return cast(float | None, getattr(self, quantity.name))
 
 
 @dataclass(frozen=True, repr=False)
@@ -235,11 +239,16 @@ class MeasurementSummary:
     moment_std: float | None = None
     held_out_missing: tuple[str, ...] = ()
 
-    def std_of(self, kind: str) -> tuple[float, str]:
-        """Standard deviation of one component of a reading, force or moment, and its unit."""
-        std = self.force_std if kind == "force" else self.moment_std
-        assert std is not None
-        return std, "N" if kind == "force" else "N m"
+    def std_of(self, reading: str) -> tuple[float, str]:
+        """Standard deviation of one component of a reading, by its name, and its unit."""
+        quantity = quantity_of(reading)
+        return getattr(self, quantity.std_key), quantity.unit
+
+    @property
+    def reading_noise(self) -> str:
+        """Standard deviations of what was read, in words."""
+        stds = ((getattr(self, x.std_key), x.unit) for x in QUANTITIES)
+        return ", ".join(f"{std:.2g} {unit}" for std, unit in stds if std is not None)
 
 
 @dataclass(frozen=True)
@@ -268,82 +277,6 @@ class Repeatability:
 
     expected_spread: float
     source: Literal["repeats", "poses"] | None
-
-
-@dataclass(frozen=True)
-class FoundEffect:
-    """An effect that was added to the model.
-
-    Parameters
-    ----------
-    name : str
-    label : str
-        Prefix of its parameters' names in the model, see `Effect`.
-    of : str or None
-        Name of its clip or obstacle, if it is of one; that of the first fitted pose.
-    parameters : dict of Estimate
-    p_value : float or None
-        See `AddedEffect`.
-    rmse_cross_validated_before, rmse_cross_validated_after : float or None [m]
-        Without and with the effect; None where a left-out pose is not predicted.
-    indistinguishable_from : tuple of str
-        Other effects that fit these data equally well.
-    """
-
-    name: str
-    label: str
-    of: str | None
-    parameters: dict[str, Estimate]
-    p_value: float | None
-    rmse_cross_validated_before: float | None
-    rmse_cross_validated_after: float | None
-    indistinguishable_from: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return f"{self.label} of {self.of}" if self.of else self.label
-
-
-def found_effects(diagnosis: Diagnosis) -> tuple[FoundEffect, ...]:
-    """Added effects with their values in the last fit."""
-    return tuple(
-        FoundEffect(
-            name=item.candidate.name,
-            label=item.candidate.effect.label,
-            of=_support(diagnosis.fit, item.candidate.effect),
-            parameters=effect_parameters(diagnosis.fit, item.candidate.effect),
-            p_value=item.p_value,
-            rmse_cross_validated_before=item.before.rmse if item.before.complete else None,
-            rmse_cross_validated_after=item.after.rmse,
-            indistinguishable_from=tuple(
-                dict.fromkeys([*(rival.candidate.name for rival in item.rivals), *item.equivalents])
-            ),
-        )
-        for item in diagnosis.added
-    )
-
-
-def _support(fit: Fit, effect: Effect) -> str | None:
-    """Name of the clip or obstacle that an effect is of; None if it is of none."""
-    first = fit.problem.measured[fit.problem.used[0]].pose
-    known = {"clip": first.clips, "obstacle": fit.model.obstacles}.get(effect.index)
-    return known[getattr(effect, effect.index)].name if known else None
-
-
-def effect_parameters(fit: Fit, effect: Effect) -> dict[str, Estimate]:
-    """Parameters of an effect by their names.
-
-    Parameters that vanish at infinity are estimated as their inverse; both are returned.
-    """
-    rows: dict[str, Estimate] = {}
-    for q in effect.parameters(fit.model.cable):
-        full = f"{effect.label}.{q.name}"
-        value, std = fit.value(full), fit.std(full)
-        rows[q.name] = Estimate(value, std, q.unit, fixed=not std)
-        if q.name in effect.inverses:
-            name, unit = effect.inverses[q.name]
-            inverse = (1 / value, std / value**2) if value > 0 else (math.inf, math.inf)
-            rows[name] = Estimate(*inverse, unit, fixed=not std)
-    return rows
 
 
 @dataclass(frozen=True)

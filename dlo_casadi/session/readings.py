@@ -17,12 +17,13 @@ from dlo_casadi.estimation.prediction import predict_each
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.rod.quantities import FORCE, quantity_of
 from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.session.axes import clamp_axes
 from dlo_casadi.session.coarse_fit import MESH, POSES, coarse_fit
 from dlo_casadi.session.compared_readings import ComparedReading, Readings
 from dlo_casadi.session.fitting import declared_model, straight
-from dlo_casadi.session.mistakes import READINGS, READINGS_ALONE, READINGS_IN
+from dlo_casadi.session.mistakes import READINGS, READINGS_ALONE
 from dlo_casadi.session.questions import Alternatives, Suspicion
 from dlo_casadi.session.read_session import ReadSession, spread
 from dlo_casadi.thresholds import (
@@ -63,24 +64,21 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
     uncertain = _by_unknowns(fit)
     rows = reaction_rows(fit.model.node, len(fit.model.clips))
     measurement, known = session.config.experiment.measurement, session.config.experiment.tolerances
-    stds = {
-        "force": np.hypot(measurement.force_std or 0.0, known.force_bias),
-        "moment": np.hypot(measurement.moment_std or 0.0, known.moment_bias),
-    }
     compared, poses = [], [session.declared[item.name] for item in shown]
     for name, at in rows.items():
         own = [k for k, item in enumerate(poses) if name in item.readings]
         if not own:
             continue
-        side, _, kind = name.rpartition("_")
+        side, quantity = name.rpartition("_")[0], quantity_of(name)
+        noise = getattr(measurement, quantity.std_key) or 0.0
         compared.append(
             ComparedReading(
                 name,
                 np.array([poses[k].readings[name] for k in own]),
                 felt[own, at],
                 _frames(fit.model, [poses[k] for k in own], name),
-                felt[own, rows[f"{side}_force"]] if kind == "moment" else None,
-                float(stds[kind]),
+                felt[own, rows[f"{side}_force"]] if quantity.turning else None,
+                float(np.hypot(noise, getattr(known, quantity.bias_key))),
                 uncertain[own, at],
             )
         )
@@ -100,7 +98,7 @@ def wrong_without_shapes(config: Config, names: Sequence[str]) -> tuple[Suspicio
     felt = _of_any_stiffness(model, [pose.held for pose in shown])
     rows = reaction_rows(model.node, len(model.clips))
     read = [name for name in rows if any(name in pose.readings for pose in shown)]
-    names = [name for name in read if name.endswith("force")] or read
+    names = [name for name in read if not quantity_of(name).turning] or read
     if not len(felt) or not names:
         return ()
     own = {name: [k for k, pose in enumerate(shown) if name in pose.readings] for name in names}
@@ -201,16 +199,16 @@ def misread(
             found += [Suspicion(_UNLIKE.format(one.name, own), False)] * doubted
             continue
         scales[one.name] = one.scale
-    forces = {name: scale for name, scale in scales.items() if name.endswith("force")}
+    forces = {name: scale for name, scale in scales.items() if not quantity_of(name).turning}
     if not sized:  # only what all readings have in common is unknown
         first = next(iter(forces or scales), "")
         for name in [name for name in scales if name != first]:
             found += _other_unit(name, scales[name] / scales[first], first, told=True)
         return tuple(found)
     # Forces in a known other unit count in newtons.
-    newtons = [x / READINGS_IN["force"].get(_unit_of(name, x), 1.0) for name, x in forces.items()]
+    newtons = [x / FORCE.others.get(_unit_of(name, x), 1.0) for name, x in forces.items()]
     for name, scale in scales.items():
-        if name.endswith("moment") and newtons:
+        if name not in forces and newtons:
             found += _other_unit(name, scale / float(np.median(newtons)), "forces")
         else:
             found += _other_unit(name, scale, "mass")
@@ -219,7 +217,7 @@ def misread(
 
 def _unit_of(name: str, scale: float) -> str:
     """The unit that a scale of readings is near; empty if there is none."""
-    units = READINGS_IN[name.split("_")[-1]]
+    units = quantity_of(name).others
     unit = min(units, key=lambda one: abs(np.log(scale / units[one])))
     return unit if 0.5 < scale / units[unit] < 2.0 else ""
 
@@ -234,7 +232,7 @@ def _other_unit(name: str, scale: float, beside: str, *, told: bool = False) -> 
     cures, pairs = [], [("", name, scale), (f"{beside} ", beside, 1 / scale)]
     for whose, one, factor in pairs[: 1 + told]:
         if unit := _unit_of(one, factor):
-            size = READINGS_IN[one.split("_")[-1]][unit]
+            size = quantity_of(one).others[unit]
             cures.append(f"{whose}in {unit}? Try: divide {whose}by {size:g}.")
     cure = f": {' Or '.join(cures)}" if cures else ". Try: N and N m."
     text = f"{name} is {scale:.3g} times what shapes and {beside} need{cure}"

@@ -21,6 +21,7 @@ from dlo_casadi.estimation.repeats import enough_poses
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import SETTLED_MODES, SMOOTH_MODES
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.quantities import quantity_of
 from dlo_casadi.runtime.executors import InProcess, one_thread, software
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.runtime.progress import Progress, Step, nobody
@@ -28,8 +29,9 @@ from dlo_casadi.runtime.work import accounted, accounted_as, add, part
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.fit_remarks import fit_warnings
+from dlo_casadi.session.found_effects import found_effects
 from dlo_casadi.session.measure import measured_poses, read_session
-from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, Stage, found_effects
+from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, Stage
 from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_parameters
@@ -302,7 +304,7 @@ def _summary(
 ) -> MeasurementSummary:
     readable = [item for item in measured if item.readable]
     readings = [name for item in readable for name in item.reactions]
-    kinds, points = {name.split("_")[-1] for name in readings}, fit.noise.of_points
+    read, points = {quantity_of(name) for name in readings}, fit.noise.of_points
     noise, shown = points.readings, any(item.has_points for item in readable)
     return MeasurementSummary(
         kind=config.experiment.measurement.kind,
@@ -314,7 +316,6 @@ def _summary(
         correlation_length=fit.noise.length if fit.noise.share > 0 else 0.0,
         noise_distance=noise_distance(measured, points.std) if shown else None,
         readings=len(readings),
-        force_std=noise.force if "force" in kinds else None,
-        moment_std=noise.moment if "moment" in kinds else None,
+        **{x.std_key: noise.of(x) for x in read},
         held_out_missing=remarks.held_out_missing(inputs, config.skipped),
     )

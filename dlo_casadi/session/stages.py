@@ -34,6 +34,7 @@ from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.quantities import quantity_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import MASS, ReadingErrors, RestCurvatureEstimate, Stage, StageName
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
@@ -209,10 +210,7 @@ class _Model:
         rows = reaction_rows(self.model.node, len(item.pose.clips))
         std = repeats.reading_std
         return {
-            name: np.hypot(
-                std[rows[name]], noise.moment if name.endswith("moment") else noise.force
-            )
-            for name in item.reactions
+            name: np.hypot(std[rows[name]], noise.of(quantity_of(name))) for name in item.reactions
         }
 
     def _either_side(
@@ -282,11 +280,12 @@ def _reading_errors(
     names = [x.pose.name for x in measured if x.held_out is held_out and x.reactions]
     if not shapes.keys() >= set(names):
         return ReadingErrors()
-    squares: dict[str, list[float]] = {"force": [], "moment": []}
+    squares: dict[str, list[float]] = {}
     for name in names:
         for reading, (known, model) in shapes[name].readings.items():
-            squares[reading.split("_")[-1]].append(float(((known - model) ** 2).sum()))
-    return ReadingErrors(*(float(np.sqrt(np.mean(x))) if x else None for x in squares.values()))
+            square = float(((known - model) ** 2).sum())
+            squares.setdefault(quantity_of(reading).name, []).append(square)
+    return ReadingErrors(**{name: float(np.sqrt(np.mean(x))) for name, x in squares.items()})
 
 
 def _no_rest(model: CableModel) -> RestCurvatureEstimate:

@@ -15,7 +15,8 @@ from dlo_casadi.report import figures, figures_poses
 from dlo_casadi.report.figures_poses import write_overlays
 from dlo_casadi.report.scene import beside
 from dlo_casadi.report.words import compared
-from dlo_casadi.session.outcome import FoundEffect, PoseInput
+from dlo_casadi.session.found_effects import FoundEffect
+from dlo_casadi.session.outcome import PoseInput
 from dlo_casadi.show.style import save_figure
 
 PHOTO = Path(__file__).parents[2] / "configs" / "bench" / "connector" / "pose_03.jpg"

@@ -12,8 +12,8 @@ from dlo_casadi.config import DeclaredEffect, load_config
 from dlo_casadi.effects import EFFECTS
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.session.fitting import declared_model
+from dlo_casadi.session.found_effects import effect_parameters
 from dlo_casadi.session.measure import measured_poses, read_inputs
-from dlo_casadi.session.outcome import effect_parameters
 
 ROOT = Path(__file__).resolve().parents[2]
 TRUTH = ROOT / "tests" / "data" / "bench_truth"
