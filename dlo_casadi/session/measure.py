@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from dlo_casadi.sensing.sensors import line_or_markers
 from dlo_casadi.session.outcome import PoseInput
 
 # Photographs read in parallel: on two cores this takes 0.66 of the serial time.
-READERS = 2
+THREADS = 2
 # Points per line used by fits, errors and pictures. More points of a photograph would repeat their
 # neighbours' noise; other lines enter the fit as means of neighbours.
 MOST_POINTS = 240
@@ -39,7 +39,7 @@ def read_inputs(config: Config, step: Step = nobody) -> tuple[PoseInput, ...]:
     Several are read at a time: OpenCV and NumPy release the interpreter for half of the work.
     """
     poses, inputs = config.experiment.poses, []
-    threads = ThreadPoolExecutor(READERS)
+    threads = ThreadPoolExecutor(THREADS)
     try:
         found = threads.map(lambda pose: _read(config, pose), poses)
         for k, pose in enumerate(poses):
@@ -56,7 +56,7 @@ def _read(config: Config, pose: Pose) -> PoseInput:
     try:
         if pose.name in skipped:
             raise MeasurementError(skipped[pose.name])
-        return _without_copies(config, pose, _reader(config, pose)(config, pose))
+        return _without_copies(config, pose, _reader(config, pose).read(config, pose))
     except MeasurementError as error:
         said = error.message.removeprefix(f"{pose.name}: ")  # a photograph may have the pose's name
         return PoseInput.unread(config, pose, said)
@@ -112,7 +112,7 @@ def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
 
     It ends where the visible cable ends, whatever the configuration says.
     """
-    if _reader(config, pose) is not _read_image:
+    if _reader(config, pose).read is not _read_image:
         return None
     try:
         image = vision.read_image(pose.paths[0])
@@ -121,16 +121,6 @@ def line_without_end(config: Config, pose: Pose) -> np.ndarray | None:
         return vision.extract_centerline(image, view, _held(config, free)).points
     except MeasurementError:
         return None
-
-
-def _reader(config: Config, pose: Pose) -> Callable[[Config, Pose], PoseInput]:
-    if not pose.shown:
-        return _read_nothing
-    if pose.points is not None:
-        return _read_points
-    if config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv":
-        return _read_csv
-    return _read_views if config.experiment.in_space else _read_image
 
 
 def _read_nothing(config: Config, pose: Pose) -> PoseInput:
@@ -226,8 +216,8 @@ def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
     Keys: name of the photograph, see `Pose.labelled`, and of the step. Raises VisionError if none
     of its photographs can be read.
     """
-    reader = _reader(config, pose)
-    if reader in (_read_csv, _read_points, _read_nothing):
+    look = _reader(config, pose).look
+    if look is None:
         return {}
     cable = _held(config, pose)
     drawn: dict[str, np.ndarray] = {}
@@ -240,16 +230,63 @@ def draw_steps(config: Config, pose: Pose) -> dict[str, np.ndarray]:
             continue
         workings = vision.Workings()
         with suppress(MeasurementError):  # the pictures show how far it got; the table says why
-            if reader is _read_views:
-                viewpoint = vision.locate_camera(image, *_equipment(config))
-                vision.see_cable(image, viewpoint, cable, workings)
-            else:
-                vision.extract_centerline(image, view_of(config, image), cable, workings)
+            look(config, image, cable, workings)
         steps = vision.draw_steps(image, workings)
         drawn |= {f"{name}_{step}": shown for step, shown in steps.items()}
     if unread is not None and not drawn:
         raise unread
     return drawn
+
+
+def _look_in_space(
+    config: Config, image: np.ndarray, cable: vision.KnownCable, workings: vision.Workings
+) -> None:
+    viewpoint = vision.locate_camera(image, *_equipment(config))
+    vision.see_cable(image, viewpoint, cable, workings)
+
+
+def _look_on_board(
+    config: Config, image: np.ndarray, cable: vision.KnownCable, workings: vision.Workings
+) -> None:
+    vision.extract_centerline(image, view_of(config, image), cable, workings)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One way in which a pose was measured.
+
+    Parameters
+    ----------
+    applies : callable
+        Whether a pose of a configuration was measured so.
+    read : callable
+        What was measured.
+    look : callable, optional
+        Repeats what the camera does in a photograph, for the pictures of its steps.
+    """
+
+    applies: Callable[[Config, Pose], bool]
+    read: Callable[[Config, Pose], PoseInput]
+    look: Callable[[Config, np.ndarray, vision.KnownCable, vision.Workings], None] | None = None
+
+
+# The first that applies reads a pose.
+READERS = (
+    Reader(lambda config, pose: not pose.shown, _read_nothing),
+    Reader(lambda config, pose: pose.points is not None, _read_points),
+    Reader(
+        lambda config, pose: (
+            config.experiment.measurement.kind != "images" or pose.paths[0].suffix.lower() == ".csv"
+        ),
+        _read_csv,
+    ),
+    Reader(lambda config, pose: config.experiment.in_space, _read_views, _look_in_space),
+    Reader(lambda config, pose: True, _read_image, _look_on_board),
+)
+
+
+def _reader(config: Config, pose: Pose) -> Reader:
+    return next(reader for reader in READERS if reader.applies(config, pose))
 
 
 def _turned(config: Config, pose: Pose, image: np.ndarray) -> str:

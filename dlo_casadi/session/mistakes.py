@@ -121,6 +121,10 @@ DIRECTIONS: tuple[Mistake[Clamps], ...] = (
     ),
     Mistake("counter-clockwise is positive:", _read("heading", lambda angle: -angle)),
     Mistake(
+        "counter-clockwise from x; here headings seem to run clockwise from y, as a compass:",
+        _read("heading", lambda angle: np.pi / 2 - angle),
+    ),
+    Mistake(
         "w last, [qx, qy, qz, qw]; here w seems to stand first:",
         _read("orientation", lambda q: np.roll(q, -1)),
     ),

@@ -12,7 +12,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
-from dlo_casadi.errors import counted
+from dlo_casadi.errors import worded
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.points import MeasuredPoints
 from dlo_casadi.sensing.sensors import line_or_markers
@@ -54,11 +54,15 @@ class Outliers:
     lines: int
 
     def __str__(self) -> str:
-        named, more = ", ".join(self.names[:NAMED]), len(self.names) - NAMED
-        return (
-            f"{counted(len(self.names), 'point')} up to {1e3 * self.farthest:.2g} mm off the "
-            f"neighbours on the line (usual: {1e3 * self.std:.2g} mm): {named}"
-            f"{f' and {more} more' if more > 0 else ''} (points are counted from the start)"
+        more = len(self.names) - NAMED
+        return worded(
+            "{count:# point} up to {farthest:mm.2g} off the neighbours on the line (usual: "
+            "{usual:mm.2g}): {named}{more} (points are counted from the start)",
+            count=len(self.names),
+            farthest=self.farthest,
+            usual=self.std,
+            named=self.names[:NAMED],
+            more=f" and {more} more" if more > 0 else "",
         )
 
 

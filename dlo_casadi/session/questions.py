@@ -10,6 +10,8 @@ from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
+from dlo_casadi.errors import worded
+
 T = TypeVar("T")
 
 
@@ -36,8 +38,8 @@ class Mistake(Generic[T]):
     Parameters
     ----------
     says : str
-        Its description and remedy. In braces: `own` and `left`, the misfits without and with it,
-        and values of what was declared and meant, such as `{was.length:.4g}`, `{meant.length}`.
+        Its description and remedy, see `errors.worded`: `own` and `left` are the misfits without
+        and with it, `was` and `meant` what was declared and meant, as in `{was.length:.4g}`.
     meant : callable
         What is compared, had it been declared as it was meant; None where the row does not apply.
     beyond : float
@@ -62,7 +64,7 @@ class Explanation(NamedTuple, Generic[T]):
     def said(self, words: str = "{row}") -> str:
         """Words, in which `{row}` stands for those of the row."""
         values = {"was": self.was, "meant": self.meant, "own": self.own, "left": self.left}
-        return words.format(row=self.row.says.format(**values), **values)
+        return worded(words, row=worded(self.row.says, **values), **values)
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,12 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
+from dlo_casadi.errors import worded
+
 
 def millimetres(value: float | None, nothing: str = "-") -> str:
     """A length [m] as text in mm, with three digits; a dash for none."""
-    return nothing if value is None else f"{1e3 * value:.3g} mm"
+    return nothing if value is None else worded("{value:mm}", value=value)
 
 
 # Bend radius [m] from which on a cable is straight: over 100 m it deviates by a millimetre.

@@ -68,6 +68,7 @@ def test_a_clamp_that_is_a_little_askew_is_no_mistake(turn, askew, tmp_path):
     [
         ("start", np.pi + np.array(BEGINS), "along the cable from its start to its end: then -1.1"),
         ("start", [1.1, 0.6, -0.2], "counter-clockwise is positive: then -1.1"),
+        ("start", np.pi / 2 - np.array(BEGINS), "clockwise from y, as a compass: then -1.1"),
         ("end", [20.0, 20.0, 20.0], "in degrees? then 0.3491."),
     ],
 )
