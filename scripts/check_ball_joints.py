@@ -1,12 +1,14 @@
 """Clean sessions of cables in space whose rest shape and twist are hard to tell, from another rod.
 
     python scripts/check_ball_joints.py [--count 40] [--first 0] [--seed 0] [--jobs N]
-        [--wires] [--keep FOLDER] [--output FILE]
+        [--wires | --swivels] [--keep FOLDER] [--output FILE]
 
 Each session is a cable between two ball joints, curved at rest about both axes by 0.2 to 1.5 over
 its length: seven fitted poses and two held out, markers and lines in turn, 0.3 mm of white noise,
 ends within 0.1 mm of where they are declared. Nothing holds its roll about its own axis, so that
 the same shapes have equilibria that are saddles of the energy.
+
+With --swivels one end or both hold the direction, too: the other one is a clamp.
 
 With --wires a session is a light wire twisted by 1 to 2 turns between two clamps that are known to
 0.05 rad: three or four fitted poses, 11 to 16 points each with 3 mm of noise, 4 mm declared.
@@ -23,7 +25,7 @@ import os
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,7 +47,8 @@ FloatArray = NDArray[np.floating]
 
 G = 9.81  # m/s^2
 SIDES = ("start", "end")
-STD, END_STD = 3e-4, 1e-4  # m
+STD, END_STD, FRAME_STD = 3e-4, 1e-4, 2e-3  # m, m, rad
+SWIVELS = (("clamped", "swivel"), ("swivel", "clamped"), ("swivel", "swivel"))
 WIRE_STD, WIRE_DECLARED, CLAMP_STD = 3e-3, 4e-3, 0.03  # m, m, rad
 # Segments of the rod: nodes of 60 lie within 0.02 mm of those of 240 (0.6 m, bent by 1.5 / m).
 SEGMENTS = {False: 60, True: 80}
@@ -92,6 +95,18 @@ class Row:
 
 def between_ball_joints(index: int, generator: np.random.Generator, folder: Path) -> float:
     """Write a session of a curved cable between two ball joints; its EI."""
+    return curved(("pinned", "pinned"), index, generator, folder)
+
+
+def between_swivels(index: int, generator: np.random.Generator, folder: Path) -> float:
+    """Write a session of a curved cable of which a swivel holds one end, or both; its EI."""
+    return curved(SWIVELS[index % len(SWIVELS)], index, generator, folder)
+
+
+def curved(
+    held: tuple[str, str], index: int, generator: np.random.Generator, folder: Path
+) -> float:
+    """Write a session of a cable that is curved at rest, held so; its EI."""
     length, mass = generator.uniform(0.4, 0.8), generator.uniform(0.03, 0.06)
     spread = np.exp(generator.uniform(*np.log([0.04, 0.3])))
     bending = mass * G * length**2 * spread
@@ -102,7 +117,13 @@ def between_ball_joints(index: int, generator: np.random.Generator, folder: Path
     )
     rest = sizes[:, None] * kinds[generator.integers(0, len(kinds), 2)]
     rod = SegmentRod(
-        length, np.array([0, 0, -mass * G]), bending, bending * generator.uniform(0.55, 0.85), rest
+        length,
+        np.array([0, 0, -mass * G]),
+        bending,
+        bending * generator.uniform(0.55, 0.85),
+        rest,
+        clamped="pinned" not in held,
+        rolls=(held[0] == "swivel", held[1] == "swivel"),
     )
     start, poses = generator.uniform(-0.2, 0.3, 3).round(3), []
     while len(poses) < 9:
@@ -110,6 +131,19 @@ def between_ball_joints(index: int, generator: np.random.Generator, folder: Path
         chord = generator.uniform(0.55, 0.9) * length * way / np.linalg.norm(way)
         end = (start + chord).round(5)
         true = Ends(start, end + END_STD * generator.standard_normal(3))
+        frames: list[Rotation] = []
+        if rod.clamped:
+            along, _ = Rotation.align_vectors([chord], [[1.0, 0.0, 0.0]])
+            turns = generator.uniform(-1.0, 1.0, (2, 3)) * [3.0, 0.6, 0.6]
+            frames = [along * Rotation.from_rotvec(turn) for turn in turns]
+            off = FRAME_STD * generator.standard_normal((2, 3))
+            true = replace(
+                true,
+                frames=tuple(
+                    (frame * Rotation.from_rotvec(one)).as_quat()
+                    for frame, one in zip(frames, off, strict=True)
+                ),
+            )
         nodes = rod.shape(true, STARTS, GAP)
         if nodes is None:
             continue
@@ -120,9 +154,11 @@ def between_ball_joints(index: int, generator: np.random.Generator, folder: Path
         write_points(folder / name, points, s if marked else None)
         role = "held_out" if len(poses) in (3, 7) else "fit"
         poses.append({"file": name, "start": start.tolist(), "end": end.tolist(), "role": role})
+        declared_frames = zip(SIDES, frames, strict=bool(frames))
+        poses[-1] |= {f"{k}_orientation": f.as_quat().tolist() for k, f in declared_frames}
     declared = bending * float(np.exp(generator.uniform(-0.7, 0.7)))
     cable = {"length": length, "mass": mass, "diameter": 0.004, "bending_stiffness": declared}
-    write(folder, cable, "pinned", STD, poses)
+    write(folder, cable, held, STD, poses)
     return bending
 
 
@@ -165,17 +201,21 @@ def twisted_wire(index: int, generator: np.random.Generator, folder: Path) -> fl
         poses.append(pose | {"turns": turns, "role": "fit"})
     declared = bending * float(np.exp(generator.uniform(-0.5, 0.5)))
     cable = {"length": length, "mass": mass, "diameter": 0.0035, "bending_stiffness": declared}
-    write(folder, cable | {"rest_shape": "straight"}, "clamped", WIRE_DECLARED, poses)
+    write(folder, cable | {"rest_shape": "straight"}, ("clamped", "clamped"), WIRE_DECLARED, poses)
     return bending
 
 
 def write(
-    folder: Path, cable: dict[str, Any], held: str, std: float, poses: list[dict[str, Any]]
+    folder: Path,
+    cable: dict[str, Any],
+    held: tuple[str, str],
+    std: float,
+    poses: list[dict[str, Any]],
 ) -> None:
     """Write session.yaml."""
     experiment = {
         "gravity": [0.0, 0.0, -G],
-        "boundary": {"start": held, "end": held},
+        "boundary": dict(zip(SIDES, held, strict=True)),
         "measurement": {"kind": "centerlines", "std": std},
         "poses": poses,
     }
@@ -183,12 +223,14 @@ def write(
     (folder / "session.yaml").write_text(dump_yaml(document), encoding="utf-8")
 
 
-def fitted(index: int, seed: int, wires: bool, keep: Path) -> Row:
+DRAWS = {"balls": between_ball_joints, "swivels": between_swivels, "wire": twisted_wire}
+
+
+def fitted(index: int, seed: int, kind: str, keep: Path) -> Row:
     """Simulate and fit one session."""
-    folder = keep / f"{'wire' if wires else 'balls'}_{index:02d}"
+    folder = keep / f"{kind}_{index:02d}"
     folder.mkdir(parents=True, exist_ok=True)
-    draw = twisted_wire if wires else between_ball_joints
-    true = draw(index, generator_of(seed, index), folder)
+    true = DRAWS[kind](index, generator_of(seed, index), folder)
     began = time.process_time()
     result = dlo.fit(folder / "session.yaml")
     seconds, stage = time.process_time() - began, result.stages[-1]
@@ -211,14 +253,14 @@ def main() -> int:
     """Print the table and its counts."""
     count = 40, "number of sessions"
     parser = options(__doc__, count=count, first=True, seed=0, jobs=True, output=True)
-    parser.add_argument("--wires", action="store_true", help="twisted wires between two clamps")
+    parser.add_argument("--wires", dest="kind", action="store_const", const="wire")
+    parser.add_argument("--swivels", dest="kind", action="store_const", const="swivels")
+    parser.set_defaults(kind="balls")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="sessions stay there")
     chosen = parser.parse_args()
     print(TITLE, flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        work = partial(
-            fitted, seed=chosen.seed, wires=chosen.wires, keep=chosen.keep or Path(folder)
-        )
+        work = partial(fitted, seed=chosen.seed, kind=chosen.kind, keep=chosen.keep or Path(folder))
         cases = range(chosen.first, chosen.first + chosen.count)
         rows = run(work, cases, chosen, lambda case, row, seconds: row.text)
     complete = sum(row.verdict == "complete" for row in rows)
@@ -229,7 +271,7 @@ def main() -> int:
         f"in {sum(row.inside for row in rows)}"
         + (f", held out {np.median(over):.2f} x noise, at most {max(over):.2f}" if over else "")
     )
-    return int(stable < len(rows) or (not chosen.wires and complete < len(rows)))
+    return int(stable < len(rows) or (chosen.kind != "wire" and complete < len(rows)))
 
 
 if __name__ == "__main__":

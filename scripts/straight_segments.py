@@ -4,7 +4,7 @@
     s.t. sum_i h t_i = end - start,   |q_i| = 1,   k_i = 2 vec(conj(q_i) q_(i+1)) / h_i
 
 Each segment has a unit quaternion q (x, y, z, w) whose first axis is its direction t. A clamp is
-one more frame, half a segment away.
+one more frame, half a segment away; of a swivel that frame may roll.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class Ends:
 class SegmentRod:
     """A rod: length [m], weight (3,) [N] of it all, stiffnesses [N m^2], rest curvature [1/m].
 
-    `rest`: (2, n) about the axes y and z in the middle of each of n segments.
+    `rest`: (2, n) about the axes y and z in the middle of each of n segments. `rolls`: whether the
+    rod may roll in the clamp of its start, of its end.
     """
 
     length: float
@@ -51,6 +52,7 @@ class SegmentRod:
     torsion: float
     rest: FloatArray
     clamped: bool = False
+    rolls: tuple[bool, bool] = (False, False)
 
     @property
     def _n(self) -> int:
@@ -63,9 +65,12 @@ class SegmentRod:
         tangents = [_direction(q[:, i]) for i in range(n)]
         places = (np.arange(n) + 0.5) * h
         joints = [(q[:, i], q[:, i + 1], h, (i + 1) * h) for i in range(n - 1)]
+        rolled, half = [clamps[:, 0], clamps[:, 1]], ca.SX.sym("half_roll", sum(self.rolls))
+        for own, side in zip(ca.vertsplit(half), np.flatnonzero(self.rolls), strict=False):
+            rolled[side] = _rolled(rolled[side], own)
         if self.clamped:
-            joints.append((clamps[:, 0], q[:, 0], h / 2, h / 4))
-            joints.append((q[:, -1], clamps[:, 1], h / 2, self.length - h / 4))
+            joints.append((rolled[0], q[:, 0], h / 2, h / 4))
+            joints.append((q[:, -1], rolled[1], h / 2, self.length - h / 4))
         energy = ca.SX(0)
         for first, last, width, place in joints:
             rest = [0.0, *(np.interp(place, places, row) for row in self.rest)]
@@ -76,7 +81,7 @@ class SegmentRod:
         reached = sum(tangents, ca.SX.zeros(3)) * h - chord
         units = ca.sum1(q**2).T - 1
         problem = {
-            "x": ca.vec(q),
+            "x": ca.vertcat(ca.vec(q), half),
             "p": ca.vertcat(ca.vec(clamps), chord),
             "f": energy / self._scale,
             "g": ca.vertcat(reached / self.length, units),
@@ -117,7 +122,11 @@ class SegmentRod:
             # The roll about the axis goes round another way than the arc about its chord.
             frames = frames * Rotation.from_rotvec(2 * np.pi * 3 * side * X)
         else:
-            first, last = (Rotation.from_quat(frame) for frame in ends.frames)
+            both = [Rotation.from_quat(frame) for frame in ends.frames]
+            for k in np.flatnonzero(self.rolls):  # begins without twist
+                x, _, _, w = (frames[-k].inv() * both[k]).as_quat()
+                both[k] = both[k] * Rotation.from_rotvec(-2 * np.arctan2(x, w) * X)
+            first, last = both
             x, _, _, w = (frames[0].inv() * first).as_quat()
             begin = 2 * np.arctan2(x, w)
             x, _, _, w = (frames[-1].inv() * last).as_quat()
@@ -127,11 +136,13 @@ class SegmentRod:
         q = frames.as_quat()
         q = q * np.cumprod(np.where((q * np.roll(q, 1, axis=0)).sum(1) < 0, -1, 1))[:, None]
         if ends.frames is not None:
-            clamps = np.array(ends.frames) * np.sign((ends.frames * q[[0, -1]]).sum(1))[:, None]
-        found = self._solver(x0=q.ravel(), p=[*clamps.ravel(), *chord], lbg=0.0, ubg=0.0)
+            clamps = np.array([first.as_quat(), last.as_quat()])
+            clamps *= np.sign((clamps * q[[0, -1]]).sum(1))[:, None]
+        x0 = np.append(q.ravel(), np.zeros(sum(self.rolls)))
+        found = self._solver(x0=x0, p=[*clamps.ravel(), *chord], lbg=0.0, ubg=0.0)
         if not self._solver.stats()["success"]:
             return None
-        return float(found["f"]), np.array(found["x"]).reshape(-1, 4)
+        return float(found["f"]), np.array(found["x"])[: q.size].reshape(-1, 4)
 
     def points(self, nodes: FloatArray, s: FloatArray) -> FloatArray:
         """Points (K, 3) at arc lengths on the smooth curve through the nodes."""
@@ -141,6 +152,14 @@ class SegmentRod:
 def _direction(q: ca.SX) -> ca.SX:
     x, y, z, w = q[0], q[1], q[2], q[3]
     return ca.vertcat(w**2 + x**2 - y**2 - z**2, 2 * (x * y + w * z), 2 * (x * z - w * y))
+
+
+def _rolled(q: ca.SX, half: ca.SX) -> ca.SX:
+    """A frame rolled about its first axis by twice that angle [rad]."""
+    s, c = ca.sin(half), ca.cos(half)
+    return ca.vertcat(
+        q[3] * s + q[0] * c, q[1] * c + q[2] * s, q[2] * c - q[1] * s, q[3] * c - q[0] * s
+    )
 
 
 def _conjugate_product(a: ca.SX, b: ca.SX) -> ca.SX:

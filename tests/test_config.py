@@ -221,8 +221,13 @@ def test_a_configuration_cannot_be_changed(tmp_path):
         ("1.28e-2", "0.7", 5, "0.7 m make 0.23 kg lighter than air.* did you mean 0.007?"),
         # words
         ("held_out", "test", 14, "role: allowed are 'fit' or 'held_out', found 'test'"),
-        ("start: pinned", "start: free", 9, "'pinned' or 'clamped', .*only the end can be free"),
-        ("end: pinned", "end: glued", 9, "'pinned', 'clamped' or 'free', found 'glued'"),
+        (
+            "start: pinned",
+            "start: free",
+            9,
+            "'pinned', 'clamped' or 'swivel', .*only the end can be free",
+        ),
+        ("end: pinned", "end: glued", 9, "'pinned', 'clamped', 'swivel' or 'free', found 'glued'"),
         ("kind: centerlines", "kind: photos", 10, "kind must be images or centerlines, .*'photos'"),
         ("kind: centerlines, ", "", 10, "kind must be images or centerlines, found nothing"),
         # stiffness

@@ -25,9 +25,9 @@ MASS, PLACE, RATIO = 0.02, 0.25, 3.0
 ON_TABLE = HeldPose((0.0, 0.0), (0.5, 0.1))
 
 
-def in_space(*effects, **values):
+def in_space(*effects, start="clamped", end="clamped", **values):
     """A curved cable between two clamps, far from straight."""
-    model = CableModel(SPACE, 20, "quadratic", "clamped", "clamped", (0, 0, -9.81), n_rest=4)
+    model = CableModel(SPACE, 20, "quadratic", start, end, (0, 0, -9.81), n_rest=4)
     for effect in effects:
         model = model.with_effect(EFFECTS[effect]())
     p = model.nominal.copy()
@@ -62,6 +62,8 @@ CASES = {
     "flat": lambda: in_space(
         "bending_anisotropy", bending_anisotropy__ratio=RATIO, bending_anisotropy__angle=0.4
     ),
+    "swivel": lambda: in_space(end="swivel"),
+    "swivels": lambda: in_space(start="swivel", end="swivel"),
     "plane": in_plane,
     "overhang": lambda: in_plane("clamped", "free"),
 }

@@ -170,7 +170,7 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
             raise DloError(f"the {side} of {name} is {held}: {key} has no meaning")
         if held.direction and given.setdefault(key, shared.get(key)) is None:
             raise DloError(
-                f"the {side} of {name} is clamped, with no {kind} that all poses share: "
+                f"the {side} of {name} is {held}, with no {kind} that all poses share: "
                 f"give {key} {own.unit}"
             )
     posed = Pose(**given)

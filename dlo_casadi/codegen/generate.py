@@ -148,7 +148,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "ELASTIC": model.n_inner > 0,
             "STRETCHES": model.extensible,
             "SMOOTH": kind.smooth,
-            "SPINS": model.may_spin and not case.rest.any(),
+            **_rolls(case),
             "SPRUNG": case.meshes["kernel"].ends is not None,
             "TABLE": table_to_c(table),
             "CODE": size_of_code(case.meshes.values(), table),
@@ -169,6 +169,27 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "PATH_STEPS": int(values["STEPS"]) + most * (2 * FINEST + 13),
         }
     )
+
+
+def _rolls(case: Case) -> dict[str, int | str]:
+    """Where the cable may roll in clamps of its ends, and whether all of it may: it is held then.
+
+    That is by the first clamp there is, or else, SPINS, by a number on the first node's diagonal.
+    """
+    ends, twists = (case.model.start, case.model.end), case.model.node.twists
+    swivels = [kind.direction and not kind.roll and twists for kind in ends]
+    spins = case.model.may_spin and not case.rest.any()
+    rolls = [own and not (spins and k == swivels.index(True)) for k, own in enumerate(swivels)]
+    if any(own and case.compliances[k] > 0 for k, own in enumerate(swivels)):
+        raise DloError("no solver can be generated for a swivel that gives way\n  Try: without it")
+    return {
+        "SPINS": spins and not any(swivels),
+        "ROLLS_START": rolls[0],
+        "ROLLS_END": rolls[1],
+        "SWIVEL_START": swivels[0],
+        "SWIVEL_END": swivels[1],
+        "TURNS": all(kind.roll for kind in ends),
+    }
 
 
 def table_of(model: CableModel, p: FloatArray, rest: FloatArray) -> list[float]:

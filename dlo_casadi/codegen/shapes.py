@@ -367,7 +367,7 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     }
     for name, direction in directions.items():
         if direction is None:
-            raise DloError(f"{said}its fixture is clamped, give {name} {own.unit}")
+            raise DloError(f"{said}its fixture holds the direction, give {name} {own.unit}")
     try:
         numbers = np.asarray([*pose.ends, pose.turns], float)
     except (TypeError, ValueError):

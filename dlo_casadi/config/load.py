@@ -321,7 +321,7 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
                 yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
         if how.direction and getattr(pose, f"{key}_{own.direction}") is None:
             one = "an" if key == "end" else "a"
-            yield f"a clamped {key} needs {one} {key}_{own.direction} {own.unit}", None
+            yield f"a {how} {key} needs {one} {key}_{own.direction} {own.unit}", None
     if held.end.place and pose.end is None:
         yield f"a {held.end} end needs its position: end: {own.place}", None
     if not held.end.place:

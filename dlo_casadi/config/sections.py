@@ -251,8 +251,8 @@ class Experiment(ConfigSection):
     """Gravity in the board frame, such as [0.0, -9.81] [m/s^2]; three numbers put the cable in
     space."""
     boundary: Annotated[Boundary, _as_boundary]
-    """How the two ends are held: {start: pinned | clamped, end: pinned | clamped | free}, or
-    [start, end]."""
+    """How the two ends are held: {start: pinned | clamped | swivel, end: pinned | clamped |
+    swivel | free}, or [start, end]."""
     measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
     """What the files of the poses are: kind: images or kind: centerlines."""
     tolerances: Annotated[DeclaredTolerances, optional(DeclaredTolerances)] = DeclaredTolerances()

@@ -24,8 +24,8 @@ from dlo_casadi.rod.obstacles import Obstacle as Surface
 from dlo_casadi.rod.supports import CLIPS, ENDS, STARTS, SupportKind
 
 # What type checkers accept as the kind of a start, an end, a clip.
-_Start: TypeAlias = SupportKind | Literal["pinned", "clamped"]
-_End: TypeAlias = SupportKind | Literal["pinned", "clamped", "free"]
+_Start: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel"]
+_End: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "free"]
 _Clip: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "eyelet"]
 
 
@@ -33,9 +33,10 @@ class Boundary(ConfigSection):
     """How the two ends are held."""
 
     start: Given[Annotated[SupportKind, one_of(STARTS)], _Start] = entry()
-    """Start of the cable: pinned (free to turn) or clamped (its heading is held)."""
+    """Start of the cable: pinned (free to turn), clamped (its direction is held, in space its roll,
+    too) or swivel (its direction is held, it may roll about its axis)."""
     end: Given[Annotated[SupportKind, one_of(ENDS)], _End] = entry()
-    """End of the cable: pinned, clamped or free."""
+    """End of the cable: pinned, clamped, swivel or free."""
 
     @property
     def directed(self) -> bool:

@@ -258,13 +258,14 @@ def guessed_frames(
 
     Between two ends: four arcs of the cable's length, the first sagging along gravity, the others
     rotated about the chord by quarter turns. They are bent into the clamps; the roll of the end
-    clamp nearest to `turns` is spread evenly. Without `turns`, a roll of nearly half a turn is
-    tried both ways round. With a free end: the rest shape, the cable fallen down, and straight on.
-    `turns` refers to the first arc; the other arcs use the nearest value.
+    clamp nearest to `turns` is spread evenly, and there is no twist where an end may roll. Without
+    `turns`, a roll of nearly half a turn is tried both ways round. With a free end: the rest shape,
+    the cable fallen down, and straight on. `turns` refers to the first arc; the other arcs use the
+    nearest value.
     """
     u, chord, frames = _held(model, p, pose)
     clamps = frame_rotation(frames[0]), frame_rotation(frames[1])
-    down = np.array(model.gravity)
+    rolls, down = (model.start.roll, model.end.roll), np.array(model.gravity)
     if chord is None:
         bends = model.chain.curvatures(rest) * np.diff(model.chain.cells, axis=1).ravel()
         return _hanging_frames(u, clamps[0], down, bends)
@@ -272,16 +273,17 @@ def guessed_frames(
     side, ratio = sagging(along, down), float(np.linalg.norm(chord))
     found: list[FloatArray] = []
     others: list[FloatArray] = []
-    aimed = turns = 0.0 if None in clamps else pose.turns
+    aimed = turns = pose.turns if all(rolls) else 0.0
     for quarter in range(4):
         turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(side)
         free, roll = carried(u, arc_tangents(u, ratio, along, turned), clamps)
-        roll = nearest_roll(roll, aimed)
+        roll = nearest_roll(roll, aimed) if rolls[1] else 0.0
         if turns and not found:
             aimed = roll / (2 * np.pi)
-        if not turns and None not in clamps and abs(roll) > np.pi - HALF_TURN:
-            others.append(rolled(u, free, clamps, roll - np.copysign(2 * np.pi, roll)))
-        found.append(rolled(u, free, clamps, roll))
+        if not turns and all(rolls) and abs(roll) > np.pi - HALF_TURN:
+            opposite = roll - np.copysign(2 * np.pi, roll)
+            others.append(rolled(u, free, opposite, at_start=rolls[0]))
+        found.append(rolled(u, free, roll, at_start=rolls[0]))
     return found + others
 
 
@@ -384,9 +386,9 @@ def carried(u: FloatArray, tangents: FloatArray, clamps: Turned) -> tuple[Rotati
     return frames, float(np.pi - (np.pi - 2 * np.arctan2(x, w)) % (2 * np.pi))
 
 
-def rolled(u: FloatArray, frames: Rotation, clamps: Turned, roll: float) -> FloatArray:
-    """Frames (k, 4) with a roll [rad] at the end, linear from a clamp, constant from a pin."""
-    share = np.ones_like(u) if clamps[0] is None else u
+def rolled(u: FloatArray, frames: Rotation, roll: float, *, at_start: bool) -> FloatArray:
+    """Frames (k, 4) with a roll [rad] at the end, linear from a start that holds its own."""
+    share = u if at_start else np.ones_like(u)
     about = Rotation.from_rotvec(np.outer(roll * share, _FORWARD))
     return same_sign((frames * about).as_quat())
 
@@ -416,7 +418,8 @@ def frames_along(
         both = frame_rotation(first), frame_rotation(last)
         turned, roll = carried(u, axes[inside], both)
         own = turns if high == held[-1][0] and None not in both else 0.0
-        frames[inside] = rolled(u, turned, both, nearest_roll(roll, own))
+        roll = nearest_roll(roll, own)
+        frames[inside] = rolled(u, turned, roll, at_start=both[0] is not None)
     return same_sign(frames)
 
 

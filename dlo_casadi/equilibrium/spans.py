@@ -94,13 +94,14 @@ class Span:
 def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
     """All holders of the cable, from start to end; arc lengths relative to the declared length."""
     (start, end), clamps, _ = true_ends(model, p, pose)
-    found = [_Holder(0.0, start, clamps[0])]
+    found = [_Holder(0.0, start, clamps[0], not model.start.roll)]
     places, at, turns = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
     for k, clip in enumerate(pose.clips):
         s = None if clip.kind.slides else float(at[k, 0])
         frame = None if clip.frame is None else model.node.moved(clip.frame, turns[:, k])
         found.append(_Holder(s, places[:, k], frame, not clip.kind.roll))
-    found.append(_Holder(model.cable.length, end if model.end.place else None, clamps[1]))
+    place = end if model.end.place else None
+    found.append(_Holder(model.cable.length, place, clamps[1], not model.end.roll))
     return found
 
 

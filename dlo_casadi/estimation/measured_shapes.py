@@ -15,6 +15,7 @@ from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel
+from dlo_casadi.model.clipped import rolled_with
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 _KINEMATIC_STEPS = 8
@@ -92,7 +93,7 @@ def _along(
         pose = item.pose.rolled(roll)
         pose = pose if turns is None else replace(pose, turns=turns[j])
         if item.has_points:  # of readings alone it stays the first guess
-            along[j] = line_nodes(item.points, pose, chain, item.places(chain.length))
+            along[j] = line_nodes(item.points, pose, model, item.places(chain.length))
     seen = [j for j in used if measured[j].has_points]
     fitted = [measured[j] for j in seen]
     wrenches = any(item.reactions for item in fitted if not item.has_line)
@@ -182,15 +183,16 @@ def _kinematic_step(
     if item.pose.end is not None:
         system.append(10 * slopes[-1, :d])
         target.append(10 * (np.array(item.pose.end) - curve.nodes[-1]))
-    for held, index, frame in (
-        (model.start.direction, 0, item.pose.frames[0]),
-        (model.end.direction, n - 1, item.pose.frames[1]),
+    for kind, index, frame in (
+        (model.start, 0, item.pose.frames[0]),
+        (model.end, n - 1, item.pose.frames[1]),
     ):
-        if held:
+        if kind.direction:
+            own = frame if kind.roll or not node.twists else rolled_with(frame[None], x[[index]])[0]
             rows = np.zeros((b, n * b))
-            rows[:, index * b : (index + 1) * b] = 0.01 * np.eye(b)
+            rows[:, index * b : (index + 1) * b] = 0.01 * np.diag(kind.rotations(node))
             system.append(rows)
-            target.append(0.01 * node.difference(x[index], frame))
+            target.append(0.01 * node.difference(x[index], own))
     stacked, left = np.concatenate(system), np.concatenate(target)
     matrix = stacked.T @ stacked
     matrix.flat[:: len(matrix) + 1] += _DAMPING * np.trace(matrix) / len(matrix)

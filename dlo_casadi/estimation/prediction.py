@@ -268,7 +268,7 @@ def _along_line(model: CableModel, p: FloatArray, line: MeasuredPose) -> list[Fl
     told = pose.turns or model.has_state
     ways = ([] if told else ways_round(model, pose)) or [pose]
     places = line.places(model.cable.length)
-    return [line_nodes(line.points, way, model.chain, places) for way in ways]
+    return [line_nodes(line.points, way, model, places) for way in ways]
 
 
 def measured_branches(

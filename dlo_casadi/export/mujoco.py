@@ -19,6 +19,8 @@ from dlo_casadi.rod.node import Frame, Heading
 STEP, DAMPING = 0.002, 0.03
 # Moduli [Pa] in bending and twist of MuJoCo 3's own cable example (model/plugin/elasticity).
 DEFAULT = (4e6, 1e7)
+# From an end that may roll to a second point of its axis [m], which is held, too.
+_LEVER = np.array([0.02, 0.0, 0.0])
 # Joint of a pin and its position in a frame, by the axes about which the cable turns.
 _PINS: dict[tuple[str, ...], tuple[str, Callable[[Rotation], FloatArray]]] = {
     Heading.about: ('type="hinge" axis="0 0 1"', lambda frame: frame.as_rotvec()[2:]),
@@ -71,6 +73,8 @@ def _gripper(side: str, fixture: Fixture) -> str:
     """The body that holds an end; for the end, also the site at which it holds the cable."""
     place, frame = fixture.offset
     site = f'<site name="{side}" pos="{_row(place)}" quat="{_turned(frame)}"/>'
+    if fixture.rolls:
+        site += f'<site name="{side}_axis" pos="{_row(place + frame.apply(_LEVER))}"/>'
     return (
         f'<body name="{side}" mocap="true" pos="{_row(fixture.place)}" '
         f'quat="{_turned(fixture.frame)}">{site if side == "end" else ""}'
@@ -88,6 +92,9 @@ def _bodies(rod: Rod) -> list[str]:
         if k == 0 and rod.start.kind.direction:
             inside = place - frame.apply([rod.h / 2, 0.0, 0.0])
             lines.append(f'<body name="cable_0" pos="{_row(inside)}" quat="{_turned(frame)}">')
+            if rod.start.rolls:
+                damping = DAMPING * float(rod.torsion[0]) / rod.h
+                lines[-1] += f'<joint name="start_roll" axis="1 0 0" damping="{damping:.9g}"/>'
         elif k == 0:
             lines.append(f'<body name="cable_0" pos="{_row(place)}">{_pin(rod)}')
         else:
@@ -97,6 +104,9 @@ def _bodies(rod: Rod) -> list[str]:
         if k == middle and rod.end.kind.place:
             at = rod.h / 2 if rod.end.kind.direction else rod.h
             lines[-1] += f'<site name="cable_end" pos="{at:.9g} 0 0"/>'
+            if rod.end.rolls:
+                axis = np.array([at, 0.0, 0.0]) + _LEVER
+                lines[-1] += f'<site name="cable_end_axis" pos="{_row(axis)}"/>'
         for carried, s in rod.lumps:
             if k == np.clip(np.searchsorted(rod.s, s) - 1, 0, middle):
                 at = (s - rod.s[k]) / (rod.s[1] - rod.s[0]) * rod.h
@@ -163,18 +173,24 @@ def _in_axes(turns: Rotation, axes: Rotation) -> FloatArray:
 def _held(rod: Rod) -> str:
     if not rod.end.kind.place:
         return ""
-    kind = "weld" if rod.end.kind.direction else "connect"
+    kind = "weld" if rod.end.kind.direction and not rod.end.rolls else "connect"
+    held = "".join(
+        f"""
+    <{kind} name="{name}" site1="cable_{name}" site2="{name}" solref="{2 * STEP:g} 1" \
+solimp="0.9999 0.9999 0.001"/>"""
+        for name in ("end", "end_axis")[: 1 + rod.end.rolls]
+    )
     return f"""
-  <equality>
-    <{kind} name="end" site1="cable_end" site2="end" solref="{2 * STEP:g} 1" \
-solimp="0.9999 0.9999 0.001"/>
+  <equality>{held}
   </equality>"""
 
 
 def _angles(rod: Rod) -> FloatArray:
     """Positions of all joints in the pose."""
     about = rod.node.about
-    start = _PINS[about][1](rod.frames[0]) if rod.start.kind.turns else np.zeros(0)
+    start = (
+        _PINS[about][1](rod.frames[0]) if rod.start.kind.turns else np.zeros(int(rod.start.rolls))
+    )
     angles = _in_axes(rod.turns, principal(rod)[1])
     free = np.array([[name in about for name in _order(k + 1)] for k in range(len(angles))])
     return np.concatenate([start, angles[free]])
@@ -205,5 +221,6 @@ def settle(text: str, rod: Rod) -> Relaxed:
         data.qvel[:] = 0.0
 
     nodes = relax(advance, energy, halt, model.opt.timestep, "MuJoCo")
-    on_cable = data.efc_force[data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY][:3]
-    return Relaxed(nodes, -on_cable if len(on_cable) else np.zeros(3))
+    on_cable = data.efc_force[data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY]
+    places = on_cable[: 3 * (1 + rod.end.rolls)].reshape((-1, 3))
+    return Relaxed(nodes, -places.sum(axis=0))

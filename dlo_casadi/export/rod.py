@@ -28,6 +28,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.export.common import printable
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clipped import rolled_with
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.element import Cell
 from dlo_casadi.rod.node import Node
@@ -49,6 +50,7 @@ Feature = Literal[
     "change of the rest shape",
     "clips",
     "obstacles",
+    "free roll of an end",
 ]
 # GJ / EI of a cable that was measured in a plane: that of a solid round rod.
 ROUND = 1 / 1.3
@@ -62,7 +64,8 @@ _CLOSING = 200
 class Fixture:
     """The support of an end: as declared, and the true end of the cable, world axes.
 
-    Places (3,) [m]; frames with x along the cable.
+    Places (3,) [m]; frames with x along the cable. `rolls`: whether the cable may roll in it, so
+    that the frame of its end has the roll of this pose.
     """
 
     kind: SupportKind
@@ -70,6 +73,7 @@ class Fixture:
     frame: Rotation
     cable_place: FloatArray
     cable_frame: Rotation
+    rolls: bool = False
 
     @property
     def offset(self) -> tuple[FloatArray, Rotation]:
@@ -139,7 +143,7 @@ class Rod:
         clamped = [kind.direction for kind in (model.start, model.end)]
         h = length / (segments - sum(clamped) / 2)
         s = h * (np.arange(segments + 1) - clamped[0] / 2)
-        fixtures = _fixtures(model, pose, true, curve)
+        fixtures = _fixtures(model, pose, true, curve, held.equilibrium.x)
         stretch = float(true_length) / length
         nodes, frames = _segments(held, fixtures, s, h * stretch)
         mass, gravity = _weights(terms, p, pose)
@@ -151,6 +155,7 @@ class Rod:
             features["rest shape"] = ()
         features |= {"clips": ()} if pose.clips else {}
         features |= {"obstacles": ()} if model.surfaces else {}
+        features |= {"free roll of an end": ()} if any(x.rolls for x in fixtures) else {}
         return cls(
             name=printable(model.cable.name),
             node=model.node,
@@ -309,9 +314,9 @@ def _spatial(vector: FloatArray) -> FloatArray:
 
 
 def _fixtures(
-    model: CableModel, pose: HeldPose, true: FloatArray, curve: NodeCurve
+    model: CableModel, pose: HeldPose, true: FloatArray, curve: NodeCurve, x: FloatArray
 ) -> tuple[Fixture, Fixture]:
-    """Both fixtures; if an end is not clamped, its frame is the world's."""
+    """Both fixtures of a shape x; if an end has no direction, its frame is the world's."""
     d, c = model.node.dimension, model.node.coordinates
     edges = np.cumsum([d, d, c])
     parts = [np.split(ends, edges) for ends in (pose.ends, true)]
@@ -322,9 +327,13 @@ def _fixtures(
         )
         if not kind.direction:
             frame = cable_frame = Rotation.identity()
+        rolls = kind.direction and not kind.roll and model.node.twists
+        if rolls:
+            ends = cable_frame.as_quat()[None], x[-k][None]
+            cable_frame = Rotation.from_quat(rolled_with(*ends)[0])
         if not kind.place:
             place = cable_place = _spatial(curve.at(np.array([curve.length])))[0]
-        out.append(Fixture(kind, place, frame, cable_place, cable_frame))
+        out.append(Fixture(kind, place, frame, cable_place, cable_frame, rolls))
     return out[0], out[1]
 
 

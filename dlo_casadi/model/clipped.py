@@ -91,7 +91,7 @@ class Clipped:
             frame = node.moved(declared[:, k, node.dimension : -1], turn[k])
             aligned, held = frame, kind.rotations(node)
             if not held.all():
-                frame = _rolled_with(frame, x[rows, index])
+                frame = rolled_with(frame, x[rows, index])
             places[rows, index] = at[:, k]
             clamps.append(ClampNode(index, frame, held, aligned, turn[k]))
         return cls(chain, kinds, at, tuple(clamps), places)
@@ -376,7 +376,7 @@ def _alike(frame: FloatArray, beside: FloatArray) -> FloatArray:
     return frame * np.where((frame * beside).sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
 
-def _rolled_with(frame: FloatArray, x: FloatArray) -> FloatArray:
+def rolled_with(frame: FloatArray, x: FloatArray) -> FloatArray:
     """Frames (m, 4) rolled about their x axes as the quaternions x (m, 4) are, relative to them."""
     a, _, _, w = quaternion_product(conjugate(frame.T), x.T)
     size = np.maximum(np.hypot(a, w), 1e-300)

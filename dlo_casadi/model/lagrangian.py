@@ -31,7 +31,7 @@ from dlo_casadi.model.cable_model import (
 )
 from dlo_casadi.model.clips import BESIDE, clip_size
 from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
-from dlo_casadi.rod.ends import ClipConditions, EndConditions
+from dlo_casadi.rod.ends import ClipConditions, EndConditions, held_turns
 
 # Number of models whose expressions and functions are cached: a diagnosis compares about thirty.
 MODELS = 64
@@ -354,12 +354,12 @@ class Lagrangian:
     def ends_lagrangian(self) -> ca.SX:
         """Lagrangian of the ends: holders, end conditions, and the work of loads at the start."""
         first, last = self.moved
-        true, gap = self.true_ends, self.node.difference
+        true = self.true_ends
         gaps = [true.start - true.end] if self.model.end.place else []
-        gaps += [gap(true.start_frame, first)] if self.model.start.direction else []
-        gaps += [gap(true.end_frame, last)] if self.model.end.direction else []
+        gaps += [held_turns(self.model.start, self.node, true.start_frame, first)]
+        gaps += [held_turns(self.model.end, self.node, true.end_frame, last)]
         held = self.lam[: len(self.model.condition_names)]
-        total = ca.dot(held, ca.vertcat(*gaps)) if gaps else ca.SX(0)
+        total = ca.dot(held, ca.vertcat(*gaps))
         for effect, local in self.effects_of(BoundaryEffect):
             total += effect.energy(first, last, local)
         for k, compliance in self.compliance_of.items():

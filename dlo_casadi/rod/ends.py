@@ -5,9 +5,11 @@ from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import casadi as ca
+import numpy as np
 
-from dlo_casadi.rod.node import Node, quaternion_product
+from dlo_casadi.rod.node import Node, conjugate, quaternion_product, rotated
 from dlo_casadi.rod.quantities import quantity_of
+from dlo_casadi.rod.supports import SupportKind
 
 # Forces and moments of the cable on the fixtures of its ends, in the order of `Assembly.reactions`.
 REACTIONS = ("start_force", "start_moment", "end_force", "end_moment")
@@ -39,6 +41,20 @@ def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
     parts = [("end", axes), ("start", turns), ("end", turns), ("unknown_force", axes)]
     parts += [(f"clip_{k}", axes) for k in range(clips)]
     return tuple(f"{what}_{name}" for what, names in parts for name in names)
+
+
+def held_turns(kind: SupportKind, node: type[Node], frame: ca.SX, x: ca.SX) -> ca.SX:
+    """Turns [rad] from the frame of an end to its node x that a support of this kind holds at zero.
+
+    Where the roll is free, those of the cable's direction: with the frame's x axis u in the axes of
+    the node, u_z about its axis y and -u_y about z, whatever the roll.
+    """
+    turns = node.difference(frame, x)
+    if node.twists and not kind.roll:
+        axis = rotated(ca.vertcat(*conjugate(ca.vertsplit(x))), node.tangent(frame))
+        turns = ca.vertcat(0, axis[2], -axis[1])
+    held = np.flatnonzero(kind.rotations(node)).tolist()
+    return ca.vertcat(ca.SX(0, 1), *(turns[k] for k in held))
 
 
 class ClipConditions(NamedTuple):

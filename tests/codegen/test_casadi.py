@@ -45,8 +45,13 @@ def cable(where, **options):
         ("plane", None, {"start": "clamped", "end": "clamped", "effects": (ClampCompliance(),)}),
         ("plane", "cw", {}),
         ("space", None, {"start": "clamped", "end": "clamped", "effects": (ClampRotation(),)}),
+        ("space", None, {"start": "clamped", "end": "swivel", "effects": (ClampRotation(),)}),
+        ("space", None, {"start": "swivel", "end": "swivel"}),
     ],
-    ids=["plane, clamps that give way", "plane, a branch", "space"],
+    ids=[
+        *("plane, clamps that give way", "plane, a branch", "space"),
+        *("space, a swivel at the end", "space, swivels"),
+    ],
 )
 def test_external_is_the_function_and_its_jacobian(tmp_path, where, branch, options):
     model, p, rest = cable(where, **options)

@@ -107,10 +107,10 @@ def test_behind_a_pinned_start_full_turns_mean_nothing(turns, tmp_path):
     experiment = config.experiment.changed(boundary=boundary)
     bare = config.changed(experiment=experiment)
     assert wrong_directions(ReadSession(bare, inputs)) == ()
-    chain = declared_model(bare).model.chain
+    model = declared_model(bare).model
     for pose, item in zip(config.experiment.poses, inputs, strict=True):
         places = np.linspace(0.0, LENGTH, len(item.points))
-        nodes = line_nodes(item.points, pose.held, chain, places)
+        nodes = line_nodes(item.points, pose.held, model, places)
         assert abs(nodes[-1, 0] - pose.end_heading) < 0.3
 
 
