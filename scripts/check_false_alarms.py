@@ -210,6 +210,18 @@ def summary(rows: list[dict]) -> str:
         inside = [row["inside"][name] for row in right if name in row["inside"]]
         if inside:
             said.append(f"{name} in its interval in {100 * np.mean(inside):.1f} %")
+    named = [len(row["hidden"]) - len(row.get("named", [])) for row in rows]
+    for name in ("bending_stiffness", "torsional_stiffness"):
+        for what, kept in (("hidden and not named", True), ("nothing is", False)):
+            asked = [row for row, left in zip(rows, named, strict=True) if (left > 0) is kept]
+            asked = [row for row in asked if name in row["if_hidden"] and not row["wrong"]]
+            if asked:
+                plain = np.mean([row["inside"][name] for row in asked])
+                inside, wider = zip(*(row["if_hidden"][name] for row in asked), strict=True)
+                said.append(
+                    f"where {what}: {name} in its interval in {100 * plain:.0f} %, if hidden in "
+                    f"{100 * np.mean(inside):.0f} % of {len(asked)}, {np.median(wider):.1f} x wide"
+                )
     said.append(
         f"processor time median {np.median(seconds):.0f} s, 95 % {np.quantile(seconds, 0.95):.0f} s"
     )
@@ -231,6 +243,7 @@ def run_random(
     found = simulated(generator, 3 if space else 2, count, random, table, strong)
     begin = time.process_time()
     row = {"hidden": found.hidden, "refused": "", "wrong": [], "inside": {}, "worse": False}
+    row["if_hidden"] = {}
     try:
         result = found.session.fit()
     except dlo.DloError as error:
@@ -264,6 +277,8 @@ def run_random(
             row.setdefault("over_true", {})[name] = float(own.value / true[name])
         if own is not None and last.explains:
             row["inside"][name] = within(own.interval_95, true[name])
+            wide = own.interval_95_if_hidden
+            row["if_hidden"][name] = within(wide, true[name]), width_over(wide, own.interval_95)
     for stage in result.stages:
         errors[stage.name] = stage.rmse_fit_measured_branch
     simpler = [x for name in ("initial", "stiffness_only") if (x := errors.get(name)) is not None]
@@ -359,6 +374,14 @@ def in_band(fit, measured) -> list[bool]:
         if item.held_out and shape is not None:
             inside += list(shape.inside_band(fit.model.cable.length, fit.noise.of_points.std))
     return inside
+
+
+def width_over(wide, interval) -> float:
+    """Ratio of the logarithmic widths of two intervals; inf where one is unbounded."""
+    ends = [*(wide or (None, None)), *(interval or (None, None))]
+    if any(not x for x in ends):
+        return np.inf
+    return float(np.log(ends[1] / ends[0]) / np.log(ends[3] / ends[2]))
 
 
 def within(interval, true) -> bool:

@@ -27,6 +27,11 @@ from dlo_casadi.show.text import html_table, plus_minus
 Value = TypeVar("Value")
 
 
+def from_to(interval: tuple[float | None, float | None]) -> str:
+    """An interval in words."""
+    return " to ".join("unbounded" if x is None else f"{x:.4g}" for x in interval)
+
+
 class Named(dict[str, Value]):
     """Values by name; for an unknown name a DloError lists the known ones."""
 
@@ -46,6 +51,8 @@ class Estimate:
     unit : str
     interval_95 : (float or None, float or None), optional
         Profile-likelihood interval; None for an unbounded side; absent if not computed.
+    interval_95_if_hidden : (float or None, float or None), optional
+        The same if one effect is hidden that the data do not exclude; `hidden` is its name.
     identifiable : bool, optional
         False if the interval is unbounded or spans more than a factor of ten. Without an interval:
         False if the measurements constrain it less than its bounds, whose width std then is.
@@ -60,6 +67,8 @@ class Estimate:
     unit: str
     interval_95: tuple[float | None, float | None] | None = None
     identifiable: bool | None = None
+    interval_95_if_hidden: tuple[float | None, float | None] | None = None
+    hidden: str = ""
     at_bound: bool = False
     fixed: bool = False
 
@@ -72,8 +81,10 @@ class Estimate:
         text = "unbounded" if math.isinf(self.value) else plus_minus(self.value, self.std)
         text = f"{text} {self.unit}".strip()
         if self.interval_95 is not None:
-            low, high = ("unbounded" if x is None else f"{x:.4g}" for x in self.interval_95)
-            text += f" (95 %: {low} to {high})"
+            text += f" (95 %: {from_to(self.interval_95)}"
+            if self.interval_95_if_hidden is not None:
+                text += f"; {from_to(self.interval_95_if_hidden)} if {self.hidden} is hidden"
+            text += ")"
         remarks = {
             "fixed": self.fixed,
             "at a bound": self.at_bound,

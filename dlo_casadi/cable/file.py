@@ -116,6 +116,8 @@ class _Value(OpenSection):
     upper: float | None = None
     tolerance: float | None = None
     interval_95: tuple[float | None, float | None] | None = None
+    interval_95_if_hidden: tuple[float | None, float | None] | None = None
+    hidden: str = ""
     identifiable: bool | None = None
     unit: str = ""
     fitted: bool = False
@@ -129,7 +131,7 @@ class _Value(OpenSection):
 
     @property
     def estimate(self) -> Estimate:
-        known = (self.interval_95, self.identifiable)
+        known = (self.interval_95, self.identifiable, self.interval_95_if_hidden, self.hidden)
         return Estimate(self.value, self.std or 0.0, self.unit, *known, fixed=not self.fitted)
 
 

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import equivalents
-from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
     at_random_instead,
     bends_at_random,
     with_loose_poses,
 )
-from dlo_casadi.diagnosis.next_measurement import hidden_weight
+from dlo_casadi.diagnosis.if_hidden import IfHidden, if_hidden
 from dlo_casadi.diagnosis.screening import p_values_of
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
-    Diagnosis,
     Found,
     Ranked,
     added_by,
@@ -30,7 +29,7 @@ from dlo_casadi.diagnosis.selection import (
     ranking,
     with_new_noise,
 )
-from dlo_casadi.diagnosis.structure import screening_degrees, structure_of
+from dlo_casadi.diagnosis.structure import Structure, screening_degrees, structure_of
 from dlo_casadi.diagnosis.trials import Trials, pruned
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force
 from dlo_casadi.errors import EstimationError
@@ -52,7 +51,42 @@ from dlo_casadi.thresholds import (
 # sessions in space with a stiff section took 420 and 730 steps, space_pull, in which no single
 # candidate reaches the noise at first, 1480: a step of it takes 0.12 s on a loaded machine.
 DIAGNOSIS_STEPS = 4000
+Verdict = Literal["complete", "effect_found", "unexplained"]
 RAN_AWAY = "its fit ran away: no noise can be estimated from it"
+
+
+@dataclass(frozen=True)
+class Diagnosis(Found):
+    """Result of a search for missing effects, and the declared model before it.
+
+    Parameters
+    ----------
+    before : Fit
+        The declared model.
+    validation_before : CrossValidation
+    structure_before : Structure
+    unknown_force : UnknownForce or None
+        If unexplained: the load that assumes no cause; None if no load fits.
+    if_hidden : dict
+        By stiffness, what one effect could do to it that the data do not exclude; empty if
+        unexplained.
+    cut_off : bool
+        Whether the bound on its work was met, so that not everything was tried.
+    """
+
+    before: Fit
+    validation_before: CrossValidation
+    structure_before: Structure
+    unknown_force: UnknownForce | None
+    if_hidden: Mapping[str, IfHidden]
+    cut_off: bool = False
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the model is complete, an effect was found, or neither explains the data."""
+        if self.unexplained:
+            return "unexplained"
+        return "effect_found" if self.added else "complete"
 
 
 def diagnose(
@@ -153,9 +187,15 @@ class Search:
             validation_before=trials.validation,
             structure_before=structure_of(fit, screening_degrees(fit)),
             unknown_force=force if found.unexplained else None,
-            weight=None if found.unexplained else hidden_weight(found.fit, trials.exclude),
+            if_hidden=self._if_hidden(found),
             cut_off=trials.bound.met,
         )
+
+    def _if_hidden(self, found: Found) -> dict[str, IfHidden]:
+        """What one effect could do to the stiffnesses of a model that explains the data."""
+        if found.unexplained:
+            return {}
+        return if_hidden(found.fit, self.trials.screened_last(found.fit))
 
     def _searched(self) -> Found:
         """Search from the measured shapes: first if the fit leaves far more than noise, else last.

@@ -1,36 +1,25 @@
-"""What the poses do not determine, and the measurement that would: hidden weight, next pose."""
+"""The measurement that would separate two models which explain the same poses."""
 
-from collections.abc import Iterator, Sequence
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
-from dlo_casadi.diagnosis.screening import Screen
-from dlo_casadi.diagnosis.selection import AddedEffect, HiddenWeight
-from dlo_casadi.effects import Load
+from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Repeats
-from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.constrained import student_95
-from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.prediction import Prediction, predict_each, predict_poses, uncertainty_of
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
-from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.thresholds import APART
 
-# Trial weights over the cable's own, in this order, until one does not fit.
-WEIGHTS = 0.05 * 1.6 ** np.arange(9)
-# Number of trial directions of the clamp for a pose that would reveal the weight.
+# Number of trial directions of the clamp for a pose that would separate two models.
 HEADINGS = 12
-# Decrease of twice the objective within which 95 % of true values lie.
-PROFILE_95 = float(chdtri(1, 0.05))
 # Number of trial end poses, drawn within the region that the session has explored.
 TRIED = 30
 SEED = 0
@@ -38,65 +27,39 @@ SEED = 0
 MOST_REPEATS = 20
 
 
-def hidden_weight(fit: Fit, exclude: Sequence[str] = ()) -> HiddenWeight | None:
-    """Largest weight that a fit would not notice; None if it notices 1/20 of the cable's own.
+@dataclass(frozen=True)
+class Telling:
+    """The measurement that separates two models which explain the same poses.
 
-    Only for a free tip: with both ends held the force between them determines the stiffness.
+    Parameters
+    ----------
+    pose : str
+        Name of the measured pose in which a reading separates them best.
+    reading : NextReading
+        That reading.
+    heading : float or None [rad]
+        For a free tip in a plane: direction of the start clamp at which the shapes differ most.
+    difference : float or None [m]
+        That difference, RMS along the cable.
     """
-    model = fit.model
-    free = not model.end.place and BENDING_STIFFNESS in fit.problem.unknowns.names
-    if not free or not any(model.gravity):
+
+    pose: str
+    reading: NextReading
+    heading: float | None = None
+    difference: float | None = None
+
+
+def telling(fit: Fit, other: Fit) -> Telling | None:
+    """The measurement that separates two fits of the same poses; None without their shapes."""
+    poses = [item.pose for item in fit.problem.fit_poses]
+    shapes = (predict_each(one.model, one.p, one.rest_now, poses) for one in (fit, other))
+    pairs = [(a, b) for a, b in zip(*shapes, strict=True) if a is not None and b is not None]
+    if not pairs:
         return None
-    listed = candidates(model, setup_of(model, n_poses=len(fit.problem.used)), exclude)
-    loads = (item for item in listed if isinstance(item.effect, Load) and item.effect.carried)
-    weight = next(loads, None)
-    if weight is None:
-        return None  # it is in the model
-    place = _place(fit, weight)
-    fits = [fit, *_with_weights(fit, weight, place)]
-    if len(fits) == 1:
-        return None
-    low, high = zip(*(_interval(one) for one in fits), strict=True)
-    mass = fits[-1].value(weight.frees[0])
-    force = mass * float(np.linalg.norm(model.gravity))
-    told = _pose_that_tells(fit, fits[-1])
-    return HiddenWeight(mass, place, (min(low), max(high)), force, *told)
-
-
-def _place(fit: Fit, weight: Candidate) -> float:
-    """Arc length [m] at which a weight makes the stiffness most uncertain."""
-    _, position = weight.frees
-    variances = []
-    for normal in Screen(fit, [weight]).normals(InProcess(), range(len(weight.scans))):
-        hessian, names = normal.hessian, normal.names
-        kept = [k for k, name in enumerate(names) if name != position]
-        covariance = np.linalg.pinv(hessian[np.ix_(kept, kept)], hermitian=True)
-        own = kept.index(names.index(BENDING_STIFFNESS))
-        variances.append(float(covariance[own, own]))
-    return weight.scans[int(np.argmax(variances))][position]
-
-
-def _with_weights(fit: Fit, weight: Candidate, place: float) -> Iterator[Fit]:
-    """Fits with increasing weights at a place, as long as they fit as well as without."""
-    model, unknowns = weight.add_to(fit.model), fit.problem.unknowns
-    free = unknowns.names[: unknowns.n_parameters]
-    start, best = fit, fit.point.objective
-    for share in WEIGHTS:
-        values = dict(zip(weight.frees, (share * model.cable.mass, place), strict=True))
-        try:
-            start = refit(start, model, free=free, values=values)
-        except EstimationError:
-            return
-        best = min(best, start.point.objective)
-        if 2 * (start.point.objective - best) > PROFILE_95 * fit.inflation**2:
-            return
-        yield start
-
-
-def _interval(fit: Fit) -> tuple[float, float]:
-    value = fit.value(BENDING_STIFFNESS)
-    half = student_95(fit, BENDING_STIFFNESS) * fit.std(BENDING_STIFFNESS) / value
-    return float(value * np.exp(-half)), float(value * np.exp(half))
+    readings = [next_reading(fit, a.seen, b.seen) for a, b in pairs]
+    best = max(range(len(pairs)), key=lambda k: readings[k].separation)
+    turned = (None, None) if fit.model.end.place else _pose_that_tells(fit, other)
+    return Telling(pairs[best][0].pose.name, readings[best], *turned)
 
 
 def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:

@@ -177,7 +177,7 @@ def scored_by_refit(
         return Screened(candidate, 0.0, 1.0, start)
     gain = max(2 * (base.point.objective - best.point.objective), 0.0)
     start = {name: best.value(name) for name in candidate.frees}
-    return Screened(candidate, gain, survival(gain, len(start), noise_dof), start, best)
+    return Screened(candidate, gain, survival(gain, len(start), noise_dof), start, fit=best)
 
 
 def confirm(

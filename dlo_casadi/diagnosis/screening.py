@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -27,6 +27,7 @@ from scipy.special import chdtrc, fdtrc
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.widened import Widened
 from dlo_casadi.effects import StateEffect
 from dlo_casadi.estimation.descent import carried_shapes
 from dlo_casadi.estimation.problem import Problem
@@ -35,7 +36,7 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import with_springs_in_place
 from dlo_casadi.estimation.unknowns import NO_INFORMATION, Linearization, Point, Values
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.parallel import begin, workers_of
 from dlo_casadi.thresholds import COLLINEAR, IN_QUESTION, SCANS_APART, SCANS_PER_TEST
@@ -53,6 +54,8 @@ class Screened:
         Corrected for the numbers of places scanned and of candidates alike, not for that of others.
     start : dict
         One-step estimate of the candidate's parameters.
+    widest : dict
+        By stiffness, the candidate beside the fit at the scan that leaves it the least known.
     fit : Fit, optional
         The refit that tests a candidate without derivative where it vanishes.
     """
@@ -61,6 +64,7 @@ class Screened:
     score: float
     p_value: float
     start: dict[str, float]
+    widest: Mapping[str, Widened] = field(default_factory=dict)
     fit: Fit | None = None
 
 
@@ -206,6 +210,7 @@ class Screen:
         runs the scans; in this process by default.
         """
         best: dict[str, tuple[Screened, int]] = {}
+        widest: dict[str, dict[str, Widened]] = {}
 
         def improved(scans: Sequence[int]) -> None:
             for normal in self.normals(executor or InProcess(), scans) if scans else ():
@@ -214,6 +219,7 @@ class Screen:
                     known = best.get(candidate.name)
                     if known is None or tried.score > known[0].score:
                         best[candidate.name] = tried, normal.k
+                    self._widen(widest.setdefault(candidate.name, {}), candidate, normal)
 
         n_scans = max(len(candidate.scans) for candidate in self.listed)
         first = range(0, n_scans, SCANS_APART)
@@ -221,7 +227,18 @@ class Screen:
         likely = [(x, k) for x, k in best.values() if x.p_value < IN_QUESTION and self.between]
         near = {j for x, k in likely for j in (k - 1, k + 1) if j < len(x.candidate.scans)}
         improved(sorted(near & {*range(1, n_scans)} - {*first}))
-        return in_order(item for item, _ in best.values())
+        return in_order(replace(x, widest=widest[name]) for name, (x, _) in best.items())
+
+    def _widen(self, known: dict[str, Widened], candidate: Candidate, normal: AtScan) -> None:
+        """Keep a candidate at a scan for each stiffness that it leaves less known than others."""
+        names = [name for name in STIFFNESSES if name in self.fit.problem.unknowns.names]
+        if not self.between or not names:
+            return
+        equations, larger = (normal.hessian, normal.gradient), self._linearized[0].unknowns
+        found = Widened.of(self.fit, candidate, normal.k, equations, larger)
+        for name in names:
+            if name not in known or found.width(name) > known[name].width(name):
+                known[name] = found
 
     def _score(self, candidate: Candidate, normal: AtScan, noise_dof: float) -> Screened:
         hessian, gradient, names = normal.hessian, normal.gradient, normal.names

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import comb, log
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 
@@ -13,15 +13,12 @@ from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
 from dlo_casadi.diagnosis.screening import Screened, sidak, survival
 from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
-from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of, settle
 from dlo_casadi.thresholds import EVIDENCE_APART, LEFT, UNSEEN
-
-Verdict = Literal["complete", "effect_found", "unexplained"]
 
 
 @dataclass(frozen=True)
@@ -71,34 +68,6 @@ class Ranked:
     p_value: float
     rmse_cross_validated: float | None
     reason: str = ""
-
-
-@dataclass(frozen=True)
-class HiddenWeight:
-    """A weight that the data cannot distinguish from stiffness.
-
-    Parameters
-    ----------
-    mass : float [kg]
-        Largest trial weight that fits as well as none.
-    position : float [m]
-        Arc length at which it would make the stiffness most uncertain.
-    stiffness_95 : (float, float) [N m^2]
-        Interval of EI if there is no weight, or any up to that one.
-    force : float [N]
-        Force of that weight: it changes the force measured on the start fixture by this amount.
-    heading : float or None [rad]
-        Direction of the start clamp in a plane at which shapes with and without it differ most.
-    difference : float or None [m]
-        That difference, RMS along the cable.
-    """
-
-    mass: float
-    position: float
-    stiffness_95: tuple[float, float]
-    force: float
-    heading: float | None
-    difference: float | None
 
 
 @dataclass(frozen=True)
@@ -178,39 +147,6 @@ class Found:
     def _sets(self, candidates: int) -> float:
         """Log of the number of sets of this many effects, all taken as equally likely."""
         return log(comb(candidates, min(len(self.added), candidates)))
-
-
-@dataclass(frozen=True)
-class Diagnosis(Found):
-    """Result of a search for missing effects, and the declared model before it.
-
-    Parameters
-    ----------
-    before : Fit
-        The declared model.
-    validation_before : CrossValidation
-    structure_before : Structure
-    unknown_force : UnknownForce or None
-        If unexplained: the load that assumes no cause; None if no load fits.
-    weight : HiddenWeight or None
-        Hidden weight that the fit would not notice.
-    cut_off : bool
-        Whether the bound on its work was met, so that not everything was tried.
-    """
-
-    before: Fit
-    validation_before: CrossValidation
-    structure_before: Structure
-    unknown_force: UnknownForce | None
-    weight: HiddenWeight | None
-    cut_off: bool = False
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the model is complete, an effect was found, or neither explains the data."""
-        if self.unexplained:
-            return "unexplained"
-        return "effect_found" if self.added else "complete"
 
 
 def likelier_by(fit: Fit, other: Fit) -> float:

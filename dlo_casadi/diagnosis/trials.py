@@ -78,6 +78,11 @@ class Trials:
         return self.screened(self.declared)
 
     @cached_property
+    def known_scores(self) -> list[tuple[Fit, list[Screened]]]:
+        """Fits with the score tests of all candidates beside them, as they were made."""
+        return []
+
+    @cached_property
     def relaxed(self) -> tuple[Fit, float]:
         """The declared model relaxed at the measured shapes, see `from_data`."""
         return from_data(self.declared)
@@ -96,11 +101,23 @@ class Trials:
         """Score tests of all candidates for a fit, or of those named, best first."""
         listed = [x for x in self.listed(current) if among is None or x.name in among]
         given = screening_degrees(current), self.significance, self.executor
-        with suppress(EstimationError):
-            return refits.scored(current, listed, *given)
-        # A held-out pose has no equilibrium, so what poses leave behind cannot be determined.
-        listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
-        return refits.scored(current, listed, *given)
+        try:
+            found = refits.scored(current, listed, *given)
+        except EstimationError:
+            # A held-out pose has no equilibrium: what poses leave behind cannot be determined.
+            listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
+            found = refits.scored(current, listed, *given)
+        if among is None:
+            self.known_scores.append((current, found))
+        return found
+
+    def screened_last(self, fit: Fit) -> list[Screened]:
+        """The last score tests of all candidates beside the effects of a fit, here or made now."""
+        labels = {effect.label for effect in fit.model.effects}
+        for known, found in reversed(self.known_scores):
+            if {effect.label for effect in known.model.effects} == labels:
+                return found
+        return self.screened(fit)
 
     @accounted_as("candidates")
     def tried(self, current: Fit, *, pairs: bool) -> Tried:

@@ -19,6 +19,7 @@ from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cable.saved import SCHEMA, parameters_hash
 from dlo_casadi.config import Config, Limits, dump_yaml
 from dlo_casadi.config.values import AXES
+from dlo_casadi.diagnosis.if_hidden import IfHidden
 from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.equilibrium.spread import Uncertainty
 from dlo_casadi.errors import DloError
@@ -48,6 +49,14 @@ def fields_of(item: object, *names: str) -> dict[str, Any]:
     return {name: getattr(item, name) for name in names}
 
 
+def hidden_dict(found: IfHidden) -> dict[str, Any]:
+    """What one effect that the data do not exclude could do to a stiffness."""
+    return fields_of(found, "effect", "interval") | {
+        "parameters": {name: size._asdict() for name, size in found.values.items()},
+        "telling": found.telling and asdict(found.telling),
+    }
+
+
 def stage_dict(stage: Stage, outcome: Outcome) -> dict[str, Any]:
     """One stage; all numbers are None where it does not apply."""
     held_out = asdict(outcome.held_out(stage)) if stage.parameters else None
@@ -62,7 +71,7 @@ def stage_dict(stage: Stage, outcome: Outcome) -> dict[str, Any]:
         about = zip(("k_y", "k_z"), *known, strict=True)
         own = {axis: {"value": value, "std": std} for axis, value, std in about}
         curvature = {"s": rest.s, **own}
-    kept = ("value", "std", "unit", "interval_95", "identifiable")
+    kept = ("value", "std", "unit", "interval_95", "interval_95_if_hidden", "identifiable")
     return {
         **fields_of(stage, "name", "explains", "rmse_fit", "rmse_held_out"),
         **{
@@ -191,6 +200,8 @@ def parameters_dict(outcome: Outcome) -> dict[str, Any]:
         if stiffness is not None:
             document["parameters"][name] |= {
                 "interval_95": finite(stiffness.interval_95),
+                "interval_95_if_hidden": finite(stiffness.interval_95_if_hidden),
+                "hidden": stiffness.hidden,
                 "identifiable": stiffness.identifiable,
             }
     if config.cable.youngs_modulus is not None:

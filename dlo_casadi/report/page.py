@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, counted
-from dlo_casadi.report import tables, words
+from dlo_casadi.report import findings, tables, words
 from dlo_casadi.report.page_pictures import pose_pictures, view_pictures
 from dlo_casadi.report.scene import VIEWS
 from dlo_casadi.report.sections import SECTIONS, Report
@@ -140,7 +140,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {"words": words, "tables": tables}
+    environment.globals |= {"words": words, "findings": findings, "tables": tables}
     for item in (units, breakable, counted, words.sentence, millimetres, text.vector):
         environment.filters[item.__name__] = item
     return environment

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from dlo_casadi.errors import counted
 from dlo_casadi.io.files import finite
-from dlo_casadi.report import documents, tables, words
+from dlo_casadi.report import documents, findings, tables, words
 from dlo_casadi.report.canvas import inline_svg
 from dlo_casadi.report.documents import fields_of
 from dlo_casadi.report.figures import figures_of
@@ -106,18 +106,18 @@ class Section:
 
 
 def _verdict(outcome: Outcome) -> dict[str, Any]:
-    found = words.conclusion_of(outcome)
+    found = findings.conclusion_of(outcome)
     return {
         "verdict": outcome.verdict or "off",
         "verdict_word": words.sentence(found.word),
         "sentence": found.sentence,
-        "details": [line.strip() for line in words.details(outcome)],
+        "details": [line.strip() for line in findings.details(outcome)],
         "tiles": tiles(outcome),
     }
 
 
 def _verdict_data(outcome: Outcome) -> dict[str, Any]:
-    repeats, weight = outcome.repeatability, outcome.hidden_weight
+    repeats = outcome.repeatability
     return {
         "verdict": outcome.verdict,
         "effects": [
@@ -140,7 +140,9 @@ def _verdict_data(outcome: Outcome) -> dict[str, Any]:
             "source": repeats.source,
             "held_out_inside_90": outcome.inside_band,
         },
-        "hidden_weight": weight and asdict(weight),
+        "if_hidden": {
+            name: documents.hidden_dict(found) for name, found in outcome.if_hidden.items()
+        },
     }
 
 
@@ -291,7 +293,7 @@ SECTIONS = (
         "verdict",
         context=_verdict,
         data=_verdict_data,
-        terminal=lambda outcome: map(Text, words.verdict_lines(outcome)),
+        terminal=lambda outcome: map(Text, findings.verdict_lines(outcome)),
     ),
     Section(
         "warnings",

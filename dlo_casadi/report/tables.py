@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import Covariance, Estimate
+from dlo_casadi.cable.estimate import Covariance, Estimate, from_to
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import counted
-from dlo_casadi.report import words
+from dlo_casadi.report import findings, words
 from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.outcome import MASS, Outcome, ReadingErrors
@@ -38,8 +38,7 @@ def describe(
         return (unidentified(estimate), "", f"not identifiable from these {seen}")
     unit, interval = _after(estimate.unit), ""
     if estimate.interval_95 is not None:
-        ends = ("unbounded" if x is None else f"{x:.4g}" for x in estimate.interval_95)
-        interval = f"{' to '.join(ends)}{unit}"
+        interval = f"{from_to(estimate.interval_95)}{unit}"
     value = text.plus_minus(estimate.value, estimate.std) + unit
     return (value, interval, "at a bound" if estimate.at_bound else "")
 
@@ -274,7 +273,7 @@ def work_rows(outcome: Outcome) -> list[tuple[str, str, str, str]]:
 
 def outcome_text(outcome: Outcome) -> str:
     """Cable, verdict, parameters and errors in a few lines."""
-    lines = words.verdict_lines(outcome)
+    lines = findings.verdict_lines(outcome)
     lines[0] = f"{outcome.config.cable.name}: {lines[0]}"
     for row in (*fitted_rows(outcome), *error_rows(outcome)):
         lines.append("  " + "  ".join(filter(None, row)))
@@ -339,7 +338,7 @@ def summary_text(outcome: Outcome) -> str:
         if {names[i], names[j]} <= set(shown) and abs(correlation[i, j]) > _STRONG
     ]
     warnings = [*outcome.doubts, *words.all_warnings(outcome)]
-    verdict, *more = words.verdict_lines(outcome)
+    verdict, *more = findings.verdict_lines(outcome)
     doubt = ""
     if outcome.stages[-1].explains is False:
         doubt = " of a model that does not fit: the standard deviations hold within it only"
@@ -364,5 +363,5 @@ def summary_text(outcome: Outcome) -> str:
 def outcome_html(outcome: Outcome) -> str:
     """The same as a short table."""
     rows = [*fitted_rows(outcome), *error_rows(outcome)]
-    remarks = [*words.verdict_lines(outcome), *words.all_warnings(outcome)]
+    remarks = [*findings.verdict_lines(outcome), *words.all_warnings(outcome)]
     return html_table(outcome.config.cable.name, rows, remarks)

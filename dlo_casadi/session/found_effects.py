@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from dlo_casadi.cable.estimate import Estimate
-from dlo_casadi.diagnosis.selection import Diagnosis
+from dlo_casadi.diagnosis.diagnose import Diagnosis
 from dlo_casadi.effects import Effect
 from dlo_casadi.estimation.result import Fit
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,8 +14,10 @@ from dlo_casadi.arrays import BoolArray, Brief, FloatArray
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.limits import LimitCheck
 from dlo_casadi.config import Config, Pose
+from dlo_casadi.diagnosis.diagnose import Verdict
+from dlo_casadi.diagnosis.if_hidden import IfHidden
 from dlo_casadi.diagnosis.next_measurement import NextPose
-from dlo_casadi.diagnosis.selection import HiddenWeight, Ranked, Verdict
+from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
 from dlo_casadi.estimation.repeats import enough_poses, repeatability
@@ -308,8 +311,8 @@ class Outcome:
         Largest error of a shape due to the mesh of the last fit, from two meshes.
     fit : Fit
         The last stage's fit, from which parameters.yaml is written.
-    hidden_weight : HiddenWeight or None
-        A weight that the shapes cannot separate from stiffness.
+    if_hidden : dict
+        By stiffness, what one effect that the data do not exclude could do to it.
     limits : tuple of LimitCheck
         Of all predicted poses, where the session declares limits.
     cut_off : bool
@@ -335,7 +338,7 @@ class Outcome:
     next_pose: NextPose | None = None
     structure: tuple[Structure, Structure] | None = None
     cross_validated: float | None = None
-    hidden_weight: HiddenWeight | None = None
+    if_hidden: Mapping[str, IfHidden] = field(default_factory=dict)
     limits: tuple[LimitCheck, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
     cut_off: bool = False

@@ -6,7 +6,6 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import SkippedPose
-from dlo_casadi.diagnosis.selection import HiddenWeight
 from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import worded
 from dlo_casadi.estimation.result import Fit
@@ -131,32 +130,6 @@ def _cure(group: Mapping[str, BranchShape]) -> str:
     if chosen_by is None:
         return "no value of `branch` or `turns` chooses it: measure the pose again, or leave it out"
     return f"`{chosen_by}` chooses it"
-
-
-def weight_warning(weight: HiddenWeight, expected: float) -> str:
-    """Consequence of an undeclared weight, and the measurement that would reveal it.
-
-    `expected` [m]: distance of a pose from its prediction if the model is complete.
-    """
-    text = worded(
-        "an undeclared weight is not told from stiffness: up to {weight.mass:.2g} kg at "
-        "{weight.position:.2f} m would fit as well as none, and bending_stiffness may then be "
-        "{low:.3g} to {high:.3g} N m^2. To tell: weigh the cable with all that hangs on it, or "
-        "measure the force on the start, which differs by up to {weight.force:.2g} N",
-        weight=weight,
-        low=weight.stiffness_95[0],
-        high=weight.stiffness_95[1],
-    )
-    if weight.heading is None or weight.difference is None:
-        return text
-    far = weight.difference > UNSEEN * expected
-    return text + worded(
-        "{tells} start_heading {weight.heading:.2f} the shapes differ by {weight.difference:mm.2g} "
-        "RMS, and a pose is measured {expected:mm.2g} from its prediction",
-        tells=", or add a pose: with" if far else ". No pose would tell: even with",
-        weight=weight,
-        expected=expected,
-    )
 
 
 def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:

@@ -1,7 +1,7 @@
 """Run one session of measurements from its configuration to the outcome."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -12,6 +12,7 @@ from dlo_casadi.config import Config, declared_effects, declared_setup
 from dlo_casadi.diagnosis.diagnose import diagnose
 from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_loose_poses
+from dlo_casadi.diagnosis.if_hidden import IfHidden
 from dlo_casadi.diagnosis.next_measurement import separating_pose
 from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
@@ -242,7 +243,7 @@ class _Run:
             "next_pose": next_pose,
             "structure": (diagnosis.structure_before, diagnosis.structure),
             "cross_validated": validated.rmse if told else None,
-            "hidden_weight": diagnosis.weight,
+            "if_hidden": diagnosis.if_hidden,
             "cut_off": diagnosis.cut_off,
         }
         return fit, found
@@ -271,19 +272,34 @@ def judged(outcome: Outcome) -> Outcome:
     told = (*doubts, *remarks.branch_warnings(stages))
     far = remarks.far_off(stages[-1], outcome.poses, told)
     said += far
-    if outcome.hidden_weight is not None:
-        said.append(remarks.weight_warning(outcome.hidden_weight, fit.expected_error))
     if verdict is not None:
         verdict = "unexplained" if doubts else verdict
         stages = (*stages[:-1], _marked(stages[-1], verdict != "unexplained"))
+    hidden = {} if verdict == "unexplained" else outcome.if_hidden
+    stages = (*stages[:-1], _if_hidden(stages[-1], hidden))
     return replace(
         outcome,
         verdict=verdict,
+        if_hidden=hidden,
         stages=stages,
         doubts=doubts,
         serious=(*outcome.serious, *far),
         warnings=(*outcome.warnings, *said, *remarks.branch_warnings(stages)),
     )
+
+
+def _if_hidden(stage: Stage, found: Mapping[str, IfHidden]) -> Stage:
+    """A stage whose stiffnesses have the interval that holds if one effect is hidden, too."""
+    parameters = dict(stage.parameters)
+    for name, one in found.items():
+        own = parameters[name]
+        if own.interval_95 is not None:
+            low, high = own.interval_95
+            low = None if low is None else min(low, one.interval[0])
+            high = None if high is None else max(high, one.interval[1])
+            wide = (low, high)
+            parameters[name] = replace(own, interval_95_if_hidden=wide, hidden=one.effect)
+    return replace(stage, parameters=parameters)
 
 
 def _marked(stage: Stage, explains: bool) -> Stage:

@@ -11,8 +11,9 @@ from small_sessions import context
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.equilibrium.spread import Tipping
 from dlo_casadi.io.files import finite
+from dlo_casadi.report.findings import verdict_lines
 from dlo_casadi.report.sections import report_dict, report_text
-from dlo_casadi.report.words import all_warnings, verdict_lines
+from dlo_casadi.report.words import all_warnings
 from dlo_casadi.session.outcome import RestCurvatureEstimate, Stage
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide
 
@@ -34,7 +35,7 @@ KEYS = {
     "unexplained": type(None),
     "next_pose": type(None),
     "structure": type(None),
-    "hidden_weight": type(None),
+    "if_hidden": dict,
     "limits": list,
 }
 

@@ -12,6 +12,7 @@ from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextReading
 from dlo_casadi.diagnosis.structure import Structure
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.report.documents import check_dict
+from dlo_casadi.report.findings import RESIDUAL, conclusion_of, details, reading_text
 from dlo_casadi.report.tables import (
     footnotes,
     nuisance_rows,
@@ -20,13 +21,7 @@ from dlo_casadi.report.tables import (
     timing_rows,
     work_rows,
 )
-from dlo_casadi.report.words import (
-    RESIDUAL,
-    all_warnings,
-    conclusion_of,
-    details,
-    reading_text,
-)
+from dlo_casadi.report.words import all_warnings
 from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.sentences import said_of

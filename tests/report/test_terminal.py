@@ -13,11 +13,12 @@ from test_page import PROPOSAL
 from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.diagnosis.selection import Ranked
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE, Structure
+from dlo_casadi.report.findings import RESIDUAL, separation_text
 from dlo_casadi.report.page_pictures import pictures
 from dlo_casadi.report.sections import print_summary, report_dict
 from dlo_casadi.report.tables import describe, stage_rows, unidentified
 from dlo_casadi.report.terminal import plain_table
-from dlo_casadi.report.words import RESIDUAL, finding_of, separation_text
+from dlo_casadi.report.words import finding_of
 from dlo_casadi.session.pose_shape import BranchShape
 from dlo_casadi.session.sentences import said_of
 from dlo_casadi.show.text import plus_minus

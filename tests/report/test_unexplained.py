@@ -7,7 +7,7 @@ from small_sessions import context
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cli import main
-from dlo_casadi.diagnosis.selection import Verdict
+from dlo_casadi.diagnosis.diagnose import Verdict
 from dlo_casadi.report.documents import parameters_text
 from dlo_casadi.report.sections import report_dict
 from dlo_casadi.report.tables import NO_FIT, fitted_rows, footnotes

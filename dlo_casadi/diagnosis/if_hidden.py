@@ -1,0 +1,114 @@
+"""What one effect that is too small to show would do to a stiffness.
+
+An interval holds the truth if the model lacks nothing. An effect may be missing that the data do
+not exclude, and move the stiffness out of it. The interval of a stiffness if a candidate's
+parameters are unknown, too, follows from the normal equations of the screening, see `widened`; the
+widest one over all candidates at all places is reported, with its candidate.
+
+References
+----------
+Leamer, Specification Searches (1978): bounds of an estimate over models that data do not exclude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from dlo_casadi.diagnosis.next_measurement import Telling, telling
+from dlo_casadi.diagnosis.screening import Screened
+from dlo_casadi.diagnosis.widened import Widened
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.constrained import threshold
+from dlo_casadi.estimation.descent import refit
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.thresholds import NORMAL_95
+
+# Share of the widest interval (of its logarithm) from which on a candidate with fewer parameters
+# stands for one with more: of a force, a weight and a tether at one place the weight is named.
+NEARLY_AS_WIDE = 0.9
+
+
+class Size(NamedTuple):
+    """A parameter of an effect."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class IfHidden:
+    """A stiffness if one effect is hidden that the data do not exclude.
+
+    Parameters
+    ----------
+    parameter : str
+        Name of the stiffness.
+    effect : str
+    interval : (float, float) [N m^2]
+        95 %, to first order about the fit.
+    values : dict
+        Parameters of the effect, by their names [SI], at the end of the interval that is farther
+        from the estimate: so large an effect is not excluded.
+    telling : Telling or None
+        The measurement that would exclude it; None if no equilibria are found there.
+    """
+
+    parameter: str
+    effect: str
+    interval: tuple[float, float]
+    values: Mapping[str, Size]
+    telling: Telling | None
+
+
+def if_hidden(fit: Fit, screened: Iterable[Screened]) -> dict[str, IfHidden]:
+    """What one effect could do to each estimated stiffness, by its name.
+
+    `screened`: the candidates beside the fit, or beside one of the same effects.
+    """
+    found: dict[str, list[Widened]] = {}
+    for item in screened:
+        for name, row in item.widest.items():
+            found.setdefault(name, []).append(row)
+    return {name: _widest(fit, name, rows) for name, rows in found.items()}
+
+
+def _widest(fit: Fit, name: str, rows: Sequence[Widened]) -> IfHidden:
+    """The widest interval of a stiffness: of nearly as wide ones, that with fewest parameters."""
+    spread = np.sqrt(threshold(fit, name)) / NORMAL_95
+    ends = [row.ends(name, spread) for row in rows]
+    width = [high - low for low, high in ends]
+    wide = [i for i, each in enumerate(width) if each >= NEARLY_AS_WIDE * max(width)]
+    best = min(wide, key=lambda i: (len(rows[i].candidate.screened), -width[i]))
+    row, value = rows[best], fit.value(name)
+    far = max(ends[best], key=abs)
+    values, other = _with(fit, row, name, far)
+    low, high = (float(value * np.exp(end)) for end in ends[best])
+    told = None if other is None else telling(fit, other)
+    return IfHidden(name, row.candidate.name, (low, high), values, told)
+
+
+def _with(fit: Fit, row: Widened, name: str, far: float) -> tuple[dict[str, Size], Fit | None]:
+    """Size of a candidate where the log of a stiffness differs by `far`, and the fit there."""
+    candidate, unknowns = row.candidate, fit.problem.unknowns
+    model = candidate.add_linear_to(fit.model)
+    parameters = {q.name: q for q in model.parameters}
+    linear = dict(row.scan)
+    for full, x in row.at(name, far).items():
+        q = parameters[full]
+        start = fit.value(full) if candidate.nuisance else q.nominal
+        linear[full] = float(np.clip(start + x * q.scale, q.lower, q.upper))
+    effect, cable = candidate.effect, fit.model.cable
+    values = linear if candidate.nuisance else candidate.of_linear(cable, linear)
+    sizes = {
+        q.name: Size(values[f"{effect.label}.{q.name}"], q.unit) for q in effect.parameters(cable)
+    }
+    free = dict.fromkeys([*unknowns.names[: unknowns.n_parameters], *candidate.screened])
+    fixed = {**linear, name: float(fit.value(name) * np.exp(far))}
+    try:
+        return sizes, refit(fit, model, free=[q for q in free if q != name], values=fixed)
+    except EstimationError:
+        return sizes, None

@@ -1,0 +1,112 @@
+"""A fit's unknowns if a candidate's parameters are unknown, too: to first order about the fit.
+
+With Hessian H and gradient g over the fit's unknowns theta and a candidate's parameters c, and B of
+what the bounds alone tell,
+
+    (theta, c) ~ N(-(H + B)^-1 g, (H + B)^-1),   c >= 0 where an effect vanishes at its bound
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.thresholds import NORMAL_95
+
+# Number of equally likely values that stand for a parameter with a bound.
+VALUES = 100
+
+
+@dataclass(frozen=True)
+class Widened:
+    """A fit's unknowns and a candidate's parameters, normally distributed about the fit.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Of the unknowns, those of the candidate last, or among the fit's if it is a nuisance.
+    mean, covariance : (m,), (m, m)
+        Of their differences from the fit and from zero, scaled as the unknowns are.
+    bounded : int or None
+        Entry of a parameter of the candidate that vanishes at its lower bound.
+    """
+
+    candidate: Candidate
+    scan: dict[str, float]
+    names: tuple[str, ...]
+    mean: FloatArray
+    covariance: FloatArray
+    bounded: int | None
+
+    @classmethod
+    def of(
+        cls,
+        fit: Fit,
+        candidate: Candidate,
+        scan: int,
+        normal: tuple[FloatArray, FloatArray],
+        larger: Unknowns,
+    ) -> Widened:
+        """From Hessian and gradient of a model with all candidates, of `larger` unknowns."""
+        own, every = fit.problem.unknowns.names, larger.names
+        total = normal[0] + np.diag(1 / larger.widest**2)
+        slope, names = normal[1].copy(), own
+        columns = [every.index(name) for name in candidate.screened]
+        if candidate.nuisance:
+            # Its directions are the fit's own: without their priors.
+            known = [own.index(name) for name in candidate.screened]
+            prior = fit.problem.precision[known]
+            total[np.ix_(columns, columns)] -= prior[:, known]
+            slope[columns] -= prior @ (fit.point.theta - fit.problem.mean)
+        else:
+            names += candidate.screened
+        kept = [every.index(name) for name in names]
+        part = total[np.ix_(kept, kept)]
+        size = np.sqrt(np.diag(part))
+        inverse = np.linalg.pinv(part / np.outer(size, size), hermitian=True)
+        covariance = inverse / np.outer(size, size)
+        parameters = {q.name: q for q in larger.model.parameters}
+        vanish = (q for q in candidate.screened if parameters[q].lower == parameters[q].nominal)
+        bounded = next((names.index(q) for q in vanish), None)
+        mean = -covariance @ slope[kept]
+        return cls(candidate, candidate.scans[scan], names, mean, covariance, bounded)
+
+    def ends(self, name: str, spread: float) -> tuple[float, float]:
+        """95 % interval of an unknown's difference, all standard deviations times `spread`."""
+        k, b = self.names.index(name), self.bounded
+        mean, covariance = self.mean, spread**2 * self.covariance
+        std = float(np.sqrt(covariance[k, k]))
+        if b is None:
+            return mean[k] - NORMAL_95 * std, mean[k] + NORMAL_95 * std
+        size = np.sqrt(covariance[b, b])
+        below = ndtr(-mean[b] / size)
+        shares = below + (1 - below) * (np.arange(VALUES) + 0.5) / VALUES
+        values = size * ndtri(np.clip(shares, 1e-300, 1 - 1e-16))
+        centers = mean[k] + covariance[k, b] / size**2 * values
+        left = np.sqrt(max(std**2 - covariance[k, b] ** 2 / size**2, 1e-12 * std**2))
+
+        def beyond(x: float, share: float) -> float:
+            return float(ndtr((x - centers) / left).mean() - share)
+
+        far = 10 * std + np.abs(centers).max()
+        low, high = (brentq(beyond, -far, far, args=(p,)) for p in (0.025, 0.975))
+        return low, high
+
+    def width(self, name: str) -> float:
+        """Width of that interval."""
+        low, high = self.ends(name, 1.0)
+        return high - low
+
+    def at(self, name: str, difference: float) -> dict[str, float]:
+        """The candidate's parameters, as screened, where an unknown differs so much."""
+        k = self.names.index(name)
+        way = self.covariance[:, k] / self.covariance[k, k]
+        moved = self.mean + way * (difference - self.mean[k])
+        return {q: float(moved[self.names.index(q)]) for q in self.candidate.screened}

@@ -1,0 +1,276 @@
+"""The verdict and the findings beside it: tables of sentences."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextPose, NextReading
+from dlo_casadi.diagnosis.structure import LARGEST_SCORE
+from dlo_casadi.errors import worded
+from dlo_casadi.report.words import NOISE_ALONE, seen, sentence
+from dlo_casadi.rod.quantities import quantity_of
+from dlo_casadi.session.outcome import Outcome
+from dlo_casadi.session.sentences import Sentence, Values, said_of
+from dlo_casadi.show.text import millimetres, vector
+from dlo_casadi.thresholds import NOTABLE, UNSEEN
+
+Found = Callable[[Outcome], Iterator[Values]]
+# What the residual may depend on, by the name of its normal score.
+DEPENDENCES = {
+    "order_z": "the order of the poses",
+    "span_z": "the distance of the ends",
+    "position_z": "the place in {where}",
+}
+
+
+class Conclusion(NamedTuple):
+    """The verdict in a word and a sentence."""
+
+    word: str
+    sentence: str
+
+
+def verdict_lines(outcome: Outcome) -> list[str]:
+    """Verdict and all findings of the diagnosis, in sentences."""
+    return [f"Verdict: {'. '.join(conclusion_of(outcome))}", *details(outcome)]
+
+
+def details(outcome: Outcome) -> list[str]:
+    """Findings beside the verdict."""
+    return [f"  {text}" for text in said_of(outcome, FINDINGS)]
+
+
+def conclusion_of(outcome: Outcome) -> Conclusion:
+    """Result of the diagnosis: the first of `CONCLUSIONS` that applies."""
+    for word, row in CONCLUSIONS:
+        for text in said_of(outcome, [row]):
+            return Conclusion(word, text)
+    raise AssertionError("the last conclusion always applies")
+
+
+def _once(applies: Callable[[Outcome], object], **values: Callable[[Outcome], Any]) -> Found:
+    """Values of a sentence that is said once, where it applies."""
+
+    def found(outcome: Outcome) -> Iterator[Values]:
+        if applies(outcome):
+            yield {name: value(outcome) for name, value in values.items()}
+
+    return found
+
+
+def _doubt(outcome: Outcome) -> str:
+    return sentence(outcome.doubts[0])
+
+
+def _names(outcome: Outcome) -> str:
+    return " and ".join(map(str, outcome.effects))
+
+
+def _unexplained(outcome: Outcome) -> bool:
+    return outcome.verdict == "unexplained"
+
+
+def _fitted_alone(outcome: Outcome) -> bool:
+    """Whether the residual is noise with added effects, but left-out poses are not predicted."""
+    after = outcome.structure[1] if outcome.structure else None
+    least = outcome.config.diagnosis.significance
+    noise = after is not None and after.p_value >= least
+    return _unexplained(outcome) and bool(outcome.effects) and noise
+
+
+CONCLUSIONS: tuple[tuple[str, Sentence[Outcome]], ...] = (
+    ("fit failed", Sentence("{doubt}.", _once(lambda x: x.doubts and x.fit.failed, doubt=_doubt))),
+    ("unexplained", Sentence("{doubt}.", _once(lambda x: x.doubts, doubt=_doubt))),
+    (
+        "not diagnosed",
+        Sentence("Nothing was looked for in the residual.", _once(lambda x: x.verdict is None)),
+    ),
+    (
+        "unexplained",
+        Sentence(
+            "With {names} every pose is fitted, but one that is left out is predicted {error:mm} "
+            f"off ({NOISE_ALONE}: {{floor:mm}}).",
+            _once(
+                _fitted_alone,
+                names=_names,
+                error=lambda x: x.effects[-1].rmse_cross_validated_after,
+                floor=lambda x: x.measurement.noise_distance,
+            ),
+        ),
+    ),
+    (
+        "unexplained",
+        Sentence(
+            "The residual is not noise even with {names}.",
+            _once(lambda x: _unexplained(x) and x.effects, names=_names),
+        ),
+    ),
+    ("unexplained", Sentence("The residual is not noise.", _once(_unexplained))),
+    (
+        "effect found",
+        Sentence(
+            "The declared model lacked {names}; with it the residual is noise.",
+            _once(lambda x: x.effects, names=_names),
+        ),
+    ),
+    (
+        "complete",
+        Sentence(
+            "The declared model explains the {seen} down to their noise.",
+            _once(lambda x: True, seen=seen),
+        ),
+    ),
+)
+
+
+def _other_doubts(outcome: Outcome) -> Iterator[Values]:
+    yield from ({"doubt": sentence(text)} for text in outcome.doubts[1:])
+
+
+def _either_side(outcome: Outcome) -> Iterator[Values]:
+    for name, found in outcome.either_side.items():
+        near = found.tipping
+        tipping = "" if near is None else worded(_TIPPING, near=near)
+        chosen = found.predicted.chosen_by or "turns: 0"
+        yield vars(found) | {"name": name, "tipping": tipping, "chosen": chosen}
+
+
+def _dependences(outcome: Outcome) -> Iterator[Values]:
+    """Evidence that the declared model's residual is not noise."""
+    if outcome.structure is None or outcome.verdict == "complete":
+        return
+    before, _ = outcome.structure
+    where = "space" if outcome.config.experiment.in_space else "the plane"
+    if outcome.measurement.kind == "images":
+        where = "the picture"
+    found = []
+    for key, text in DEPENDENCES.items():
+        z = getattr(before, key)
+        score = f"z = {z:+.1f}"
+        if abs(z) >= 0.999 * LARGEST_SCORE:  # beyond the resolution of its test
+            score = "z > 7" if z > 0 else "z < -7"
+        if abs(z) > NOTABLE:
+            found.append(f"{text.format(where=where)} ({score})")
+    said = [f"depends on {', '.join(found)}"] if found else []
+    if abs(before.runs_z) > NOTABLE:
+        often, z = "less" if before.runs_z < 0 else "more", before.runs_z
+        said.insert(0, f"changes its sign along the cable {often} often than noise (z = {z:+.1f})")
+    if said:
+        yield {"what": ", and ".join(said)}
+
+
+def _added(outcome: Outcome) -> Iterator[Values]:
+    for effect in outcome.effects:
+        values, chance = [f"{name} {found}" for name, found in effect.parameters.items()], ""
+        if effect.p_value is not None:
+            # It underflows: below the smallest double.
+            chance = f" (p = {effect.p_value:.1g})" if effect.p_value > 0 else " (p < 1e-307)"
+        yield {
+            "line": worded(
+                "{effect}: {values}{chance}", effect=effect, values=values, chance=chance
+            )
+        }
+        if rivals := " or ".join(effect.indistinguishable_from):
+            yield {"line": f"  These data cannot tell it from {rivals}."}
+
+
+def _hidden(outcome: Outcome) -> Iterator[Values]:
+    """What one effect that the data do not exclude could do to each stiffness."""
+    for found in outcome.if_hidden.values():
+        tip, telling = found.telling, ""
+        if tip is not None:
+            telling = " " + reading_text(tip.reading, f"in {tip.pose}")
+        if tip is not None and tip.heading is not None and tip.difference is not None:
+            expected = outcome.fit.expected_error
+            far = tip.difference > UNSEEN * expected
+            other = "So would another pose" if far else "No other pose would tell"
+            telling += worded(_TURNED, other=other, tip=tip, expected=expected)
+        sizes = (f"{name} {x.value:.2g} {x.unit}".strip() for name, x in found.values.items())
+        yield {"found": found, "sizes": ", ".join(sizes), "telling": telling}
+
+
+def _pulled(outcome: Outcome) -> Iterator[Values]:
+    if (load := outcome.unexplained) is not None:
+        yield {"load": load, "force": vector(load.force, ".3g", "N")}
+
+
+def _lifted_tip(outcome: Outcome) -> bool:
+    load, experiment = outcome.unexplained, outcome.config.experiment
+    free = not experiment.boundary.end.place
+    return load is not None and free and bool(np.dot(load.force, experiment.gravity) < 0)
+
+
+def _proposed(outcome: Outcome) -> Iterator[Values]:
+    if (proposal := outcome.next_pose) is not None:
+        yield {
+            "rivals": " from ".join(proposal.separates),
+            "end": vector(proposal.end, ".3f", "m"),
+            "separation": separation_text(proposal),
+            "reading": reading_text(proposal.reading),
+        }
+
+
+_TIPPING = (
+    "its clamp is {near.angle:.2g} rad (known to {near.std:.2g} rad) from the angle at which both "
+    "ways to hang are equally low; "
+)
+_TURNED = (
+    " {other}: with start_heading {tip.heading:.2f} the shapes differ by {tip.difference:mm} RMS, "
+    "and a pose is measured {expected:mm} from its prediction."
+)
+RESIDUAL = Sentence("The declared model's residual {what}.", _dependences)
+FINDINGS: tuple[Sentence[Outcome], ...] = (
+    Sentence("{doubt}.", _other_doubts),
+    Sentence(
+        "{name} (held out): {tipping}`{chosen}` (predicted) {predicted.rmse:mm} off, "
+        "`{other.chosen_by}` {other.rmse:mm} off.",
+        _either_side,
+    ),
+    RESIDUAL,
+    Sentence("{line}", _added),
+    Sentence(
+        "If {found.effect} is hidden (up to {sizes} is not excluded), {found.parameter} is "
+        "{found.interval[0]:.4g} to {found.interval[1]:.4g} N m^2.{telling}",
+        _hidden,
+    ),
+    Sentence(
+        "Without naming a cause: as if pulled by {force} on average at {load.position:.3f} m "
+        "({load.interval[0]:.3f} to {load.interval[1]:.3f} m) from the start.",
+        _pulled,
+    ),
+    Sentence(
+        "Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or another "
+        "stiffness may stand behind it.",
+        _once(_lifted_tip),
+    ),
+    Sentence("To tell {rivals}: hold the end at {end}; {separation}", _proposed),
+    Sentence("{reading}", _proposed),
+)
+
+
+def separation_text(proposal: NextPose) -> str:
+    """Difference of rivals in a proposed pose, and how often it has to be measured."""
+    text = (
+        f"they differ there by {millimetres(proposal.difference)} RMS, {proposal.separation:.2g} "
+        "standard deviations of one measured line, its fixtures and what both fits leave open: "
+    )
+    if proposal.times is None:
+        return text + f"even {MOST_REPEATS} measurements would not tell them apart."
+    return text + (
+        "one measurement suffices."
+        if proposal.times == 1
+        else f"measure it {proposal.times} times."
+    )
+
+
+def reading_text(reading: NextReading, where: str = "there") -> str:
+    """How a reading of force or moment in a pose would separate rivals."""
+    unit, times = quantity_of(reading.name).unit, reading.times
+    text = (
+        f"A reading of {reading.name} {where} differs by {reading.difference:.2g} {unit}, "
+        f"{reading.separation:.2g} standard deviations of one: "
+    )
+    if times is None or times > MOST_REPEATS:
+        return text + "it would not tell them apart."
+    return text + ("one suffices." if times == 1 else f"read it {times} times.")
