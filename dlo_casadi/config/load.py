@@ -41,6 +41,7 @@ from dlo_casadi.config.values import AXES, REST_COEFFICIENTS, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData
 from dlo_casadi.errors import ConfigError, counted
 from dlo_casadi.rod.chain import ELEMENTS, RestCurvature
+from dlo_casadi.rod.quantities import QUANTITIES
 
 
 def load_config(path: str | Path) -> Config:
@@ -312,13 +313,11 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
         angle = getattr(pose, heading) or 0.0
         if how.direction and abs(angle) > most:
             yield f"{heading}: {angle:g} rad: in degrees? then {math.radians(angle):.4g}", heading
-        for kind, count, what in (
-            ("force", d, own.force),
-            ("moment", 2 * d - 3, "[mx, my, mz]" if space else "one number"),
-        ):
-            reading = getattr(pose, f"{key}_{kind}")
-            if reading is not None and len(reading) != count:
-                yield f"{key}_{kind}: {what} belongs here ({numbers})", f"{key}_{kind}"
+        for quantity in QUANTITIES:
+            name, axes = f"{key}_{quantity.name}", "xyz"[:d]
+            reading = getattr(pose, name)
+            if reading is not None and len(reading) != len(quantity.components(axes)):
+                yield f"{name}: {quantity.written(axes)} belongs here ({numbers})", name
         if how.direction and getattr(pose, f"{key}_{own.direction}") is None:
             one = "an" if key == "end" else "a"
             yield f"a {how} {key} needs {one} {key}_{own.direction} {own.unit}", None

@@ -21,6 +21,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.obstacles import Capsule, Plane, bars_of
 from dlo_casadi.rod.obstacles import Obstacle as Surface
+from dlo_casadi.rod.quantities import FORCE
 from dlo_casadi.rod.supports import CLIPS, ENDS, STARTS, SupportKind
 
 # What type checkers accept as the kind of a start, an end, a clip.
@@ -117,7 +118,7 @@ def clip_problems(clips: Sequence[Clip], length: float, axes: int) -> Iterator[t
         if not clamped and getattr(clip, own.direction) is not None:
             yield f"{called}: {own.direction} is of a clamped clip, it is {clip.kind}", k
         if clip.clip_force is not None and len(clip.clip_force) != axes:
-            yield f"{called}: clip_force: {own.force} belongs here", k
+            yield f"{called}: clip_force: {FORCE.written('xyz'[:axes])} belongs here", k
         if clip.roll != "held" and not (clamped and own is AXES[3]):
             yield f"{called}: roll: free is of a clamped clip in space", k
         elif clamped and not clip.kind.roll and own is not AXES[3]:

@@ -141,7 +141,6 @@ class Axes(NamedTuple):
     where: str
     gravity: str
     place: str
-    force: str
     direction: str
     unit: str
 
@@ -149,8 +148,8 @@ class Axes(NamedTuple):
 # Keyed by the number of gravity's components.
 _TURNED, _FRAME = "[rad], continuous along the cable", "[qx, qy, qz, qw]"
 AXES = {
-    2: Axes("a plane", "two numbers", "[x, y]", "[fx, fy]", "heading", _TURNED),
-    3: Axes("space", "three numbers", "[x, y, z]", "[fx, fy, fz]", "orientation", _FRAME),
+    2: Axes("a plane", "two numbers", "[x, y]", "heading", _TURNED),
+    3: Axes("space", "three numbers", "[x, y, z]", "orientation", _FRAME),
 }
 
 

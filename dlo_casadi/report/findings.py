@@ -1,7 +1,7 @@
 """The verdict and the findings beside it: tables of sentences."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from dlo_casadi.session.sentences import Sentence, Values, said_of
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import NOTABLE, UNSEEN
 
-Found = Callable[[Outcome], Iterator[Values]]
 # What the residual may depend on, by the name of its normal score.
 DEPENDENCES = {
     "order_z": "the order of the poses",
@@ -43,28 +42,17 @@ def details(outcome: Outcome) -> list[str]:
 
 def conclusion_of(outcome: Outcome) -> Conclusion:
     """Result of the diagnosis: the first of `CONCLUSIONS` that applies."""
-    for word, row in CONCLUSIONS:
-        for text in said_of(outcome, [row]):
-            return Conclusion(word, text)
-    raise AssertionError("the last conclusion always applies")
-
-
-def _once(applies: Callable[[Outcome], object], **values: Callable[[Outcome], Any]) -> Found:
-    """Values of a sentence that is said once, where it applies."""
-
-    def found(outcome: Outcome) -> Iterator[Values]:
-        if applies(outcome):
-            yield {name: value(outcome) for name, value in values.items()}
-
-    return found
-
-
-def _doubt(outcome: Outcome) -> str:
-    return sentence(outcome.doubts[0])
-
-
-def _names(outcome: Outcome) -> str:
-    return " and ".join(map(str, outcome.effects))
+    added = outcome.effects[-1:]
+    word, says = next((word, says) for word, says, applies in CONCLUSIONS if applies(outcome))
+    said = worded(
+        says,
+        doubt=sentence("".join(outcome.doubts[:1])),
+        names=" and ".join(map(str, outcome.effects)),
+        error=added[0].rmse_cross_validated_after if added else None,
+        floor=outcome.measurement.noise_distance,
+        seen=seen(outcome),
+    )
+    return Conclusion(word, said)
 
 
 def _unexplained(outcome: Outcome) -> bool:
@@ -74,53 +62,33 @@ def _unexplained(outcome: Outcome) -> bool:
 def _fitted_alone(outcome: Outcome) -> bool:
     """Whether the residual is noise with added effects, but left-out poses are not predicted."""
     after = outcome.structure[1] if outcome.structure else None
-    least = outcome.config.diagnosis.significance
-    noise = after is not None and after.p_value >= least
+    noise = after is not None and after.p_value >= outcome.config.diagnosis.significance
     return _unexplained(outcome) and bool(outcome.effects) and noise
 
 
-CONCLUSIONS: tuple[tuple[str, Sentence[Outcome]], ...] = (
-    ("fit failed", Sentence("{doubt}.", _once(lambda x: x.doubts and x.fit.failed, doubt=_doubt))),
-    ("unexplained", Sentence("{doubt}.", _once(lambda x: x.doubts, doubt=_doubt))),
+# Word, sentence, and where both apply.
+CONCLUSIONS: tuple[tuple[str, str, Callable[[Outcome], object]], ...] = (
+    ("fit failed", "{doubt}.", lambda x: x.doubts and x.fit.failed),
+    ("unexplained", "{doubt}.", lambda x: x.doubts),
+    ("not diagnosed", "Nothing was looked for in the residual.", lambda x: x.verdict is None),
     (
-        "not diagnosed",
-        Sentence("Nothing was looked for in the residual.", _once(lambda x: x.verdict is None)),
+        "unexplained",
+        "With {names} every pose is fitted, but one that is left out is predicted {error:mm} off "
+        f"({NOISE_ALONE}: {{floor:mm}}).",
+        _fitted_alone,
     ),
     (
         "unexplained",
-        Sentence(
-            "With {names} every pose is fitted, but one that is left out is predicted {error:mm} "
-            f"off ({NOISE_ALONE}: {{floor:mm}}).",
-            _once(
-                _fitted_alone,
-                names=_names,
-                error=lambda x: x.effects[-1].rmse_cross_validated_after,
-                floor=lambda x: x.measurement.noise_distance,
-            ),
-        ),
+        "The residual is not noise even with {names}.",
+        lambda x: _unexplained(x) and x.effects,
     ),
-    (
-        "unexplained",
-        Sentence(
-            "The residual is not noise even with {names}.",
-            _once(lambda x: _unexplained(x) and x.effects, names=_names),
-        ),
-    ),
-    ("unexplained", Sentence("The residual is not noise.", _once(_unexplained))),
+    ("unexplained", "The residual is not noise.", _unexplained),
     (
         "effect found",
-        Sentence(
-            "The declared model lacked {names}; with it the residual is noise.",
-            _once(lambda x: x.effects, names=_names),
-        ),
+        "The declared model lacked {names}; with it the residual is noise.",
+        lambda x: x.effects,
     ),
-    (
-        "complete",
-        Sentence(
-            "The declared model explains the {seen} down to their noise.",
-            _once(lambda x: True, seen=seen),
-        ),
-    ),
+    ("complete", "The declared model explains the {seen} down to their noise.", lambda x: True),
 )
 
 
@@ -195,10 +163,10 @@ def _pulled(outcome: Outcome) -> Iterator[Values]:
         yield {"load": load, "force": vector(load.force, ".3g", "N")}
 
 
-def _lifted_tip(outcome: Outcome) -> bool:
+def _lifted_tip(outcome: Outcome) -> Iterator[Values]:
     load, experiment = outcome.unexplained, outcome.config.experiment
-    free = not experiment.boundary.end.place
-    return load is not None and free and bool(np.dot(load.force, experiment.gravity) < 0)
+    if load is not None and not experiment.boundary.end.place:
+        yield from [{}] * bool(np.dot(load.force, experiment.gravity) < 0)
 
 
 def _proposed(outcome: Outcome) -> Iterator[Values]:
@@ -242,7 +210,7 @@ FINDINGS: tuple[Sentence[Outcome], ...] = (
     Sentence(
         "Nothing lifts a cable with a free tip: a weight elsewhere (lumped_mass) or another "
         "stiffness may stand behind it.",
-        _once(_lifted_tip),
+        _lifted_tip,
     ),
     Sentence("To tell {rivals}: hold the end at {end}; {separation}", _proposed),
     Sentence("{reading}", _proposed),

@@ -378,7 +378,7 @@ def report_dict(outcome: Outcome) -> dict[str, Any]:
     Every key of the schema is present; unknown values are None, never NaN.
     """
     document: dict[str, Any] = {"schema": "dlo-report/1"}
-    for section in SECTIONS[::-1]:
+    for section in SECTIONS:
         document |= section.data(outcome)
     return finite(document)
 

@@ -37,6 +37,11 @@ class Quantity:
         """Names of its components in a plane or in space, of two or three axes; one has none."""
         return ("",) if self.turning and len(axes) == 2 else tuple(axes)
 
+    def written(self, axes: Sequence[str]) -> str:
+        """How a configuration gives it, such as [fx, fy]."""
+        names = [f"{self.name[0]}{axis}" for axis in self.components(axes)]
+        return f"[{', '.join(names)}]" if len(names) > 1 else "one number"
+
     def scale(self, force: float, arm: float) -> float:
         """Its usual size where forces are of the size `force` [N], and lever arms of `arm` [m]."""
         return force * arm if self.turning else force

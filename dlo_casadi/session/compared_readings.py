@@ -1,6 +1,6 @@
 """Readings of forces and moments beside those of a model, and as they may have been meant."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
@@ -14,52 +14,78 @@ from dlo_casadi.thresholds import FITTED_READINGS, MISREAD
 
 
 @dataclass(frozen=True)
-class Readings:
-    """Readings of one kind, of poses that nothing else shows, by the names of the readings.
+class Reading:
+    """One kind of reading on one side of the cable, of m poses.
 
     Parameters
     ----------
-    measured : tuple of (m, c) [N] or [N m]
-    felt : tuple of (k, m, c) [N] or [N m]
-        Those of a straight cable at k stiffnesses, in rising order.
-    frames : tuple of (m, d, d) or None
-        Axes of the clamps in the world, as columns.
-    sizes : tuple of float [N] or [N m]
-        Root mean squares of the readings as they were declared.
-    weightless : bool
-        Whether there is no gravity, so that readings are known up to a common factor.
+    name : str
+        As in a configuration, such as end_force.
+    measured : (m, c) [N] or [N m]
+    frames : (m, d, d) or None
+        Axes of the clamp in the world, as columns; None at a pin.
     """
 
-    names: tuple[str, ...]
-    measured: tuple[FloatArray, ...]
-    felt: tuple[FloatArray, ...]
-    frames: tuple[FloatArray | None, ...]
-    sizes: tuple[float, ...]
+    name: str
+    measured: FloatArray
+    frames: FloatArray | None = field(default=None, kw_only=True)
+
+    def scaled(self, factor: float) -> Self:
+        """Readings times a factor."""
+        return replace(self, measured=factor * self.measured)
+
+    def in_world(self, sign: int) -> Self | None:
+        """Readings along the axes of their clamps, turned into the world's, with a sign.
+
+        None for one number in a plane, or at a pin.
+        """
+        if self.frames is None or self.measured.shape[1] == 1:
+            return None
+        world = np.einsum("mij,mj->mi", self.frames, self.measured)
+        return replace(self, measured=sign * world)
+
+
+@dataclass(frozen=True)
+class ReadAlone(Reading):
+    """A reading of poses that nothing else shows.
+
+    Parameters
+    ----------
+    felt : (k, m, c) [N] or [N m]
+        That of a straight cable at k stiffnesses, in rising order.
+    size : float [N] or [N m]
+        Root mean square of the readings as they were declared.
+    """
+
+    felt: FloatArray
+    size: float
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Readings of one kind, of poses that nothing else shows.
+
+    `weightless`: there is no gravity, so that they are known up to a common factor.
+    """
+
+    parts: tuple[ReadAlone, ...]
     weightless: bool
 
     @property
     def quantity(self) -> Quantity:
         """What was read."""
-        return quantity_of(self.names[0])
+        return quantity_of(self.parts[0].name)
 
     @property
     def said(self) -> str:
         """Their names in words."""
-        return " and ".join(self.names)
+        return " and ".join(part.name for part in self.parts)
 
     @property
     def misfit(self) -> float:
         """Distance of readings from the nearest stiffness, relative to their size as declared."""
-        y, path = (
-            np.concatenate(
-                [
-                    x.reshape((*x.shape[:-2], -1)) / size
-                    for x, size in zip(parts, self.sizes, strict=True)
-                ],
-                axis=-1,
-            )
-            for parts in (self.measured, self.felt)
-        )
+        y = np.concatenate([x.measured.ravel() / x.size for x in self.parts])
+        path = np.concatenate([x.felt.reshape((len(x.felt), -1)) / x.size for x in self.parts], 1)
         if self.weightless:
             path = np.concatenate([np.zeros_like(path), 1e6 * path])
         steps = np.diff(path, axis=0)
@@ -69,36 +95,23 @@ class Readings:
 
     def scaled(self, factor: float) -> Self:
         """All readings times a factor."""
-        return replace(self, measured=tuple(factor * x for x in self.measured))
+        return replace(self, parts=tuple(part.scaled(factor) for part in self.parts))
 
     def in_world(self, sign: int) -> Self | None:
-        """Readings along the axes of their clamps, turned into the world's, with a sign."""
-        turned = [_in_world(*both) for both in zip(self.frames, self.measured, strict=True)]
-        known = [x for x in turned if x is not None]
-        if len(known) < len(turned):
-            return None
-        return replace(self, measured=tuple(sign * x for x in known))
-
-
-def _in_world(frames: FloatArray | None, vectors: FloatArray) -> FloatArray | None:
-    """Vectors (m, d) along axes (m, d, d), in the world; None for numbers in a plane, or a pin."""
-    if frames is None or vectors.shape[1] == 1:
-        return None
-    return np.asarray(np.einsum("mij,mj->mi", frames, vectors))
+        """All readings turned from their clamps' axes, see `Reading.in_world`; None if one is."""
+        turned = [part.in_world(sign) for part in self.parts]
+        known = tuple(part for part in turned if part is not None)
+        return replace(self, parts=known) if len(known) == len(turned) else None
 
 
 @dataclass(frozen=True)
-class ComparedReading:
-    """One kind of reading on one side of the cable, of m poses.
+class ComparedReading(Reading):
+    """A reading beside what the shapes need.
 
     Parameters
     ----------
-    name : str
-        As in a configuration, such as end_force.
-    measured, model : (m, c) [N] or [N m]
-        Readings, and the values that the shapes need; known only up to the mass.
-    frames : (m, d, d) or None
-        Axes of the clamp in the world, as columns; None at a pin.
+    model : (m, c) [N] or [N m]
+        The values that the shapes need; known only up to the mass.
     forces : (m, d) or None [N]
         Only for moments: the model's forces on the same side.
     std : float [N] or [N m]
@@ -109,10 +122,7 @@ class ComparedReading:
         How `measured` was changed, where numbers were fitted, in words.
     """
 
-    name: str
-    measured: FloatArray
     model: FloatArray
-    frames: FloatArray | None = None
     forces: FloatArray | None = None
     std: float = 0.0
     uncertain: FloatArray | None = None
@@ -171,15 +181,6 @@ class ComparedReading:
         return float(rows @ model / (model @ model))
 
     # ---- as they may have been meant ----
-
-    def scaled(self, factor: float) -> Self:
-        """Readings times a factor."""
-        return replace(self, measured=factor * self.measured)
-
-    def in_world(self, sign: int) -> Self | None:
-        """Readings along the axes of their clamps, turned into the world's, with a sign."""
-        world = _in_world(self.frames, self.measured)
-        return None if world is None else replace(self, measured=sign * world)
 
     def with_axes(self, axes: FloatArray) -> Self | None:
         """Readings along exchanged axes (d, d), if that explains them."""

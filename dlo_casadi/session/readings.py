@@ -21,7 +21,7 @@ from dlo_casadi.rod.quantities import FORCE, quantity_of
 from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.session.axes import clamp_axes
 from dlo_casadi.session.coarse_fit import MESH, POSES, coarse_fit
-from dlo_casadi.session.compared_readings import ComparedReading, Readings
+from dlo_casadi.session.compared_readings import ComparedReading, ReadAlone, Readings
 from dlo_casadi.session.fitting import declared_model, straight
 from dlo_casadi.session.mistakes import READINGS, READINGS_ALONE
 from dlo_casadi.session.questions import Alternatives, Suspicion
@@ -76,10 +76,10 @@ def wrong_readings(session: ReadSession) -> tuple[Suspicion, ...]:
                 name,
                 np.array([poses[k].readings[name] for k in own]),
                 felt[own, at],
-                _frames(fit.model, [poses[k] for k in own], name),
                 felt[own, rows[f"{side}_force"]] if quantity.turning else None,
                 float(np.hypot(noise, getattr(known, quantity.bias_key))),
                 uncertain[own, at],
+                frames=_frames(fit.model, [poses[k] for k in own], name),
             )
         )
     explained = found.rms <= UNEXPLAINED * session.config.cable.length
@@ -102,17 +102,13 @@ def wrong_without_shapes(config: Config, names: Sequence[str]) -> tuple[Suspicio
     if not len(felt) or not names:
         return ()
     own = {name: [k for k, pose in enumerate(shown) if name in pose.readings] for name in names}
-    measured = [
-        np.array([np.atleast_1d(shown[k].readings[name]) for k in own[name]]) for name in names
-    ]
-    readings = Readings(
-        tuple(names),
-        tuple(measured),
-        tuple(felt[:, own[name], rows[name]] for name in names),
-        tuple(_frames(model, [shown[k] for k in own[name]], name) for name in names),
-        tuple(float(np.sqrt(np.mean(x**2))) or 1.0 for x in measured),
-        weightless=not any(model.gravity),
-    )
+    parts = []
+    for name in names:
+        measured = np.array([np.atleast_1d(shown[k].readings[name]) for k in own[name]])
+        size = float(np.sqrt(np.mean(measured**2))) or 1.0
+        frames = _frames(model, [shown[k] for k in own[name]], name)
+        parts.append(ReadAlone(name, measured, felt[:, own[name], rows[name]], size, frames=frames))
+    readings = Readings(tuple(parts), weightless=not any(model.gravity))
     return _ALONE.suspicions([readings])
 
 

@@ -36,5 +36,8 @@ def test_its_components_are_those_of_the_model(node, sizes):
     rows = reaction_rows(node, clips=1)
     for name, at in rows.items():
         assert at.stop - at.start == sizes[QUANTITIES.index(quantity_of(name))]
+    axes = "xyz"[: sizes[0]]
+    known = {2: ["[fx, fy]", "one number"], 3: ["[fx, fy, fz]", "[mx, my, mz]"]}
+    assert [quantity.written(axes) for quantity in QUANTITIES] == known[len(axes)]
     last = rows["clip_1_force"]
     assert last.stop == 2 * sum(sizes) + sizes[0]

@@ -70,12 +70,12 @@ def said_of(
     """What is said of readings whose true forces the shapes give at another mass."""
     model_force, model_moment, axes = read
     noise = np.random.default_rng(1).normal(scale=0.01, size=force.shape)
+    shaken = force + noise * np.abs(force).max()
+    needed = model_force / mass
     found = misread(
         [
-            ComparedReading(
-                "end_force", force + noise * np.abs(force).max(), model_force / mass, axes
-            ),
-            ComparedReading("end_moment", moment, model_moment / mass, axes, model_force / mass),
+            ComparedReading("end_force", shaken, needed, frames=axes),
+            ComparedReading("end_moment", moment, model_moment / mass, needed, frames=axes),
         ]
     )
     return [item.message for item in found if item.certain is certain]
@@ -128,8 +128,8 @@ def test_a_moment_in_another_unit_where_shapes_leave_the_stiffness_open(read, sc
     """Readings are then known up to a common factor; 0.1 N mm look like N cm without the forces."""
     force, moment, axes = read
     readings = [
-        ComparedReading("end_force", scale * force, force, axes),
-        ComparedReading("end_moment", 1e3 * scale * moment, moment, axes, force),
+        ComparedReading("end_force", scale * force, force, frames=axes),
+        ComparedReading("end_moment", 1e3 * scale * moment, moment, force, frames=axes),
     ]
     (found,) = misread(readings, sized=False)
     assert "1e+03 times what shapes and end_force need: in N mm?" in found.message
@@ -188,7 +188,7 @@ def test_readings_within_their_noise_are_not_doubted(read):
     force, _, axes = read
     std = 2 * np.abs(force).max()
     noise = np.random.default_rng(2).normal(scale=std, size=force.shape)
-    one = ComparedReading("end_force", force + noise, force, axes)
+    one = ComparedReading("end_force", force + noise, force, frames=axes)
     assert misread([one])
     assert misread([replace(one, std=std)]) == ()
     assert misread([replace(one, measured=-force, std=std / 10)])  # the sign is still told
