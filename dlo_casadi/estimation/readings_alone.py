@@ -5,8 +5,8 @@ Shapes and unknowns are found in turn: each pose takes that of all its equilibri
 to its readings, then the unknowns move to their minimum, until no pose takes another one. At first
 readings count as noisy as the cable's forces are large, so that a pose in a wrong equilibrium
 hardly pulls the unknowns. They begin at the minimum of the poses that have points; without any, at
-the stiffness with which a cable that is straight at rest explains the readings best, or a larger
-one, and at several rolls of its end, until one of these starts explains the readings.
+a stiffness at which a cable that is straight at rest gives readings as large as those measured, or
+half or twice as large ones, and at several rolls of its end, until a start explains the readings.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,11 +20,10 @@ from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import MISFIT_GAIN, NEARLY, descend
 from dlo_casadi.estimation.measured_shapes import measured_shapes
-from dlo_casadi.estimation.prediction import predict_every
+from dlo_casadi.estimation.prediction import predict_every, predict_poses
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import FOLLOWED, ROLLS, SearchSettings
-from dlo_casadi.estimation.stiffness import fit_stiffness
 from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.estimation.variances import first_reading_noise
 from dlo_casadi.model.assembly import Shapes
@@ -35,10 +34,11 @@ LOOSE = 1.0
 # Mean square of the readings over that noise below which a start explains them. Evidence: of 100
 # starts of five sessions, right minima left 0.003 to 0.01, wrong ones 0.5 to 2.6.
 EXPLAINED = 0.05
-# First stiffnesses, relative to that of a straight cable. What a rest curvature adds to readings
-# hardly resembles them, so that this came out 2 to 73 % too low in seven sessions.
-STIFFER = (1.0, 2.0, 4.0)
-# Maximum number of times that poses take another equilibrium, at each noise.
+# First stiffnesses, relative to that at which readings are as large as measured.
+STIFFER = (1.0, 0.5, 2.0)
+# Largest factor in one step to that stiffness; logarithm of a factor that ends the search.
+FARTHEST, NEAR = 30.0, 0.2
+# Maximum number of times that poses take another equilibrium, at each noise; of these steps.
 ROUNDS = 8
 
 
@@ -66,7 +66,7 @@ def minimum_of_readings(
         near = near_shapes(shown, theta)
         starts = [near.point.theta]
     else:
-        problem, theta = _by_stiffness(problem, theta)
+        problem, theta = _by_size(problem, theta)
         starts = [*_starts(unknowns, theta)]
     begun: list[Fit] = []
     loose = _loosened(problem, starts[0])
@@ -94,18 +94,36 @@ def minimum_of_readings(
     return best or likely[0].reweighed(problem.noise)
 
 
-def _by_stiffness(problem: Problem, theta: FloatArray) -> tuple[Problem, FloatArray]:
-    """Start of the unknowns by readings alone, with a first guess of their noise there."""
+def _by_size(problem: Problem, theta: FloatArray) -> tuple[Problem, FloatArray]:
+    """Start of the unknowns by readings alone, with a first guess of their noise there.
+
+    The stiffness at which a cable that is straight at rest gives readings as large as those
+    measured. That of least squares is too small, to any degree: what a rest curvature adds to the
+    readings hardly resembles those of a straight cable.
+    """
     unknowns, model, own = problem.unknowns, problem.unknowns.model, problem.noise.readings
     plain = replace(model, cable=replace(model.cable, straight=True), effects=(), priors={})
-    mesh = min(model.n, SearchSettings.of(model).mesh)
-    found = fit_stiffness(plain.with_mesh(mesh), problem.history, own)
-    p = unknowns.p(theta)
-    p[model.stiffness_indices] *= found.EI / p[0]
+    plain = plain.with_mesh(min(model.n, SearchSettings.of(model).mesh))
+    p, rest = plain.nominal.copy(), np.zeros(plain.chain.n_rests)
+    for _ in range(ROUNDS):
+        found = predict_poses(plain, p, rest, [item.pose for item in problem.history])
+        both = [
+            (np.array(pair) * (model.cable.length if "force" in name else 1.0)).reshape((2, -1))
+            for k, item in zip(problem.fitted, problem.fit_poses, strict=True)
+            if (one := found[k]) is not None
+            for name, pair in item.readings_beside(one.seen).items()
+        ]
+        sizes = [np.linalg.norm(part) for part in np.hstack(both)] if both else [1.0, 1.0]
+        ratio = float(np.clip(sizes[0] / max(sizes[1], 1e-300), 1 / FARTHEST, FARTHEST))
+        p[plain.stiffness_indices] *= ratio
+        if abs(np.log(ratio)) < NEAR:
+            break
+    start = unknowns.p(theta)
+    start[model.stiffness_indices] *= p[0] / start[0]
     known = (own.force if own.force_known else None, own.moment if own.moment_known else None)
-    noise = first_reading_noise(model, *known, stiffness=found.EI)
+    noise = first_reading_noise(model, *known, stiffness=float(p[0]))
     problem = replace(problem, noise=replace(problem.noise, readings=noise), weights=None)
-    return problem, unknowns.pack(p, unknowns.coefficients(theta))
+    return problem, unknowns.pack(start, unknowns.coefficients(theta))
 
 
 def _starts(unknowns: Unknowns, theta: FloatArray) -> Iterator[FloatArray]:
