@@ -232,8 +232,9 @@ def measured_elsewhere(
     """Stable equilibria in which poses were measured, where others are predicted; else None.
 
     Each pose is solved from its measured shape. The result counts if its headings differ from the
-    prediction and it is nearer to the points. `fitted`: nodes (n_nodes, coordinates) of fitted
-    poses, by name, as further starts: those of a fit that lacks something may be far off.
+    prediction and it is nearer to the points, or without points to the readings. `fitted`: nodes
+    (n_nodes, coordinates) of fitted poses, by name, as further starts: those of a fit that lacks
+    something may be far off.
     """
     fits, lines = fitted or {}, [item.traced for item in measured]
     starts = [
@@ -249,7 +250,7 @@ def measured_elsewhere(
     for j, (item, known) in enumerate(zip(measured, predictions, strict=True)):
         ways = [x for k, x in zip(of, solved, strict=True) if k == j and x is not None]
         stable = [x for x in ways if x.equilibrium.stable]
-        if not (item.has_points and known is not None and stable):
+        if not (item.readable and known is not None and stable):
             out.append(None)
             continue
         found = stable[int(np.argmin([_square(x, item) for x in stable]))]
@@ -303,7 +304,16 @@ def measured_branches(
 
 
 def _square(prediction: Prediction, item: MeasuredPose) -> float:
-    """Mean square distance [m^2] of measured points to a prediction."""
+    """Mean square distance [m^2] of measured points to a prediction.
+
+    Without points sum of squares of the errors of readings [N^2], moments over the length.
+    """
+    if not item.has_points:
+        length, pairs = prediction.model.cable.length, item.readings_beside(prediction.seen)
+        return sum(
+            float(((read - seen) ** 2).sum()) / (1.0 if "force" in name else length**2)
+            for name, (read, seen) in pairs.items()
+        )
     return float((item.distances(prediction.curve) ** 2).mean())
 
 

@@ -19,7 +19,7 @@ from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
-from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise
+from dlo_casadi.sensing.noise import NoiseModel
 
 # Steps per decade of the first search.
 _PER_DECADE = 3
@@ -42,9 +42,7 @@ class StiffnessFit:
     log_std: float
 
 
-def fit_stiffness(
-    model: CableModel, measured: Sequence[MeasuredPose], readings: ReadingNoise | None = None
-) -> StiffnessFit:
+def fit_stiffness(model: CableModel, measured: Sequence[MeasuredPose]) -> StiffnessFit:
     """Least squares of the distances of all fit points over EI, the cable straight at rest.
 
     If no fit pose has points, of the errors of readings over their noise. The equilibria are
@@ -56,7 +54,7 @@ def fit_stiffness(
     alone, used = not seen, seen or used
     equilibria = BatchEquilibrium(model, [item.pose for item in used], wrenches=alone)
     rest = np.zeros(model.chain.n_rests)
-    noise = replace(NoiseModel(1.0), readings=readings or first_reading_noise(model))
+    noise = replace(NoiseModel(1.0), readings=first_reading_noise(model))
     # Several squares for each marker, and for each point of a line in space.
     compared = [item.traced if item.has_line else item for item in used]
     n_squares = sum(int((item.on_points | alone).sum()) for item in compared)

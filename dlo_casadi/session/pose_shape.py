@@ -18,8 +18,8 @@ class BranchShape(Brief):
 
     Parameters
     ----------
-    rmse : float [m]
-        Root mean square distance of the measured points from it.
+    rmse : float or None [m]
+        Root mean square distance of the measured points from it; None of readings alone.
     branch : "ccw", "cw", "previous" or None
         Value of `branch` with which it is predicted; None if there is none.
     turns : 0.5, -0.5, 1, -1 or None
@@ -28,7 +28,7 @@ class BranchShape(Brief):
         Its energy minus that of the predicted equilibrium.
     """
 
-    rmse: float
+    rmse: float | None
     branch: PoseBranch | None
     turns: float | None = None
     above: float = 0.0
@@ -62,7 +62,7 @@ class EitherSide(Brief):
     def told(self) -> bool:
         """Whether the pose was measured on the other side, or the lower side is uncertain."""
         near = self.tipping is not None and self.tipping.either
-        return near or self.other.rmse < self.predicted.rmse
+        return near or (self.other.rmse or 0.0) < (self.predicted.rmse or 0.0)
 
 
 @dataclass(frozen=True, repr=False)

@@ -92,7 +92,7 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             names=[*group],
             energy=_energy(group),
             predicted=max(stage.shapes[name].rmse or 0.0 for name in group),
-            measured=max(shape.rmse for shape in group.values()),
+            measured=max(shape.rmse or 0.0 for shape in group.values()),
             cure=_cure(group),
         )
         if undecided := [name for name in group if stage.shapes[name].undecided]:
@@ -103,9 +103,9 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             )
         lines.append(said)
     return lines + [
-        f"stage {stage.name}: {', '.join(group)}: the cable hangs on another side than "
-        f"predicted, {_energy(group)}; fit poses are compared where they hang, and a "
-        f"prediction of the same ends needs `{next(iter(group.values())).chosen_by}`"
+        f"stage {stage.name}: {', '.join(group)}: the cable is in another equilibrium than "
+        f"predicted, {_energy(group)}; fit poses are compared where they are, and "
+        f"{_needed(group)}"
         for group in _by_choice(stage.measured_side)
     ]
 
@@ -130,6 +130,13 @@ def _cure(group: Mapping[str, BranchShape]) -> str:
     if chosen_by is None:
         return "no value of `branch` or `turns` chooses it: measure the pose again, or leave it out"
     return f"`{chosen_by}` chooses it"
+
+
+def _needed(group: Mapping[str, BranchShape]) -> str:
+    chosen_by = next(iter(group.values())).chosen_by
+    if chosen_by is None:
+        return "no value of `branch` or `turns` predicts them there"
+    return f"a prediction of the same ends needs `{chosen_by}`"
 
 
 def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
@@ -283,7 +290,7 @@ def _errors(shape: PoseShape) -> FloatArray:
     assert shape.missed is not None
     expected, there = shape.expected**2, shape.measured_branch
     if there is not None and (there.branch not in SIGNS or shape.either_side is not None):
-        return np.stack([np.full_like(expected, there.rmse**2), expected])
+        return np.stack([np.full_like(expected, (there.rmse or 0.0) ** 2), expected])
     return np.stack([shape.missed**2, expected])
 
 

@@ -58,7 +58,7 @@ def pose_shape(
         gap = item.traced.points - curve.at(s)
     return PoseShape(
         curve.at(np.linspace(0.0, curve.length, _CURVE_POINTS)),
-        _rmse(prediction, item) if item.has_points else None,
+        _rmse(prediction, item),
         s,
         gap,
         _across(prediction, s, gap),
@@ -72,8 +72,10 @@ def pose_shape(
     )
 
 
-def _rmse(prediction: Prediction, item: MeasuredPose) -> float:
-    """Root mean square distance [m] of a pose's points to a prediction."""
+def _rmse(prediction: Prediction, item: MeasuredPose) -> float | None:
+    """Root mean square distance [m] of a pose's points to a prediction; None without points."""
+    if not item.has_points:
+        return None
     return float(np.sqrt((item.distances(prediction.curve) ** 2).mean()))
 
 
@@ -139,8 +141,10 @@ class _Model:
             if known is None:
                 continue
             side = None
-            if other is not None and other.other_side and not item.held_out:
-                # A fit has used the side on which the cable of each pose hangs.
+            chosen = other is not None and (other.other_side or not item.has_points)
+            if other is not None and chosen and not item.held_out:
+                # A fit has used the side on which the cable of each pose hangs, or the equilibrium
+                # that its readings show.
                 side = _branch_shape(other, item, known)
                 known, other = other.prediction, None
                 predictions[j], others[j] = known, other

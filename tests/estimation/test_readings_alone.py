@@ -23,9 +23,23 @@ FORCE_STD, MOMENT_STD = 0.01, 1e-3
 
 
 def session(
-    d, *, poses=10, held_out=1, shown=0, guess=1.0, gravity=9.81, reads=2, curved=1.0, declared=True
+    d,
+    *,
+    poses=10,
+    held_out=1,
+    shown=0,
+    guess=1.0,
+    gravity=9.81,
+    reads=2,
+    curved=1.0,
+    declared=True,
+    higher=0,
 ):
-    """A curved cable between clamps, with readings of its end; the first `shown` have points."""
+    """A curved cable between clamps, with readings of its end.
+
+    The first `shown` poses have points; the first `higher` of those that have a second equilibrium
+    are read there.
+    """
     rng, ends = np.random.default_rng(1), ("clamped", "clamped")
     sizes = {"length": LENGTH, "mass": 0.05, "diameter": 0.006}
     down = (0.0,) * (d - 1) + (-gravity,)
@@ -49,8 +63,14 @@ def session(
         shape = true.solve(**held)
         if not shape.stable:
             continue
-        force = shape.end_force + rng.normal(0, FORCE_STD, d)
-        moment = shape.end_moment + rng.normal(0, MOMENT_STD, np.shape(shape.end_moment))
+        force, moment, pose = shape.end_force, shape.end_moment, HeldPose((0.0,) * d, **held)
+        every = all_equilibria(true.model, true.p, true.rest, [pose])[0] if higher else []
+        if len(every) > 1:
+            higher -= 1
+            other = max(every, key=lambda eq: eq.energy)
+            force, moment = other.end_force, other.moments[1]
+        force = force + rng.normal(0, FORCE_STD, d)
+        moment = moment + rng.normal(0, MOMENT_STD, np.shape(moment))
         read = dict([("end_force", force), ("end_moment", moment)][:reads])
         if len(taken) < shown:
             read["points"] = shape.points[2:-2] + rng.normal(0, 3e-4, shape.points[2:-2].shape)
@@ -130,6 +150,18 @@ def test_readings_choose_the_equilibrium_of_a_curved_cable():
     low, high = result.params["bending_stiffness"].interval_95
     assert low < STIFFNESS < high < 1.05 * low
     assert result.stages[-1].readings_fit.force == pytest.approx(FORCE_STD, rel=0.5)
+
+
+def test_a_pose_in_a_higher_equilibrium_is_compared_there():
+    """Of two poses whose readings are those of the higher of two equilibria."""
+    result = session(2, guess=10.0, held_out=0, higher=2).fit(diagnosis=False)
+    low, high = result.params["bending_stiffness"].interval_95
+    assert low < STIFFNESS < high < 1.05 * low
+    stage = result.stages[-1]
+    assert len(stage.measured_side) == 2
+    assert stage.readings_fit.force == pytest.approx(FORCE_STD, rel=0.5)
+    assert result.doubts == ()
+    assert any("is in another equilibrium than predicted" in text for text in result.warnings)
 
 
 def test_all_equilibria_hold_the_lowest_one():
