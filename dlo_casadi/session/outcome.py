@@ -126,7 +126,7 @@ class Stage(Brief):
 
     @property
     def measured_side(self) -> dict[str, BranchShape]:
-        """Fit poses, by name, compared on another side than the one a prediction takes."""
+        """Fit poses, by name, compared in another equilibrium than the predicted one."""
         return {name: found for name, x in self.shapes.items() if (found := x.measured_side)}
 
 

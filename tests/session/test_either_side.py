@@ -119,7 +119,7 @@ def test_fit_poses_are_compared_the_way_round_in_which_they_hang(result):
     assert stage.rmse_fit_measured_branch == stage.rmse_fit
     turned = {name: side["turns"] for name, side in report["measured_side"].items()}
     assert turned == {"high": -0.5, "higher": 0.5}
-    said = [text for text in result.warnings if "hangs on another side" in text]
+    said = [text for text in result.warnings if "is in another equilibrium" in text]
     assert [text.partition(": ")[2].partition(":")[0] for text in said] == ["high", "higher"]
     assert said[0].endswith("needs `turns: -0.5`")
 
