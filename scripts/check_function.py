@@ -29,7 +29,7 @@ from harness import options, run
 from numpy.typing import NDArray
 
 from dlo_casadi.codegen import Capsule, CompiledSolver, generate
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library, workspace_of
 from dlo_casadi.effects import EFFECTS, BoundaryEffect, CableData, Effect
 from dlo_casadi.equilibrium.implicit import pose_of
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -172,7 +172,7 @@ def slowdown(dimension: int, calls: int = 3000) -> float:
     rest, pose = np.zeros(model.chain.n_rests), np.array(POSES[dimension])
     with TemporaryDirectory() as folder:
         library = compile_library(generate(model, p, rest), Path(folder))
-        bare, workspace = CDLL(str(library)).dlo_solve, generate(model, p, rest).workspace
+        bare, workspace = CDLL(str(library)).dlo_solve, workspace_of(CDLL(str(library)))
         function = ca.external("dlo_cable", str(library))
     work, shape = np.zeros(workspace), np.zeros(100 * workspace)
     places = [c_void_p(array.ctypes.data) for array in (pose, shape, work)]

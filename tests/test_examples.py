@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.codegen import generate
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library
 from dlo_casadi.effects import EFFECTS
 
 EXAMPLES = Path(__file__).parents[1] / "scripts" / "examples"

@@ -13,9 +13,21 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.kernels import Holding, Kernels, c_number, kernels_of
+from dlo_casadi.codegen.statuses import STATUS_TEXTS
 from dlo_casadi.effects import Load
-from dlo_casadi.equilibrium.guesses import resting_headings
-from dlo_casadi.equilibrium.solve import coarse_rest
+from dlo_casadi.equilibrium.guess_table import SLACKS, TAUT, GuessRow, guess_table
+from dlo_casadi.equilibrium.guesses import (
+    CURVED,
+    FAR,
+    HALF_ANGLE,
+    HALF_TURN,
+    LARGEST_BEND,
+    ONE_POINT,
+    TIE,
+    resting_headings,
+)
+from dlo_casadi.equilibrium.sides import NEAR_BAR
+from dlo_casadi.equilibrium.solve import MOST_SHED, coarse_rest
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import surfaces_at
@@ -23,6 +35,9 @@ from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.obstacles import Obstacle, Plane
 from dlo_casadi.rod.supports import SupportKind
+
+# Newton steps of a descent, and for a part of a path, as in the templates.
+ITERATIONS, TRY_STEPS = 80, 12
 
 
 def template(name: str) -> str:
@@ -63,6 +78,7 @@ class Obstacles:
         found = {
             "AMONG": "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     ",
             "GIVEN": "obstacles, n_obstacles, ",
+            "TAKEN": "take_obstacles(w, obstacles, n_obstacles)",
             "DECLARED_GIVEN": "DECLARED_OBSTACLES, DLO_DECLARED, " if self.declared else "0, 0, ",
             "NO_OBSTACLES": "NULL, 0, ",
             "OBSTACLES_ARE": _SAID,
@@ -71,7 +87,8 @@ class Obstacles:
             "HPP_GIVEN": "obstacles.data(), obstacles.size(), ",
             "DECLARED_OBSTACLES": ", ".join(map(_initializer, self.declared)),
         }
-        return found if self.most else dict.fromkeys(found, "")
+        none = dict.fromkeys(found, "") | {"TAKEN": "take_obstacles(w, 0, 0)"}
+        return found if self.most else none
 
 
 # Text about obstacles in the header.
@@ -111,8 +128,7 @@ def case_of(
 class Case:
     """Contents of the templates: the cable's numbers, and the text parts of its kind.
 
-    `name`: prefix of its templates. `try_steps`: Newton steps for a part of a path; `iterations`:
-    of a descent.
+    `name`: of its templates.
     """
 
     model: CableModel
@@ -121,8 +137,8 @@ class Case:
     inline: bool
     obstacles: Obstacles
     name: ClassVar[str]
-    try_steps: ClassVar[int]
-    iterations: ClassVar[int]
+    # Elements of the mesh for first guesses; 0 if there is none.
+    coarse_elements: ClassVar[int] = 0
 
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
@@ -171,7 +187,7 @@ class Case:
 
     @property
     def holding(self) -> list[float]:
-        """Declared length [m]; per clip the true minus the declared values; and each tether."""
+        """Per clip the true minus the declared values; and each tether."""
         node, length = self.model.node, self.model.cable.length
         own = np.array(node.identity)
         places, at, turns = (
@@ -183,7 +199,7 @@ class Case:
             for s, place, turn in zip(at.ravel(), places.T, turns.T, strict=True)
         ]
         tethers = [[*tether, *own] for tether in self.tethers]
-        return [length, *(float(x) for row in (*clips, *tethers) for x in row)]
+        return [float(x) for row in (*clips, *tethers) for x in row]
 
     @property
     def example_clips(self) -> str:
@@ -228,26 +244,79 @@ class Case:
         return list(np.array(found(self.p)).T)
 
     @property
-    def numbers(self) -> list[float]:
-        """Numbers outside the kernels, in the order of the template's macros."""
+    def clamps(self) -> tuple[FloatArray, FloatArray]:
+        """True minus declared place of the end [m], and the true clamps in the declared ones."""
         raise NotImplementedError
 
     @property
-    def contact_size(self) -> int:
-        """Doubles of a workspace for obstacles: 0 without any."""
-        d, n, most = self.model.node.dimension, self.model.n, self.obstacles.most
-        slots, columns = 4 * most * n, (1 + d) * n
-        rows = self.model.node.increment * self.model.chain.n_nodes + self.border
-        # Two points per plane, columns with their block, sums and forces; as in the template.
-        size = (2 if d == 2 else 1) * ((3 + d) * slots + d * (3 * n + 2))
-        size += columns * (4 * d + 5 + 2 * rows) + columns * (columns + 1) + columns
-        size += d * (d + 1) // 2 * n + d * n + (7 + 3 * d) * slots
-        return size if most else 0
+    def resting(self) -> FloatArray:
+        """The cable at rest as first guesses need it, see the templates."""
+        raise NotImplementedError
+
+    @property
+    def numbers(self) -> list[float]:
+        """Numbers outside the kernels, in the order of the template's macros."""
+        model, chain = self.model, self.model.chain
+        offset, turned = self.clamps
+        stretch = self.length / model.cable.length
+        found = [self.length, model.cable.length, *model.gravity, *self.load, *offset, *turned]
+        found += [*self.stiffnesses, *(chain.places / model.cable.length)]
+        found += [*(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)), *self.resting]
+        return [*found, *self.holding]
+
+    @property
+    def rows(self) -> tuple[GuessRow, ...]:
+        """First guesses by spans."""
+        model = self.model
+        return guess_table(len(model.clips) + 1, model.in_space, bool(model.sliding))
+
+    @property
+    def guesses(self) -> int:
+        """Number of first guesses."""
+        raise NotImplementedError
+
+    @property
+    def descents(self) -> int:
+        """Descents of a solve, as in the template, which checks it: MOST_STEPS.
+
+        One from a warm start. Each first guess starts one; in a plane, one more guided by springs
+        in 15 stages; with a coarse mesh one there and one that goes on, and three of these are
+        followed until their energy is known. All may land on obstacles, pushed aside or not.
+        """
+        most, coarse = self.obstacles.most, bool(self.coarse_elements)
+        each = 1 + (2 * coarse if self.model.in_space else 15)
+        return 1 + each * self.guesses + 3 * coarse + bool(most) * (2 + 4 * (self.guesses + most))
 
     @property
     def values(self) -> dict[str, int | str]:
         """Values that replace the templates' marks."""
-        raise NotImplementedError
+        model, chain, coefficients = self.model, self.model.chain, map(c_number, HALF_ANGLE)
+        joined = not model.in_space and model.clamped_between and not self.obstacles.most
+        table = (
+            _braces([str(row.slack), str(int(row.rolled)), _braces(map(str, row.sides))])
+            for row in self.rows
+        )
+        return {
+            "COARSE": self.coarse_elements,
+            "SHAPES": self.guesses if self.coarse_elements else 0,
+            "ELEMENTS": chain.n_segments,
+            "FIRST": chain.layout.advancing[0],
+            "RESTING": len(self.resting),
+            "STEPS": self.descents * ITERATIONS + 10 * joined,
+            "GUESSES": self.guesses,
+            "GUESS_TABLE": ",\n    ".join(table),
+            "SLACKS": ", ".join(map(c_number, SLACKS)),
+            "HALF_ANGLE": ", ".join(coefficients),
+            "FAR": c_number(FAR),
+            "CURVED": c_number(CURVED),
+            "LARGEST_BEND": c_number(LARGEST_BEND),
+            "HALF_TURN": c_number(HALF_TURN),
+            "TIE": c_number(TIE),
+            "TAUT": c_number(TAUT),
+            "ONE_POINT": c_number(ONE_POINT),
+            "MOST_SHED": c_number(MOST_SHED),
+            "NEAR_BAR": c_number(NEAR_BAR),
+        }
 
     @property
     def table(self) -> list[float]:
@@ -261,7 +330,7 @@ class Case:
         text = template(f"{self.name}_words.in")
         _, *parts = re.split(r"^@([A-Z_]+)@\n", text, flags=re.MULTILINE)
         found = {mark: part[:-1] for mark, part in zip(parts[::2], parts[1::2], strict=True)}
-        return found | self.obstacles.words
+        return found | self.obstacles.words | STATUS_TEXTS
 
     @property
     def lagrangian(self) -> Lagrangian:
@@ -284,63 +353,32 @@ def _braces(parts: Iterable[str]) -> str:
 
 
 class _PlaneCase(Case):
-    name, try_steps, iterations = "plane", 13, 100
-    # Doubles of a workspace per node, as in the template: arrays, border, two-point segments.
-    doubles = 12 + 2 + 2 * 15
-    # Doubles of a workspace for each segment with a clip or tether inside.
-    held_doubles = 15 + 2 + 2 + 2 + 4 + 3 + 8
+    name = "plane"
 
     @property
-    def numbers(self) -> list[float]:
-        model, chain, gravity = self.model, self.model.chain, self.model.gravity
+    def clamps(self) -> tuple[FloatArray, FloatArray]:
         offsets, _ = self.lagrangian.true_ends_and_length(self.p, 0, 0)
-        stretch = self.length / model.cable.length
-        return [
-            self.length,
-            float(np.arctan2(gravity[1], gravity[0])) if any(gravity) else 0.0,
-            *self.load,
-            *np.array(offsets).ravel()[2:],
-            *self.stiffnesses,
-            *(chain.places / model.cable.length),
-            *resting_headings(chain, self.rest),
-            *(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)),
-            *self.holding,
-        ]
+        found = np.array(offsets).ravel()[2:]
+        return found[:2], found[2:]
+
+    @property
+    def resting(self) -> FloatArray:
+        return resting_headings(self.model.chain, self.rest)
+
+    @property
+    def guesses(self) -> int:
+        pinned = self.model.start.turns and self.model.end.turns
+        return len(self.rows) if self.model.clips else 4 + pinned
 
     @property
     def values(self) -> dict[str, int | str]:
-        model, chain, kernels = self.model, self.model.chain, self.meshes["kernel"]
-        count, gives = chain.n_nodes, [c > 0 for c in self.compliances]
-        # Each first guess starts one free descent, and one guided by springs in 15 stages; a
-        # descent takes 100 steps; each may land on obstacles, in 100. The template checks the
-        # number. The lowest stretches between saddles are joined in 10.
-        guesses = 5 if model.start.turns and model.end.turns else 4
-        held = 0
-        if self.holds:
-            held = 2 * self.held_doubles * self.holds + (5 + 15) * chain.n_segments
-            held += (self.border - 2) * count + 2 * self.held_doubles
-        if spans := len(model.clips) and len(model.clips) + 1:
-            guesses = (2**spans if spans <= 4 else spans + 2) * (3 if model.sliding else 1)
-        mixing = 10 if model.clamped_between and not self.obstacles.most else 0
-        landings = 2 + 4 * (guesses + self.obstacles.most) if self.obstacles.most else 0
-        return {
-            "WORKSPACE": self.doubles * (count + 1) + held,
-            "ELEMENTS": chain.n_segments,
-            "FIRST": chain.layout.advancing[0],
-            "LOW": model.start.direction and not gives[0],
-            "HIGH": count - (model.end.direction and not gives[1]),
-            # Elimination and solution take about 30 operations per node; the kernels run twice.
-            "OPERATIONS": 2 * kernels.operations + 30 * count,
-            "STEPS": (1 + 16 * guesses) * 100 + 100 * landings + mixing,
-        }
+        # Elimination and solution take about 30 operations per node; the kernels run twice.
+        kernels, count = self.meshes["kernel"], self.model.chain.n_nodes
+        return super().values | {"OPERATIONS": 2 * kernels.operations + 30 * count}
 
 
 class _SpaceCase(Case):
-    name, try_steps, iterations = "space", 12, 80
-    # Doubles of a workspace per node, and those of eight coarse shapes; as in the template.
-    doubles = 4 + 4 + 4 + 3 + 6 + 9 + 58
-    # Doubles of a workspace for each segment with a clip or tether inside.
-    held_doubles = 58 + 3 + 9 + 9 + 9 + 6 + 14
+    name = "space"
     # Fewest arcs of the coarse mesh, and fine elements per arc. Of 3,000 random clamped problems
     # with n = 12, 10 lead to a higher and 4 to a lower equilibrium than with all first guesses on
     # the fine mesh.
@@ -351,8 +389,7 @@ class _SpaceCase(Case):
     coarse_span = 3
 
     @property
-    def coarse_elements(self) -> int:
-        """Number of arcs of the mesh for first guesses; 0 if there is none."""
+    def coarse_elements(self) -> int:  # type: ignore[override]
         model = self.model
         eyelets = len(model.sliding) if model.clamped_between else 0
         spans = len(model.clips) - eyelets + 1
@@ -375,9 +412,7 @@ class _SpaceCase(Case):
         return found | {"coarse_kernel": self.kernels(coarse, rest, bool(self.model.clips))}
 
     @property
-    def clamps(self) -> FloatArray:
-        """Forward offset of the end (3,), and frames (8,) of true clamps in the declared ones."""
-
+    def clamps(self) -> tuple[FloatArray, FloatArray]:
         def held(frames: FloatArray) -> FloatArray:
             ends = np.concatenate([np.zeros(6), frames.ravel()])
             return np.array(self.lagrangian.true_ends_and_length(self.p, ends, 0)[0]).ravel()
@@ -393,34 +428,20 @@ class _SpaceCase(Case):
                 "no solver can be generated: an effect moves the clamps in another way than about "
                 "their own axes\n  Try: dlo predict, or dlo_casadi.predict, which know it."
             )
-        return found[3:]
+        return found[3:6], found[6:]
 
     @property
-    def numbers(self) -> list[float]:
-        model, chain = self.model, self.model.chain
+    def resting(self) -> FloatArray:
+        chain = self.model.chain
         bends = chain.curvatures(self.rest) * np.diff(chain.cells, axis=1).ravel()
-        length = self.length
-        first = [length, length / model.n, *model.gravity]
-        clamps = [*self.clamps, *self.stiffnesses]
-        return [*first, *self.load, *clamps, *bends.T.ravel(), *self.holding]
+        return np.asarray(bends.T.ravel())
+
+    @property
+    def guesses(self) -> int:
+        return len(self.rows) if self.model.end.place or self.model.clips else 3
 
     @property
     def values(self) -> dict[str, int | str]:
-        n, coarse = self.model.n, self.coarse_elements
-        # Each first guess starts a descent on the coarse mesh, whose minimum starts one on the fine
-        # mesh; if all fail, the first guess starts one on the fine mesh. A descent takes 80 steps.
-        # The template checks the number.
-        hangs = not (self.model.end.place or self.model.clips)
-        guesses = 3 if hangs else 8 + 2 * bool(self.model.sliding)
-        held = self.held_doubles * self.holds + (11 + 58) * n if self.holds else 0
-        return {
-            "WORKSPACE": (self.doubles + 3 * self.border) * (n + 2)
-            + 4 * guesses * (coarse + 1)
-            + held,
-            "COARSE": coarse,
-            "SHAPES": guesses,
-            "FIRST": 0,
-            # Elimination and solution: about 500 operations a node.
-            "OPERATIONS": self.meshes["kernel"].operations + 500 * (n + 1),
-            "STEPS": (1 + 3 * guesses + 3 * self.obstacles.most) * 80,
-        }
+        # Elimination and solution: about 500 operations a node.
+        operations = self.meshes["kernel"].operations + 500 * (self.model.n + 1)
+        return super().values | {"OPERATIONS": operations}

@@ -1,9 +1,7 @@
 """CompiledSolver: the generated C solver, compiled and called from Python."""
 
 import ctypes
-import os
 import shutil
-import subprocess
 import tempfile
 import weakref
 from collections.abc import Mapping, Sequence
@@ -17,10 +15,10 @@ from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.cases import row_of
-from dlo_casadi.codegen.generate import Solver, generate
+from dlo_casadi.codegen.compiler import compile_library, workspace_of
+from dlo_casadi.codegen.generate import generate
 from dlo_casadi.codegen.shapes import (
     QUANTITIES,
-    STATUSES,
     AnyObstacle,
     AnyPose,
     CompiledShape,
@@ -28,11 +26,11 @@ from dlo_casadi.codegen.shapes import (
     ShapePath,
     Slope,
     Usage,
-    no_equilibrium,
     pose_table,
     records_of,
     surfaces_of,
 )
+from dlo_casadi.codegen.statuses import STATUSES, no_equilibrium
 from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
@@ -56,39 +54,6 @@ _ARGUMENTS = {
 }
 # Index of the argument before which obstacles are inserted, if the solver supports any.
 _AMONG = {"dlo_solve": 1, "dlo_step": 1, "dlo_sensitivity": 1, "dlo_batch": 2, "dlo_path": 2}
-
-
-def compile_library(solver: Solver, folder: Path, flags: Sequence[str] = ("-O2",)) -> Path:
-    """Compile a solver into a shared library in a folder, with the required flags and these.
-
-    Raises
-    ------
-    DloError
-        If there is no compiler, or it fails.
-    """
-    named = os.environ.get("CC", "").strip()
-    # A path, or a name with options: gcc -m64.
-    words = [named] if shutil.which(named) else named.split()
-    names = words[:1] or ["cc", "gcc", "clang"]
-    compiler = next((name for name in names if shutil.which(name)), None)
-    if compiler is None:
-        looked = f"CC is {named!r}" if named else f"looked for {', '.join(names)}"
-        raise DloError(
-            f"no C compiler found ({looked}).\n"
-            "  Try: apt-get install gcc, or set CC; dlo generate-solver needs none."
-        )
-    if isinstance(flags, str):
-        raise DloError(f"flags is a sequence of words, found {flags!r}\n  Try: {flags.split()}")
-    solver.write(folder)
-    library = folder / f"{solver.prefix}_solver.so"
-    prefix = solver.prefix.upper()
-    command = [compiler, *words[1:], "-std=c99", *flags, "-fPIC", "-shared"]
-    command += [f"-D{prefix}_SHARED", f"-D{prefix}_BUILDING"]
-    command += [f"{solver.prefix}_solver.c", "-o", library.name, "-lm"]
-    run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    if run.returncode:
-        raise DloError(f"{compiler} could not compile the solver:\n{run.stderr[:2000]}")
-    return library
 
 
 class CompiledSolver:
@@ -143,7 +108,7 @@ class CompiledSolver:
                 kinds = kinds[: _AMONG[name]] + "pn" + kinds[_AMONG[name] :]
             getattr(self._c, name).argtypes = [_TYPES[kind] for kind in kinds]
         self._records = records_of(model, self.most_obstacles)
-        self.workspace = self.source.workspace
+        self.workspace = workspace_of(self._c)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return self._remade

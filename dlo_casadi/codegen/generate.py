@@ -10,7 +10,14 @@ import numpy as np
 
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.cases import Case, Obstacles, case_of, template
+from dlo_casadi.codegen.cases import (
+    ITERATIONS,
+    TRY_STEPS,
+    Case,
+    Obstacles,
+    case_of,
+    template,
+)
 from dlo_casadi.codegen.kernels import c_number, kernel_texts, size_of_code, table_to_c
 from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
@@ -49,8 +56,6 @@ class Solver:
         SHA-256 of everything that determines the solver's numbers: see `solver_hash`.
     files : dict
         File name -> text.
-    workspace : int
-        Size of a workspace in doubles.
     obstacles : Obstacles
         Maximum number of obstacles of a call, and those of the model.
     """
@@ -58,7 +63,6 @@ class Solver:
     prefix: str
     hash: str
     files: dict[str, str]
-    workspace: int
     obstacles: Obstacles
 
     def write(self, folder: Path | str) -> list[Path]:
@@ -117,13 +121,12 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
     ends, among = f"start {model.start}, end {model.end}", case.obstacles.most
     held = [*model.clips, *[SupportKind.PINNED] * len(case.tethers)]
     table, values = case.table, case.values
-    tries = case.try_steps * (2 if among else 1)
-    most = tries + (case.iterations if among else 0)
+    tries = TRY_STEPS * (2 if among else 1)
+    most = tries + (ITERATIONS if among else 0)
     return (
         values
         | kernel_texts(case.meshes)
         | {
-            "WORKSPACE": int(values["WORKSPACE"]) + case.contact_size,
             "PREFIX": prefix,
             "FILE": f"{prefix}_solver",
             "TITLE": comment(model.cable.name),
@@ -157,13 +160,13 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "CLIPS": len(model.clips),
             "CLIP_KINDS": ", ".join(model.clips),
             "CLAMPS": sum(kind.direction for kind in model.clips),
-            "CLAMP_KINDS": ", ".join(str(kind.direction * (1 + (not kind.roll))) for kind in held),
+            "CLAMP_KINDS": ", ".join(str(kind.direction * (1 + (not kind.roll))) for kind in held)
+            or "0",
             "EYELETS": len(model.sliding),
-            "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows),
+            "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows) or "0",
             "EXAMPLE_CLIPS": case.example_clips,
             "OBSTACLES": among,
             "DECLARED": len(case.obstacles.declared),
-            "CONTACT_SIZE": case.contact_size,
             "PER_FORCE": c_number(gap_per_force(model, 1.0)),
             "TRY_STEPS": tries,
             "PATH_STEPS": int(values["STEPS"]) + most * (2 * FINEST + 13),
@@ -289,17 +292,20 @@ def generate(
         mark: value if isinstance(value, str) else str(int(value))
         for mark, value in _values(case, prefix, digest).items()
     }
-    own = [f"{case.name}_{part}" for part in ("descent", "guesses", "shape")]
-    first = ("common", case.name, "contact", "newton", "columns", own[0], "descent", "between")
-    sources = (*first, "landing", *own[1:], "shape", "clearance", "limits", "interface", "casadi")
+    node, guessed = f"node_{case.name}", f"guesses_{case.name}"
+    first = ("common", "contact", "newton", node, "columns", "descent", "between", "landing")
+    then = ("guesses", guessed, "pose", "find", "shape", "clearance", "limits", "interface")
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),
         "CMakeLists.txt": template("CMakeLists.txt.in"),
         f"{prefix}_solver.pc.in": template("solver.pc.in"),
         "example.c": template("example.c.in"),
-        f"{prefix}_solver.c": "".join(template(f"{name}.c.in") for name in sources),
+        f"{prefix}_solver.c": "".join(
+            template(f"{name}.c.in") for name in (*first, *then, "casadi")
+        ),
     }
+    found = {name: marked(text, case.words) for name, text in found.items()}
     names = set(re.findall(r"(?<!@)\b\w+\b(?!@)", "".join(found.values())))
     for name in sorted(names):
         renamed = fill(name, {}, prefix)
@@ -308,5 +314,5 @@ def generate(
                 f"the prefix {prefix!r} would make {renamed} of {name}, a name that the solver has "
                 "already; choose another one, e.g. --prefix harness"
             )
-    filled = {name: fill(marked(text, case.words), values, prefix) for name, text in found.items()}
-    return Solver(prefix, digest, filled, int(values["WORKSPACE"]), among)
+    filled = {name: fill(text, values, prefix) for name, text in found.items()}
+    return Solver(prefix, digest, filled, among)

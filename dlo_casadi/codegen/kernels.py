@@ -155,16 +155,15 @@ def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
             holders.append(kernels.holder.at_holder(f"{name}_held"))
             even.append(str(at))
             at += kernels.holder.rows.size
-        if kernels.ends is not None:
-            functions.append(_ends_text(kernels.ends))
         loops.append("\n".join(statements))
-    text = "\n".join(functions)
-    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text]
+    text, ends = "\n".join(functions), "\n".join(_ends_text(x.ends) for x in meshes.values())
+    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text + ends]
     return {
         "KERNELS": "\n".join([*helpers, text]),
         "LOOPS": _by_mesh(loops),
         "HELD": _by_mesh(holders),
-        "EVEN": f"w->coarse ? {even[1]} : {even[0]}" if len(even) > 1 else "".join(even),
+        "EVEN": f"w->coarse ? {even[1]} : {even[0]}" if len(even) > 1 else "".join(even) or "0",
+        "ENDS": ends,
         "EXTRA": at,
     }
 
@@ -426,16 +425,18 @@ def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[
     return "\n".join("  " + line for line in text.splitlines() if line.strip())
 
 
-def _ends_text(function: ca.Function) -> str:
-    """C text of the energy of the holders of a planar cable."""
+def _ends_text(function: ca.Function | None) -> str:
+    """C text of the energy of the holders of a planar cable, if any."""
+    if function is None:
+        return "static void add_ends(point_t *q, const double *table) { (void)q, (void)table; }\n"
     targets = ["q->lagrangian +="]
     targets += ["first[SLOPE_0] +=", "last[SLOPE_1] +=", "first[BEND_00] +=", "last[BEND_11] +="]
     return f"""\
 /* Adds what holds the first and the last node beside their conditions. */
 static void add_ends(point_t *q, const double *table)
 {{
-    const double x[2] = {{q->x[0], q->x[NODE(1)]}};
-    double *const first = q->segment, *const last = q->segment + SEGMENT * (NODE(1) - 1);
+    const double x[2] = {{q->x[0], q->x[DLO_NODES - 1]}};
+    double *const first = q->segment, *const last = q->segment + SEGMENT * (DLO_NODES - 2);
 {_statements(function, ("x", "table"), targets)}
     (void)x, (void)table;
 }}

@@ -11,40 +11,13 @@ from dlo_casadi.config import Obstacle, Pose
 from dlo_casadi.config.supports import obstacle_problems
 from dlo_casadi.config.values import AXES
 from dlo_casadi.equilibrium.implicit import pose_size
-from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 
-# Same values as in the header.
-STATUSES = (
-    "ok",
-    "unreachable",
-    "iteration_limit",
-    "not_finite",
-    "unstable",
-    "workspace_too_small",
-    "bad_argument",
-    "other_branch",
-    "turns_shed",
-    "no_room",
-)
-_BRANCHES = {None: 0, "ccw": 1, "cw": 2}
-# Status -> advice.
-_HINTS = {
-    "unreachable": "is the end in metres?",
-    "iteration_limit": "warm: the shape of a pose nearby.",
-    "not_finite": "finite numbers for start, end and directions.",
-    "unstable": "another branch, or a pose nearby.",
-    "bad_argument": "in space a pose without a branch, orientations that are not zero, clips in "
-    "their order and not two in one element, a warm start whose status is ok.",
-    "other_branch": "the other branch, or none: the equilibria that were found turn the other way.",
-    "turns_shed": "fewer turns, or the end farther from the start.",
-    "no_room": "the obstacles' places: a fixture is inside of one.",
-}
-
-
+_BRANCHES: dict[Branch | None, int] = {None: 0, "ccw": 1, "cw": 2}
 # A pose or obstacle of a session, or only its ends, its form.
 AnyPose = Pose | HeldPose
 AnyObstacle = Obstacle | Surface
@@ -398,14 +371,3 @@ def surfaces_of(model: CableModel, obstacles: Sequence[AnyObstacle]) -> list[Sur
         one.surface(k) if isinstance(one, Obstacle) else one
         for k, one in enumerate(obstacles, start=1)
     ]
-
-
-def no_equilibrium(status: str, pose: AnyPose, length: float) -> str:
-    """Message for a status other than ok."""
-    places = (() if place is None else place for place in (pose.start, pose.end))
-    start, end = (", ".join(f"{x:.4f}" for x in place) for place in places)
-    hint = _HINTS.get(status)
-    return (
-        f"no equilibrium: {status} with the end {f'at ({end}) m' if end else 'free'}, the start at "
-        f"({start}) m; the cable is {length:.4f} m long." + (f"\n  Try: {hint}" if hint else "")
-    )

@@ -1,6 +1,6 @@
 """First guesses of the nodes of a cable held at the ends of a pose.
 
-The generated solver tries the same guesses with the same numbers: codegen/templates/*_guesses.c.in.
+The generated solver tries the same guesses with the same numbers: codegen/templates/guesses*.c.in.
 """
 
 from collections.abc import Sequence
@@ -31,9 +31,9 @@ _DECAY = 5
 # four sides differ by that much, by 1.2 rad in a pose whose lowest equilibrium is the other way.
 HALF_TURN = 1.0
 # Rounding error allowed in comparing twists [turns]: two may be equally near to half a turn.
-_ROUNDING = 1e-6
+TIE = 1e-6
 # Coefficients of half_angle^2 / (1 - ratio) in powers of 1 - ratio: least squares, 2e-4 rad error.
-_HALF_ANGLE = (
+HALF_ANGLE = (
     *(5.9998487866413575, 1.818549938733748, 0.45541329964829563, 3.159529741805951),
     *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
 )
@@ -138,7 +138,7 @@ def arc_half_angle(chord: float, length: float) -> float:
     """
     y = max(1.0 - chord / length, 0.0)
     total = 0.0
-    for coefficient in _HALF_ANGLE[::-1]:
+    for coefficient in HALF_ANGLE[::-1]:
         total = coefficient + y * total
     return float(np.sqrt(y * total))
 
@@ -428,4 +428,4 @@ def nearest_roll(roll: float, aimed: float) -> float:
 
     If two are equally near up to rounding, the larger one.
     """
-    return roll + 2 * np.pi * float(np.floor(aimed - roll / (2 * np.pi) + 0.5 + _ROUNDING))
+    return roll + 2 * np.pi * float(np.floor(aimed - roll / (2 * np.pi) + 0.5 + TIE))

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.equilibrium.guess_table import MOST_SIDES, SLACKS, TAUT
 from dlo_casadi.equilibrium.guesses import (
     arc_half_angle,
     arc_headings,
@@ -40,14 +41,8 @@ from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.node import Frame
 
-# Half angle [rad] of an arc below which its sides are not distinguished.
-_TAUT = 0.3
-# Maximum number of combinations of sides of the spans in a plane.
-MOST_SIDES = 16
 # Distance [lengths] within which two places are one; eyelets 1 mm apart are no difficulty.
 ONE_PLACE = 1e-6
-# Shares of the slack between two fixed arc lengths that the first of two spans gets.
-_SLACK = (0.5, 0.15, 0.85)
 # Number of candidate places along the axis of a bar at one of which the cable passes it.
 _ALONG = 21
 
@@ -88,7 +83,7 @@ class Span:
     def taut(self) -> bool:
         """Whether the span is so taut that the sides of its arc hardly differ."""
         size = 0.0 if self.chord is None else float(np.linalg.norm(self.chord))
-        return arc_half_angle(size, self.length) < _TAUT
+        return arc_half_angle(size, self.length) < TAUT
 
 
 def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
@@ -141,7 +136,7 @@ def arches(
     k = _insert(held, place[None])
     up = model.node.sides // 2
     sides = [tuple(up * (i == arch) for i in range(len(held) - 1)) for arch in (k - 1, k)]
-    yield from _span_guesses(model, pose, held, _SLACK[:1], sides)
+    yield from _span_guesses(model, pose, held, SLACKS[:1], sides)
 
 
 def chords(held: Sequence[_Holder]) -> list[float]:
@@ -157,13 +152,13 @@ def fixed_stretches(held: Sequence[_Holder]) -> list[tuple[int, int, float]]:
 
 
 def _arc_lengths(held: Sequence[_Holder], share: float) -> list[float]:
-    """Arc lengths [m] of all holders; eyelets share the slack evenly, or as in _SLACK."""
+    """Arc lengths [m] of all holders; eyelets share the slack evenly, or as in SLACKS."""
     at, apart = [one.at or 0.0 for one in held], chords(held)
     for low, high, length in fixed_stretches(held):
         own = np.array(apart[low:high])
         slack = max(length - own.sum(), 0.0)
         weights = own + 1e-3 * length
-        if share != _SLACK[0]:
+        if share != SLACKS[0]:
             weights = np.full(len(own), (1 - share) / max(len(own) - 1, 1))
             weights[0] = share
         parts = own + slack * weights / weights.sum()
@@ -187,9 +182,9 @@ def first_guesses(
     """
     none, held = np.zeros(model.n_border), holders(model, p, pose)
     if named_sides(model, pose):
-        yield from _span_guesses(model, pose, _with_bars(model, pose, held), _SLACK)
+        yield from _span_guesses(model, pose, _with_bars(model, pose, held), SLACKS)
     if pose.clips:
-        yield from _span_guesses(model, pose, held, _SLACK if model.sliding else _SLACK[:1])
+        yield from _span_guesses(model, pose, held, SLACKS if model.sliding else SLACKS[:1])
     elif model.node is Frame:
         yield from ((x, none) for x in guessed_frames(model, p, rest, pose))
     else:

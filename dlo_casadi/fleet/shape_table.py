@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.compiled import Branch, CompiledSolver
+from dlo_casadi.codegen import STATUSES, CompiledSolver
 from dlo_casadi.codegen.generate import solver_hash
-from dlo_casadi.codegen.shapes import STATUSES, records_of
+from dlo_casadi.codegen.shapes import Branch, records_of
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.fleet import parquet_library
 from dlo_casadi.io.files import LOCK, only_run, write_file

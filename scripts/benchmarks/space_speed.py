@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.speed import FLAGS, HERE, summary
 from dlo_casadi.codegen import CompiledSolver, generate
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library, workspace_of
 from dlo_casadi.codegen.shapes import pose_table, records_of
 from dlo_casadi.effects import BendingSoftening, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -117,7 +117,7 @@ class Timed:
             for clock in (one.dlo_time, one.dlo_time_bare):
                 clock.argtypes = [pointer, number, pointer, size, pointer, pointer, pointer]
         self._c.dlo_bare.argtypes = [pointer, number, pointer, pointer, pointer]
-        self._work = np.empty(source.workspace)
+        self._work = np.empty(workspace_of(self._c))
 
     def solve(
         self, pose: HeldPose, warm: NDArray[np.void] | None, repeats: int

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from dlo_casadi.codegen import CompiledSolver, generate
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library, workspace_of
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.guesses import arc_headings
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -87,7 +87,7 @@ def generated(n: int, element: str, repeats: int) -> dict[str, Any]:
     c = ctypes.CDLL(str(compile_library(replace(source, files=texts), folder, FLAGS)))
     pointer, size = ctypes.c_void_p, ctypes.c_size_t
     c.dlo_time.argtypes = [pointer, ctypes.c_int, pointer, size, pointer, pointer, pointer]
-    work, shape = np.empty(source.workspace), np.zeros(16 * (n + 8))
+    work, shape = np.empty(workspace_of(c)), np.zeros(16 * (n + 8))
     everything = []
     for end in poses():
         pose = np.array([0.0, 0.0, *end, 0.0, 0.0])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cables.ipopt import Ipopt
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library, workspace_of
 from dlo_casadi.codegen.generate import generate, table_of
 from dlo_casadi.codegen.shapes import pose_table, records_of
 from dlo_casadi.effects import CableData
@@ -271,7 +271,7 @@ class AnyCable:
             *(pointer, pointer, size, ctypes.c_int, pointer, pointer, pointer, pointer, size)
         ]
         self.record = records_of(model).shape
-        self._work = np.empty(source.workspace)
+        self._work = np.empty(workspace_of(self._c))
 
     def table(self, problem: Problem | SpaceProblem) -> FloatArray:
         """Numbers of a cable, laid out as the compiled code expects."""

@@ -17,7 +17,7 @@ import numpy as np
 import rockit
 
 from dlo_casadi.codegen import generate
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library
 from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.model.cable_model import CableModel

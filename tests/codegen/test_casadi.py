@@ -8,7 +8,7 @@ import pytest
 from solvers import QUICK
 
 from dlo_casadi.codegen import generate
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library
 from dlo_casadi.effects import AxialStretch, CableData, ClampCompliance, ClampRotation, Tether
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import DloError

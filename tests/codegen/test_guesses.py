@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dlo_casadi.codegen import generate
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library, workspace_of
 from dlo_casadi.effects import CableData, ClampAngle, EndOffset, LengthError
 from dlo_casadi.equilibrium.equilibrium import JOINT_BOUND
 from dlo_casadi.equilibrium.guesses import guesses
@@ -47,7 +47,7 @@ def by_c(model, p, rest, poses, folder):
     library = ctypes.CDLL(str(compile_library(replace(source, files=texts), folder, ("-O0",))))
     pointer = ctypes.c_void_p
     library.dlo_guess.argtypes = [pointer, ctypes.c_int, pointer, pointer]
-    work, found = np.empty(source.workspace), []
+    work, found = np.empty(workspace_of(library)), []
     for pose in poses:
         at, found_here = pose.vector, []
         for which in range(5):

@@ -102,7 +102,9 @@ def test_what_is_no_pose_is_refused(links, arguments, message):
     ("headings", "name"), [((None, 0.1), "start_heading"), ((0.1, None), "end_heading")]
 )
 def test_a_clamp_without_a_direction_is_refused(clamped, headings, name):
-    with pytest.raises(DloError, match=rf"is clamped, give {name} \[rad\], continuous along the"):
+    with pytest.raises(
+        DloError, match=rf"holds the direction, give {name} \[rad\], continuous along the"
+    ):
         clamped.solve(at((0.5, 0.1), headings=headings))
 
 

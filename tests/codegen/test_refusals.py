@@ -56,12 +56,12 @@ def test_directions_of_clamps_and_saddles_are_needed_in_space():
     ahead = (0.0, 0.0, 0.0, 1.0)
     saddle = HeldClip("clamped", (0.3, 0.0, -0.1), 0.4, orientation=ahead)
     pose = HeldPose((0.0,) * 3, (0.5, 0.0, 0.1), clips=(saddle,), start_orientation=ahead)
-    with pytest.raises(DloError, match=r"is clamped, give end_orientation \[qx"):
+    with pytest.raises(DloError, match=r"holds the direction, give end_orientation \[qx"):
         pose_table(model, [pose])
     pose = replace(pose, end_orientation=ahead)
     assert np.isfinite(pose_table(model, [pose])[0]).all()
     pose = replace(pose, clips=(replace(saddle, orientation=None),))
-    with pytest.raises(DloError, match=r"is clamped, give the orientation of clip 1 \[qx"):
+    with pytest.raises(DloError, match=r"holds the direction, give the orientation of clip 1 \[qx"):
         pose_table(model, [pose])
 
 

@@ -15,7 +15,7 @@ from solvers import QUICK, STRICT, WARNINGS, all_zero, moved
 
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate
 from dlo_casadi.codegen.cases import Obstacles, case_of
-from dlo_casadi.codegen.compiled import compile_library
+from dlo_casadi.codegen.compiler import compile_library, workspace_of
 from dlo_casadi.effects import AxialStretch, BendingSoftening, CableData, LumpedMass, PointForce
 from dlo_casadi.equilibrium.guesses import guessed_frames
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -227,7 +227,7 @@ def test_first_guesses_are_those_of_python_number_for_number(tmp_path, ends, gra
     texts = {**source.files, "dlo_solver.c": source.files["dlo_solver.c"] + WINDOW}
     library = ctypes.CDLL(str(compile_library(replace(source, files=texts), tmp_path, ("-O0",))))
     library.dlo_guess.argtypes = [ctypes.c_void_p, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p]
-    work = np.empty(source.workspace)
+    work = np.empty(workspace_of(library))
     along = HeldPose(
         (0.0, 0.0, 0.0),
         (0.0, 0.0, -0.4),
