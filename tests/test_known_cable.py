@@ -369,7 +369,11 @@ def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
     [
         (ROPE, {"boundary": None}, "'boundary' is missing in the arguments: How the two ends"),
         (ROPE, {"gravity": None}, "'gravity' is missing in the arguments"),
-        (ROPE, {"boundary": ("pinned", "hinged")}, "boundary: allowed are 'pinned', 'clamped' or"),
+        (
+            ROPE,
+            {"boundary": ("pinned", "hinged")},
+            "boundary: allowed are 'pinned', 'clamped', 'swivel' or",
+        ),
         (ROPE, {"boundary": "pinned"}, "[start, end] belongs here, such as [pinned, clamped]"),
         (ROPE, {"gravity": (0, 0, -9.81)}, "cable.torsional_stiffness is not given, and no fit"),
         (

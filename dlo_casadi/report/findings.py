@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dlo_casadi.cable.estimate import from_to
 from dlo_casadi.diagnosis.next_measurement import MOST_REPEATS, NextPose, NextReading
 from dlo_casadi.diagnosis.structure import LARGEST_SCORE
 from dlo_casadi.errors import worded
@@ -145,7 +146,10 @@ def _added(outcome: Outcome) -> Iterator[Values]:
 
 def _hidden(outcome: Outcome) -> Iterator[Values]:
     """What one effect that the data do not exclude could do to each stiffness."""
-    for found in outcome.if_hidden.values():
+    last = outcome.stages[-1].parameters
+    for name, found in outcome.if_hidden.items():
+        if (interval := last[name].interval_95_if_hidden) is None:
+            continue
         tip, telling = found.telling, ""
         if tip is not None:
             telling = " " + reading_text(tip.reading, f"in {tip.pose}")
@@ -154,8 +158,13 @@ def _hidden(outcome: Outcome) -> Iterator[Values]:
             far = tip.difference > UNSEEN * expected
             other = "So would another pose" if far else "No other pose would tell"
             telling += worded(_TURNED, other=other, tip=tip, expected=expected)
-        sizes = (f"{name} {x.value:.2g} {x.unit}".strip() for name, x in found.values.items())
-        yield {"found": found, "sizes": ", ".join(sizes), "telling": telling}
+        sizes = (f"{key} {x.value:.2g} {x.unit}".strip() for key, x in found.values.items())
+        yield {
+            "found": found,
+            "sizes": ", ".join(sizes),
+            "range": from_to(interval),
+            "telling": telling,
+        }
 
 
 def _pulled(outcome: Outcome) -> Iterator[Values]:
@@ -199,7 +208,7 @@ FINDINGS: tuple[Sentence[Outcome], ...] = (
     Sentence("{line}", _added),
     Sentence(
         "If {found.effect} is hidden (up to {sizes} is not excluded), {found.parameter} is "
-        "{found.interval[0]:.4g} to {found.interval[1]:.4g} N m^2.{telling}",
+        "{range} N m^2.{telling}",
         _hidden,
     ),
     Sentence(
