@@ -163,7 +163,7 @@ class Session(Config):
     gravity : (d,) [m/s^2]
         Two numbers put the cable in a plane, three in space.
     boundary : (str, str)
-        How start and end are held: pinned, clamped, swivel, or free (only the end).
+        How start and end are held: pinned, clamped, swivel; the end also slide or free.
     std : float [m], optional
         Standard deviation of one coordinate of a point; estimated when absent.
     force_std, moment_std : float [N], [N m], optional

@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.assembly import Assembly, Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel
 
@@ -70,3 +72,24 @@ def central(
             values.append(np.asarray(function(replace(here, shapes=there, given=others))))
         columns.append((values[0] - values[1]) / (2 * d))
     return np.stack(columns, axis=-1)
+
+
+def assert_derivatives(model, pose, p, rest, columns):
+    """Derivatives of curve and border are those of equilibria of changed parameters."""
+    equilibria, size, h = BatchEquilibrium(model, [pose]), len(p), 2e-5
+    eq = solve_equilibrium(model, p, rest, pose)
+    shapes, _ = equilibria.solve(eq.shapes, p, rest, tolerance=1e-13)
+    along = equilibria.directions(shapes, p, rest, np.eye(size), np.zeros((len(rest), size)))
+    ((_, change),) = equilibria.observe(shapes, p, rest, along)
+    for k in columns:
+        rows = []
+        for step in (-2 * h, -h, h, 2 * h):
+            moved = p + step * np.eye(size)[k]
+            there, ok = equilibria.solve(shapes, moved, rest, tolerance=1e-13)
+            assert ok.all()
+            (seen,) = equilibria.seen(there, moved, rest)
+            rows.append(np.concatenate([seen.curve.numbers.ravel(), there.lam[0]]))
+        expected = (rows[0] - 8 * rows[1] + 8 * rows[2] - rows[3]) / (12 * h)
+        found = np.concatenate([change.curve[..., k].ravel(), along.lam[0, :, k]])
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, atol=1e-8 * scale, err_msg=model.names[k])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from perturbed import assert_derivatives
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
@@ -486,27 +487,6 @@ def test_derivatives_by_arc_lengths_beside_all_else(kind, space):
     rest = model.rest_basis @ (0.3 * np.cos(np.arange(model.n_coefficients)))
     assert solve_equilibrium(model, p, rest, pose).contacts
     assert_derivatives(model, pose, p, rest, range(first + 3, first + 5))
-
-
-def assert_derivatives(model, pose, p, rest, columns):
-    """Derivatives of curve and border are those of equilibria of changed parameters."""
-    equilibria, size, h = BatchEquilibrium(model, [pose]), len(p), 2e-5
-    eq = solve_equilibrium(model, p, rest, pose)
-    shapes, _ = equilibria.solve(eq.shapes, p, rest, tolerance=1e-13)
-    along = equilibria.directions(shapes, p, rest, np.eye(size), np.zeros((len(rest), size)))
-    ((_, change),) = equilibria.observe(shapes, p, rest, along)
-    for k in columns:
-        rows = []
-        for step in (-2 * h, -h, h, 2 * h):
-            moved = p + step * np.eye(size)[k]
-            there, ok = equilibria.solve(shapes, moved, rest, tolerance=1e-13)
-            assert ok.all()
-            (seen,) = equilibria.seen(there, moved, rest)
-            rows.append(np.concatenate([seen.curve.numbers.ravel(), there.lam[0]]))
-        expected = (rows[0] - 8 * rows[1] + 8 * rows[2] - rows[3]) / (12 * h)
-        found = np.concatenate([change.curve[..., k].ravel(), along.lam[0, :, k]])
-        scale = np.abs(expected).max()
-        np.testing.assert_allclose(found, expected, atol=1e-8 * scale, err_msg=model.names[k])
 
 
 SADDLE = HeldClip("clamped", (0.31, 0.05), 0.365, heading=0.3)  # 0.3 elements before a node

@@ -227,7 +227,12 @@ def test_a_configuration_cannot_be_changed(tmp_path):
             9,
             "'pinned', 'clamped' or 'swivel', .*only the end can be free",
         ),
-        ("end: pinned", "end: glued", 9, "'pinned', 'clamped', 'swivel' or 'free', found 'glued'"),
+        (
+            "end: pinned",
+            "end: glued",
+            9,
+            "'pinned', 'clamped', 'swivel', 'slide' or 'free', found 'glued'",
+        ),
         ("kind: centerlines", "kind: photos", 10, "kind must be images or centerlines, .*'photos'"),
         ("kind: centerlines, ", "", 10, "kind must be images or centerlines, found nothing"),
         # stiffness

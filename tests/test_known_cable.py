@@ -372,7 +372,7 @@ def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
         (
             ROPE,
             {"boundary": ("pinned", "hinged")},
-            "boundary: allowed are 'pinned', 'clamped', 'swivel' or",
+            "boundary: allowed are 'pinned', 'clamped', 'swivel'",
         ),
         (ROPE, {"boundary": "pinned"}, "[start, end] belongs here, such as [pinned, clamped]"),
         (ROPE, {"gravity": (0, 0, -9.81)}, "cable.torsional_stiffness is not given, and no fit"),

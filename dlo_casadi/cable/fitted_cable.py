@@ -72,54 +72,49 @@ class FittedCable(EstimatedCable):
         clips: Sequence[Clip | Mapping[str, Any]] = (),
         obstacles: Sequence[Obstacle | Mapping[str, Any]] = (),
         over: bool | Mapping[str, bool] | None = None,
+        end_tension: float | None = None,
     ) -> "Shape":
         """Predict the shape of the cable in a pose.
 
         Of several equilibria this is the stable one of lowest energy, unless `branch`, `turns` or
-        `over` selects one. If it is uncertain which of two sides is the lower one, the other shape
-        is in `other_side`.
+        `over` selects one. If it is uncertain which is lower, the other one is in `other_side`.
 
         Parameters
         ----------
         end : (d,) [m], or Pose
             Where the end is held, d = 2 or 3 in space; None for a free end. Or a whole pose.
         start : (d,) [m], optional
-            Where the start is held; by default the place shared by all poses of the session, or the
-            origin.
+            Where the start is held; by default as in all poses of the session, or the origin.
         start_heading, end_heading : float [rad], optional
-            Directions of clamped ends in a plane, continuous along the cable; by default those that
-            all poses of the session share.
+            Directions of clamped ends in a plane, continuous along the cable; by default as start.
         start_orientation, end_orientation : (4,), optional
-            Frames of clamped ends in space: unit quaternions (x, y, z, w), x forward along the
-            cable; by default those that all poses of the session share.
+            Frames of clamped ends in space: quaternions (x, y, z, w), x forward along the cable.
         turns : float
-            In space: number of full turns to which the twist must be nearest, see `Pose`. A cable
-            may lose two of them over a loop; that is an error.
+            In space: number of full turns to which the twist must be nearest, see `Pose`.
         branch : "ccw" or "cw", optional
             In a plane: direction in which the cable turns from start to end. Between two pins it
-            selects the first stable equilibrium found, as a rule that of its own arc, with a clamp
-            the lowest one. Between two clamps their headings fix the turn, and a branch that
-            contradicts them is an error; several equilibria may have that turn.
+            selects the first stable equilibrium found, with a clamp the lowest one. A branch that
+            contradicts the headings of two clamps is an error.
         clips : sequence of Clip or dict
-            Supports between the ends, in order along the cable, see `Clip`; none by default, even
-            if the session had clips.
+            Supports between the ends, in order along the cable; none by default.
         obstacles : sequence of Obstacle or dict
             Obstacles that the cable may touch, see `Obstacle`; none by default.
         over : bool or mapping of str to bool, optional
             Whether the cable passes over or under the bars among the obstacles, see `Pose`.
+        end_tension : float [N], optional
+            Of the cable beyond a sliding end.
 
         Raises
         ------
         EquilibriumError
-            If the pose has no equilibrium, e.g. because the end is out of reach, or if none is
-            found on the branch or side.
+            If the pose has no equilibrium, e.g. out of reach, or none on the branch or side.
         DloError
             If the ends are not held as the cable's boundary requires, or are not finite numbers.
         """
         asked: dict[str, Any] = {"start": start, "end": end, "turns": turns, "branch": branch}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        asked |= {"clips": clips, "over": over}
+        asked |= {"clips": clips, "over": over, "end_tension": end_tension}
         pose = held_pose(self.model, self.metadata.fixtures, all_asked(asked))
         held = self.with_clips([clip.kind for clip in pose.clips])
         if obstacles or over is not None:
@@ -232,18 +227,15 @@ class Shape:
     Parameters
     ----------
     cable : FittedCable
-        The fitted cable.
     pose : HeldPose
         End conditions; with the `turns` or the `branch` of this shape if the cable may hang on
         either of two sides.
     equilibrium : Equilibrium
-        Nodes, reactions, energy and stability.
     other_side : Shape or None
         The same pose on the other side: fallen to the other side with a free end, or twisted the
-        other way between two clamps in space. Set only if parameters and fixtures leave the lower
-        side uncertain and the pose does not select one.
+        other way between two clamps. Set only if it is uncertain which side is lower.
     tipping : Tipping or None
-        Set with `other_side`: angle of the clamp from where both sides have equal energy.
+        Set with `other_side`: angle of the clamp from where both have equal energy.
     """
 
     cable: FittedCable
@@ -267,12 +259,20 @@ class Shape:
     @cached_property
     def curve(self) -> CableCurve:
         """The true curve of the cable, at any arc length: `curve.at(s)`."""
-        return CableCurve.of(self.cable.length, self.held.curve.numbers)
+        return self._along(self.held)
 
     @cached_property
     def seen(self) -> CableCurve:
         """The same curve as measured by the session's camera."""
-        return CableCurve.of(self.cable.length, self._measured.curve.numbers)
+        return self._along(self._measured)
+
+    def _along(self, held: SolvedCable) -> CableCurve:
+        return CableCurve.of(self.free_length, held.curve.along(self.free_length).numbers)
+
+    @property
+    def free_length(self) -> float:
+        """Length [m] between the ends: the cable's, beside what was fed through a sliding end."""
+        return self.cable.length + self.equilibrium.fed
 
     @property
     def s(self) -> FloatArray:

@@ -136,7 +136,7 @@ def placed(
             f"within: two corners of a region belong here, found {within!r}.\n  Try: {_TRY}"
         )
     known = cable.metadata
-    default: dict[str, Any] = {"turns": 0.0, "branch": None, "clips": []}
+    default: dict[str, Any] = {"turns": 0.0, "branch": None, "clips": [], "end_tension": None}
     held = tuple(
         replace(held_pose(cable.model, known.fixtures, default | dict(pose)), name=f"pose_{k}")
         for k, pose in enumerate(poses, start=1)

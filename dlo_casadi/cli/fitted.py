@@ -82,6 +82,7 @@ POSE = (
         for side in ("start", "end")
     ),
     option("--turns", type=float, metavar="N", help="extra turns of twist in space"),
+    option("--end-tension", type=float, metavar="N", help="tension beyond a sliding end [N]"),
     BRANCH,
 )
 

@@ -120,6 +120,8 @@ def case_of(
     model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, obstacles: Obstacles
 ) -> "Case":
     """Contents of the templates for this cable."""
+    if model.end.slides:
+        raise DloError("no solver can be generated for a cable that slides through its end yet")
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
     return kind(model, p, rest, inline, obstacles)
 

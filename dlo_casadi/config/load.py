@@ -33,6 +33,7 @@ from dlo_casadi.config.supports import (
     clip_problems,
     clips_differ,
     obstacle_problems,
+    too_much_for_a_slide,
     too_short,
     undetermined,
     unused_directions,
@@ -87,6 +88,7 @@ def checked_config(source: Source) -> Config:
     config = source.checked(Config)
     if problems := [
         *_contradictions(config.experiment, config.cable.length),
+        *too_much_for_a_slide(config.experiment, config.cable.rest_shape),
         *_weightless(config),
         *wrong_effects(config),
         *impossible_noise(config.experiment, config.cable.length),
@@ -329,6 +331,11 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
                 yield f"a free end has no {key}; boundary.end: pinned or clamped?", None
     if pose.turns and not (space and held.start.roll and held.end.roll):
         yield "turns are of a cable in space that is clamped at both ends", "turns"
+    if held.end.slides != (pose.end_tension is not None):
+        yield f"a {held.end} end has {'an' if held.end.slides else 'no'} end_tension [N]", None
+    if held.end.slides and (pose.clips or pose.at is not None):
+        known = "clips" if pose.clips else "at: arc lengths of points"
+        yield f"a cable that slides through its end has no {known}", None
     if pose.branch in ("ccw", "cw") and space:
         yield f"branch: {pose.branch} is of a cable in a plane", "branch"
 

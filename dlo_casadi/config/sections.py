@@ -131,6 +131,8 @@ class Pose(ConfigSection):
     """Of several equilibria: the way the cable turns from start to end, or the previous pose's."""
     clips: Given[tuple[Clip, ...], Sequence[Clip | Mapping[str, Any]]] = entry(default=())
     """What holds the cable between its ends, in the order along it."""
+    end_tension: Number | None = None
+    """Tension [N] of the cable beyond a sliding end, which pulls it out; 0 where it lies slack."""
     over: StrictBool | dict[str, StrictBool] | None = None
     """Whether the cable passes over (true) or under (false) the bars among the obstacles, or some
     of them, {bar: true}: whether it crosses the half-plane that stands on a bar's axis, or the one
@@ -252,7 +254,7 @@ class Experiment(ConfigSection):
     space."""
     boundary: Annotated[Boundary, _as_boundary]
     """How the two ends are held: {start: pinned | clamped | swivel, end: pinned | clamped |
-    swivel | free}, or [start, end]."""
+    swivel | slide | free}, or [start, end]."""
     measurement: Annotated[Images | Centerlines, Field(discriminator="kind")]
     """What the files of the poses are: kind: images or kind: centerlines."""
     tolerances: Annotated[DeclaredTolerances, optional(DeclaredTolerances)] = DeclaredTolerances()

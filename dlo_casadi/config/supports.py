@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from dlo_casadi.config.frozen import ConfigSection, Given, Numbers, Turned, entry
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
@@ -26,7 +26,7 @@ from dlo_casadi.rod.supports import CLIPS, ENDS, STARTS, SupportKind
 
 # What type checkers accept as the kind of a start, an end, a clip.
 _Start: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel"]
-_End: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "free"]
+_End: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "slide", "free"]
 _Clip: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "eyelet"]
 
 
@@ -37,7 +37,8 @@ class Boundary(ConfigSection):
     """Start of the cable: pinned (free to turn), clamped (its direction is held, in space its roll,
     too) or swivel (its direction is held, it may roll about its axis)."""
     end: Given[Annotated[SupportKind, one_of(ENDS)], _End] = entry()
-    """End of the cable: pinned, clamped, swivel or free."""
+    """End of the cable: pinned, clamped, swivel, free, or slide: it is fed through a guide that
+    holds its direction; `end_tension` of the pose determines its free length."""
 
     @property
     def directed(self) -> bool:
@@ -54,6 +55,19 @@ def undetermined(start: SupportKind, end: SupportKind, in_space: bool) -> Iterat
             "start_orientation; or two numbers of gravity, in the plane in which it hangs"
         )
         yield ConfigProblem(("experiment", "boundary"), text)
+
+
+def too_much_for_a_slide(experiment: Any, rest_shape: str) -> Iterator[ConfigProblem]:
+    """What a session of a cable that slides through its end may not have yet."""
+    if not experiment.boundary.end.slides:
+        return
+    text = "a cable that slides through its end"
+    if rest_shape != "straight":
+        yield ConfigProblem(
+            ("cable",), f"{text} is straight at rest yet. Try: rest_shape: straight"
+        )
+    if experiment.obstacles:
+        yield ConfigProblem(("experiment", "obstacles"), f"{text} has no obstacles yet")
 
 
 def unused_directions(start: SupportKind, end: SupportKind) -> list[str]:

@@ -41,6 +41,11 @@ class NodeCurve:
         d = z.shape[1] // 2
         return cls(length, z[:, :d], z[:, d:])
 
+    def along(self, length: float) -> Self:
+        """The same curve by arc lengths of a cable of another length [m]."""
+        slopes = None if self.slopes is None else self.slopes * (self.length / length)
+        return type(self)(length, self.nodes, slopes)
+
     @property
     def numbers(self) -> FloatArray:
         """Nodes and dr/ds as one array (n + 1, d or 2 d)."""
@@ -185,14 +190,14 @@ def chord_places(points: FloatArray, pose: HeldPose, length: float) -> FloatArra
     Chords are shorter than the cable across gaps: with two fixtures, they are scaled to L.
     """
     # Noise lengthens a dense polyline, so lengths are those of a smoothed one.
-    s = _denoised_length(pose.joined(points))
+    s = denoised_length(pose.joined(points))
     places = s[1 : len(points) + 1]
     if pose.end is not None:
         places = places * (length / s[-1])
     return np.clip(places, 0.0, length)
 
 
-def _denoised_length(polyline: FloatArray) -> FloatArray:
+def denoised_length(polyline: FloatArray) -> FloatArray:
     """Cumulative length of the polyline smoothed over about 1/50 of itself."""
     s = chord_lengths(polyline)
     total = np.linalg.norm(np.diff(polyline, axis=0), axis=1).sum()

@@ -67,6 +67,8 @@ class Equilibrium:
         What the cable does to its clips, in their order.
     contacts : tuple of Contact
         Where the cable touches obstacles, from its start to its end.
+    fed : float [m]
+        Length of the cable that was fed through a sliding end: free minus declared length.
     """
 
     x: FloatArray
@@ -86,6 +88,7 @@ class Equilibrium:
     other_side: "Equilibrium | None" = None
     clips: tuple[ClipLoad, ...] = ()
     contacts: tuple[Contact, ...] = ()
+    fed: float = 0.0
 
     @property
     def shapes(self) -> Shapes:
@@ -196,6 +199,7 @@ def equilibria_of(found: Assembly, *, stable: BoolArray, iterations: IntArray) -
                 iterations=int(iterations[j]),
                 clips=on_clips[j],
                 contacts=contacts[j],
+                fed=float(shapes.lam[j, found.model.fed].sum()),
             )
         )
     return out

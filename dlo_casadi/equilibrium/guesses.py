@@ -22,6 +22,9 @@ Turned = tuple[Rotation | None, Rotation | None]
 # Angles [rad] below which some first guesses are left out, see `guesses`, because they seldom lead
 # to the lowest equilibrium. None is lost in 300 random problems with a clamp at the end or both.
 FAR, CURVED = 1.5, 1.0
+# First guess of a cable that slides through its end: its length over the chord, less one. Where it
+# is much longer its weight pulls ever more through the end.
+SLACK = 0.05
 # Largest joint angle of a first guess [rad]: 0.9 of the bound of an equilibrium.
 LARGEST_BEND = 0.9 * np.pi / 2
 # Power of the decay (1 - s/L)^5 of a clamp's bend. In 1200 random problems with clamps the powers
@@ -59,15 +62,31 @@ def _held(
 def true_ends(
     model: CableModel, p: FloatArray, pose: HeldPose
 ) -> tuple[tuple[FloatArray, FloatArray], Clamps, float]:
-    """Positions [m] of the ends; frames of clamps, None for a pin or a free end; length [m]."""
-    ends, length = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
+    """Positions [m] of the ends; frames of clamps, None for a pin or a free end; length [m].
+
+    The length of a cable that slides through its end is a first guess: SLACK beyond the chord.
+    """
+    ends, own = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
     d, c = model.node.dimension, model.node.coordinates
     start, end, first, last = np.split(np.array(ends).ravel(), [d, 2 * d, 2 * d + c])
     clamps = (
         first if model.start.direction else None,
         last if model.end.direction else None,
     )
-    return (start, end), clamps, float(length)
+    length = float(own)
+    if model.end.slides:
+        length = max((1 + SLACK) * float(np.linalg.norm(end - start)), SLACK * length)
+    return (start, end), clamps, length
+
+
+def border_guess(model: CableModel, p: FloatArray, pose: HeldPose) -> FloatArray:
+    """First guess of the border (n_border,): of a sliding end the length of `true_ends`."""
+    border = np.zeros(model.n_border)
+    if model.fed:
+        *_, length = true_ends(model, p, pose)
+        own = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1]
+        border[model.fed] = length - float(own)
+    return border
 
 
 # ---- in a plane ----------------------------------------------------------------------------------

@@ -27,6 +27,8 @@ from dlo_casadi.model.contact import DEPTH, gap_per_force
 from dlo_casadi.rod.band import NEUTRAL, BandFactor, BandMatrix, Vector
 from dlo_casadi.rod.obstacles import bars_of
 
+# Largest share of the length that a cable may lose through its end.
+SHORTEST = 0.95
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
 # Longest step of a node [rad].
@@ -82,8 +84,8 @@ class Minima(NamedTuple):
 
 
 def turn_per_slip(model: CableModel) -> FloatArray:
-    """Turn [rad/m] equivalent to a change of an eyelet's arc length; zero for others (k,)."""
-    slide = np.isin(np.arange(model.n_border), list(model.sliding.values()))
+    """Turn [rad/m] equivalent to a slip through an eyelet or an end; zero for others (k,)."""
+    slide = np.isin(np.arange(model.n_border), [*model.sliding.values(), *model.fed])
     return slide * (_TURN / model.chain.length)
 
 
@@ -293,6 +295,7 @@ def stepped(here: Assembly, step: Vector, size: FloatArray) -> Assembly:
     lam = shapes.lam + share[:, None] * step.y[..., 0]
     for row in model.sliding.values():
         lam[:, row] = lam[:, row].clip(0.0, model.chain.length)
+    lam[:, model.fed] = lam[:, model.fed].clip(-SHORTEST * model.chain.length)
     return replace(here, shapes=replace(shapes, x=x, lam=lam))
 
 

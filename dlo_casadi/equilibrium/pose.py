@@ -48,6 +48,8 @@ class HeldPose:
         What holds the cable between its ends, in the order along it.
     over : bool or mapping of str to bool, optional
         Whether the cable passes over or under bars, see `Capsule.passed`: for all, or by name.
+    end_tension : float [N], optional
+        Of the cable beyond a sliding end, which pulls it out.
     """
 
     start: tuple[float, ...]
@@ -62,6 +64,7 @@ class HeldPose:
     camera_center: tuple[float, float, float] | None = None
     clips: tuple[HeldClip, ...] = ()
     over: bool | Mapping[str, bool] | None = field(default=None, hash=False)
+    end_tension: float | None = None
 
     @property
     def node(self) -> type[Node]:
@@ -154,13 +157,15 @@ class HeldPose:
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `pose`: the ends, the camera, see `effects.Viewpoint`, the clips.
+        """The model's argument `pose`: ends, camera (`effects.Viewpoint`), tension, clips.
 
         The camera's centre (x, y, z) enters as (x, y, 1) / z: zeros if it is not known.
         """
         x, y, z = self.camera_center or (0.0, 0.0, np.inf)
         clips = (clip.vector(self.node) for clip in self.clips)
-        return np.concatenate([self.ends, np.array([x, y, 1.0]) / z, *clips])
+        camera = np.array([x, y, 1.0]) / z
+        beyond = [] if self.end_tension is None else [self.end_tension]
+        return np.concatenate([self.ends, camera, beyond, *clips])
 
 
 def pose_numbers(pose: object) -> Any:

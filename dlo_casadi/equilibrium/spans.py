@@ -21,6 +21,7 @@ from dlo_casadi.equilibrium.guesses import (
     arc_into_clamps,
     arc_tangents,
     bent_into,
+    border_guess,
     chord_direction,
     downwards,
     fallen,
@@ -180,7 +181,7 @@ def first_guesses(
     Without clips these are `guesses` or `guessed_frames`; with clips, arcs span by span. If the
     pose names sides of bars, arcs past these bars come first.
     """
-    none, held = np.zeros(model.n_border), holders(model, p, pose)
+    none, held = border_guess(model, p, pose), holders(model, p, pose)
     if named_sides(model, pose):
         yield from _span_guesses(model, pose, _with_bars(model, pose, held), SLACKS)
     if pose.clips:
@@ -216,7 +217,7 @@ def _span_guesses(
 
 def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
     """First guess of the border (n_border,) for nodes x: each eyelet is nearest to its place."""
-    border, places = np.zeros(model.n_border), model.chain.places
+    border, places = border_guess(model, model.nominal, pose), model.chain.places
     if not model.sliding:
         return border
     ahead = tangents(model.node, x)
@@ -351,12 +352,17 @@ def no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
 
 def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
     """Why a pose is out of reach: its end is missing or too far, or a number is meaningless."""
+    if model.end.slides != (pose.end_tension is not None):
+        what = (
+            f"no equilibrium: the end of the cable is {model.end}, end_tension {pose.end_tension}"
+        )
+        return no_equilibrium(pose, what, "end_tension [N] of a sliding end, and of no other.")
     if pose.end is None and model.end.place:
         what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
         return no_equilibrium(pose, what, "Pose(start, end).")
     if wrong := _meaningless(pose) or _wrong_clips(model, p, pose) or _inside(model, p, pose):
         return no_equilibrium(pose, *wrong)
-    if pose.end is None or model.extensible:
+    if pose.end is None or model.extensible or model.end.slides:
         return None
     (start, end), _, length = true_ends(model, p, pose)
     distance = float(np.linalg.norm(end - start))
@@ -374,6 +380,7 @@ def _meaningless(pose: HeldPose) -> tuple[str, str] | None:
     """Which number of a pose is not finite, or which quaternion zero, and what to try."""
     camera = pose.vector[len(pose.ends) :][:3]
     known = {"start": pose.start, "end": pose.end, **pose.directions, "camera": camera}
+    known["end_tension"] = pose.end_tension
     for clip in pose.clips:
         own = {"place": clip.place, "at": clip.at, "direction": clip.frame}
         known |= {f"{what} of {clip.name}": x for what, x in own.items()}

@@ -337,7 +337,8 @@ class CasadiCable:
     ) -> tuple[CableNumbers, dict[str, Any]]:
         """The cable's numbers, and symbols of the pose and of the parameters asked for."""
         model = self.model
-        if wrong := ["clips"] * bool(model.clips) + ["obstacles"] * bool(model.surfaces):
+        wrong = ["clips"] * bool(model.clips) + ["obstacles"] * bool(model.surfaces)
+        if wrong := wrong + ["sliding end"] * model.end.slides:
             said = " and ".join(wrong)
             raise DloError(f"a function of the pose has no {said} yet.\n  Try: solve(...).")
         numbers = numbers_of(model, self.p, self.rest, parameters)

@@ -1,6 +1,6 @@
 """Shapes along the measured lines, before any force is known."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -9,7 +9,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.effects import BoundaryEffect, Kinematics, MeasurementEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
-from dlo_casadi.equilibrium.curve import Observed, ObservedChange
+from dlo_casadi.equilibrium.curve import Observed, ObservedChange, denoised_length
 from dlo_casadi.equilibrium.measured_line import line_nodes
 from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.estimation.problem import Problem
@@ -71,7 +71,24 @@ def measured_shapes(
         roll,
         None if turns is None else tuple(turns.tolist()),
     )
-    return problem.equilibria.start_shapes(x.copy()), [places.copy() for places in projections]
+    shapes = problem.equilibria.start_shapes(x.copy())
+    shapes = with_fed_lengths(shapes, model, enumerate(problem.measured))
+    return shapes, [places.copy() for places in projections]
+
+
+def with_fed_lengths(
+    shapes: Shapes, model: CableModel, measured: Iterable[tuple[int, MeasuredPose]]
+) -> Shapes:
+    """Shapes whose sliding ends were fed as much as measured lines are longer than the cable.
+
+    `measured`: index and measurement of some poses.
+    """
+    lam = shapes.lam.copy()
+    for j, item in measured if model.fed else ():
+        if item.has_line:
+            length = denoised_length(item.pose.joined(item.points))[-1]
+            lam[j, model.fed] = length - model.cable.length
+    return replace(shapes, lam=lam)
 
 
 @lru_cache(maxsize=_KINEMATICS)
@@ -121,7 +138,8 @@ def _kinematics(
     roll: float,
 ) -> tuple[Shapes, list[FloatArray], list[float]]:
     """Shapes from nodes x on, arc lengths of points, and residual of each (used,) [m^2]."""
-    model, shapes = equilibria.model, equilibria.start_shapes(x)
+    model = equilibria.model
+    shapes = with_fed_lengths(equilibria.start_shapes(x), model, zip(used, fitted, strict=True))
     lines = [item.traced if item.has_line else item for item in fitted]
     each, flat = _each_node(equilibria), np.zeros(model.chain.n_rests)
     projections = [item.places(model.chain.length) for item in lines]

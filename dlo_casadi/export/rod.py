@@ -26,6 +26,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import SolvedCable
+from dlo_casadi.errors import DloError
 from dlo_casadi.export.common import printable
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clipped import rolled_with
@@ -135,6 +136,11 @@ class Rod:
     def of(cls, held: SolvedCable, segments: int | None = None) -> Self:
         """Cut a cable into segments, by default as many as keep each joint's turn below `TURN`."""
         model, p, pose, curve = held.model, held.p, held.pose, held.curve
+        if model.end.slides:
+            raise DloError(
+                "a cable that slides through its end cannot be exported yet.\n"
+                "  Try: end: swivel, with the free length as cable.length"
+            )
         terms, length = lagrangian_of(model), model.cable.length
         true, true_length = _numbers(terms, p, pose, terms.true_ends.vector, length * terms.stretch)
         if segments is None:

@@ -109,8 +109,10 @@ class Assembly:
         if not name.startswith("segment_state"):  # a state is of the even cells
             own = clipped.rest(own[..., None])[..., 0]
         p, deviation = (repeated(one, count) for one in (self.given.p, shapes.deviation))
-        both = clipped.carried(self._both(shapes.x))
-        return [both, lam, p, own, clipped.segments(), deviation]
+        both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
+        if self.model.fed:
+            table = np.concatenate([table, lam[..., self.model.fed]], axis=2)
+        return [both, lam, p, own, table, deviation]
 
     @property
     def _rest_inside(self) -> FloatArray:

@@ -53,7 +53,7 @@ def _stiffness(name: str, nominal: float) -> Parameter:
 
 @dataclass(frozen=True)
 class CableModel:
-    """An elastic cable between two fixtures, in a plane or in space.
+    """An elastic cable between two fixtures, in a plane or in space; immutable.
 
     Parameters
     ----------
@@ -79,10 +79,6 @@ class CableModel:
         What the cable may touch in any pose, without friction.
     random : tuple of Effect
         Effects whose parameters each pose has of its own: they are among `deviation_names`.
-
-    Notes
-    -----
-    Immutable: `model.with_effect(effect)` returns another model.
     """
 
     cable: CableData
@@ -111,6 +107,8 @@ class CableModel:
         if (self.clips or self.surfaces) and not self.chain.kind.smooth:
             what = "clips" if self.clips else "obstacles"
             raise DloError(f"{what} need a smooth element, found {self.element!r}; try 'quadratic'")
+        if self.end.slides and (self.clips or self.surfaces or not self.chain.kind.smooth):
+            raise DloError("a cable that slides through its end has no clips, obstacles or links")
         every = (*self.effects, *self.random)
         labels = [effect.label for effect in every]
         for effect in every:
@@ -149,7 +147,7 @@ class CableModel:
     @property
     def n_pose(self) -> int:
         """Size of `HeldPose.vector`."""
-        return EndConditions.size(self.node) + VIEWPOINT_SIZE + self.clip_numbers
+        return EndConditions.size(self.node) + VIEWPOINT_SIZE + len(self.fed) + self.clip_numbers
 
     @property
     def clip_numbers(self) -> int:
@@ -266,10 +264,7 @@ class CableModel:
 
     @property
     def may_spin(self) -> bool:
-        """Whether only a rest curvature determines the roll of the cable about its own axis.
-
-        This is so in space between ball joints, with one bending stiffness about all axes.
-        """
+        """Whether only a rest curvature determines the roll of the cable about its own axis."""
         held = any(kind.roll for kind in (self.start, self.end, *self.clips))
         laws = [effect for effect in self.effects if isinstance(effect, SectionLaw)]
         return self.node.twists and not held and all(law.isotropic for law in laws)
@@ -313,8 +308,7 @@ class CableModel:
     def end_pull(self) -> list[int]:
         """Rows of the border (dimension,) of a force at the end of the cable, if there are any.
 
-        With obstacles a free end has these rows, too, with values of zero: all forces beyond a
-        segment act on it like one force at its end.
+        With obstacles a free end has them, too, with zeros: all forces beyond a segment act there.
         """
         free = not self.end.place
         if free and not self.surfaces:
@@ -333,7 +327,8 @@ class CableModel:
 
         A multiplier belongs to a condition on a distance [m] or an angle [rad]. A spring's place y
         [m] is an unknown, held on the cable by a multiplier [N]; the Hessian then couples only
-        neighbouring nodes, see `SpringAt`. An eyelet's arc length [m] is an unknown, too. The
+        neighbouring nodes, see `SpringAt`. An eyelet's arc length [m] is an unknown, too, and the
+        length fed through a sliding end: free minus declared length [m]. The
         multiplier of a contact is the size of its force [N]; contacts differ from mesh to mesh.
         """
         places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
@@ -347,6 +342,8 @@ class CableModel:
             kinds |= {f"clip_{k}.{name}": "distance" for name in pulls}
             if kind.slides:
                 kinds[f"clip_{k}.place_s"] = "place"
+        if self.end.slides:
+            kinds["end.fed"] = "place"
         if self.surfaces and not self.end.place:
             kinds |= {f"free_end_{axis}": "distance" for axis in self.node.axes}
         for k in range(self.n_contacts):
@@ -371,6 +368,11 @@ class CableModel:
         """Index of each eyelet among the clips -> border row of its arc length."""
         eyelets = [k for k, kind in enumerate(self.clips) if kind.slides]
         return {k: self.border_names.index(f"clip_{k}.place_s") for k in eyelets}
+
+    @cached_property
+    def fed(self) -> list[int]:
+        """Border row of the length fed through a sliding end [m], if it slides."""
+        return [self.border_names.index("end.fed")] if self.end.slides else []
 
     @property
     def clamped_between(self) -> bool:
@@ -404,8 +406,8 @@ class CableModel:
     def tipped_by(self) -> str | None:
         """The end condition whose angle decides which of two sides has the lower energy.
 
-        A free end falls to either side of a clamp that points up. Between two clamps in space, one
-        rolled by half a turn, the cable is twisted either way. Other cables have no two sides.
+        A free end falls to either side of a clamp that points up. Between clamps in space, one
+        rolled by half a turn, the cable is twisted either way.
         """
         rolled = self.start.roll and self.end.roll
         hangs = self.start.direction and not self.end.place

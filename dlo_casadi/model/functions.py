@@ -38,6 +38,8 @@ class Functions(CableFunctions):
         # part of `place`; values by which gradients of segments are also differentiated.
         self._by, first = ca.vertcat(own.delta, lam), own.delta.numel()
         self._sliding = [(first + row, place[LAYOUT_SIZE + k]) for k, row in model.sliding.items()]
+        self._sliding += [(first + row, place[-1]) for row in model.fed]
+        self._by_ends = ca.vertcat(own.delta, lam)
         for row, s in self._sliding:
             self._by[row] = s
         self._numbers = ca.vertcat(own.p, own.rest_strains, own.deviation)
@@ -172,13 +174,18 @@ class Functions(CableFunctions):
     @cached_property
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `segment`."""
-        hessian, gradient = ca.hessian(self.terms.ends_lagrangian, self._by)
-        return self._of_ends("at_ends", self.terms.ends_lagrangian, gradient, hessian)
+        hessian, gradient = ca.hessian(self._of_both, self._by_ends)
+        return self._of_ends("at_ends", self._of_both, gradient, hessian)
+
+    @property
+    def _of_both(self) -> ca.SX:
+        """Lagrangian of the ends."""
+        return self.terms.ends_lagrangian + self.terms.feeding
 
     @cached_property
     def end_slope(self) -> ca.Function:
         """As `at_ends` -> its gradient alone."""
-        return self._of_ends("end_slope", ca.gradient(self.terms.ends_lagrangian, self._by))
+        return self._of_ends("end_slope", ca.gradient(self._of_both, self._by_ends))
 
     @cached_property
     def end_shape(self) -> ca.Function:
@@ -189,7 +196,7 @@ class Functions(CableFunctions):
         rows, sides = reaction_rows(self.node), ("start", "end")
         forces = [self._reactions[rows[f"{side}_force"]] for side in sides]
         moments = [self._reactions[rows[f"{side}_moment"]] for side in sides]
-        value = self.terms.ends_lagrangian
+        value = self._of_both
         return self._of_ends("end_shape", value, ca.horzcat(*forces), ca.horzcat(*moments))
 
     @cached_property
@@ -216,7 +223,7 @@ class Functions(CableFunctions):
     @cached_property
     def end_sensitivity(self) -> ca.Function:
         """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
-        gradient = ca.gradient(self.terms.ends_lagrangian, self._by)
+        gradient = ca.gradient(self._of_both, self._by_ends)
         numbers = ca.vertcat(self.terms.p, self.terms.deviation)
         return self._of_ends("end_sensitivity", ca.jacobian(gradient, numbers))
 
@@ -394,7 +401,7 @@ class Functions(CableFunctions):
     @cached_property
     def reading_slopes(self) -> ca.Function:
         """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
-        by = (self._by, self.terms.p, self.terms.deviation)
+        by = (self._by_ends, self.terms.p, self.terms.deviation)
         return self._of_ends("reading_slopes", *(ca.jacobian(self._readings, one) for one in by))
 
 

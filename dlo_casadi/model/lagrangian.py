@@ -67,8 +67,10 @@ class Lagrangian:
         Coordinates of a segment's two nodes, or of the first and last node; their increments.
     rest_strains : (3 strains,) [1/m]
         Rest strains inside a segment, see `Chain.rest_stencils`.
-    place : (6 + n_clips,)
-        A row of `Layout.segments`, then the arc lengths of the clips.
+    place : (6 + n_clips,) or (7,)
+        A row of `Layout.segments`, then the arc lengths of the clips, or the length that was fed
+        through a sliding end [m]. All segments get longer alike: on its mesh the cable begins at
+        0 and ends at the declared length.
     inner : (n_inner,)
         Internal unknowns of an element, which are eliminated.
     """
@@ -84,7 +86,7 @@ class Lagrangian:
         self.x = ca.SX.sym("x", 2 * self.node.coordinates)
         self.delta = ca.SX.sym("delta", 2 * self.node.increment)
         self.rest_strains = ca.SX.sym("rest", 3 * len(self.node.strains))
-        self.place = ca.SX.sym("place", LAYOUT_SIZE + len(model.clips))
+        self.place = ca.SX.sym("place", LAYOUT_SIZE + len(model.clips) + len(model.fed))
         self.inner = ca.SX.sym("inner", self.kind.n_inner)
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
@@ -151,13 +153,22 @@ class Lagrangian:
 
         The ends as `EndConditions.vector`, declared and true.
         """
-        length = self.model.cable.length * self.stretch
+        length = self.model.cable.length * self._stretch_of_effects
         arguments = [self.p, self.declared_ends, self.deviation]
         return ca.Function("true_ends_and_length", arguments, [self.true_ends.vector, length])
 
     @cached_property
+    def fed(self) -> ca.SX:
+        """Length that was fed through a sliding end over the declared one."""
+        return self.place[-1] / self.model.cable.length if self.model.fed else ca.SX(0)
+
+    @cached_property
     def stretch(self) -> ca.SX:
         """True length without load over the declared one."""
+        return self._stretch_of_effects + self.fed
+
+    @cached_property
+    def _stretch_of_effects(self) -> ca.SX:
         cable, effects = self.model.cable, self.effects_of(Kinematics)
         return prod((effect.stretch(cable, local) for effect, local in effects), start=ca.SX(1))
 
@@ -177,6 +188,10 @@ class Lagrangian:
 
     def resultant(self, s: ca.SX | float) -> ca.SX:
         """Force [N] of all distributed loads on the part of the cable beyond s."""
+        return self._declared_resultant(s) * (1 + self.fed)
+
+    def _declared_resultant(self, s: ca.SX | float) -> ca.SX:
+        """The same of a cable of the declared length."""
         weight = self.model.cable.mass / self.model.cable.length * self.felt_gravity
         total = weight * (self.model.cable.length - s)
         for effect, local in self.effects_of(Load):
@@ -269,6 +284,7 @@ class Lagrangian:
         """(p, place) -> the shares of a segment (n_forces + n_springs + n_clips,)."""
         start = self.place[0]
         positions = [x.position for x in self.dead_forces] + [x.position for x in self.springs]
+        positions = [s / (1 + self.fed) for s in positions]  # of one cable, however long it is
         if len(self.pulls) > self.model.n_springs:
             positions += ca.vertsplit(self.place[LAYOUT_SIZE:])
         last = start + self.length > self.model.cable.length - BESIDE * self.length
@@ -370,7 +386,26 @@ class Lagrangian:
         places += [clip.place for clip in true.clips]
         for place, rows in zip(places, self.model.pulls, strict=True):
             total += ca.dot(self.lam[rows], true.start - place)
-        return total - ca.dot(self.total_load, true.start)
+        return total - ca.dot(self._at_ends(self.total_load), true.start)
+
+    def _at_ends(self, expression: ca.SX) -> ca.SX:
+        """An expression of a segment with the length that was fed from the border."""
+        if not self.model.fed:
+            return expression
+        return ca.substitute(expression, self.place[-1], self.lam[self.model.fed])
+
+    @cached_property
+    def feeding(self) -> ca.SX:
+        """Energy [J] of what a sliding end takes from beyond it: against the tension, its weight.
+
+        With it the condition of the length that was fed is T = N + M k / 2 for the tension N in the
+        cable there; the weight that enters comes from the same place.
+        """
+        if not self.model.fed:
+            return ca.SX(0)
+        per_length = self._declared_resultant(0.0) / self.model.cable.length
+        tension = self.pose[EndConditions.size(self.node) + VIEWPOINT_SIZE]
+        return self.lam[self.model.fed] * (tension + ca.dot(per_length, self.true_ends.end))
 
 
 def lagrangian_of(model: CableModel, unheld: bool = False) -> Lagrangian:

@@ -208,6 +208,8 @@ def _segment_arguments(
             place = ca.vertcat(low, width, low, width, place[4:, :])
             rest = moved_rest(chain, rest, low, width)
         place = ca.vertcat(place, ca.repmat(ca.vertcat(*at), 1, chain.n_segments))
+    for row in model.fed:
+        place = ca.vertcat(place, ca.repmat(s.lam[row], 1, chain.n_segments))
     after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)
     both = ca.vertcat(x[:, : chain.n_segments], x[:, after.tolist()])
     return [both, s.lam, s.p, rest, place, s.deviation]

@@ -91,6 +91,7 @@ def stage_dict(stage: Stage, outcome: Outcome) -> dict[str, Any]:
             if shape.readings
         },
         "clips": {pose: shape.clips for pose, shape in stage.shapes.items() if shape.clips},
+        "fed": {pose: shape.fed for pose, shape in stage.shapes.items() if shape.fed},
         "contacts": {pose: one.contacts for pose, one in stage.shapes.items() if one.contacts},
         **fields_of(stage, "rmse_fit_measured_branch", "rmse_held_out_measured_branch"),
         "other_branch": {

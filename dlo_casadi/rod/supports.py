@@ -26,6 +26,7 @@ class SupportKind(StrEnum):
     FREE = "free"
     PINNED = "pinned"
     EYELET = "eyelet"
+    SLIDE = "slide"
     SWIVEL = "swivel"
     CLAMPED = "clamped"
 
@@ -73,10 +74,11 @@ HOLDS = {
     SupportKind.FREE: Holds(0),
     SupportKind.PINNED: _POINT,
     SupportKind.EYELET: Holds.PLACE,
+    SupportKind.SLIDE: Holds.PLACE | Holds.DIRECTION,
     SupportKind.SWIVEL: _POINT | Holds.DIRECTION,
     SupportKind.CLAMPED: _POINT | Holds.DIRECTION | Holds.ROLL,
 }
 # Kinds that a start, an end, and a clip between the ends may have.
 STARTS = (SupportKind.PINNED, SupportKind.CLAMPED, SupportKind.SWIVEL)
-ENDS = (*STARTS, SupportKind.FREE)
+ENDS = (*STARTS, SupportKind.SLIDE, SupportKind.FREE)
 CLIPS = (SupportKind.PINNED, SupportKind.CLAMPED, SupportKind.SWIVEL, SupportKind.EYELET)

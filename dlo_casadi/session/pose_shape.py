@@ -109,6 +109,8 @@ class PoseShape(Brief):
         Set for a held-out pose without a declared side that has two; None if it was not computed.
     clips : tuple of dict
         Forces and moments on its clips, see `clip_rows`.
+    fed : float [m]
+        Length that was fed through a sliding end: free minus declared length.
     contacts : tuple of dict
         Where it touches obstacles, see `Contact.row`.
     """
@@ -131,6 +133,7 @@ class PoseShape(Brief):
     readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     reading_std: Mapping[str, FloatArray] = field(default_factory=dict)
     clips: tuple[Mapping[str, Any], ...] = ()
+    fed: float = 0.0
     contacts: tuple[Mapping[str, Any], ...] = ()
 
     @property

@@ -68,6 +68,7 @@ def pose_shape(
         None if other is None else _branch_shape(other, item, prediction),
         readings=item.readings_beside(prediction.seen),
         clips=tuple(clip_rows(item.pose.clips, eq.clips)),
+        fed=eq.fed,
         contacts=tuple(contact.row for contact in eq.contacts),
     )
 

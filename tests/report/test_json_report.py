@@ -95,6 +95,7 @@ def test_every_key_of_the_schema_is_there(outcome):
             "readings",
             "clips",
             "contacts",
+            "fed",
             "rmse_fit_measured_branch",
             "rmse_held_out_measured_branch",
             "other_branch",
