@@ -1,7 +1,7 @@
 """What wrench measurements tell, on sessions simulated by this toolkit's own model.
 
-    python scripts/check_readings.py [--sets 4] [--tables clean mass loads clamps plane space]
-        [--jobs N] [--figure power.png]
+    python scripts/check_readings.py [--count 4] [--tables clean mass loads clamps plane space]
+        [--first 0] [--seed 0] [--jobs N] [--output FILE] [--figure power.png]
 
 The cable and the poses of configs/cable.yaml, 0.3 mm of white noise, fixtures and sensors off by
 draws from their tolerances; forces of 15 mN and moments of 1 mN m of noise. The tables, loads and
@@ -24,7 +24,6 @@ gravity.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import time
@@ -35,6 +34,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from harness import options, run
 from scipy.spatial.transform import Rotation
 from simulated import random_session
 
@@ -46,8 +46,7 @@ from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import profile_intervals
 from dlo_casadi.estimation.fit import fine_enough
-from dlo_casadi.io.files import write_file
-from dlo_casadi.runtime.parallel import generator_of, map_as_completed, open_executor
+from dlo_casadi.runtime.parallel import generator_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model, fit_declared
 from dlo_casadi.show.style import BLUE, GREY, VERMILLION, save_figure, styled
@@ -302,25 +301,17 @@ def run_one(index: int, seed: int, tables: tuple[str, ...]) -> dict:
 
 def main() -> None:
     """Simulate, fit, count."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sets", type=int, default=4)
-    parser.add_argument("--seed", type=int, default=0)
+    count = 4, "number of sets"
+    parser = options(__doc__, count=count, first=True, seed=0, jobs=True, output=True)
     parser.add_argument("--tables", nargs="+", choices=TABLES, default=TABLES)
-    parser.add_argument("--output", type=Path)
     parser.add_argument("--figure", type=Path, help="of what is told apart (loads, clamps)")
-    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
-    args = parser.parse_args()
-    rows = []
-    with open_executor(args.jobs) as executor:
-        work = partial(run_one, seed=args.seed, tables=tuple(args.tables))
-        for done in map_as_completed(executor, work, range(args.sets)):
-            rows.append(done.value)
-            print(json.dumps(done.value), flush=True)
-    if args.output:
-        write_file(args.output, json.dumps(rows))
+    chosen = parser.parse_args()
+    work = partial(run_one, seed=chosen.seed, tables=tuple(chosen.tables))
+    cases = range(chosen.first, chosen.first + chosen.count)
+    rows = run(work, cases, chosen, lambda case, row, seconds: json.dumps(row))
     print_tables(rows)
-    if args.figure:
-        draw(rows, args.figure)
+    if chosen.figure:
+        draw(rows, chosen.figure)
 
 
 def draw(rows: list[dict], path: Path) -> None:
