@@ -311,9 +311,15 @@ class _StiffensPerPose(SectionLaw):
         return ca.exp((params["share"] + 0.1 * params["unknown_force_x"]) * square)
 
 
-@pytest.mark.parametrize("end", ["clamped", "free"])
-@pytest.mark.parametrize("element", ["arc", "quadratic"])
-@pytest.mark.parametrize("more", [(), (_StiffensPerPose(),)])
+@pytest.mark.parametrize(
+    ("element", "end", "more"),
+    [
+        ("arc", "free", ()),
+        ("quadratic", "clamped", (_StiffensPerPose(),)),
+        pytest.param("arc", "clamped", (_StiffensPerPose(),), marks=pytest.mark.long),
+        pytest.param("quadratic", "free", (), marks=pytest.mark.long),
+    ],
+)
 def test_a_segment_is_differentiated_as_by_casadi_in_one_go(element, end, more):
     """Loads, a spring to a fixed point, a stretching cable and softening sections at once."""
     effects = [EFFECTS[name]() for name in ("tether", "axial_stretch", "bending_softening")]

@@ -241,7 +241,14 @@ def on_a_table(d: int, guess: float, read=lambda name, value: value):
     return find_suspicions(session, read_inputs(session))
 
 
-@pytest.mark.parametrize(("d", "guess"), [(2, 0.1), (2, 5.0), (2, 100.0), (3, 10.0)])
+@pytest.mark.parametrize(
+    ("d", "guess"),
+    [
+        (2, 0.1),
+        (2, 100.0),
+        *(pytest.param(*x, marks=pytest.mark.long) for x in ((2, 5.0), (3, 10.0))),
+    ],
+)
 def test_without_weight_the_first_guess_of_the_stiffness_sizes_no_reading(d, guess):
     assert on_a_table(d, guess) == ()
 
