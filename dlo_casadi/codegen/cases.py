@@ -15,17 +15,8 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.kernels import Holding, Kernels, c_number, kernels_of
 from dlo_casadi.codegen.statuses import STATUS_TEXTS
 from dlo_casadi.effects import Load
-from dlo_casadi.equilibrium.guess_table import SLACKS, TAUT, GuessRow, guess_table
-from dlo_casadi.equilibrium.guesses import (
-    CURVED,
-    FAR,
-    HALF_ANGLE,
-    HALF_TURN,
-    LARGEST_BEND,
-    ONE_POINT,
-    TIE,
-    resting_headings,
-)
+from dlo_casadi.equilibrium.guess_table import HALF_ANGLE, NUMBERS, SLACKS, GuessRow, guess_table
+from dlo_casadi.equilibrium.guesses import resting_headings
 from dlo_casadi.equilibrium.sides import NEAR_BAR
 from dlo_casadi.equilibrium.solve import MOST_SHED, coarse_rest
 from dlo_casadi.errors import DloError
@@ -309,15 +300,9 @@ class Case:
             "GUESS_TABLE": ",\n    ".join(table),
             "SLACKS": ", ".join(map(c_number, SLACKS)),
             "HALF_ANGLE": ", ".join(coefficients),
-            "FAR": c_number(FAR),
-            "CURVED": c_number(CURVED),
-            "LARGEST_BEND": c_number(LARGEST_BEND),
-            "HALF_TURN": c_number(HALF_TURN),
-            "TIE": c_number(TIE),
-            "TAUT": c_number(TAUT),
-            "ONE_POINT": c_number(ONE_POINT),
             "MOST_SHED": c_number(MOST_SHED),
             "NEAR_BAR": c_number(NEAR_BAR),
+            **{name: c_number(number) for name, number in NUMBERS.items()},
         }
 
     @property

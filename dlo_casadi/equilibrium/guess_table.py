@@ -1,8 +1,32 @@
-"""The table of first guesses of a cable by spans: Python and the generated C read it."""
+"""Numbers of first guesses, and their table by spans: Python and the generated C read them."""
 
 from itertools import product
 from typing import NamedTuple
 
+import numpy as np
+
+# Angles [rad] below which some first guesses are left out, see `guesses`, because they seldom lead
+# to the lowest equilibrium. None is lost in 300 random problems with a clamp at the end or both.
+FAR, CURVED = 1.5, 1.0
+# First guess of a cable that slides through its end: its length over the chord, less one. Where it
+# is much longer its weight pulls ever more through the end.
+SLACK = 0.05
+# Largest joint angle of a first guess [rad]: 0.9 of the bound of an equilibrium.
+LARGEST_BEND = 0.9 * np.pi / 2
+# A roll within this distance [rad] of half a turn is tried both ways round: the rolls of arcs to
+# four sides differ by that much, by 1.2 rad in a pose whose lowest equilibrium is the other way.
+HALF_TURN = 1.0
+# Rounding error allowed in comparing twists [turns]: two may be equally near to half a turn.
+TIE = 1e-6
+# Coefficients of half_angle^2 / (1 - ratio) in powers of 1 - ratio: least squares, 2e-4 rad error.
+HALF_ANGLE = (
+    *(5.9998487866413575, 1.818549938733748, 0.45541329964829563, 3.159529741805951),
+    *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
+)
+# Chord over arc length below which both ends count as at one place, so that its direction does not
+# matter: over a short chord ahead of a clamp the arc leaves against the clamp, and no guess of a
+# weightless cable led to the circle.
+ONE_POINT = 1e-2
 # Maximum number of combinations of sides of the spans in a plane.
 MOST_SIDES = 16
 # Shares of the slack between two fixed arc lengths that the first of two spans gets; the first one
@@ -10,6 +34,16 @@ MOST_SIDES = 16
 SLACKS = (0.5, 0.15, 0.85)
 # Half angle [rad] of an arc below which its sides are not distinguished.
 TAUT = 0.3
+# Some of these numbers by their names in C.
+NUMBERS = {
+    "FAR": FAR,
+    "CURVED": CURVED,
+    "LARGEST_BEND": LARGEST_BEND,
+    "HALF_TURN": HALF_TURN,
+    "TIE": TIE,
+    "TAUT": TAUT,
+    "ONE_POINT": ONE_POINT,
+}
 
 
 class GuessRow(NamedTuple):

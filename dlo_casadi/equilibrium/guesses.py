@@ -10,6 +10,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray, cross, unit
+from dlo_casadi.equilibrium.guess_table import (
+    CURVED,
+    FAR,
+    HALF_ANGLE,
+    HALF_TURN,
+    LARGEST_BEND,
+    ONE_POINT,
+    SLACK,
+    TIE,
+)
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -19,32 +29,10 @@ from dlo_casadi.rod.node import same_sign
 Clamps = tuple[FloatArray | None, FloatArray | None]
 Turned = tuple[Rotation | None, Rotation | None]
 
-# Angles [rad] below which some first guesses are left out, see `guesses`, because they seldom lead
-# to the lowest equilibrium. None is lost in 300 random problems with a clamp at the end or both.
-FAR, CURVED = 1.5, 1.0
-# First guess of a cable that slides through its end: its length over the chord, less one. Where it
-# is much longer its weight pulls ever more through the end.
-SLACK = 0.05
-# Largest joint angle of a first guess [rad]: 0.9 of the bound of an equilibrium.
-LARGEST_BEND = 0.9 * np.pi / 2
 # Power of the decay (1 - s/L)^5 of a clamp's bend. In 1200 random problems with clamps the powers
 # 3, 4, 5, 6, 8 missed the lowest equilibrium 9, 2, 0, 0, 1 times; high powers converge less often.
 _DECAY = 5
-# A roll within this distance [rad] of half a turn is tried both ways round: the rolls of arcs to
-# four sides differ by that much, by 1.2 rad in a pose whose lowest equilibrium is the other way.
-HALF_TURN = 1.0
-# Rounding error allowed in comparing twists [turns]: two may be equally near to half a turn.
-TIE = 1e-6
-# Coefficients of half_angle^2 / (1 - ratio) in powers of 1 - ratio: least squares, 2e-4 rad error.
-HALF_ANGLE = (
-    *(5.9998487866413575, 1.818549938733748, 0.45541329964829563, 3.159529741805951),
-    *(-9.268767992481754, 17.431184753381647, -15.583929636428092, 5.856747675543661),
-)
 _FORWARD, _NOWHERE = np.array([1.0, 0.0, 0.0]), np.zeros(3)
-# Chord over arc length below which both ends count as at one place, so that its direction does not
-# matter: over a short chord ahead of a clamp the arc leaves against the clamp, and no guess of a
-# weightless cable led to the circle.
-ONE_POINT = 1e-2
 
 
 def _held(
@@ -417,8 +405,12 @@ def frames_along(
     axes: FloatArray,
     held: Sequence[tuple[float, Sequence[float] | FloatArray | None]],
     turns: float,
-) -> FloatArray:
-    """Frames (k, 4) at arc lengths s (k,) [m] with these tangents (k, 3).
+    *,
+    other_way: bool = False,
+) -> tuple[FloatArray, float]:
+    """Frames (k, 4) at arc lengths s (k,) [m] with these tangents (k, 3), and the last roll [rad].
+
+    That is 0 unless both sides of the last stretch hold it.
 
     Parameters
     ----------
@@ -427,8 +419,10 @@ def frames_along(
         next its roll is spread evenly.
     turns : float
         Of twist before the end, see `HeldPose`.
+    other_way : bool
+        Whether the last roll goes the other way round.
     """
-    frames = np.zeros((len(s), 4))
+    frames, last_roll = np.zeros((len(s), 4)), 0.0
     for (low, first), (high, last) in pairwise(held):
         inside = (s >= low - 1e-9) & (s <= high + 1e-9)
         if not inside.any():  # two clamped clips between nodes of the mesh
@@ -436,10 +430,12 @@ def frames_along(
         u = (s[inside] - low) / (high - low)
         both = frame_rotation(first), frame_rotation(last)
         turned, roll = carried(u, axes[inside], both)
-        own = turns if high == held[-1][0] and None not in both else 0.0
-        roll = nearest_roll(roll, own)
+        at_end = high == held[-1][0] and None not in both
+        roll = nearest_roll(roll, turns if at_end else 0.0)
+        if at_end:
+            roll = last_roll = roll - other_way * float(np.copysign(2 * np.pi, roll))
         frames[inside] = rolled(u, turned, roll, at_start=both[0] is not None)
-    return same_sign(frames)
+    return same_sign(frames), last_roll
 
 
 def nearest_roll(roll: float, aimed: float) -> float:

@@ -39,4 +39,4 @@ def line_nodes(
         *((at, frame) for at, frame in clips if at is not None),
         (chain.length, pose.end_orientation if model.end.roll else None),
     ]
-    return frames_along(chain.places, tangents, held, pose.turns)
+    return frames_along(chain.places, tangents, held, pose.turns)[0]

@@ -7,30 +7,21 @@ chord by quarter turns. The spans also determine whether a pose is within reach.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, product
-from math import prod
+from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.equilibrium.guess_table import MOST_SIDES, SLACKS, TAUT
+from dlo_casadi.equilibrium.arcs import Span, arc_frames
+from dlo_casadi.equilibrium.guess_table import SLACKS, GuessRow, guess_table
 from dlo_casadi.equilibrium.guesses import (
-    arc_half_angle,
     arc_headings,
     arc_into_clamps,
-    arc_tangents,
-    bent_into,
     border_guess,
-    chord_direction,
     downwards,
     fallen,
-    frame_rotation,
-    frames_along,
     guessed_frames,
     guesses,
-    sagging,
-    smallest_turn,
     true_ends,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -64,27 +55,6 @@ class _Holder:
     def chord_to(self, other: "_Holder") -> FloatArray | None:
         """Vector (dimension,) [m] to the next holder; None to a free end."""
         return None if self.place is None or other.place is None else other.place - self.place
-
-
-@dataclass(frozen=True)
-class Span:
-    """The cable between two holders; arc lengths [m], `chord` (dimension,) [m] or None at a tip."""
-
-    start: float
-    end: float
-    chord: FloatArray | None
-    frames: tuple[FloatArray | None, FloatArray | None]
-
-    @property
-    def length(self) -> float:
-        """Length along the cable [m]."""
-        return self.end - self.start
-
-    @property
-    def taut(self) -> bool:
-        """Whether the span is so taut that the sides of its arc hardly differ."""
-        size = 0.0 if self.chord is None else float(np.linalg.norm(self.chord))
-        return arc_half_angle(size, self.length) < TAUT
 
 
 def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
@@ -136,8 +106,9 @@ def arches(
     held = holders(model, p, pose)
     k = _insert(held, place[None])
     up = model.node.sides // 2
-    sides = [tuple(up * (i == arch) for i in range(len(held) - 1)) for arch in (k - 1, k)]
-    yield from _span_guesses(model, pose, held, SLACKS[:1], sides)
+    spans = range(len(held) - 1)
+    rows = [GuessRow(tuple(up * (i == arch) for i in spans)) for arch in (k - 1, k)]
+    yield from _span_guesses(model, pose, held, rows)
 
 
 def chords(held: Sequence[_Holder]) -> list[float]:
@@ -183,9 +154,13 @@ def first_guesses(
     """
     none, held = border_guess(model, p, pose), holders(model, p, pose)
     if named_sides(model, pose):
-        yield from _span_guesses(model, pose, _with_bars(model, pose, held), SLACKS)
+        past = _with_bars(model, pose, held)
+        yield from _span_guesses(
+            model, pose, past, guess_table(len(past) - 1, model.in_space, True)
+        )
     if pose.clips:
-        yield from _span_guesses(model, pose, held, SLACKS if model.sliding else SLACKS[:1])
+        rows = guess_table(len(held) - 1, model.in_space, bool(model.sliding))
+        yield from _span_guesses(model, pose, held, rows)
     elif model.node is Frame:
         yield from ((x, none) for x in guessed_frames(model, p, rest, pose))
     else:
@@ -193,26 +168,28 @@ def first_guesses(
 
 
 def _span_guesses(
-    model: CableModel,
-    pose: HeldPose,
-    held: Sequence[_Holder],
-    shares: Sequence[float],
-    sides: Sequence[tuple[int, ...]] | None = None,
+    model: CableModel, pose: HeldPose, held: Sequence[_Holder], rows: Sequence[GuessRow]
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Arcs span by span, for shares of the slack; `sides`: combinations of the spans' sides."""
+    """Arcs span by span, for each row of a table; taut spans have one side alone."""
     rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
     clips = [k for k, one in enumerate(held) if not one.passed][1:]
-    for share in shares:
-        at = _arc_lengths(held, share)
+    tried = set()
+    for row in rows:
+        at = _arc_lengths(held, SLACKS[row.slack])
         spans, border = spans_of(held, at), np.zeros(model.n_border)
-        for k, row in model.sliding.items():
-            border[row] = at[clips[k]]
-        edges = [(at[k], held[k].frame) for k in rolls]
-        for chosen in sides or _sides(spans, model.node.sides):
-            if model.node is Frame:
-                yield _frames(model, pose, spans, edges, chosen), border
-            else:
-                yield _joined_headings(model, spans, chosen), border
+        for k, place in model.sliding.items():
+            border[place] = at[clips[k]]
+        sides = tuple(0 if x.taut else side for side, x in zip(row.sides, spans, strict=True))
+        if (known := row._replace(sides=sides)) in tried:
+            continue
+        tried.add(known)
+        if model.node is Frame:
+            edges = [(at[k], held[k].frame) for k in rolls]
+            x = arc_frames(model, pose, spans, edges, known)
+        else:
+            x = _joined_headings(model, spans, sides)
+        if x is not None:
+            yield x, border
 
 
 def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
@@ -229,20 +206,6 @@ def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
         gaps[places <= low] = np.inf
         border[row] = low = float(np.clip(places[gaps.argmin()], places[1], places[-2]))
     return border
-
-
-def _sides(spans: Sequence[Span], choices: int) -> list[tuple[int, ...]]:
-    """Combinations of the spans' sides; if there are too many, those that differ in one span."""
-    free = [1 if span.taut else choices for span in spans]
-    if prod(free) <= MOST_SIDES:  # NumPy's product overflows to zero
-        return list(product(*(range(count) for count in free)))
-    alike = [tuple(min(side, count - 1) for count in free) for side in range(choices)]
-    single = [
-        tuple(side if i == k else 0 for i in range(len(spans)))
-        for k, count in enumerate(free)
-        for side in range(1, count)
-    ]
-    return list(dict.fromkeys([*alike, *single]))
 
 
 # ---- in a plane ----------------------------------------------------------------------------------
@@ -298,48 +261,6 @@ def _joined(parts: list[tuple[FloatArray, FloatArray]], fixed: list[bool]) -> No
                 s, phi = parts[k]
                 turns = np.round((parts[other][1][beside] - phi[own]) / (2 * np.pi))
                 parts[k], known[k] = (s, phi + 2 * np.pi * turns), True
-
-
-# ---- in space ------------------------------------------------------------------------------------
-
-
-def _frames(
-    model: CableModel,
-    pose: HeldPose,
-    spans: Sequence[Span],
-    clamps: Sequence[tuple[float, FloatArray | None]],
-    sides: tuple[int, ...],
-) -> FloatArray:
-    """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all holders that fix the roll."""
-    places, length = model.chain.places, model.chain.length
-    axes = np.zeros((len(places), 3))
-    for span, quarter in zip(spans, sides, strict=True):
-        inside = (places >= span.start - 1e-9) & (places <= span.end + 1e-9)
-        u = np.clip((places[inside] - span.start) / span.length, 0.0, 1.0)
-        axes[inside] = _axes(model, span, quarter, u)
-    edges: list[tuple[float, FloatArray | None]] = list(clamps)
-    if not edges or edges[0][0] > 0:
-        edges.insert(0, (0.0, None))
-    if edges[-1][0] < length:
-        edges.append((length, None))
-    return frames_along(places, axes, edges, pose.turns)
-
-
-def _axes(model: CableModel, span: Span, quarter: int, u: FloatArray) -> FloatArray:
-    """Tangents (k, 3) of the arc of a span, bent into its clamps."""
-    down = np.array(model.gravity)
-    clamps = frame_rotation(span.frames[0]), frame_rotation(span.frames[1])
-    ends = [None if one is None else one.apply(np.eye(3)[0]) for one in clamps]
-    if span.chord is None:
-        down = down / max(float(np.linalg.norm(down)), 1e-12)
-        first = down if ends[0] is None else ends[0]
-        fall = smallest_turn(first, down if np.any(down) else first).as_rotvec()
-        return Rotation.from_rotvec(fallen(u)[:, None] * fall).apply(first)
-    along = chord_direction(span.chord / span.length, clamps, down)
-    turned = Rotation.from_rotvec(quarter * np.pi / 2 * along).apply(sagging(along, down))
-    over = float(np.linalg.norm(span.chord)) / span.length, along, turned
-    axes, arc = arc_tangents(u, *over), arc_tangents(np.array([0.0, 1.0]), *over)
-    return np.asarray(bent_into(u, axes, arc, ends))
 
 
 # ---- whether a pose is in reach ------------------------------------------------------------------
