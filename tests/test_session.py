@@ -163,7 +163,30 @@ BY_REFERENCE = {
     },
     "limits": {"clearance": 0.01},
 }
-ALL = {"in a plane": IN_PLANE, "in space": IN_SPACE, "by a reference": BY_REFERENCE}
+FED = {
+    "cable": CABLE | {"bending_stiffness": 0.01, "rest_shape": "straight"},
+    "experiment": {
+        "gravity": [0.0, -9.81],
+        "boundary": {"start": "clamped", "end": "slide"},
+        "measurement": {"kind": "centerlines"},
+        "poses": [
+            {
+                "file": "fed.csv",
+                "start": [0.0, 0.0],
+                "end": [0.4, 0.0],
+                "start_heading": 0.0,
+                "end_heading": 0.1,
+                "end_tension": 0.8,
+            }
+        ],
+    },
+}
+ALL = {
+    "in a plane": IN_PLANE,
+    "in space": IN_SPACE,
+    "by a reference": BY_REFERENCE,
+    "fed": FED,
+}
 
 
 def from_arguments(tree: dict[str, Any]) -> dlo.Session:
@@ -217,7 +240,7 @@ def test_every_key_of_the_schema_is_tried_here():
 @pytest.mark.parametrize("name", ALL)
 def test_arguments_make_what_a_file_makes(name, tmp_path):
     """Each key; files that are missing are told of in both, and only after all else was right."""
-    for picture in ("a.jpg", "a_1.jpg", "a_2.jpg"):
+    for picture in ("a.jpg", "a_1.jpg", "a_2.jpg", "fed.csv"):
         (tmp_path / picture).touch()
     tree = copy.deepcopy(ALL[name])
     (pose,) = tree["experiment"]["poses"]

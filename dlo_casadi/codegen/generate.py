@@ -177,7 +177,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
 def _rolls(case: Case) -> dict[str, int | str]:
     """Where the cable may roll in clamps of its ends, and whether all of it may: it is held then.
 
-    That is by the first clamp there is, or else, SPINS, by a number on the first node's diagonal.
+    That is by the first clamp there is, or else, SPINS, by a spring about the first node's tangent.
     """
     ends, twists = (case.model.start, case.model.end), case.model.node.twists
     swivels = [kind.direction and not kind.roll and twists for kind in ends]
