@@ -30,6 +30,8 @@ from dlo_casadi.thresholds import NORMAL_95
 # Share of the widest interval (of its logarithm) from which on a candidate with fewer parameters
 # stands for one with more: of a force, a weight and a tether at one place the weight is named.
 NEARLY_AS_WIDE = 0.9
+# Largest factor by which the refit moves an end, of its logarithm.
+FARTHEST = 2.0
 
 
 class Size(NamedTuple):
@@ -48,8 +50,9 @@ class IfHidden:
     parameter : str
         Name of the stiffness.
     effect : str
-    interval : (float, float) [N m^2]
-        95 %, to first order about the fit.
+    interval : (float or None, float or None) [N m^2]
+        95 %, to first order about the fit; the end that is farther from the estimate is moved
+        outwards as far as a refit there is likelier than to first order.
     values : dict
         Parameters of the effect, by their names [SI], at the end of the interval that is farther
         from the estimate: so large an effect is not excluded.
@@ -59,7 +62,7 @@ class IfHidden:
 
     parameter: str
     effect: str
-    interval: tuple[float, float]
+    interval: tuple[float | None, float | None]
     values: Mapping[str, Size]
     telling: Telling | None
 
@@ -86,12 +89,22 @@ def _widest(fit: Fit, name: str, rows: Sequence[Widened]) -> IfHidden:
     row, value = rows[best], fit.value(name)
     far = max(ends[best], key=abs)
     values, other = _with(fit, row, name, far)
-    low, high = (float(value * np.exp(end)) for end in ends[best])
+    low, high = ends[best]
+    if other is not None:
+        rise = 2 * (other.point.objective - fit.point.objective) + row.gain
+        more = np.sqrt(threshold(fit, name) / max(rise, 1e-9))
+        # As the secant step of a profile: the root of its rise is nearly linear.
+        far *= float(np.clip(more, 1.0, FARTHEST))
+        values, _ = _with(fit, row, name, far, refitted=False)
+        low, high = min(low, far), max(high, far)
+    low, high = (float(value * np.exp(end)) for end in (low, high))
     told = None if other is None else telling(fit, other)
     return IfHidden(name, row.candidate.name, (low, high), values, told)
 
 
-def _with(fit: Fit, row: Widened, name: str, far: float) -> tuple[dict[str, Size], Fit | None]:
+def _with(
+    fit: Fit, row: Widened, name: str, far: float, *, refitted: bool = True
+) -> tuple[dict[str, Size], Fit | None]:
     """Size of a candidate where the log of a stiffness differs by `far`, and the fit there."""
     candidate, unknowns = row.candidate, fit.problem.unknowns
     model = candidate.add_linear_to(fit.model)
@@ -108,6 +121,8 @@ def _with(fit: Fit, row: Widened, name: str, far: float) -> tuple[dict[str, Size
     }
     free = dict.fromkeys([*unknowns.names[: unknowns.n_parameters], *candidate.screened])
     fixed = {**linear, name: float(fit.value(name) * np.exp(far))}
+    if not refitted:
+        return sizes, None
     try:
         return sizes, refit(fit, model, free=[q for q in free if q != name], values=fixed)
     except EstimationError:

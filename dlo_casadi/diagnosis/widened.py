@@ -78,6 +78,11 @@ class Widened:
         mean = -covariance @ slope[kept]
         return cls(candidate, candidate.scans[scan], names, mean, covariance, bounded)
 
+    @property
+    def gain(self) -> float:
+        """Fall of twice the objective, to first order, if the candidate is in the model."""
+        return float(self.mean @ np.linalg.pinv(self.covariance, hermitian=True) @ self.mean)
+
     def ends(self, name: str, spread: float) -> tuple[float, float]:
         """95 % interval of an unknown's difference, all standard deviations times `spread`."""
         k, b = self.names.index(name), self.bounded

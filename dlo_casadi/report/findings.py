@@ -16,6 +16,9 @@ from dlo_casadi.session.sentences import Sentence, Values, said_of
 from dlo_casadi.show.text import millimetres, vector
 from dlo_casadi.thresholds import NOTABLE, UNSEEN
 
+Ends = tuple[float | None, float | None]
+# Ratio of widths from which on it is said what a hidden effect would do to a stiffness.
+WIDER = 1.2
 # What the residual may depend on, by the name of its normal score.
 DEPENDENCES = {
     "order_z": "the order of the poses",
@@ -144,11 +147,18 @@ def _added(outcome: Outcome) -> Iterator[Values]:
             yield {"line": f"  These data cannot tell it from {rivals}."}
 
 
+def _wider(one: Ends, other: Ends) -> bool:
+    """Whether an interval of a positive number is wider than another one by more than WIDER."""
+    widths = [np.log(high / low) if low and high else np.inf for low, high in (one, other)]
+    return bool(widths[0] > WIDER * widths[1])
+
+
 def _hidden(outcome: Outcome) -> Iterator[Values]:
     """What one effect that the data do not exclude could do to each stiffness."""
     last = outcome.stages[-1].parameters
     for name, found in outcome.if_hidden.items():
-        if (interval := last[name].interval_95_if_hidden) is None:
+        interval, known = last[name].interval_95_if_hidden, last[name].interval_95
+        if interval is None or known is None or not _wider(interval, known):
             continue
         tip, telling = found.telling, ""
         if tip is not None:
@@ -207,8 +217,8 @@ FINDINGS: tuple[Sentence[Outcome], ...] = (
     RESIDUAL,
     Sentence("{line}", _added),
     Sentence(
-        "If {found.effect} is hidden (up to {sizes} is not excluded), {found.parameter} is "
-        "{range} N m^2.{telling}",
+        "A hidden {found.effect} would not show: with {sizes} {found.parameter} may be {range} "
+        "N m^2.{telling}",
         _hidden,
     ),
     Sentence(
@@ -246,7 +256,7 @@ def reading_text(reading: NextReading, where: str = "there") -> str:
     unit, times = quantity_of(reading.name).unit, reading.times
     text = (
         f"A reading of {reading.name} {where} differs by {reading.difference:.2g} {unit}, "
-        f"{reading.separation:.2g} standard deviations of one: "
+        f"{reading.separation:.2g} standard deviations of one reading: "
     )
     if times is None or times > MOST_REPEATS:
         return text + "it would not tell them apart."

@@ -148,9 +148,13 @@ def footnotes(outcome: Outcome) -> list[str]:
             "start_force of more poses, or a smaller force_std and force_bias."
         )
     if twisting is not None and twisting.identifiable is False:
+        held = outcome.config.experiment.boundary
         lines.append(
             f"GJ is not identifiable from these {words.seen(outcome)}. Try: poses that twist the "
             "cable, with the end clamp rolled by up to half a turn."
+            if held.start.roll and held.end.roll
+            else "GJ is not identifiable: only ends that both hold the roll twist the cable. Try: "
+            "clamps at both ends, one rolled by up to half a turn."
         )
     return lines
 

@@ -275,7 +275,7 @@ def judged(outcome: Outcome) -> Outcome:
     if verdict is not None:
         verdict = "unexplained" if doubts else verdict
         stages = (*stages[:-1], _marked(stages[-1], verdict != "unexplained"))
-    hidden = {} if verdict == "unexplained" else outcome.if_hidden
+    hidden = {} if verdict == "unexplained" else _joined(stages[-1], outcome.if_hidden)
     stages = (*stages[:-1], _if_hidden(stages[-1], hidden))
     return replace(
         outcome,
@@ -288,17 +288,26 @@ def judged(outcome: Outcome) -> Outcome:
     )
 
 
+def _joined(stage: Stage, found: Mapping[str, IfHidden]) -> dict[str, IfHidden]:
+    """What one hidden effect could do, its intervals joined with those if nothing is hidden."""
+    joined = {}
+    for name, one in found.items():
+        low, high = stage.parameters[name].interval_95 or one.interval
+        ends = (
+            None if low is None else min(low, one.interval[0] or low),
+            None if high is None else max(high, one.interval[1] or high),
+        )
+        joined[name] = replace(one, interval=ends)
+    return joined
+
+
 def _if_hidden(stage: Stage, found: Mapping[str, IfHidden]) -> Stage:
     """A stage whose stiffnesses have the interval that holds if one effect is hidden, too."""
     parameters = dict(stage.parameters)
     for name, one in found.items():
         own = parameters[name]
         if own.interval_95 is not None:
-            low, high = own.interval_95
-            low = None if low is None else min(low, one.interval[0])
-            high = None if high is None else max(high, one.interval[1])
-            wide = (low, high)
-            parameters[name] = replace(own, interval_95_if_hidden=wide, hidden=one.effect)
+            parameters[name] = replace(own, interval_95_if_hidden=one.interval, hidden=one.effect)
     return replace(stage, parameters=parameters)
 
 

@@ -54,7 +54,7 @@ def test_footnotes_tell_the_ratio_and_the_reading_that_would_tell_more(outcome):
     ("name", "said"),
     [
         ("mass", "The readings do not tell mass from EI"),
-        ("torsional_stiffness", "GJ is not identifiable from these shapes"),
+        ("torsional_stiffness", "GJ is not identifiable: only ends that both hold the roll"),
     ],
 )
 def test_what_cannot_be_told_apart_has_its_footnote(outcome, name, said):

@@ -128,7 +128,7 @@ def test_an_added_effect_is_told_with_its_rivals(outcome):
 
     assert "Verdict: effect found. The declared model lacked lumped_mass; with it the" in text
     assert "A reading of end_force there differs by 0.3 N" in text
-    assert "4 standard deviations of one: read it 2 times." in text
+    assert "4 standard deviations of one reading: read it 2 times." in text
     assert "lumped_mass: mass 0.0500 ± 0.0020 kg (p = 1e-09)" in text
     assert "These data cannot tell it from point_force." in text
     assert (
