@@ -17,6 +17,7 @@ from dlo_casadi.session.questions import Suspicion
 from dlo_casadi.session.read_session import ReadSession
 from dlo_casadi.session.readings import wrong_readings, wrong_without_shapes
 from dlo_casadi.session.shapes import ends_exchanged, hangs_elsewhere
+from dlo_casadi.thresholds import FITTED_READINGS
 
 NEVERTHELESS = (
     "If all this is as it should be: `estimation: {plausibility: false}` fits nevertheless, in "
@@ -77,10 +78,11 @@ def contradictions(found: Sequence[Suspicion], inputs: Sequence[PoseInput]) -> l
 def find_suspicions(config: Config, inputs: Sequence[PoseInput]) -> tuple[Suspicion, ...]:
     """Everything in a session that looks like a mistake, see `QUESTIONS`."""
     session = ReadSession(config, tuple(item for item in inputs if len(item.points)))
-    found: tuple[Suspicion, ...] = ()
-    if not session.lines.names:
-        alone = [item.name for item in inputs if item.unseen]
-        return wrong_without_shapes(config, alone) if alone else found
+    alone, shown = [item.name for item in inputs if item.unseen], bool(session.lines.names)
+    asked = len(alone) >= (FITTED_READINGS if shown else 1)
+    found = wrong_without_shapes(config, alone) if asked else ()
+    if not shown:
+        return found
     for questions in QUESTIONS:
         for alternatives in questions:
             found += next(filter(None, (ask(session) for ask in alternatives)), ())

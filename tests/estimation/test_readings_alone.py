@@ -220,6 +220,21 @@ def test_mistakes_of_readings_without_shapes(change, said):
     assert said is None or said in found[0].message
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_readings_of_poses_without_shapes_are_asked_beside_poses_with_shapes(sign):
+    taken = session(2, held_out=0)
+    seen = np.linspace((0.0, 0.0), (0.3, 0.2), 20)
+    poses = [
+        pose.changed(points=seen, end_force=None, end_moment=None)
+        if k == 0
+        else pose.changed(end_force=tuple(sign * np.array(pose.end_force)))
+        for k, pose in enumerate(taken.experiment.poses)
+    ]
+    mixed = taken.changed(experiment={"poses": poses})
+    said = [x.message for x in find_suspicions(mixed, read_inputs(mixed)) if "sign" in x.message]
+    assert len(said) == (sign < 0)
+
+
 def rotation(angle):
     """The rotation (2, 2) by an angle [rad]."""
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
