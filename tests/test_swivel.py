@@ -138,7 +138,10 @@ def test_derivatives_by_the_pose_and_by_errors_of_its_direction():
         assert np.array(exact[2 * i + 1])[:, 0] == pytest.approx(change, abs=1e-6), output
 
 
-@pytest.mark.parametrize("boundary", [("clamped", "swivel"), ("swivel", "swivel")])
+@pytest.mark.parametrize(
+    "boundary",
+    [pytest.param(("clamped", "swivel"), marks=pytest.mark.long), ("swivel", "swivel")],
+)
 def test_a_session_with_swivels(boundary):
     """Simulated on a fine mesh, 0.3 mm of noise; predictions ignore the declared rolls."""
     model = CableModel(LOOM, n=60, n_rest=4, gravity=DOWN, start=boundary[0], end=boundary[1])

@@ -17,7 +17,9 @@ def effect(report, name):
     return next(item for item in report["effects"] if item["name"] == name)
 
 
-@pytest.mark.parametrize("name", ["short_clean", "weightless_fit"])
+@pytest.mark.parametrize(
+    "name", ["short_clean", pytest.param("weightless_fit", marks=pytest.mark.long)]
+)
 def test_a_complete_model_gets_no_effect(report, name):
     found = report(name)
     assert found["verdict"] == "complete"
