@@ -210,7 +210,7 @@ class Screen:
         runs the scans; in this process by default.
         """
         best: dict[str, tuple[Screened, int]] = {}
-        widest: dict[str, dict[str, Widened]] = {}
+        widest: dict[str, dict[str, tuple[float, Widened]]] = {}
 
         def improved(scans: Sequence[int]) -> None:
             for normal in self.normals(executor or InProcess(), scans) if scans else ():
@@ -227,9 +227,12 @@ class Screen:
         likely = [(x, k) for x, k in best.values() if x.p_value < IN_QUESTION and self.between]
         near = {j for x, k in likely for j in (k - 1, k + 1) if j < len(x.candidate.scans)}
         improved(sorted(near & {*range(1, n_scans)} - {*first}))
-        return in_order(replace(x, widest=widest[name]) for name, (x, _) in best.items())
+        kept = {name: {q: x for q, (_, x) in own.items()} for name, own in widest.items()}
+        return in_order(replace(x, widest=kept[name]) for name, (x, _) in best.items())
 
-    def _widen(self, known: dict[str, Widened], candidate: Candidate, normal: AtScan) -> None:
+    def _widen(
+        self, known: dict[str, tuple[float, Widened]], candidate: Candidate, normal: AtScan
+    ) -> None:
         """Keep a candidate at a scan for each stiffness that it leaves less known than others."""
         names = [name for name in STIFFNESSES if name in self.fit.problem.unknowns.names]
         if not self.between or not names:
@@ -237,8 +240,9 @@ class Screen:
         equations, larger = (normal.hessian, normal.gradient), self._linearized[0].unknowns
         found = Widened.of(self.fit, candidate, normal.k, equations, larger)
         for name in names:
-            if name not in known or found.width(name) > known[name].width(name):
-                known[name] = found
+            width = found.width(name)
+            if name not in known or width > known[name][0]:
+                known[name] = width, found
 
     def _score(self, candidate: Candidate, normal: AtScan, noise_dof: float) -> Screened:
         hessian, gradient, names = normal.hessian, normal.gradient, normal.names
