@@ -12,7 +12,7 @@ from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Repeats
-from dlo_casadi.estimation.prediction import Prediction, predict_each, predict_poses, uncertainty_of
+from dlo_casadi.estimation.prediction import Prediction, predict_each, uncertainty_of
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
@@ -69,9 +69,9 @@ def _pose_that_tells(fit: Fit, other: Fit) -> tuple[float | None, float | None]:
     base = fit.problem.fit_poses[0].pose
     places = np.linspace(0.0, fit.model.cable.length, 51)
     headings, differences = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False), []
-    for heading in headings:
-        pose = replace(base, start_heading=float(heading), branch=None)
-        pair = [predict_poses(one.model, one.p, one.rest_now, [pose])[0] for one in (fit, other)]
+    poses = [replace(base, start_heading=float(x), branch=None) for x in headings]
+    shapes = (predict_each(one.model, one.p, one.rest_now, poses) for one in (fit, other))
+    for pair in zip(*shapes, strict=True):
         curves = [
             item.curve.at(places)
             for item in pair
