@@ -1,15 +1,22 @@
-"""One thread per process: the matrices are small, and the tests run in two processes."""
+"""What all tests share: threads, the C compiler, sessions that are run once."""
 
 import os
 import pickle
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
 
+# One thread per process: the matrices are small, and the tests run in two processes.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+# Solvers are compiled without optimisation, which takes clang a fifth of GCC's time. Tests that name
+# a compiler, optimise or sanitise keep theirs.
+if shutil.which("clang"):
+    os.environ.setdefault("CC", "clang")
 
 # Nothing that a test writes has to outlast a power cut, and each wait for the disk takes
 # milliseconds. Tests of disks that fail put their own in its place.

@@ -59,7 +59,9 @@ def compiled(model: CableModel, *flags: str, obstacles: int = 2) -> CompiledSolv
 def own(request) -> tuple[CableModel, CompiledSolver]:
     """A cable that touches its table, and its solver."""
     model = cable(request.param)
-    return model, compiled(replace(model, obstacles=(TABLE[request.param],)), *STRICT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CC", "cc")  # its warnings are those of GCC
+        return model, compiled(replace(model, obstacles=(TABLE[request.param],)), *STRICT)
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 from contextlib import redirect_stdout
@@ -149,7 +150,15 @@ class Story:
             )
             given.append(f".clips = {{{rows}}}")
         shutil.copy(HERE / "main.c", folder)
-        command = ["cc", "-std=c99", "-O0", flag, "-Wall", "-Wextra", "-Werror"]
+        command = [
+            os.environ.get("CC", "cc"),
+            "-std=c99",
+            "-O0",
+            flag,
+            "-Wall",
+            "-Wextra",
+            "-Werror",
+        ]
         command += [f"-DPOSE={', '.join(given)}", f"-DAMONG={obstacles}"]
         command += ["main.c", "dlo_solver.c", "-lm", "-o", "main"]
         subprocess.run(command, cwd=folder, check=True)
