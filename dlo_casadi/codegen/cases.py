@@ -12,7 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.kernels import Holding, Kernels, c_number, kernels_of
+from dlo_casadi.codegen.c_text import c_number
+from dlo_casadi.codegen.kernels import Holding, Kernels, Moved, kernels_of
 from dlo_casadi.codegen.statuses import STATUS_TEXTS
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.guess_table import HALF_ANGLE, NUMBERS, SLACKS, GuessRow, guess_table
@@ -136,15 +137,13 @@ class Case:
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
         """Kernels of its meshes by their names in C, the cable's own first."""
-        return {"kernel": self.kernels(self.model, self.rest, self.model.clamped_between)}
+        moved = Moved.SOME if self.model.moves_nodes else Moved.NONE
+        return {"kernel": self.kernels(self.model, self.rest, moved)}
 
-    def kernels(self, model: CableModel, rest: FloatArray, moved: bool) -> Kernels:
-        """Kernels of a mesh without the supports between the ends.
-
-        `moved`: whether nodes move along the cable.
-        """
-        inside = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
-        bare = replace(model, clips=(), effects=tuple(inside))
+    def kernels(self, model: CableModel, rest: FloatArray, moved: Moved) -> Kernels:
+        """Kernels of a mesh without the supports between the ends."""
+        others = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
+        bare = replace(model, clips=(), effects=tuple(others))
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
         if not bare.end.place and (self.obstacles.most or self.holds):
             bare = replace(
@@ -158,7 +157,8 @@ class Case:
                 "  Try: another element, --element quadratic"
             )
         slides = bool(self.model.sliding)
-        return kernels_of(bare, p, rest, self.inline, Holding(moved, slides))
+        inside = slides or bool(self.tethers)
+        return kernels_of(bare, p, rest, self.inline, Holding(moved, inside, slides))
 
     @property
     def holds(self) -> int:
@@ -396,7 +396,8 @@ class _SpaceCase(Case):
             return found
         coarse = self.model.with_mesh(self.coarse_elements, "arc")
         rest = coarse_rest(self.model, coarse, self.rest)
-        return found | {"coarse_kernel": self.kernels(coarse, rest, bool(self.model.clips))}
+        moved = Moved.ALL if self.model.clips else Moved.NONE
+        return found | {"coarse_kernel": self.kernels(coarse, rest, moved)}
 
     @property
     def clamps(self) -> tuple[FloatArray, FloatArray]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.codegen.c_text import c_number, table_to_c
 from dlo_casadi.codegen.cases import (
     ITERATIONS,
     TRY_STEPS,
@@ -18,7 +19,7 @@ from dlo_casadi.codegen.cases import (
     case_of,
     template,
 )
-from dlo_casadi.codegen.kernels import c_number, kernel_texts, size_of_code, table_to_c
+from dlo_casadi.codegen.kernels import kernel_texts, size_of_code
 from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
@@ -160,6 +161,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "CLIPS": len(model.clips),
             "CLIP_KINDS": ", ".join(model.clips),
             "CLAMPS": sum(kind.direction for kind in model.clips),
+            "AT_NODES": sum(not kind.slides for kind in model.clips),
             "CLAMP_KINDS": ", ".join(str(kind.direction * (1 + (not kind.roll))) for kind in held)
             or "0",
             "EYELETS": len(model.sliding),
@@ -287,6 +289,11 @@ def generate(
         raise DloError(
             f"two tethers are in one of the {counted(bare.n, 'element')}: no solver can be made\n"
             "  Try: a finer mesh, --n, or one tether in place of both"
+        )
+    if len(bare.clips) >= bare.n:
+        raise DloError(
+            f"{counted(len(bare.clips), 'clip')} on {counted(bare.n, 'element')}: a clip needs a "
+            "node\n  Try: a finer mesh, --n"
         )
     values = {
         mark: value if isinstance(value, str) else str(int(value))

@@ -1,18 +1,18 @@
-"""C text of the model's segments, printed by CasADi from the same functions as used elsewhere."""
+"""The model's segments as C functions, made of the same expressions as used elsewhere."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from functools import cached_property, partial
 from itertools import pairwise
-from math import isfinite
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.errors import DloError
+from dlo_casadi.codegen.c_text import ends_text, helpers_of, statements
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.framed import SegmentNumbers, in_frame
 from dlo_casadi.model.functions import functions_of
@@ -23,27 +23,6 @@ from dlo_casadi.rod.supports import SupportKind
 
 # Largest difference at which two numbers count as equal: rounding of the mesh.
 _ROUNDING = 1e-14
-# Functions that CasADi renames; the others have libm's names.
-_CALLS = {"casadi_sq": "square", "casadi_sign": "sign_of", "casadi_real": "double"}
-_HELPERS = {
-    "square": "static double square(double a) { return a * a; }\n",
-    "sign_of": "static double sign_of(double a) { return a > 0.0 ? 1.0 : (a < 0.0 ? -1.0 : a); }\n",
-}
-
-
-def c_number(value: float) -> str:
-    """Shortest C literal of a finite double that reads back to the same bits."""
-    if not isfinite(value):
-        raise DloError(f"the generated solver would contain the constant {value}")
-    text = repr(float(value))
-    return text if any(mark in text for mark in ".e") else text + ".0"
-
-
-def table_to_c(numbers: Sequence[float]) -> str:
-    """Initialiser of the table; one zero where there is nothing to store."""
-    texts = [c_number(number) for number in numbers] or ["0.0"]
-    rows = [", ".join(texts[i : i + 4]) for i in range(0, len(texts), 4)]
-    return ",\n    ".join(rows)
 
 
 @dataclass(frozen=True)
@@ -51,7 +30,8 @@ class Kernel:
     """Segments first <= j < last of one kind, which differ only in a row of numbers each.
 
     `members`: (first, last); `rows` (last - first, k): the numbers of each segment; `derive`: makes
-    the function. Where nodes move along the cable the pose has the rows, see `row_of` in C.
+    the function. `moved`: of segments beside nodes that are moved along the cable; the pose has
+    their rows, see `row_of` in C.
     """
 
     members: tuple[int, int]
@@ -68,10 +48,10 @@ class Kernel:
         """C statement that calls it for all its segments; their rows begin at `table_at`."""
         (first, last), width = self.members, self.rows.shape[1]
         row = f"table + {table_at} + (j - {first}) * {width}" if width else "table"
-        row = "row_of(w, j)" if self.moved else row
+        row, of = ("row_of(w, j)", "MOVED") if self.moved else (row, "SEGMENTS")
         state = self.function.numel_in(0) // 2
         return f"""\
-    FOR_SEGMENTS({first}, {last})
+    FOR_{of}({first}, {last})
         {name}(x + {state} * j, FORCE, {row}, table,
         {" " * len(name)} segment + SEGMENT * j);"""
 
@@ -89,7 +69,7 @@ class Kernel:
 {head}const double *x, const double *lam, const double *row,
 {" " * len(head)}const double *table, double *RESTRICT out)
 {{
-{_statements(self.function, ("x", "lam", "row", "table"), targets)}
+{statements(self.function, ("x", "lam", "row", "table"), targets)}
     (void)x, (void)lam, (void)row, (void)table;
 }}
 """
@@ -101,13 +81,15 @@ class Kernels:
 
     `segments` are in the order of the cable. `ends` is the energy of the holders, if any, as a
     function of the first and last node. `shared` (n_parameters,) or (0,) are the parameters in the
-    table, before the segments' rows. `holder` is a segment with a clip or a tether inside, at a
-    share of its length that follows its row.
+    table, before the segments' rows. `even` (n, k): rows of all segments between even nodes, from
+    which those between moved ones are made. `holder` is a segment with a clip or a tether inside,
+    at a share of its length that follows its row.
     """
 
     segments: tuple[Kernel, ...]
     ends: ca.Function | None
     shared: FloatArray
+    even: FloatArray
     holder: Kernel | None = None
 
     @property
@@ -118,8 +100,8 @@ class Kernels:
     @property
     def table(self) -> list[float]:
         """Numbers that the kernels read: shared ones, then the rows of all segments."""
-        rows = [kernel.rows.ravel() for kernel in self.all]
-        return [float(number) for number in np.concatenate([self.shared, *rows])]
+        rows = [kernel.rows.ravel() for kernel in self.segments]
+        return [float(number) for number in np.concatenate([self.shared, *rows, self.even.ravel()])]
 
     @property
     def operations(self) -> int:
@@ -135,9 +117,9 @@ class Kernels:
 def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
     """C text of the kernels of meshes by the mesh's name, as values of the templates' marks.
 
-    LOOPS call the KERNELS for the segments, HELD the one for a segment that holds the cable; the
-    rows of the latter begin at EVEN in their table, of length EXTRA. With two meshes the second one
-    is called if `w->coarse` is set.
+    LOOPS call the KERNELS for the segments, HELD the one for a segment that holds the cable; rows
+    of segments between even nodes begin at EVEN in their table, of length EXTRA. With two meshes
+    the second one is called if `w->coarse` is set.
     """
     functions: list[str] = []
     loops: list[str] = []
@@ -153,11 +135,12 @@ def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
         if kernels.holder is not None:
             functions.append(kernels.holder.text(f"{name}_held"))
             holders.append(kernels.holder.at_holder(f"{name}_held"))
+        if kernels.even.size:
             even.append(str(at))
-            at += kernels.holder.rows.size
+            at += kernels.even.size
         loops.append("\n".join(statements))
-    text, ends = "\n".join(functions), "\n".join(_ends_text(x.ends) for x in meshes.values())
-    helpers = [helper for name, helper in _HELPERS.items() if f"{name}(" in text + ends]
+    text, ends = "\n".join(functions), "\n".join(ends_text(x.ends) for x in meshes.values())
+    helpers = helpers_of(text + ends)
     return {
         "KERNELS": "\n".join([*helpers, text]),
         "LOOPS": _by_mesh(loops),
@@ -185,14 +168,24 @@ def size_of_code(meshes: Iterable[Kernels], numbers: Sequence[float]) -> int:
     return 25_000 + sum(kernels.code_size for kernels in meshes) + 8 * len(numbers)
 
 
+class Moved(Enum):
+    """Which nodes of a mesh are moved along the cable."""
+
+    NONE = auto()
+    SOME = auto()
+    ALL = auto()
+
+
 @dataclass(frozen=True)
 class Holding:
-    """How something holds a cable inside a segment.
+    """How a cable is held between its ends.
 
-    `moved`: whether nodes move along the cable; `slides`: whether the cable may slide through.
+    `moved`: nodes that are moved to what holds it. `inside`: whether something holds it inside a
+    segment; `slides`: whether the cable may slide through that.
     """
 
-    moved: bool
+    moved: Moved
+    inside: bool
     slides: bool
 
 
@@ -204,38 +197,39 @@ def kernels_of(
     held: Holding | None = None,
 ) -> Kernels:
     """Kernels of a model without clips and tethers; `inline` as in `generate`."""
-    bare, moved = model, held is not None and held.moved
+    bare, moved = model, Moved.NONE if held is None else held.moved
     if held is not None:
-        model = replace(model, clips=(SupportKind.CLAMPED if moved else SupportKind.PINNED,))
+        model = replace(model, clips=(SupportKind.PINNED,))
     places = model.chain.layout.segments
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
     shared = np.zeros(0) if inline else np.asarray(p, float)
     rows = np.insert(own, 1, places[:, 1], axis=1)
-    whole = (0, len(own))
-    holder = None
-    if held is not None:
+    whole, none = (0, len(own)), own[:, :0]
+    holder, beside = None, list[Kernel]()
+    if held is not None and held.inside:
         inside = partial(_segment_from_row, model, parameters, rows.shape[1], held)
-        holder = Kernel(whole, rows, inside, moved)
-    if moved:
+        holder = Kernel(whole, none, inside)
+    if moved != Moved.NONE:
         plain = partial(_segment_from_row, model, parameters, rows.shape[1])
-        return Kernels(
-            (Kernel(whole, own[:, :0], plain, moved),), _ends(bare, parameters), shared, holder
-        )
+        beside = [Kernel(whole, none, plain, moved=True)]
+    told = _ends(bare, parameters), shared, none if held is None else rows, holder
+    if moved == Moved.ALL:
+        return Kernels(tuple(beside), *told)
     kinds = places[:, 1:] - [0, 1, 0, 0, 0] * places[:, :1]
     # A point force acts on a whole segment, on none of it, or from a place inside it.
     shares = np.array([np.array(lagrangian_of(bare).shares(p, place)).ravel() for place in places])
     within = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * within
-    told = (
+    alike = (
         np.column_stack([kinds.round(14), shares * ~within, alone]) if inline else kinds.round(14)
     )
-    edges = [0, *(np.flatnonzero(np.any(np.diff(told, axis=0), axis=1)) + 1), len(own)]
+    edges = [0, *(np.flatnonzero(np.any(np.diff(alike, axis=0), axis=1)) + 1), len(own)]
     segments = tuple(
         _kernel(bare, parameters, places[first], own[first:last], (first, last), inline)
         for first, last in pairwise(edges)
     )
-    return Kernels(segments, _ends(bare, parameters), shared, holder)
+    return Kernels((*segments, *beside), *told)
 
 
 def _segment_from_row(
@@ -258,7 +252,7 @@ def _segment_from_row(
     x = ca.SX.sym("x", 2 * model.node.coordinates)
     start, length, share = row[0], row[1], row[width] if inside else ca.SX(0)
     has_cell, mesh = model.chain.layout.segments[0, 4:]
-    length = length if model.clamped_between else ca.SX(mesh)
+    length = ca.SX(mesh) if held is not None and held.moved == Moved.NONE else length
     place = ca.vertcat(start, length, start, length, has_cell, mesh, start + share * length)
     still = ca.SX.zeros(len(model.deviation_names))
     shares = ca.vertcat(*ca.vertsplit(terms.shares(p, place))[:-1], share)
@@ -396,48 +390,3 @@ def _ends(model: CableModel, p: ca.SX) -> ca.Function | None:
 
 def _symbols(p: ca.SX) -> ca.SX:
     return p if p.is_valid_input() else ca.SX.zeros(0)
-
-
-# ---- text --------------------------------------------------------------------------------------
-
-_BODY = re.compile(r"^static int casadi_f0\(.*?\{\n(.*?)^\}", re.MULTILINE | re.DOTALL)
-_INPUT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
-_OUTPUT = re.compile(r"if \(res\[0\]!=0\) res\[0\]\[(\d+)\]=(.*?);")
-
-
-def _statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[str]) -> str:
-    """C statements that CasADi prints for a function, with our names of inputs and outputs.
-
-    `inputs`: C arrays of its inputs; `targets`: left side and operator of the assignment to each
-    number of its output.
-    """
-    generator = ca.CodeGenerator("kernel")
-    generator.add(function)
-    found = _BODY.search(generator.dump())
-    if found is None:  # pragma: no cover: another version of CasADi prints in another way
-        raise DloError("CasADi printed no function; try another version of CasADi")
-    text = _INPUT.sub(lambda match: f"{inputs[int(match[1])]}[{match[2]}]", found[1])
-    text = _OUTPUT.sub(lambda match: f"{targets[int(match[1])]} {match[2]};", text)
-    text = text.replace("  return 0;\n", "")
-    text = re.sub(
-        r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text
-    )
-    return "\n".join("  " + line for line in text.splitlines() if line.strip())
-
-
-def _ends_text(function: ca.Function | None) -> str:
-    """C text of the energy of the holders of a planar cable, if any."""
-    if function is None:
-        return "static void add_ends(point_t *q, const double *table) { (void)q, (void)table; }\n"
-    targets = ["q->lagrangian +="]
-    targets += ["first[SLOPE_0] +=", "last[SLOPE_1] +=", "first[BEND_00] +=", "last[BEND_11] +="]
-    return f"""\
-/* Adds what holds the first and the last node beside their conditions. */
-static void add_ends(point_t *q, const double *table)
-{{
-    const double x[2] = {{q->x[0], q->x[DLO_NODES - 1]}};
-    double *const first = q->segment, *const last = q->segment + SEGMENT * (DLO_NODES - 2);
-{_statements(function, ("x", "table"), targets)}
-    (void)x, (void)table;
-}}
-"""

@@ -25,7 +25,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import clamped_nodes
+from dlo_casadi.model.clips import held_nodes
 from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -99,7 +99,7 @@ def by_ipopt(
     """
     count, touching = model.chain.n_nodes, model.n_contacts
     conditions = model.n_multipliers - touching
-    solver = _solver(model, clamped_nodes(model.chain, pose.clips))
+    solver = _solver(model, held_nodes(model.chain, pose.clips))
     deviation = np.zeros(len(model.deviation_names))
     others = border_of(model, pose, phi[:, None])[~model.are_multipliers]
     rows, most = np.flatnonzero(model.are_multipliers)[:conditions], np.full(touching, np.inf)

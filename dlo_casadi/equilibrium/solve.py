@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from dlo_casadi.equilibrium.spans import (
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import clamped_nodes, node_places
+from dlo_casadi.model.clips import held_nodes, node_places
 from dlo_casadi.rod.node import Frame
 
 # Largest move of an end in one step [lengths, rad], so that a shape can be followed up to a fold.
@@ -377,10 +378,9 @@ def _twists(model: CableModel, pose: HeldPose, twist: FloatArray) -> FloatArray:
 
     `twist` (m, n_cells). A clamped clip holds the roll: turns of the end stop there.
     """
-    holding = [clip for clip in pose.clips if clip.kind.roll]
-    first = max(clamped_nodes(model.chain, holding), default=0)
-    widths = np.diff(node_places(model.chain, pose.clips))
-    return twist[:, first:] @ widths[first:] / (2 * np.pi)
+    rolled = [clip.kind.roll for clip in pose.clips if not clip.kind.slides]
+    first = max(compress(held_nodes(model.chain, pose.clips), rolled), default=0)
+    return twist[:, first:] @ np.diff(node_places(model.chain, pose.clips))[first:] / (2 * np.pi)
 
 
 def _holds(pose: HeldPose, twists: FloatArray) -> BoolArray:

@@ -26,9 +26,9 @@ from dlo_casadi.equilibrium.guesses import (
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import named_sides
-from dlo_casadi.errors import EquilibriumError
+from dlo_casadi.errors import EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import clamped_nodes, tangents
+from dlo_casadi.model.clips import held_nodes, tangents
 from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.node import Frame
@@ -338,8 +338,11 @@ def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str,
     if tuple(clip.kind for clip in pose.clips) != model.clips:
         own, others = (", ".join(x) or "none" for x in ([c.kind for c in pose.clips], model.clips))
         return f"no equilibrium: the pose has the clips {own}, the model {others}", "the same."
-    nodes = clamped_nodes(model.chain, pose.clips)
-    if len(set(nodes)) < len(nodes):
+    if len(pose.clips) >= model.n:
+        what = f"{counted(len(pose.clips), 'clip')} on {counted(model.n, 'element')}"
+        return f"no equilibrium: {what}, a clip needs a node", "a finer mesh (model.n)."
+    clamped = [held_nodes(model.chain, [x])[0] for x in pose.clips if x.kind.direction]
+    if len(set(clamped)) < len(clamped):
         what = f"clamped clips are nearer to each other than an element, {model.chain.h:.4g} m"
         return f"no equilibrium: {what}", "a finer mesh (model.n)."
     held = holders(model, p, pose) if pose.clips and not model.extensible else []

@@ -318,7 +318,7 @@ class Assembly:
         (advance,) = self._call_segments("segment_curve")
         node, clipped = self.model.node, self.clipped
         places, rates = self._stations(advance[..., 0], self.given.poses[:, : node.dimension])
-        if not clipped.clamps:
+        if not clipped.moved:
             return places
         moved = np.concatenate([places, rates[..., :1] * tangents(node, self.shapes.x)], axis=2)
         return clipped.evenly(moved[..., None])[:, :, : node.dimension, 0]
@@ -403,7 +403,7 @@ class Assembly:
         """
         after, *by = (self._stacked(part) for part in self._call_segments("segment_state"))
         m, n_p = self.given.p.shape
-        if self.model.clamped_between:  # only saddles move the edges of cells
+        if self.model.moves_nodes:
             every = np.broadcast_to(np.eye(n_p), (m, n_p, n_p))
             slipped = self._by_slips("segment_state_by_place", every)
             by[2] = by[2] + (self._stacked(slipped) if slipped.any() else 0.0)

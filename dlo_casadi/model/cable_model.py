@@ -35,10 +35,8 @@ STIFFNESS_RATIO_STD = float(np.log(3.0))
 ROLL_STD = 1.0
 TORSIONAL_STIFFNESS = "torsional_stiffness"
 STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
-# Number of elements of `CableModel.coarse`.
-COARSE_MESH = 10
-# Smallest mean number of elements of `CableModel.coarse` between two clips.
-COARSE_SPAN = 6
+# Number of elements of `CableModel.coarse`, and their smallest mean number between two clips.
+COARSE_MESH, COARSE_SPAN = 10, 6
 # Parameter name: true minus declared roll of the end clamp [rad], equivalent to a rest twist.
 END_ROLL = "end_roll"
 # Size of the camera part of `HeldPose.vector`.
@@ -194,9 +192,8 @@ class CableModel:
             listed.append(replace(torsion, prior_std=np.inf))
             if self.start.roll and self.end.roll:
                 std = self.priors.get(END_ROLL, ROLL_STD)
-                listed.append(
-                    Parameter(END_ROLL, "rad", scale=0.1, lower=-9.0, upper=9.0, prior_std=std)
-                )
+                roll = Parameter(END_ROLL, "rad", scale=0.1, lower=-9.0, upper=9.0, prior_std=std)
+                listed.append(roll)
         for effect in self.effects:
             for parameter in effect.parameters(self.cable):
                 name = f"{effect.label}.{parameter.name}"
@@ -328,8 +325,8 @@ class CableModel:
         A multiplier belongs to a condition on a distance [m] or an angle [rad]. A spring's place y
         [m] is an unknown, held on the cable by a multiplier [N]; the Hessian then couples only
         neighbouring nodes, see `SpringAt`. An eyelet's arc length [m] is an unknown, too, and the
-        length fed through a sliding end: free minus declared length [m]. The
-        multiplier of a contact is the size of its force [N]; contacts differ from mesh to mesh.
+        length fed through a sliding end [m]. The multiplier of a contact is the size of its force
+        [N]; contacts differ from mesh to mesh.
         """
         places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
         kinds: dict[str, Literal["distance", "angle", "place"]] = {}
@@ -373,6 +370,11 @@ class CableModel:
     def fed(self) -> list[int]:
         """Border row of the length fed through a sliding end [m], if it slides."""
         return [self.border_names.index("end.fed")] if self.end.slides else []
+
+    @property
+    def moves_nodes(self) -> bool:
+        """Whether nodes are moved to clips."""
+        return not all(kind.slides for kind in self.clips)
 
     @property
     def clamped_between(self) -> bool:
@@ -445,5 +447,4 @@ class Tolerances:
         node = model.node
         sizes = (self.end, getattr(self, node.tolerance), np.inf, self.clip)
         d = node.dimension
-        counts = (d, 2 * node.increment, d, d * len(model.clips))
-        return np.repeat(sizes, counts)
+        return np.repeat(sizes, (d, 2 * node.increment, d, d * len(model.clips)))

@@ -1,9 +1,10 @@
 """Where the clips of many poses are on their cables, and what their arc lengths and turns change.
 
-The nearest node is moved to a clamped clip and carries its frame: see `clips`. If the clip slips by
-ds, the two segments beside it change in start, length and rest strains; if a clip holds no node,
-its share of the segment around it changes. If a clamped clip turns, its node turns with it. These
-changes are exact: derivatives of the segments by these numbers are the same as by any other.
+The nearest node is moved to each clip but eyelets, and carries a clamped one's frame: see `clips`.
+If such a clip slips by ds, the two segments beside it change in start, length and rest strains; of
+an eyelet its share of the segment around it changes. If a clamped clip turns, its node turns with
+it. These changes are exact: derivatives of the segments by these numbers are the same as by any
+other.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, cross
-from dlo_casadi.model.clips import BESIDE, ClipLoad
+from dlo_casadi.model.clips import BESIDE, ClipLoad, nearest_nodes
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.element import LAYOUT_SIZE
@@ -57,13 +58,16 @@ class Clipped:
     kinds : (k,) SupportKind
     at : (m, k) [m]
         Arc lengths of the clips.
+    nodes : (m, held) int
+        Nodes that are moved to the clips, but to eyelets.
     places : (m, n + 1) [m]
-        Arc lengths of the nodes; nodes of clamped clips are moved to these.
+        Arc lengths of the nodes.
     """
 
     chain: Chain
     kinds: tuple[SupportKind, ...]
     at: FloatArray
+    nodes: IntArray
     clamps: tuple[ClampNode, ...]
     places: FloatArray
 
@@ -84,22 +88,29 @@ class Clipped:
         """
         node, rows = chain.kind.node, np.arange(len(x))
         places, clamps = np.tile(chain.places, (len(x), 1)), []
-        for k, kind in enumerate(kinds):
-            if not kind.direction:
+        moved = [k for k, kind in enumerate(kinds) if not kind.slides]
+        nodes = nearest_nodes(chain, declared[:, moved, -1])
+        places[rows[:, None], nodes] = at[:, moved]
+        for k, index in zip(moved, nodes.T, strict=True):
+            if not kinds[k].direction:
                 continue
-            index = np.rint(declared[:, k, -1] / chain.h).astype(np.intp).clip(1, chain.n - 1)
             frame = node.moved(declared[:, k, node.dimension : -1], turn[k])
-            aligned, held = frame, kind.rotations(node)
+            aligned, held = frame, kinds[k].rotations(node)
             if not held.all():
                 frame = rolled_with(frame, x[rows, index])
-            places[rows, index] = at[:, k]
             clamps.append(ClampNode(index, frame, held, aligned, turn[k]))
-        return cls(chain, kinds, at, tuple(clamps), places)
+        return cls(chain, kinds, at, nodes, tuple(clamps), places)
 
     @classmethod
     def none(cls, chain: Chain, count: int) -> "Clipped":
         """Cables of `count` poses without clips."""
-        return cls(chain, (), np.zeros((count, 0)), (), np.tile(chain.places, (count, 1)))
+        nodes = np.zeros((count, 0), dtype=np.intp)
+        return cls(chain, (), np.zeros((count, 0)), nodes, (), np.tile(chain.places, (count, 1)))
+
+    @property
+    def moved(self) -> list[int]:
+        """Indices of the clips to which nodes are moved."""
+        return [k for k, kind in enumerate(self.kinds) if not kind.slides]
 
     @property
     def in_order(self) -> BoolArray:
@@ -109,14 +120,14 @@ class Clipped:
 
     @property
     def cells(self) -> FloatArray:
-        """Bending cells (m, n_cells, 2) [m]; between moved nodes where a clip is clamped."""
-        if self.clamps:
+        """Bending cells (m, n_cells, 2) [m], between the nodes."""
+        if self.moved:
             return np.stack([self.places[:, :-1], self.places[:, 1:]], axis=2)
         return np.broadcast_to(self.chain.cells, (len(self.at), *self.chain.cells.shape))
 
     @property
     def segments_at(self) -> IntArray:
-        """Segment (m, k) inside which each clip is; of clamped ones the one that begins there."""
+        """Segment (m, k) inside which each clip is, or the one that begins at its node."""
         share = (self.at[:, None] - self.places[:, :-1, None]) / np.diff(self.places)[..., None]
         # A clip at a node counts in one segment only: derivatives by its arc length are one-sided.
         return np.maximum((share >= -BESIDE).sum(axis=1) - 1, 0)
@@ -133,12 +144,12 @@ class Clipped:
 
         These are both ends, both sides of each clamped clip, and the other clips.
         """
-        cells, nodes = self.cells, iter(self.clamped.T)
+        cells, nodes = self.cells, iter(self.nodes.T)
         found = [(cells[:, 0, 0], np.zeros(len(cells), dtype=np.intp))]
         for kind, at in zip(self.kinds, self.at.T, strict=True):
-            if kind.direction:
+            if not kind.slides:
                 node = next(nodes)
-                found += [(at, node - 1), (at, node)]
+                found += [(at, node - 1)] * kind.direction + [(at, node)]
             else:
                 found.append((at, np.maximum((cells[:, :, 0] <= at[:, None]).sum(axis=1) - 1, 0)))
         found.append((cells[:, -1, 1], np.full(len(cells), cells.shape[1] - 1)))
@@ -177,7 +188,7 @@ class Clipped:
         if not self.at.shape[1]:
             return table
         table = table.copy()
-        if self.clamps:
+        if self.moved:
             table[..., [0, 2]] = self.places[:, :-1, None]
             table[..., [1, 3]] = np.diff(self.places)[..., None]
         at = np.broadcast_to(self.at[:, None], (*table.shape[:2], self.at.shape[1]))
@@ -188,7 +199,7 @@ class Clipped:
 
         m + a x + c (x^2 - 1/12) of an even element, with x = x_0 + w y.
         """
-        if not self.clamps:
+        if not self.moved:
             return inside
         own, (mean, a, c) = np.empty_like(inside), (inside[:, :, k::3] for k in range(3))
         for k, part in enumerate(_within(mean, a, c, *self._even())):
@@ -202,12 +213,12 @@ class Clipped:
         segments (m, n_segments, 3 strains), and of rows of `segments`.
         """
         first, rows = self.segments_at[:, k, None], np.arange(len(self.at))[:, None]
-        clamped = self.kinds[k].direction
-        index = np.concatenate([first - 1, first], axis=1) if clamped else first
+        moved = not self.kinds[k].slides
+        index = np.concatenate([first - 1, first], axis=1) if moved else first
         size = inside.shape[2]
         change = np.zeros((*index.shape, size + LAYOUT_SIZE + len(self.kinds)))
         change[..., size + LAYOUT_SIZE + k] = 1.0
-        if clamped:
+        if moved:
             low, width = np.array([0.0, 1.0]), np.array([1.0, -1.0])
             change[..., [size, size + 2]] = low[:, None]
             change[..., [size + 1, size + 3]] = width[:, None]
@@ -289,27 +300,25 @@ class Clipped:
     def evenly(self, stations: FloatArray) -> FloatArray:
         """Places and dr/ds (m, n + 1, 2 d, q) at even arc lengths, given those at moved nodes."""
         out, rows = stations.copy(), np.arange(len(stations))
-        for clamp in self.clamps:
-            e, u, width = self._evened(clamp)
+        for index in self.nodes.T:
+            e, u, width = self._evened(index)
             (r0, t0), (r1, t1) = (np.split(stations[rows, e + j], 2, axis=1) for j in (0, 1))
             chord, v = r1 - r0, 1 - u
             place = r0 + u**2 * (3 - 2 * u) * chord + width * u * v * (v * t0 - u * t1)
             slope = 6 * u * v * chord / width + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1
-            out[rows, clamp.index] = np.concatenate([place, slope], axis=1)
+            out[rows, index] = np.concatenate([place, slope], axis=1)
         return out
 
     def evenly_along(self, stations: FloatArray, at: FloatArray) -> FloatArray:
         """Change of `evenly` (m, n + 1, 2 d, q) as the clips slide by `at` (m, k, q) [m]."""
-        if not self.clamps:
+        if not self.moved:
             return NONE
         m, count, size, _ = stations.shape
         out, rows = np.zeros((m, count, size, at.shape[2])), np.arange(m)
         moved = np.zeros((m, count, 1, at.shape[2]))
-        clamped = [k for k, kind in enumerate(self.kinds) if kind.direction]
-        for k, clamp in zip(clamped, self.clamps, strict=True):
-            moved[rows, clamp.index, 0] = at[:, k]
-        for clamp in self.clamps:
-            e, u, width = self._evened(clamp)
+        moved[rows[:, None], self.nodes, 0] = at[:, self.moved]
+        for index in self.nodes.T:
+            e, u, width = self._evened(index)
             dw = moved[rows, e + 1] - moved[rows, e]
             du = -(moved[rows, e] + u * dw) / width
             (r0, t0), (r1, t1) = (np.split(stations[rows, e + j], 2, axis=1) for j in (0, 1))
@@ -320,13 +329,13 @@ class Clipped:
             )
             bend = 6 * (1 - 2 * u) * chord + (6 * u - 4) * t0 + (6 * u - 2) * t1
             slope = bend * du - 6 * u * v * chord * dw / width
-            out[rows, clamp.index] = np.concatenate([place, slope], axis=1)
+            out[rows, index] = np.concatenate([place, slope], axis=1)
         return out
 
-    def _evened(self, clamp: ClampNode) -> tuple[IntArray, FloatArray, FloatArray]:
+    def _evened(self, index: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
         """Element (m,) with the even place of a moved node; its share (m, 1, 1) and length [m]."""
-        rows, s = np.arange(len(self.at)), self.chain.places[clamp.index]
-        e = clamp.index - (s <= self.places[rows, clamp.index])
+        rows, s = np.arange(len(self.at)), self.chain.places[index]
+        e = index - (s <= self.places[rows, index])
         width = self.places[rows, e + 1] - self.places[rows, e]
         u = (s - self.places[rows, e]) / width
         return e, u[:, None, None], width[:, None, None]

@@ -3,8 +3,8 @@
 A clip k at the arc length s_k adds lam_k . (r(s_k) - place_k) to the Lagrangian. In every segment
 r(s_k) advances by the share of the segment before s_k, as for a point force: arc lengths need not
 be nodes. For an eyelet s_k is also an unknown, and dL/ds_k = lam_k . t = 0: no force along the
-cable. A clamped clip bends the cable by a moment. The nearest node is moved to it and carries its
-frame, so that the curvature does not jump inside an element.
+cable. The nearest node is moved to each other clip, so that shear and curvature do not jump inside
+an element; a clamped clip bends the cable by a moment, and its node carries its frame.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Heading, Node
 from dlo_casadi.rod.supports import SupportKind
@@ -103,17 +103,24 @@ def clip_size(node: type[Node]) -> int:
     return node.dimension + node.coordinates + 1
 
 
-def clamped_nodes(chain: Chain, clips: Sequence[HeldClip]) -> tuple[int, ...]:
-    """Nodes held by the clamped clips: those nearest to them."""
-    at = np.array([clip.at for clip in clips if clip.kind.direction], dtype=float)
-    return tuple(np.rint(at / chain.h).astype(int).clip(1, chain.n - 1).tolist())
+def nearest_nodes(chain: Chain, at: FloatArray) -> IntArray:
+    """Nodes (..., k) nearest to arc lengths (..., k) [m] in order, another one for each."""
+    k = np.arange(at.shape[-1])
+    near = np.maximum(np.rint(at / chain.h).astype(np.intp) - k, 1)
+    return np.asarray(np.minimum(np.maximum.accumulate(near, axis=-1), chain.n - len(k)) + k)
+
+
+def held_nodes(chain: Chain, clips: Sequence[HeldClip]) -> tuple[int, ...]:
+    """Nodes that are moved to the clips, but to eyelets."""
+    at = np.array([clip.at for clip in clips if not clip.kind.slides], dtype=float)
+    return tuple(nearest_nodes(chain, at).tolist())
 
 
 def node_places(chain: Chain, clips: Sequence[HeldClip]) -> FloatArray:
-    """Arc lengths (n_nodes,) [m] of the nodes; nodes of clamped clips are moved to these."""
+    """Arc lengths (n_nodes,) [m] of the nodes; some are moved to the clips."""
     places = chain.places.copy()
-    held = [clip.at for clip in clips if clip.kind.direction]
-    places[list(clamped_nodes(chain, clips))] = held
+    held = [clip.at for clip in clips if not clip.kind.slides]
+    places[list(held_nodes(chain, clips))] = held
     return places
 
 

@@ -295,8 +295,8 @@ class Lagrangian:
 
     @property
     def length(self) -> ca.SX:
-        """Length of a segment [m], of all the same without clamped clips."""
-        return self.place[1 if self.model.clamped_between else 5]
+        """Length of a segment [m], of all the same unless nodes are moved to clips."""
+        return self.place[1 if self.model.moves_nodes else 5]
 
     def with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Expressions with the shares in place of their symbols."""

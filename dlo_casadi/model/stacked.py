@@ -300,12 +300,12 @@ class Unheld:
     @classmethod
     def of(cls, model: CableModel, table: FloatArray, segments: IntArray) -> Unheld:
         """Segments of a model with clips, from `Clipped.segments` and `Clipped.segments_at`."""
-        width = table[..., 1:2] if model.clamped_between else model.chain.h
+        width = table[..., 1:2] if model.moves_nodes else model.chain.h
         share = (table[..., -len(model.clips) :] - table[..., :1]) / width
-        nodes = [k for k, kind in enumerate(model.clips) if not kind.direction]
+        sliding = list(model.sliding)
         end = model.end_pull or [-1] * model.node.dimension
         rows = [end, *model.pulls[model.n_springs :]]
-        return cls((share > 0.5).astype(float), segments[:, nodes], np.array(rows))
+        return cls((share > 0.5).astype(float), segments[:, sliding], np.array(rows))
 
     def evaluated(
         self,

@@ -62,17 +62,17 @@ class Potential:
     by_segment: ca.SX
 
 
-def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
+def potential(model: CableModel, nodes: tuple[int, ...] = ()) -> Potential:
     """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
 
     The coordinates are those of the nodes, places of springs and eyelets, unknowns inside segments,
     and those of compliant clamps: a clamp of the compliance c turns by sqrt(c) a and stores a^2/2.
-    `clamped`: the nodes that the clamped clips hold, see `clips.clamped_nodes`.
+    `nodes`: those that are moved to the clips, see `clips.held_nodes`.
     """
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
     energy, gradient, _ = functions.at_ends(*end_arguments(model, s))
-    segments = _segment_arguments(model, s, clamped)
+    segments = _segment_arguments(model, s, nodes)
     own, reached = functions.compact("segment_potential")(*segments, inner)
     energy = sum(ca.horzsplit(own), start=energy)
     conditions = sum(ca.horzsplit(reached), start=gradient[2 * model.node.increment :])
@@ -84,7 +84,7 @@ def potential(model: CableModel, clamped: tuple[int, ...] = ()) -> Potential:
         conditions[lagrangian.compliant] -= ca.sqrt(lagrangian.compliances(s.p)) * given_way
     given, zero = [energy, conditions[multipliers], reached], ca.SX.zeros(len(multipliers))
     energy, conditions, reached = ca.substitute(given, [s.lam[multipliers]], [zero])
-    for node, frame in zip(clamped, _clip_frames(model, s, clamped), strict=True):
+    for node, frame in _clip_frames(model, s, nodes).items():
         # Nothing else depends on the coordinates of a node that a clip holds.
         energy += ca.sumsqr(s.x[_rows(model, node)] - frame) / 2
     coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
@@ -165,15 +165,17 @@ def _rows(model: CableModel, node: int) -> list[int]:
     return list(range(c * node, c * (node + 1)))
 
 
-def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) -> list[Any]:
-    """Frames of clamped clips, from the pose; swivels take the roll of the nodes that they hold.
+def _clip_frames(model: CableModel, s: PoseSymbols, nodes: tuple[int, ...]) -> dict[int, Any]:
+    """Frames at nodes of clamped clips, from the pose; swivels take the roll of their nodes.
 
     As in `clips.Clipped.of`.
     """
     size, c, count = clip_size(model.node), model.node.coordinates, len(model.clips)
-    held, frames = [k for k, kind in enumerate(model.clips) if kind.direction], []
-    turns = functions_of(model).true_clips(s.p, s.pose)[2]
-    for k, node in zip(held, clamped, strict=True):
+    moved = [k for k, kind in enumerate(model.clips) if not kind.slides]
+    turns, frames = functions_of(model).true_clips(s.p, s.pose)[2], {}
+    for k, node in zip(moved, nodes, strict=True):
+        if not model.clips[k].direction:
+            continue
         last = model.n_pose - size * (count - k) + size - 1
         frame = model.node.moved(s.pose[last - c : last], ca.SX(turns[:, k]))
         if not model.clips[k].roll:
@@ -182,13 +184,11 @@ def _clip_frames(model: CableModel, s: PoseSymbols, clamped: tuple[int, ...]) ->
             length = ca.sqrt(roll**2 + rest**2)
             turn = (roll / length, ca.SX(0), ca.SX(0), rest / length)
             frame = ca.vertcat(*quaternion_product(parts, turn))
-        frames.append(frame)
+        frames[node] = frame
     return frames
 
 
-def _segment_arguments(
-    model: CableModel, s: PoseSymbols, clamped: tuple[int, ...] = ()
-) -> list[Any]:
+def _segment_arguments(model: CableModel, s: PoseSymbols, nodes: tuple[int, ...] = ()) -> list[Any]:
     """One column for each segment, or a single column if all segments share it."""
     chain = model.chain
     x = ca.reshape(s.x, model.node.coordinates, chain.n_nodes)
@@ -200,11 +200,13 @@ def _segment_arguments(
         for k, row in model.sliding.items():
             at[k] = s.lam[row]
         places = ca.SX(ca.DM(chain.places))
-        held = [k for k, kind in enumerate(model.clips) if kind.direction]
-        for k, node, frame in zip(held, clamped, _clip_frames(model, s, clamped), strict=True):
-            x[:, node], places[node] = frame, at[k]
+        moved = [k for k, kind in enumerate(model.clips) if not kind.slides]
+        for k, node in zip(moved, nodes, strict=False):  # none in problems of users
+            places[node] = at[k]
+        for node, frame in _clip_frames(model, s, nodes).items() if nodes else ():
+            x[:, node] = frame
         low, width = places[:-1].T, (places[1:] - places[:-1]).T
-        if clamped:
+        if nodes:
             place = ca.vertcat(low, width, low, width, place[4:, :])
             rest = moved_rest(chain, rest, low, width)
         place = ca.vertcat(place, ca.repmat(ca.vertcat(*at), 1, chain.n_segments))

@@ -47,7 +47,7 @@ class Ipopt:
     Increments are about the frames of a first guess, which are parameters. A clamp's frame is a
     condition as the end position is; that no node is inside of an obstacle are inequalities.
     Stability is not checked, as by IPOPT it is not. `clamped`: nodes that clamped clips hold, see
-    `clips.clamped_nodes`. In a plane the frames are headings.
+    `clips.held_nodes`. In a plane the frames are headings.
     """
 
     def __init__(self, model: CableModel, clamped: tuple[int, ...] = ()) -> None:
