@@ -13,8 +13,8 @@ from filelock import FileLock
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-# Solvers are compiled without optimisation, which takes clang a fifth of GCC's time. Tests that name
-# a compiler, optimise or sanitise keep theirs.
+# Solvers are compiled without optimisation, which takes clang a fifth of GCC's time. Tests that
+# name a compiler keep theirs.
 if shutil.which("clang"):
     os.environ.setdefault("CC", "clang")
 
