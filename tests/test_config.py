@@ -542,7 +542,7 @@ def test_headings_follow_the_boundary(tmp_path):
         load(tmp_path, ("start: pinned", "start: clamped"))
     with pytest.raises(ConfigError, match=r"pose 2 \(b.csv\): a clamped end needs an end_heading"):
         load(tmp_path, ("end: pinned", "end: clamped"))
-    with pytest.raises(ConfigError, match=r"pose 3 \(c.csv\): a free end has no end"):
+    with pytest.raises(ConfigError, match=r"pose 3 \(c.csv\): a free end has no end.*, slide"):
         load(tmp_path, ("end: pinned", "end: free"))
     with pytest.raises(ConfigError, match=r"pose 2 \(b.csv\): a pinned end needs its position"):
         load(tmp_path, ("end: [0.4, 0.1], ", ""))
@@ -550,6 +550,13 @@ def test_headings_follow_the_boundary(tmp_path):
     assert unused.warnings == ("start_heading is not used, the start is pinned: b",)
     assert all(x.start_heading is None for x in unused.experiment.poses)
     assert unused.experiment.poses[1].held.start_heading is None
+
+
+def test_a_swivel_in_a_plane_is_said_to_be_a_clamp(tmp_path):
+    headings = ("end: [0.", "end_heading: 0.1, end: [0.")
+    (said,) = load(tmp_path, ("end: pinned", "end: swivel"), headings).warnings
+    assert said.startswith("boundary.end: swivel: in a plane no cable rolls about its axis")
+    assert "Try: end: clamped" in said
 
 
 def test_a_ball_joint_and_a_free_end_hold_no_shape_in_space(tmp_path):
@@ -731,6 +738,13 @@ def test_reference_points_are_two(tmp_path):
         ("4.55e8", "455", "youngs_modulus 455 Pa is softer than any cable"),
         ("length: 0.8", "length: 81", "81 m long, but its ends are never more than 0.5"),
         ("-9.81", "-9810", "gravity is 9810 m/s"),
+        (
+            "-9.81",
+            "-1",
+            "gravity is 1 m/s^2, on Earth 9.81; a stiffness is found in proportion to ",
+        ),
+        ("-9.81", "-1", "in units of g? Try: [0.0, -9.81]"),
+        ("-9.81", "-1.62", "gravity is 1.62 m/s^2, on Earth 9.81"),  # the Moon's
         ("3e-4", "0.02", "std 0.02 m is large"),
     ],
 )

@@ -375,7 +375,11 @@ def test_a_known_load_may_be_many_times_the_weight(tmp_path, load):
             "boundary: allowed are 'pinned', 'clamped', 'swivel'",
         ),
         (ROPE, {"boundary": "pinned"}, "[start, end] belongs here, such as [pinned, clamped]"),
-        (ROPE, {"gravity": (0, 0, -9.81)}, "cable.torsional_stiffness is not given, and no fit"),
+        (
+            ROPE,
+            {"gravity": (0, 0, -9.81)},
+            "needs: of a solid round rod EI / 1.3 = 0.00769",
+        ),
         (
             WIRE,
             {"gravity": (0, 0, -9.81), "boundary": ("pinned", "free")},

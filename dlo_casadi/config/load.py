@@ -17,6 +17,7 @@ from dlo_casadi.config.document import BACKSLASH, Document
 from dlo_casadi.config.effects import without_values, wrong_effects, wrong_limits
 from dlo_casadi.config.frozen import plain
 from dlo_casadi.config.noise import impossible_noise
+from dlo_casadi.config.oddities import oddities
 from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.problems import (
     Arguments,
@@ -40,9 +41,10 @@ from dlo_casadi.config.supports import (
 )
 from dlo_casadi.config.values import AXES, REST_COEFFICIENTS, Range
 from dlo_casadi.effects import EFFECTS, UNKNOWN_MASS, CableData
-from dlo_casadi.errors import ConfigError, counted
-from dlo_casadi.rod.chain import ELEMENTS, RestCurvature
+from dlo_casadi.errors import ConfigError
+from dlo_casadi.rod.chain import RestCurvature
 from dlo_casadi.rod.quantities import QUANTITIES
+from dlo_casadi.rod.supports import ENDS
 
 
 def load_config(path: str | Path) -> Config:
@@ -120,7 +122,7 @@ def checked_config(source: Source) -> Config:
         if n_fit == 0:
             raise source.error(lost, "no pose to fit is left")
         raise source.error([*lost, *weightless])
-    warnings = [*_oddities(config)]
+    warnings = [*oddities(config)]
     if n_fit == 1:
         warnings.append("only one pose to fit: what it tells cannot be checked on another one")
     skipped = [pose for pose in poses if pose.name in reasons]
@@ -148,7 +150,11 @@ def known_config(given: dict[str, Any], names: tuple[str, ...]) -> tuple[Config,
     ends, cable, in_space = config.experiment.boundary, config.cable, config.experiment.in_space
     needed = (
         ("mass", "the mass of its length [kg]; without gravity any"),
-        ("torsional_stiffness", "GJ [N m^2]; EI / 1.3 of a solid round rod"),
+        (
+            "torsional_stiffness",
+            "GJ [N m^2], which a cable in space (three numbers of gravity) needs: of a solid round "
+            f"rod EI / 1.3 = {cable.prior_torsional_stiffness:.3g}",
+        ),
     )[: 1 + in_space]
     problems = [
         *undetermined(ends.start, ends.end, in_space),
@@ -212,14 +218,6 @@ _LONGEST_NAME = 200
 
 # Interferometers resolve a nanometre over a metre.
 _FINEST_TOLERANCE = 1.0e-9
-
-# Order of convergence -> number of elements below which a declared mesh is coarse. A mesh chosen
-# from the data has at least 20 elements, a compromise of error and time.
-_COARSE = {4: 10, 2: 20}
-# Largest number of elements of a mesh chosen from the data.
-_FINE = 160
-# Time of COBYLA for one pose: 1 s measured for 10 links, 4 s for 20; it grows with the square.
-_COBYLA_LINKS = 20
 
 # A start heading needs at most one full turn [rad]; an end heading is continuous along the cable,
 # which may turn several times.
@@ -328,7 +326,8 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
     if not held.end.place:
         for key in ("end", "end_heading", "end_orientation", "end_force", "end_moment"):
             if getattr(pose, key) is not None:
-                yield f"a free end has no {key}; boundary.end: pinned or clamped?", None
+                others = ", ".join(kind for kind in ENDS if kind.place)
+                yield f"a free end has no {key}. Try: boundary.end: one of {others}", None
     if pose.turns and not (space and held.start.roll and held.end.roll):
         yield "turns are of a cable in space that is clamped at both ends", "turns"
     if held.end.slides != (pose.end_tension is not None):
@@ -383,49 +382,6 @@ def _absent(file: Path) -> str:
     except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
         reason = getattr(error, "strerror", None) or error
         return f"{show(str(file))} cannot be read: {reason}"
-
-
-def _oddities(config: Config) -> Iterator[str]:
-    """Find values that are computable but probably unintended."""
-    cable, experiment, estimation = config.cable, config.experiment, config.estimation
-    young, std = cable.youngs_modulus, experiment.measurement.std
-    n, element = config.model.n, config.model.element
-    if young is not None and young < 1.0e4:
-        yield f"youngs_modulus {young:g} Pa is softer than any cable: in pascal?"
-    if cable.mass is None:
-        yield (
-            f"cable.mass is not declared: the first stages assume {cable.prior_mass:.3g} kg (a "
-            "solid cable of this diameter); the batch fit then estimates it from the force readings"
-        )
-    spans = [math.dist(pose.start, pose.end) for pose in experiment.poses if pose.end is not None]
-    if spans and 0.0 < 50.0 * max(spans) < cable.length:
-        yield (
-            f"the cable is {cable.length:g} m long, but its ends are never more than "
-            f"{max(spans):g} m apart: all in metres?"
-        )
-    if math.hypot(*experiment.gravity) > 30.0:  # Jupiter has 25
-        yield f"gravity is {math.hypot(*experiment.gravity):g} m/s^2, on Earth 9.81: in m/s^2?"
-    if std is not None and std > 0.02 * cable.length:
-        yield f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?"
-    if n is not None and n < _COARSE[ELEMENTS[element].order]:
-        yield (
-            f"model.n: {counted(n, f'{element} element')}: so coarse that the mesh's own error "
-            "can look like a missing effect. Without model.n the mesh is chosen from the data"
-        )
-    if n is not None and n > _FINE:
-        yield (
-            f"model.n: {counted(n, 'element')} take minutes and much memory; the mesh that is "
-            f"chosen from the data, without model.n, never has more than {_FINE}"
-        )
-    links = estimation.algorithm1_n
-    if estimation.algorithm1_inner == "cobyla" and links > _COBYLA_LINKS:
-        yield (
-            f"estimation.algorithm1_n: COBYLA takes about {(links / 10) ** 2:.0f} s for one shape "
-            f"of {links} links, and the loop needs hundreds; ipopt takes milliseconds"
-        )
-    for key in unused_directions(experiment.boundary.start, experiment.boundary.end):
-        if given := [p.name for p in experiment.poses if getattr(p, key) is not None]:
-            yield f"{key} is not used, the {key.partition('_')[0]} is pinned: {', '.join(given)}"
 
 
 def _impossible_tolerances(experiment: Experiment, length: float) -> Iterator[ConfigProblem]:

@@ -145,6 +145,8 @@ class Axes(NamedTuple):
     unit: str
 
 
+# Gravity on Earth [m/s^2].
+EARTH = 9.81
 # Keyed by the number of gravity's components.
 _TURNED, _FRAME = "[rad], continuous along the cable", "[qx, qy, qz, qw]"
 AXES = {

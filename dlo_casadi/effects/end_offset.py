@@ -35,7 +35,7 @@ class EndOffset(BoundaryEffect):
             return super().impossible(setup)
         return (
             "it moves the end fixture, and the end is free. "
-            "Try: experiment.boundary, with the end pinned or clamped"
+            "Try: experiment.boundary, with an end that is held: pinned, swivel, clamped or slide"
         )
 
     def conditions(self, ends: EndConditions, params: Params) -> EndConditions:

@@ -36,12 +36,13 @@ class Conclusion(NamedTuple):
 
 def verdict_lines(outcome: Outcome) -> list[str]:
     """Verdict and all findings of the diagnosis, in sentences."""
-    return [f"Verdict: {'. '.join(conclusion_of(outcome))}", *details(outcome)]
+    verdict = f"Verdict: {'. '.join(conclusion_of(outcome))}"
+    return [verdict, *(f"  {text}" for text in details(outcome))]
 
 
 def details(outcome: Outcome) -> list[str]:
     """Findings beside the verdict."""
-    return [f"  {text}" for text in said_of(outcome, FINDINGS)]
+    return [*said_of(outcome, FINDINGS)]
 
 
 def conclusion_of(outcome: Outcome) -> Conclusion:
@@ -72,7 +73,6 @@ def _fitted_alone(outcome: Outcome) -> bool:
 
 # Word, sentence, and where both apply.
 CONCLUSIONS: tuple[tuple[str, str, Callable[[Outcome], object]], ...] = (
-    ("fit failed", "{doubt}.", lambda x: x.doubts and x.fit.failed),
     ("unexplained", "{doubt}.", lambda x: x.doubts),
     ("not diagnosed", "Nothing was looked for in the residual.", lambda x: x.verdict is None),
     (
@@ -144,7 +144,7 @@ def _added(outcome: Outcome) -> Iterator[Values]:
             )
         }
         if rivals := " or ".join(effect.indistinguishable_from):
-            yield {"line": f"  These data cannot tell it from {rivals}."}
+            yield {"line": f"These data cannot tell it from {rivals}."}
 
 
 def _wider(one: Ends, other: Ends) -> bool:

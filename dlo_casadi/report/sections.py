@@ -108,10 +108,10 @@ class Section:
 def _verdict(outcome: Outcome) -> dict[str, Any]:
     found = findings.conclusion_of(outcome)
     return {
-        "verdict": "unexplained" if outcome.doubts else outcome.verdict or "off",
+        "verdict": outcome.verdict or "off",
         "verdict_word": words.sentence(found.word),
         "sentence": found.sentence,
-        "details": [line.strip() for line in findings.details(outcome)],
+        "details": findings.details(outcome),
         "tiles": tiles(outcome),
     }
 

@@ -20,13 +20,6 @@ NOISE_ALONE = "noise alone"
 ON_BRANCH = "on the measured branch"
 # Order of candidates; the score alone does not show how good a refit is.
 CANDIDATE_ORDER = "first those that were refitted, by log likelihood, the rest by score"
-STAGE_LABELS: dict[StageName, str] = {
-    "initial": "initial guess",
-    "stiffness_only": "stiffness alone",
-    "algorithm1": "Algorithm 1",
-    "batch": "declared model, fitted",
-    "closed": "with added effects",
-}
 
 
 # ---- numbers -----------------------------------------------------------------------------------
@@ -91,7 +84,7 @@ def label_of(stage: Stage, outcome: Outcome) -> str:
     """Label of a stage."""
     if stage.name == "closed" and outcome.effects:
         return "with " + " and ".join(map(str, outcome.effects))
-    return STAGE_LABELS[stage.name]
+    return stage.label
 
 
 def directions(outcome: Outcome) -> tuple[str, ...]:
@@ -143,7 +136,7 @@ def all_warnings(outcome: Outcome) -> list[str]:
             )
         ]
         if any(missing):
-            lines.append(f"stage {stage.name}: {stage.note or 'some poses could not be predicted'}")
+            lines.append(f"{stage.label}: {stage.note or 'some poses could not be predicted'}")
     for key, estimate in outcome.stages[-1].parameters.items():
         if estimate.at_bound:
             value = f"{estimate.value:.4g} {estimate.unit}".strip()

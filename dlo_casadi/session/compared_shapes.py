@@ -10,6 +10,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Pose
+from dlo_casadi.config.values import EARTH
 from dlo_casadi.model.cable_model import BENDING_STIFFNESS
 from dlo_casadi.session.axes import clamp_axes, exchanges, listed
 from dlo_casadi.session.coarse_fit import Coarse, coarse_fit
@@ -24,9 +25,6 @@ from dlo_casadi.thresholds import (
     NEIGHBOURS_ALIKE,
     UNEXPLAINED,
 )
-
-# Gravity on Earth [m/s^2].
-EARTH = 9.81
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,13 @@ from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
 # Name of the cable's mass among a stage's parameters.
 MASS = "mass"
+STAGE_LABELS: dict[StageName, str] = {
+    "initial": "initial guess",
+    "stiffness_only": "stiffness alone",
+    "algorithm1": "Algorithm 1",
+    "batch": "declared model, fitted",
+    "closed": "with added effects",
+}
 # Stages that a batch fit must not be worse than.
 SIMPLER: tuple[StageName, ...] = ("initial", "stiffness_only")
 
@@ -118,6 +125,11 @@ class Stage(Brief):
     readings_held_out: ReadingErrors = ReadingErrors()
     explains: bool | None = None
     surfaces: tuple[Obstacle, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """Its name in words."""
+        return STAGE_LABELS[self.name]
 
     @property
     def other_branch(self) -> dict[str, BranchShape]:

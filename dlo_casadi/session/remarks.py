@@ -86,9 +86,9 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
     lines = []
     for group in _by_choice(others):
         said = worded(
-            "stage {stage}: {names}: measured in another equilibrium than predicted, {energy}: the "
+            "{stage}: {names}: measured in another equilibrium than predicted, {energy}: the "
             "predicted one is up to {predicted:mm} off, the measured one {measured:mm}; {cure}",
-            stage=stage.name,
+            stage=stage.label,
             names=[*group],
             energy=_energy(group),
             predicted=max(stage.shapes[name].rmse or 0.0 for name in group),
@@ -103,7 +103,7 @@ def branch_warnings(stages: Sequence[Stage]) -> list[str]:
             )
         lines.append(said)
     return lines + [
-        f"stage {stage.name}: {', '.join(group)}: the cable is in another equilibrium than "
+        f"{stage.label}: {', '.join(group)}: the cable is in another equilibrium than "
         f"predicted, {_energy(group)}; fit poses are compared where they are, and "
         f"{_needed(group)}"
         for group in _by_choice(stage.measured_side)
@@ -151,7 +151,7 @@ def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
     least = last.rmse_fit / (1 + 1 / np.sqrt(2 * max(count, 1)))
     return [
         worded(
-            "stage {near.name} comes nearer to the fit poses than stage {last.name}: "
+            '"{near.label}" comes nearer to the fit poses than "{last.label}": '
             "{near.rmse_fit:mm.4g} instead of {last.rmse_fit:mm.4g} RMS",
             near=stage,
             last=last,
@@ -174,7 +174,7 @@ def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> 
     lines, stage = [], stages[-1]
     if fit.failed:
         lines.append(
-            f"the fit of stage {stage.name} has not converged: its numbers are where it stopped, "
+            f"the fit ({stage.label}) has not converged: its numbers are where it stopped, "
             "not a minimum. Try: a bending_stiffness nearer to the truth, more poses, or "
             "rest_shape: straight"
         )
@@ -249,7 +249,7 @@ def _nothing_predicted(stages: Sequence[Stage]) -> list[str]:
         return []
     said = (
         "no pose is predicted from its ends: in all {count} the predicted equilibrium is another "
-        "one than the measured one, {off:mm} RMS off, and stage {nearest.name} comes nearer, "
+        'one than the measured one, {off:mm} RMS off, and "{nearest.label}" comes nearer, '
         "{other:mm}. Try: are start and end of the poses exchanged, or headings off by a turn?"
     )
     return [worded(said, count=len(shown), off=off, nearest=nearest, other=other)]

@@ -272,8 +272,8 @@ def judged(outcome: Outcome) -> Outcome:
     told = (*doubts, *remarks.branch_warnings(stages))
     far = remarks.far_off(stages[-1], outcome.poses, told)
     said += far
+    verdict = "unexplained" if doubts else verdict
     if verdict is not None:
-        verdict = "unexplained" if doubts else verdict
         stages = (*stages[:-1], _marked(stages[-1], verdict != "unexplained"))
     hidden = {} if verdict == "unexplained" else _joined(stages[-1], outcome.if_hidden)
     stages = (*stages[:-1], _if_hidden(stages[-1], hidden))

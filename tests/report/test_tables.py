@@ -116,9 +116,9 @@ def test_a_stage_that_lost_poses_is_a_warning(outcome):
     assert not any("could not be predicted" in line for line in all_warnings(outcome))
     for error in ("rmse_fit", "rmse_held_out"):
         lost = all_warnings(with_last(outcome, **{error: None}))
-        assert "stage batch: some poses could not be predicted" in lost
+        assert "declared model, fitted: some poses could not be predicted" in lost
     lost = all_warnings(with_last(outcome, rmse_fit=None, note="no root"))
-    assert "stage batch: no root" in lost
+    assert "declared model, fitted: no root" in lost
 
 
 def test_nothing_lifts_a_free_tip(outcome):

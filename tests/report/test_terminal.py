@@ -20,6 +20,7 @@ from dlo_casadi.report.tables import describe, stage_rows, unidentified
 from dlo_casadi.report.terminal import plain_table
 from dlo_casadi.report.words import finding_of
 from dlo_casadi.session.pose_shape import BranchShape
+from dlo_casadi.session.run import judged
 from dlo_casadi.session.sentences import said_of
 from dlo_casadi.show.text import plus_minus
 
@@ -195,8 +196,15 @@ def test_what_keeps_a_fit_from_holding_stands_in_the_verdicts_place(outcome):
     off = fit.point.theta + 0.5 * np.eye(problem.unknowns.size)[0]  # ln EI
     point = problem.balanced(replace(fit.point, theta=off))
     stopped = replace(found, fit=replace(fit, point=point, converged=False))
-    assert "Verdict: fit failed. Fit poses" in said(stopped)
-    assert context("verdict", stopped)["verdict_word"] == "Fit failed"
+    # One word in all places, also where nothing was diagnosed.
+    assert "Verdict: unexplained. Fit poses" in said(stopped)
+    undiagnosed = replace(stopped, verdict=None, doubts=())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dlo_casadi.session.remarks.doubts_of", lambda *_: (doubt,))
+        again = judged(undiagnosed)
+    assert report_dict(again)["verdict"] == "unexplained"
+    assert context("verdict", again)["verdict_word"] == "Unexplained"
+    assert "Verdict: unexplained. Fit poses" in said(again)
 
 
 def test_a_score_where_its_test_ends_is_a_bound_and_a_plane_is_no_picture(outcome):

@@ -109,7 +109,8 @@ def test_a_fit_pose_on_the_other_side_is_compared_there_and_named():
     assert {name: side.branch for name, side in stage.measured_side.items()} == {"-0.30": "ccw"}
     # Simulated as the cable turned over on the side where it is higher.
     assert re.search(
-        r"^stage batch: -0.30: .* equilibrium than predicted, with an energy [\d.e-]+ J higher;",
+        r"^declared model, fitted: -0.30: .* equilibrium than predicted, with an energy "
+        r"[\d.e-]+ J higher;",
         said,
     )
     assert said.endswith("needs `branch: ccw`")

@@ -70,7 +70,9 @@ def test_a_pose_measured_on_another_branch_is_named_with_its_error_there():
     assert stage.rmse_fit_measured_branch == pytest.approx(NOISE, rel=0.25)
     assert stage.rmse_held_out_measured_branch == pytest.approx(NOISE, rel=0.35)
     (said,) = branch_warnings([replace(stage, name="batch")])
-    assert said.startswith("stage batch: 0, 2: measured in another equilibrium than predicted")
+    assert said.startswith(
+        "declared model, fitted: 0, 2: measured in another equilibrium than predicted"
+    )
     assert re.search(r"with an energy up to [\d.]+ J higher: .*`branch: cw` chooses it", said)
     lower = {
         name: replace(shape, measured_branch=replace(shape.measured_branch, above=-0.01))
@@ -177,7 +179,7 @@ def test_where_no_pose_is_predicted_a_simpler_model_may_do_better(nearer, doubte
     assert len(doubts) == doubted
     for text in doubts:
         assert text.startswith("no pose is predicted from its ends: in all 3 the predicted")
-        assert f"{1e3 * stage.rmse_fit:.3g} mm RMS off, and stage initial comes nearer" in text
+        assert f'{1e3 * stage.rmse_fit:.3g} mm RMS off, and "initial guess" comes nearer' in text
 
 
 def test_a_fit_is_no_worse_than_the_stiffness_alone():
@@ -194,7 +196,9 @@ def test_a_fit_is_no_worse_than_the_stiffness_alone():
     stage, doubts = judged(poses, stopped)
     assert "has not converged" in doubts[0]
     (said,) = worse_than_simpler([stages[0], stage])
-    assert said.startswith("stage initial comes nearer to the fit poses than stage batch")
+    assert said.startswith(
+        '"initial guess" comes nearer to the fit poses than "declared model, fitted"'
+    )
     again = not_worse(stopped, [stages[0], stage])
     assert again.point.objective < 1.01 * fit.point.objective
     assert again.converged
