@@ -109,6 +109,22 @@ class VisionError(MeasurementError):
     """A photograph in which the board or the cable cannot be found."""
 
 
+class MotionError(DloError):
+    """A motion that cannot be computed.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what to try.
+    t : float [s]
+        When.
+    """
+
+    def __init__(self, message: str, t: float) -> None:
+        super().__init__(message)
+        self.t = t
+
+
 class EquilibriumError(DloError):
     """A pose without a (stable) equilibrium.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dlo_casadi.effects import EFFECTS, NUISANCES
+from dlo_casadi.effects import EFFECTS, IN_MOTION, NUISANCES
 
 PACKAGE = Path(__file__).parents[1] / "dlo_casadi"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -24,11 +24,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "effects": {"rod"},
     "model": {"rod", "effects"},
     "equilibrium": {"rod", "effects", "model", "runtime"},
+    "motion": MECHANICS,
     "config": MECHANICS,
     "io": {*MECHANICS, "config"},
     "codegen": {*MECHANICS, "config", "io"},
     "export": {*MECHANICS, "io"},
-    "cable": {*MECHANICS, "config", "io", "codegen", "show", "export", "runtime"},
+    "cable": {*MECHANICS, "motion", "config", "io", "codegen", "show", "export", "runtime"},
     "vision": set(),
     "sensing": {*MECHANICS, "vision"},
     "estimation": {*MECHANICS, "sensing", "runtime"},
@@ -138,7 +139,7 @@ def test_a_library_with_one_place(library, room):
 
 def test_effects_are_named_by_themselves_alone():
     """A new effect is its file and one line in EFFECTS."""
-    kinds = {**EFFECTS, **NUISANCES}
+    kinds = {**EFFECTS, **IN_MOTION, **NUISANCES}
     names = {*kinds, *(kind.__name__ for kind in kinds.values())}
     for file in FILES:
         if room_of(file) == "effects":

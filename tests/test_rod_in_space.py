@@ -21,7 +21,8 @@ from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
-from dlo_casadi.rod.node import Frame, same_sign
+from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.quaternions import same_sign
 
 LENGTH, EI, GJ = 0.8, 0.02, 0.015
 DOWN = (0.0, 0.0, -9.81)

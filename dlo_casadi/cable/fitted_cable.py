@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import CableCurve, EstimatedCable
+from dlo_casadi.cable.estimate import CableCurve
 from dlo_casadi.cable.held import all_asked, among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
+from dlo_casadi.cable.motion import POINTS, CableInMotion, ShapeInMotion
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.cable.placing import Aim, Placing, placed
 from dlo_casadi.config import Clip, Obstacle, Pose
@@ -36,12 +37,9 @@ from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.runtime.progress import Progress
 from dlo_casadi.show.text import bend_radius, html_table
 
-# Number of points of a shape.
-_POINTS = 101
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FittedCable(EstimatedCable):
+class FittedCable(CableInMotion):
     """A fitted cable: its model with the fitted values and their uncertainty.
 
     Made by `Result.cable`, by `dlo_casadi.load` from a folder of results, or without a fit by
@@ -221,7 +219,7 @@ class FittedCable(EstimatedCable):
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class Shape(ShapeInMotion):
     """A fitted cable in one pose; a notebook shows a short table, `print` the same as text.
 
     Parameters
@@ -277,7 +275,7 @@ class Shape:
     @property
     def s(self) -> FloatArray:
         """Arc lengths (101,) [m] of `points` and `frames`, evenly spaced from start to end."""
-        return np.linspace(0.0, self.curve.length, _POINTS)
+        return np.linspace(0.0, self.curve.length, POINTS)
 
     @cached_property
     def points(self) -> FloatArray:

@@ -1,6 +1,7 @@
 """Effects: the explicit list of what a configuration or the diagnosis may name."""
 
 from dlo_casadi.effects.across_gravity import GravityTilt, SideLoad
+from dlo_casadi.effects.acting import MassAt, PointForceAt, SpringAt
 from dlo_casadi.effects.bending_anisotropy import BendingAnisotropy
 from dlo_casadi.effects.bending_softening import BendingSoftening
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
@@ -8,6 +9,7 @@ from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle, ClampCompliance, ClampRotation
 from dlo_casadi.effects.clips import ClipAngle, ClipOffset, ClipSlip
 from dlo_casadi.effects.contact import ContactPlane, ObstacleOffset
+from dlo_casadi.effects.damping import AirDrag, Damping, PinFriction, ViscousDrag
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
     ContactEffect,
@@ -17,10 +19,8 @@ from dlo_casadi.effects.effect import (
     Kinematics,
     Load,
     MeasurementEffect,
-    PointForceAt,
     PointLoad,
     SectionLaw,
-    SpringAt,
     StateEffect,
     Viewpoint,
 )
@@ -36,7 +36,7 @@ from dlo_casadi.effects.point_force import PointForce, UnknownPull
 from dlo_casadi.effects.registry import Registry
 from dlo_casadi.effects.rest_shape import PlasticSet, RestCurvatureDrift
 from dlo_casadi.effects.standoff_error import StandoffError
-from dlo_casadi.effects.stiffness import StiffnessGradient, StiffSection
+from dlo_casadi.effects.stiffness import DynamicStiffness, StiffnessGradient, StiffSection
 from dlo_casadi.effects.tether import Tether
 from dlo_casadi.rod.element import Cell
 
@@ -47,10 +47,12 @@ __all__ = [
     "CableData",
     "Cell",
     "ContactEffect",
+    "Damping",
     "Effect",
     "EndConditions",
     "Kinematics",
     "Load",
+    "MassAt",
     "MeasurementEffect",
     "Parameter",
     "PointForceAt",
@@ -96,6 +98,11 @@ EFFECTS = Registry(
     )
 )
 
+# Effects that still shapes do not know.
+IN_MOTION: dict[str, type[Effect]] = {
+    kind.name: kind for kind in (AirDrag, ViscousDrag, PinFriction, DynamicStiffness)
+}
+
 # Effect that estimates the mass if it is not declared.
 UNKNOWN_MASS: type[Effect] = MassError
 # Effect whose parameter moves a clip along the cable, for derivatives by the clip's arc length.
@@ -113,4 +120,4 @@ def random_effects() -> dict[str, type[Effect]]:
 
 def known_effect(name: str) -> type[Effect] | None:
     """The effect or nuisance of that name."""
-    return EFFECTS.get(name) or NUISANCES.get(name)
+    return EFFECTS.get(name) or IN_MOTION.get(name) or NUISANCES.get(name)

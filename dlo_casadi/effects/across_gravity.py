@@ -9,7 +9,7 @@ import numpy as np
 
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import Load, Params
-from dlo_casadi.rod.node import rotated, rotation
+from dlo_casadi.rod.quaternions import rotated, rotation
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,9 @@ class CableData:
         True if no rest curvature is fitted.
     torsional_stiffness : float [N m^2], optional
         Crude prior of GJ. A cable that has one is in space; others stay in a plane.
+    damping_time : float [s], optional
+        First guess of tau: M = EI (kappa - kappa_0 + tau dkappa/dt), the same for the twist. A
+        cable that has one has it as a parameter; it has no effect at rest.
     """
 
     length: float
@@ -44,6 +47,7 @@ class CableData:
     name: str = "cable"
     straight: bool = False
     torsional_stiffness: float | None = None
+    damping_time: float | None = None
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -184,6 +188,8 @@ class Setup:
         Height of the first pose's start fixture, along the vertical from the origin.
     resting : float, optional [m]
         Lowest height that several shapes have in common; absent if there is none.
+    moves : bool
+        Whether there are recordings of the moving cable.
     """
 
     cable: CableData
@@ -203,6 +209,7 @@ class Setup:
     obstacles: int = 0
     level: float = 0.0
     resting: float | None = None
+    moves: bool = False
 
     def __post_init__(self) -> None:
         for name in ("start", "end"):

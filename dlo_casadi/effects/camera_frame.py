@@ -6,7 +6,7 @@ import casadi as ca
 
 from dlo_casadi.effects.cable import CableData, Parameter
 from dlo_casadi.effects.effect import MeasurementEffect, Params, Viewpoint, vector
-from dlo_casadi.rod.node import rotated, rotation
+from dlo_casadi.rod.quaternions import rotated, rotation
 
 _ROTATIONS = ("rotation_x", "rotation_y", "rotation_z")
 _TRANSLATIONS = ("translation_x", "translation_y", "translation_z")

@@ -7,7 +7,7 @@ import casadi as ca
 
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.effect import BoundaryEffect, EndConditions, Fitted, Params
-from dlo_casadi.rod.node import quaternion_product, rotation
+from dlo_casadi.rod.quaternions import quaternion_product, rotation
 
 
 @dataclass(frozen=True)

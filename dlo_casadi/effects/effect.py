@@ -1,4 +1,4 @@
-"""The contract of an effect and its seven kinds.
+"""The contract of an effect and its kinds.
 
 An effect declares parameters and belongs to one kind. It sees the curve, never the solver's
 coordinates; it creates no symbol, keeps no state and calls no solver. It also states where it
@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.effects.acting import MassAt, PointForceAt, SpringAt
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.errors import counted
 from dlo_casadi.rod.element import Cell
@@ -31,37 +32,6 @@ PLACES = np.linspace(0.06, 0.94, 23)
 def vector(params: Params, prefix: str) -> ca.SX:
     """Vector (dimension,) of the parameters `prefix`x, `prefix`y and, in space, `prefix`z."""
     return ca.vertcat(*(params[prefix + axis] for axis in "xyz" if prefix + axis in params))
-
-
-@dataclass(frozen=True)
-class PointForceAt:
-    """A dead force (dimension,) [N] on the cable at the arc length `position` [m]."""
-
-    force: ca.SX
-    position: ca.SX
-
-
-@dataclass(frozen=True)
-class SpringAt:
-    """A spring on the cable at the arc length `position` [m]; its place is y (dimension,) [m].
-
-        V(y) = stiffness |y|^2 / 2 - force . y + constant               [J]
-
-    with the stiffness k [N/m] and the force (dimension,) [N] at y = 0, which is k times the anchor.
-    """
-
-    stiffness: ca.SX
-    force: ca.SX
-    constant: ca.SX
-    position: ca.SX
-
-    def energy(self, place: ca.SX) -> ca.SX:
-        """Energy [J] at a place."""
-        return self.stiffness * ca.sumsqr(place) / 2 - ca.dot(self.force, place) + self.constant
-
-    def on_cable(self, place: ca.SX) -> ca.SX:
-        """Force (dimension,) [N] on the cable at a place: minus the gradient of the energy."""
-        return self.force - self.stiffness * place
 
 
 @dataclass(frozen=True)
@@ -256,6 +226,10 @@ class SectionLaw(Effect):
         """Bending stiffness B (2, 2) [N m^2] of a cable in space about its axes y and z."""
         return stiffness
 
+    def dynamic(self, params: Params) -> ca.SX | float:
+        """Factor on the stiffness against changes from the shape at rest, in motion alone."""
+        return 1.0
+
 
 class Kinematics(Effect):
     """Kind `kinematics`: true length and axial strain."""
@@ -311,6 +285,14 @@ class Load(Effect):
     def springs(self, params: Params) -> tuple[SpringAt, ...]:
         """Springs at single places of the cable."""
         return ()
+
+    def masses(self, params: Params) -> tuple[MassAt, ...]:
+        """Compact masses on the cable: their inertia; their weights are among `forces`."""
+        return ()
+
+    def mass_per_length(self, s: ca.SX, cable: CableData, params: Params) -> ca.SX | float:
+        """Mass per length [kg/m] at s in addition to the declared one; its weight: `resultant`."""
+        return 0.0
 
 
 class PointLoad(Load):

@@ -5,8 +5,9 @@ from math import inf
 import casadi as ca
 import numpy as np
 
+from dlo_casadi.effects.acting import MassAt, PointForceAt
 from dlo_casadi.effects.cable import CableData, Parameter
-from dlo_casadi.effects.effect import Fitted, Params, PointForceAt, PointLoad
+from dlo_casadi.effects.effect import Fitted, Params, PointLoad
 from dlo_casadi.thresholds import ALONG_GRAVITY
 
 
@@ -41,6 +42,10 @@ class LumpedMass(PointLoad):
     def forces(self, gravity: ca.SX, params: Params) -> tuple[PointForceAt, ...]:
         """Weight of the mass."""
         return (PointForceAt(params["mass"] * gravity, params["position"]),)
+
+    def masses(self, params: Params) -> tuple[MassAt, ...]:
+        """The mass itself."""
+        return (MassAt(params["mass"], params["position"]),)
 
     def may_be(self, found: Fitted) -> bool:
         """A dead force may be a weight if it is along gravity, within two standard deviations."""

@@ -42,3 +42,7 @@ class MassError(Load):
     def resultant(self, s: ca.SX, gravity: ca.SX, cable: CableData, params: Params) -> ca.SX:
         """Weight of the part beyond s, in addition to the declared one."""
         return (params["factor"] - 1) * cable.mass * gravity * (1 - s / cable.length)
+
+    def mass_per_length(self, s: ca.SX, cable: CableData, params: Params) -> ca.SX:
+        """Its inertia, likewise."""
+        return (params["factor"] - 1) * cable.mass / cable.length

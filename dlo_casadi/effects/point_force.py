@@ -4,8 +4,9 @@ from math import inf
 
 import casadi as ca
 
+from dlo_casadi.effects.acting import PointForceAt
 from dlo_casadi.effects.cable import CableData, Parameter
-from dlo_casadi.effects.effect import Params, PointForceAt, PointLoad, vector
+from dlo_casadi.effects.effect import Params, PointLoad, vector
 
 
 class PointForce(PointLoad):

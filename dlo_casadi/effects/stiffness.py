@@ -97,3 +97,30 @@ class StiffSection(SectionLaw):
         covered = ramp(high - start) - ramp(low - start) - ramp(high - end) + ramp(low - end)
         share = covered / cell.width
         return 1 / (1 + share * (1 / params["factor"] - 1))
+
+
+class DynamicStiffness(SectionLaw):
+    """A cable that is stiffer in motion than at rest: polymers relax, strands stick.
+
+        M = M_rest + factor EI (kappa - kappa_rest)
+
+    for changes from the shape at rest, with the moment M_rest and the curvature there; GJ alike.
+    Still shapes do not know it.
+
+    Parameters
+    ----------
+    factor : scalar, > 0
+        Vanishes at 1.
+    """
+
+    name = "dynamic_stiffness"
+    declared = (Parameter("factor", nominal=1.0, scale=0.2, lower=0.2, upper=10.0),)
+
+    @classmethod
+    def applies(cls, setup: Setup) -> bool:
+        """True if there are recordings of the moving cable."""
+        return super().applies(setup) and setup.moves
+
+    def dynamic(self, params: Params) -> ca.SX:
+        """The factor."""
+        return params["factor"]

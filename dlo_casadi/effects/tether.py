@@ -5,8 +5,9 @@ from collections.abc import Mapping
 
 import casadi as ca
 
+from dlo_casadi.effects.acting import SpringAt
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
-from dlo_casadi.effects.effect import Effect, Params, PointLoad, SpringAt, vector
+from dlo_casadi.effects.effect import Effect, Params, PointLoad, vector
 
 # Largest distance of an anchor from the board's origin, in lengths of the cable: its force then
 # changes by a tenth in direction and size if the cable moves by its own length.

@@ -10,7 +10,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from dlo_casadi.effects.acting import MassAt, PointForceAt, SpringAt
 from dlo_casadi.effects.cable import CableData, Parameter, Setup
+from dlo_casadi.effects.damping import Damping
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
     ContactEffect,
@@ -19,9 +21,7 @@ from dlo_casadi.effects.effect import (
     Kinematics,
     Load,
     MeasurementEffect,
-    PointForceAt,
     SectionLaw,
-    SpringAt,
     StateEffect,
     Viewpoint,
 )
@@ -122,6 +122,7 @@ class Trial:
             if d == 3:
                 stiff = cable.bending_stiffness * ca.SX.eye(2)
                 yield _Law("bending", (stiff, params), _shaped(2, 2))
+            yield _Law("dynamic", (params,), _number)
         if isinstance(effect, Kinematics):
             yield _Law("stretch", (cable, params), _number)
             yield _Law("compliance", (params,), _number)
@@ -131,6 +132,13 @@ class Trial:
             yield _Law("forces", (gravity, params), _items(PointForceAt, {"force": d}))
             springs = _items(SpringAt, {"force": d}, effect.n_springs)
             yield _Law("springs", (params,), springs)
+            yield _Law("masses", (params,), _items(MassAt, {}))
+            yield _Law("mass_per_length", (sym("s", 0.4), cable, params), _number)
+        if isinstance(effect, Damping):
+            velocity, tangent = sym("velocity", np.zeros(d)), sym("tangent", np.eye(d)[0])
+            yield _Law("density", (velocity, tangent, cable, params), _number)
+            turning = sym("turning", np.zeros(self.node.increment))
+            yield _Law("at_pin", (turning, params), _number)
         if isinstance(effect, BoundaryEffect):
             frames = (self.node.identity, self.node.identity)
             first, last = (sym(name, x) for name, x in zip(("first", "last"), frames, strict=True))
@@ -350,7 +358,7 @@ def _items(
     """A tuple of items whose attributes have these sizes, all others 1."""
 
     def parts(result: Any) -> Iterator[Any]:
-        method = {PointForceAt: "forces", SpringAt: "springs"}[item]
+        method = {PointForceAt: "forces", SpringAt: "springs", MassAt: "masses"}[item]
         _check_tuple(method, result, item)
         if count is not None and len(result) != count:
             raise Mistake(

@@ -24,7 +24,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.rod.chain import Chain
-from dlo_casadi.rod.node import same_sign
+from dlo_casadi.rod.quaternions import same_sign
 
 Clamps = tuple[FloatArray | None, FloatArray | None]
 Turned = tuple[Rotation | None, Rotation | None]

@@ -11,7 +11,8 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.clips import HeldClip
-from dlo_casadi.rod.node import Frame, Heading, Node, quaternion_product
+from dlo_casadi.rod.node import Frame, Heading, Node
+from dlo_casadi.rod.quaternions import quaternion_product
 
 Branch = Literal["ccw", "cw"]
 # In a session, a pose may also continue the pose before it, see `solve.continued`.

@@ -33,7 +33,7 @@ STIFFNESS_PRIOR_STD = float(np.log(1e3))
 STIFFNESS_RATIO_STD = float(np.log(3.0))
 # Prior std of the end roll [rad]: the twist at which the cable was gripped is unknown.
 ROLL_STD = 1.0
-TORSIONAL_STIFFNESS = "torsional_stiffness"
+TORSIONAL_STIFFNESS, DAMPING_TIME = "torsional_stiffness", "damping_time"
 STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
 # Number of elements of `CableModel.coarse`, and their smallest mean number between two clips.
 COARSE_MESH, COARSE_SPAN = 10, 6
@@ -44,9 +44,8 @@ VIEWPOINT_SIZE = 3
 
 
 def _stiffness(name: str, nominal: float) -> Parameter:
-    lower, upper = STIFFNESS_BOUNDS
-    std = STIFFNESS_PRIOR_STD
-    return Parameter(name, "N m^2", nominal, lower=lower, upper=upper, prior_std=std, log=True)
+    bounds, std = STIFFNESS_BOUNDS, STIFFNESS_PRIOR_STD
+    return Parameter(name, "N m^2", nominal, 1.0, *bounds, prior_std=std, log=True)
 
 
 @dataclass(frozen=True)
@@ -108,9 +107,8 @@ class CableModel:
         if self.end.slides and (self.clips or self.surfaces or not self.chain.kind.smooth):
             raise DloError("a cable that slides through its end has no clips, obstacles or links")
         every = (*self.effects, *self.random)
-        labels = [effect.label for effect in every]
         for effect in every:
-            if labels.count(effect.label) > 1:
+            if [other.label for other in every].count(effect.label) > 1:
                 raise DloError(
                     f"two effects are both labelled {effect.label!r}; give one another label, "
                     f"e.g. {type(effect).__name__}(label='{effect.label}_2')"
@@ -194,6 +192,8 @@ class CableModel:
                 std = self.priors.get(END_ROLL, ROLL_STD)
                 roll = Parameter(END_ROLL, "rad", scale=0.1, lower=-9.0, upper=9.0, prior_std=std)
                 listed.append(roll)
+        if self.cable.damping_time is not None:
+            listed.append(Parameter(DAMPING_TIME, "s", self.cable.damping_time, 0.01, 0.0, 10.0))
         for effect in self.effects:
             for parameter in effect.parameters(self.cable):
                 name = f"{effect.label}.{parameter.name}"

@@ -18,7 +18,8 @@ from dlo_casadi.model.clips import BESIDE, ClipLoad, nearest_nodes
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.element import LAYOUT_SIZE
-from dlo_casadi.rod.node import Node, conjugate, quaternion_product
+from dlo_casadi.rod.node import Node
+from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 from dlo_casadi.rod.supports import SupportKind
 
 # No change of segments or nodes, which broadcasts.

@@ -15,7 +15,7 @@ from dlo_casadi.model.clipped import moved_rest
 from dlo_casadi.model.clips import clip_size
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
-from dlo_casadi.rod.node import conjugate, quaternion_product
+from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,8 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.rod.element import Condensed, Element, Layout, Section, Segment
-from dlo_casadi.rod.node import (
-    SINE,
-    Frame,
-    Heading,
-    conjugate,
-    quaternion_product,
-    rotated,
-    series,
-    traced,
-)
+from dlo_casadi.rod.node import Frame, Heading
+from dlo_casadi.rod.quaternions import SINE, conjugate, quaternion_product, rotated, series, traced
 
 # Gauss points on [-1/2, 1/2] at which bend and twist are compared with the rest shape.
 _GAUSS = 0.5 / np.sqrt(3)

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.rod.node import Node, conjugate, quaternion_product, rotated
+from dlo_casadi.rod.node import Node
 from dlo_casadi.rod.quantities import quantity_of
+from dlo_casadi.rod.quaternions import conjugate, quaternion_product, rotated
 from dlo_casadi.rod.supports import SupportKind
 
 # Forces and moments of the cable on the fixtures of its ends, in the order of `Assembly.reactions`.

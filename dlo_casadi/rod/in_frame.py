@@ -27,7 +27,7 @@ import casadi as ca
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.rod.element import Element
 from dlo_casadi.rod.elements import inverse_of
-from dlo_casadi.rod.node import conjugate, quaternion_product, traced
+from dlo_casadi.rod.quaternions import conjugate, quaternion_product, traced
 
 # (rotation vector phi (3,), internal unknowns, forces (3, m) [N]) -> energy of a segment [J].
 Energy = Callable[[ca.SX, ca.SX, ca.SX], ca.SX]

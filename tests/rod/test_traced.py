@@ -6,7 +6,8 @@ import pytest
 
 from dlo_casadi.rod import elements, in_frame, node
 from dlo_casadi.rod.elements import Helix
-from dlo_casadi.rod.node import Frame, rotation, traced
+from dlo_casadi.rod.node import Frame
+from dlo_casadi.rod.quaternions import rotation, traced
 
 
 def random(*sizes):

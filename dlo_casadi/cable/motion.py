@@ -1,0 +1,245 @@
+"""A fitted cable in motion: its modes in a shape, and its way under moving fixtures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.estimate import EstimatedCable
+from dlo_casadi.cable.held import held_pose
+from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.motion.modes import damped_modes, displacements
+from dlo_casadi.motion.path import FixturePath
+from dlo_casadi.motion.system import MovingCable, State
+from dlo_casadi.motion.trajectory import TOLERANCE, Way, way_of
+
+# Number of points along a cable.
+POINTS = 101
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Small motions of a cable about a shape, the slowest first.
+
+    Parameters
+    ----------
+    frequencies : (M,) [Hz]
+        Natural ones |s| / (2 pi) of exp(s t); those that are seen are sqrt(1 - zeta^2) times that.
+    damping_ratios : (M,)
+        zeta = -Re s / |s|; above 1 a mode does not swing.
+    shapes : (M, K, d)
+        Displacements of the points of the shape; the largest is 1.
+    points : (K, d) [m]
+        The shape.
+    """
+
+    frequencies: FloatArray
+    damping_ratios: FloatArray
+    shapes: FloatArray
+    points: FloatArray
+
+    def __repr__(self) -> str:
+        rows = zip(self.frequencies.tolist(), self.damping_ratios.tolist(), strict=True)
+        return "\n".join(f"{f:10.4g} Hz  damping ratio {zeta:.3g}" for f, zeta in rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A cable in motion.
+
+    Parameters
+    ----------
+    cable : EstimatedCable
+    t : (T,) [s]
+    way : Way
+        The states at the ends of all steps.
+    """
+
+    cable: EstimatedCable
+    t: FloatArray
+    way: Way
+
+    @property
+    def s(self) -> FloatArray:
+        """Arc lengths (101,) [m] of `points`, evenly spaced."""
+        return np.linspace(0.0, self.cable.length, POINTS)
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Points (T, 101, d) [m] along the cable, at `s`."""
+        return self.at(self.s)
+
+    def at(self, s: ArrayLike) -> FloatArray:
+        """Points (T, K, d) [m] at arc lengths s (K,) [m]."""
+        return self.way.points(self.t, np.atleast_1d(np.asarray(s, dtype=float)))
+
+    @cached_property
+    def start_force(self) -> FloatArray:
+        """Force (T, d) [N] of the cable on whatever holds its start."""
+        return self.way.at(self.t, self.way.forces[0])
+
+    @cached_property
+    def end_force(self) -> FloatArray:
+        """Force (T, d) [N] of the cable on whatever holds its end; zero at a free end."""
+        return self.way.at(self.t, self.way.forces[1])
+
+    @cached_property
+    def energy(self) -> FloatArray:
+        """Kinetic and potential energy (T,) [J]."""
+        return self.way.at(self.t, self.way.energy)
+
+
+class ShapeInMotion:
+    """Of a shape what concerns motions about it."""
+
+    cable: EstimatedCable
+    pose: HeldPose
+    equilibrium: Equilibrium
+
+    def modes(self, count: int = 6) -> Modes:
+        """Small motions about the shape, with the fixtures at rest.
+
+        Raises
+        ------
+        DloError
+            If the mesh has fewer modes, or if motion does not know a part of the cable.
+        """
+        if not isinstance(count, int | np.integer) or count < 1:
+            raise DloError(f"modes: a number of modes belongs here, found {count!r}")
+        moving = moving_cable(self.cable)
+        fixtures = moving.fixtures(self.pose.vector)
+        state = moving.at_rest(self.equilibrium, fixtures)
+        roots, vectors = damped_modes(moving, state, fixtures, int(count))
+        sizes = np.abs(roots)
+        s = np.linspace(0.0, self.cable.length, POINTS)
+        points, moved = displacements(moving, state, vectors, s)
+        zeta = np.divide(-roots.real, sizes, out=np.zeros_like(sizes), where=sizes > 0)
+        return Modes(sizes / (2 * np.pi), zeta, moved, points)
+
+
+class CableInMotion(EstimatedCable):
+    """A fitted cable that moves."""
+
+    def simulate(
+        self,
+        t: ArrayLike,
+        *,
+        start: ArrayLike | None = None,
+        end: ArrayLike | None = None,
+        start_heading: ArrayLike | None = None,
+        end_heading: ArrayLike | None = None,
+        start_orientation: ArrayLike | None = None,
+        end_orientation: ArrayLike | None = None,
+        begins: ShapeInMotion | Motion | None = None,
+        tolerance: float = TOLERANCE,
+    ) -> Motion:
+        """The motion of the cable under moving fixtures, from rest.
+
+        Parameters
+        ----------
+        t : (T,) [s]
+            Times at which the motion is wanted, in order; it begins at the first one. Steps between
+            them are chosen by their error.
+        start, end : (d,) or (T, d) [m]
+            Places of the fixtures, smooth between the times; otherwise as in `solve`.
+        start_heading, end_heading : float or (T,) [rad]
+        start_orientation, end_orientation : (4,) or (T, 4)
+        begins : Shape or Motion, optional
+            The shape from which the cable is let go, with no velocity: of this cable or of another
+            one of the same length, held in any way. Or a motion that is continued from its last
+            state. By default the equilibrium at the first instant.
+        tolerance : float
+            Largest error of the places in one step over the length.
+
+        Raises
+        ------
+        MotionError
+            If a step has no solution, e.g. if an end is torn out of reach; it says when.
+        EquilibriumError
+            If the cable has no shape at the first instant.
+        DloError
+            If times or fixtures are no such arrays, or if motion does not know a part of the cable.
+        """
+        times = _times(t)
+        node = self.model.node
+        asked: dict[str, Any] = {"start": start, "end": end}
+        asked |= {"start_heading": start_heading, "end_heading": end_heading}
+        asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
+        rows = {key: _rows(key, x, len(times)) for key, x in asked.items() if x is not None}
+        first = {key: (x[0] if x.ndim > 1 else x) for key, x in rows.items()}
+        given = dict.fromkeys((*asked, "turns", "branch", "clips", "end_tension"))
+        numbers = {k: float(x[0]) if k.endswith("heading") else x for k, x in first.items()}
+        pose = held_pose(self.model, self.metadata.fixtures, {**given, "turns": 0.0, **numbers})
+        direction = node.direction
+        moving = {key.replace(direction, "frame"): x for key, x in rows.items() if x.ndim > 1}
+        path = FixturePath.of(pose, times, moving)
+        cable = moving_cable(self)
+        state = _begun(self, cable, pose, begins)
+        way = way_of(cable, state, path, (times[0], times[-1]), tolerance)
+        return Motion(self, times, way)
+
+
+def moving_cable(cable: EstimatedCable, still: FloatArray | None = None) -> MovingCable:
+    """The cable in motion, without effects of the camera."""
+    model, p = cable.model.without_kind(MeasurementEffect, cable.p)
+    return MovingCable(model, p, cable.rest, still)
+
+
+def _begun(
+    cable: EstimatedCable,
+    moving: MovingCable,
+    pose: HeldPose,
+    begins: ShapeInMotion | Motion | None,
+) -> State:
+    """The state from which a motion begins."""
+    if isinstance(begins, Motion):
+        return begins.way.states[-1]
+    if begins is None:
+        found = solve_equilibrium(moving.model, moving.p, moving.rest, pose)
+        return moving.at_rest(found, moving.fixtures(pose.vector))
+    x, places = begins.equilibrium.x, moving.model.chain.places
+    if x.shape[1] != moving.model.node.coordinates:
+        raise DloError("begins: a shape in space cannot move in a plane, nor the reverse")
+    known = np.linspace(0.0, cable.length, len(x))
+    x = moving.model.node.interpolated(places, known, x)
+    force = np.zeros((moving.n_segments, moving.d * (1 + 2 * moving.model.n_springs)))
+    moment = np.zeros(moving.n_moments)
+    return moving.with_places(moving.still_state(x, force, moment), moving.fixtures(pose.vector))
+
+
+def _times(t: ArrayLike) -> FloatArray:
+    """Times in order, at least two."""
+    try:
+        times = np.asarray(t, dtype=float).ravel()
+    except (TypeError, ValueError):
+        raise DloError(f"t: times [s] belong here, found {t!r}") from None
+    if len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise DloError("t: two times [s] or more, each later than the one before, belong here")
+    return times
+
+
+def _rows(key: str, values: ArrayLike, count: int) -> FloatArray:
+    """Values of a fixture, one row (k,) or a row for each time (T, k)."""
+    try:
+        rows = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise DloError(f"{key}: numbers belong here, found {values!r}") from None
+    if key.endswith("heading"):
+        rows = rows[..., None]
+    if rows.ndim not in (1, 2) or (rows.ndim == 2 and len(rows) != count):
+        raise DloError(
+            f"{key}: one row, or one for each of {count} times belongs here, found the shape "
+            f"{np.shape(values)}"
+        )
+    if not np.isfinite(rows).all():
+        raise DloError(f"{key}: not all its numbers are finite")
+    return rows

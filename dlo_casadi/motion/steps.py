@@ -1,0 +1,195 @@
+"""Steps in time: the generalised-alpha method on the nodes' rotations and places.
+
+With body rates and velocities v, accelerations v' in balance at the end of each step, and the
+method's own accelerations a,
+
+    (1 - alpha_m) a_1 + alpha_m a_0 = (1 - alpha_f) v'_1 + alpha_f v'_0
+    X = dt v_0 + dt^2 ((1/2 - beta) a_0 + beta a_1),   x_1 = moved(x_0, X)
+    v_1 = v_0 + dt ((1 - gamma) a_0 + gamma a_1)
+
+Second order, unconditionally stable in linear problems; the highest frequencies decay by `rho` in a
+step. Places that fixtures hold follow them exactly; conditions on places and directions are those
+of the end of the step, with forces as unknowns. An equilibrium of statics stays as it is.
+
+References
+----------
+Chung and Hulbert, J. Appl. Mech. 60 (1993); Arnold and Bruels, Multibody Syst. Dyn. 18 (2007);
+Bruels, Cardona and Arnold, Mech. Mach. Theory 48 (2012).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.motion.system import Fixtures, MovingCable, State
+
+# Factor by which the highest frequencies decay in a step.
+RHO = 0.8
+# Newton's steps in one step of time, and the size [rad, lengths] of the last one.
+NEWTON_STEPS, LAST_STEP = 12, 1e-9
+# Longest step of Newton's method [rad]: farther, the Cayley map is no guide.
+_LONGEST = 1.0
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """Coefficients of the method."""
+
+    alpha_m: float
+    alpha_f: float
+    beta: float
+    gamma: float
+
+    @classmethod
+    def of(cls, rho: float) -> Scheme:
+        """The method by the decay of the highest frequencies."""
+        alpha_m, alpha_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
+        gamma = 0.5 + alpha_f - alpha_m
+        return cls(alpha_m, alpha_f, (gamma + 0.5) ** 2 / 4, gamma)
+
+    @property
+    def error(self) -> float:
+        """Error of the places of a step over dt^3 times the third derivative by time."""
+        return abs((self.alpha_m - self.alpha_f) / 2 + self.beta - 1 / 6)
+
+    def factors(self, dt: float) -> tuple[float, float]:
+        """Derivatives of velocities and accelerations by X."""
+        return self.gamma / (self.beta * dt), (1 - self.alpha_m) / (
+            self.beta * dt**2 * (1 - self.alpha_f)
+        )
+
+
+# Backward Euler: velocities and accelerations of a step need no earlier accelerations.
+FIRST = Scheme(0.0, 0.0, 1.0, 1.0)
+# Step [s] in which only a jump changes velocities, and the change [lengths/s, rad/s] that is one.
+_INSTANT, _JUMP = 1e-8, 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """A state, and the accelerations of the method (n_nodes, increment + dimension)."""
+
+    state: State
+    own: FloatArray
+
+    @property
+    def rates(self) -> FloatArray:
+        """W and v (n_nodes, increment + dimension)."""
+        return np.hstack([self.state.w, self.state.v])
+
+    @property
+    def accelerations(self) -> FloatArray:
+        """Alpha and a likewise."""
+        return np.hstack([self.state.alpha, self.state.a])
+
+    def for_step(self, factor: float) -> Moving:
+        """Continued with a step `factor` times as long: `own` are of a time shifted by a share."""
+        known = self.accelerations
+        return Moving(self.state, known + factor * (self.own - known))
+
+
+def step(
+    cable: MovingCable, before: Moving, fixtures: Fixtures, dt: float, scheme: Scheme
+) -> Moving | None:
+    """One step of time to where `fixtures` are at its end; None if Newton's method fails."""
+    b, held = cable.b, _held(cable)
+    start, rates, known = before.state, before.rates, before.accelerations
+    c = scheme.factors(dt)
+    # Accelerations and rates are affine in X.
+    own_0 = -(rates / dt + (0.5 - scheme.beta) * before.own) / scheme.beta
+    by_x = 1 / (scheme.beta * dt**2)
+
+    def at(moved: FloatArray) -> Moving:
+        own = own_0 + by_x * moved
+        share = (1 - scheme.alpha_m) * own + scheme.alpha_m * before.own
+        changed = (share - scheme.alpha_f * known) / (1 - scheme.alpha_f)
+        velocity = rates + dt * ((1 - scheme.gamma) * before.own + scheme.gamma * own)
+        r, v, a = start.r + moved[:, b:], velocity[:, b:], changed[:, b:]
+        for k, node in held:
+            r[node], v[node], a[node] = (
+                x[k] for x in (fixtures.places, fixtures.velocities, fixtures.accelerations)
+            )
+        x = np.asarray(cable.model.node.moved(start.x, moved[:, :b]))
+        return Moving(State(x, r, velocity[:, :b], v, changed[:, :b], a, force, moment), own)
+
+    # As if the method's accelerations stayed the same.
+    moved = dt * rates + dt**2 / 2 * before.own
+    force, moment = start.force, start.moment
+    length = cable.model.cable.length
+    for _ in range(NEWTON_STEPS):
+        now = at(moved)
+        balance = cable.evaluated(now.state, fixtures, c)
+        solver = balance.stepped(_turns(moved[:, :b]))
+        found = solver.solve(-balance.residual)
+        if solver.singular or not np.isfinite(found).all():
+            return None
+        turned, shifted, pulled, twisted = cable.steps(found)
+        size = max(float(np.abs(turned).max()), float(np.abs(shifted).max()) / length)
+        share = min(1.0, _LONGEST / size) if size else 1.0
+        moved = np.hstack([_composed(moved[:, :b], share * turned), moved[:, b:] + share * shifted])
+        force, moment = force + share * pulled, moment + share * twisted
+        if size < LAST_STEP:
+            return _with_fixtures(at(moved), held, fixtures)
+    return None
+
+
+def _held(cable: MovingCable) -> list[tuple[int, int]]:
+    """Which fixture holds the place of which node."""
+    return [(0, 0), (1, cable.n_nodes - 1)] if cable.model.end.place else [(0, 0)]
+
+
+def _with_fixtures(now: Moving, held: list[tuple[int, int]], fixtures: Fixtures) -> Moving:
+    """Own accelerations of held places are the fixtures'."""
+    own, d = now.own.copy(), fixtures.places.shape[1]
+    for k, node in held:
+        own[node, -d:] = fixtures.accelerations[k]
+    return replace(now, own=own)
+
+
+def _composed(x: FloatArray, turned: FloatArray) -> FloatArray:
+    """The increment x followed by another one, both of the same nodes."""
+    if x.shape[1] == 1:
+        return x + turned
+    total = x + turned + np.cross(x, turned) / 2
+    return np.asarray(total / (1 - (x * turned).sum(axis=1, keepdims=True) / 4))
+
+
+def _turns(x: FloatArray) -> FloatArray:
+    """Derivative (n_nodes, increment, increment) of `_composed` by the second increment at zero."""
+    count, b = x.shape
+    unit = np.broadcast_to(np.eye(b), (count, b, b))
+    if b == 1:
+        return unit
+    around = np.cross(x[:, None, :], np.eye(3)[None]).transpose(0, 2, 1)
+    return np.asarray(unit + around / 2 + x[:, :, None] * x[:, None, :] / 4)
+
+
+def started(
+    cable: MovingCable, state: State, now: Fixtures, later: Fixtures, dt: float
+) -> Moving | None:
+    """A state with its first forces and accelerations, which are means over a step dt.
+
+    `now`, `later`: the fixtures before and after that step. Velocities that contradict those of the
+    fixtures jump as in an impact.
+    """
+    soon = replace(now, places=now.places + _INSTANT * now.velocities)
+    after = step(cable, _without_acceleration(state), soon, _INSTANT, FIRST)
+    if after is None:
+        return None
+    turned, moved = after.state.w - state.w, after.state.v - state.v
+    if max(np.abs(turned).max(), np.abs(moved).max() / cable.model.cable.length) > _JUMP:
+        state = replace(state, w=after.state.w, v=after.state.v)
+    after = step(cable, _without_acceleration(state), later, dt, FIRST)
+    if after is None:
+        return None
+    found = after.state
+    begun = replace(state, alpha=found.alpha, a=found.a, force=found.force, moment=found.moment)
+    return Moving(begun, np.hstack([found.alpha, found.a]))
+
+
+def _without_acceleration(state: State) -> Moving:
+    none = np.zeros_like(state.w), np.zeros_like(state.v)
+    return Moving(replace(state, alpha=none[0], a=none[1]), np.hstack(none))

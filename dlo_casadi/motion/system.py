@@ -1,0 +1,445 @@
+"""The whole cable in motion: segments and ends assembled into one banded system.
+
+Unknowns are ordered along the cable: multipliers of the start's direction, turn and place of
+node 0, force of segment 0 and its springs, node 1, ..., multipliers of the end's direction. Places
+that a fixture holds are known functions of time and no unknowns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import lapack
+
+from dlo_casadi.arrays import FloatArray, IntArray
+from dlo_casadi.effects import Damping
+from dlo_casadi.equilibrium.equilibrium import Equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.functions import functions_of
+from dlo_casadi.motion.segment import MovingSegment, moving_segment
+from dlo_casadi.rod.ends import EndConditions
+
+
+@dataclass(frozen=True, eq=False)
+class Fixtures:
+    """Where the fixtures are at one instant.
+
+    Parameters
+    ----------
+    pose : (n_pose,)
+        See `HeldPose.vector`.
+    places, velocities, accelerations : (2, dimension) [m, m/s, m/s^2]
+        True ones of the cable's start and end; of a free end they mean nothing.
+    """
+
+    pose: FloatArray
+    places: FloatArray
+    velocities: FloatArray
+    accelerations: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A cable in motion at one instant.
+
+    Parameters
+    ----------
+    x, r : (n_nodes, coordinates), (n_nodes, dimension) [m]
+        Frames and places of the nodes.
+    w, v : (n_nodes, increment) [rad/s], (n_nodes, dimension) [m/s]
+        Body rates and velocities.
+    alpha, a : likewise [rad/s^2], [m/s^2]
+    force : (n_segments, dimension (1 + 2 n_springs))
+        See `MovingSegment`.
+    moment : (n_n_multipliers,) [N m]
+        Multipliers of the directions that the ends hold: of the start, then of the end.
+    """
+
+    x: FloatArray
+    r: FloatArray
+    w: FloatArray
+    v: FloatArray
+    alpha: FloatArray
+    a: FloatArray
+    force: FloatArray
+    moment: FloatArray
+
+
+class Banded:
+    """A banded matrix, factorised for any number of right-hand sides."""
+
+    def __init__(self, band: FloatArray, width: int) -> None:
+        self._width = width
+        self._lu, self._pivots, self.singular = lapack.dgbtrf(band, width, width)
+
+    def solve(self, right: FloatArray, *, transposed: bool = False) -> FloatArray:
+        """Solution of right-hand sides (N,) or (N, q)."""
+        rows = right if right.ndim == 2 else right[:, None]
+        found, _ = lapack.dgbtrs(
+            self._lu, self._width, self._width, rows, self._pivots, trans=int(transposed)
+        )
+        return np.asarray(found.reshape(right.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """Residual (N,) of the equations of motion, and its derivatives.
+
+    `stiffness`, `damping`: K, and c_1 C + c_2 M, of segments (n_segments, L, L) and of the ends.
+    """
+
+    cable: MovingCable
+    residual: FloatArray
+    stiffness: tuple[FloatArray, FloatArray]
+    damping: tuple[FloatArray, FloatArray]
+
+    def band(self, *parts: tuple[FloatArray, FloatArray]) -> FloatArray:
+        """The sum of parts as a band, see `Banded`."""
+        return self.cable.band(*(sum(both) for both in zip(*parts, strict=True)))
+
+    def stepped(self, turns: FloatArray) -> Banded:
+        """K + (c_1 C + c_2 M) T for blocks T (n_nodes, increment, increment) of turns."""
+        b, (of_segment, at_ends) = self.cable.b, map(np.copy, self.damping)
+        ends = (turns[:-1], turns[1:]), (turns[0], turns[-1])
+        for matrix, both in zip((of_segment, at_ends), ends, strict=True):
+            for k, block in enumerate(both):
+                own = slice(k * b, (k + 1) * b)
+                matrix[..., own] = matrix[..., own] @ block
+        return Banded(self.band(self.stiffness, (of_segment, at_ends)), self.cable.width)
+
+
+class MovingCable:
+    """A model with its parameters, on its mesh, ready to be evaluated in motion.
+
+    Parameters
+    ----------
+    model : CableModel
+    p : (n_parameters,)
+    rest : (n_rests,) [1/m]
+    still : (n_segments, 2 strains) [1/m], optional
+        Strains at rest, see `MovingSegment.still`.
+
+    Raises
+    ------
+    DloError
+        If the model has a part that motion does not know: obstacles, a sliding end, links, clips.
+    """
+
+    def __init__(
+        self, model: CableModel, p: FloatArray, rest: FloatArray, still: FloatArray | None = None
+    ) -> None:
+        _refuse(model)
+        self.model, self.p, self.rest = model, np.asarray(p, float), np.asarray(rest, float)
+        self.segment: MovingSegment = moving_segment(model)
+        chain, node = model.chain, model.node
+        self.n_segments, self.n_nodes = chain.n_segments, chain.n_nodes
+        self.b, self.d = node.increment, node.dimension
+        if still is None:
+            still = np.zeros((self.n_segments, 2 * len(node.strains)))
+        self.still = still
+
+    # ---- where unknowns are --------------------------------------------------------------------
+
+    @cached_property
+    def springs_on(self) -> FloatArray:
+        """Which springs are on which segments (n_segments, n_springs): 1 or 0."""
+        places = np.array(functions_of(self.model).spring_places(self.p)).ravel()
+        low, width = self.model.chain.layout.segments[:, :2].T
+        last = np.arange(self.n_segments) == self.n_segments - 1
+        share = (places - low[:, None]) / width[:, None]
+        return ((share >= 0) & ((share < 1) | last[:, None])).astype(float)
+
+    @cached_property
+    def _condition_rows(self) -> tuple[list[int], list[int]]:
+        """Rows of the border of the directions held at the start, and at the end."""
+        names = self.model.condition_names
+        turns = {f"{side}_{turn}" for side in ("start", "end") for turn in self.model.node.turns}
+        rows = [k for k, name in enumerate(names) if name in turns]
+        return (
+            [k for k in rows if names[k].startswith("start")],
+            [k for k in rows if names[k].startswith("end")],
+        )
+
+    @cached_property
+    def _places(self) -> tuple[IntArray, IntArray, IntArray, int]:
+        """Unknowns of nodes (n_nodes, b + d), forces (n_segments, ...), moments; their number.
+
+        Minus one for what is no unknown.
+        """
+        b, d, count = self.b, self.d, 0
+        start, end = self._condition_rows
+        nodes = np.full((self.n_nodes, b + d), -1)
+        forces = np.full((self.n_segments, d * (1 + 2 * self.model.n_springs)), -1)
+        moments = np.full(len(start) + len(end), -1)
+
+        def take(rows: IntArray) -> None:
+            nonlocal count
+            rows[...] = np.arange(count, count + rows.size).reshape(rows.shape)
+            count += rows.size
+
+        take(moments[: len(start)])
+        for i in range(self.n_nodes):
+            take(nodes[i, :b])
+            held = i == 0 or (i == self.n_nodes - 1 and self.model.end.place)
+            if not held:
+                take(nodes[i, b:])
+            if i < self.n_segments:
+                take(forces[i, :d])
+                for k in np.flatnonzero(self.springs_on[i]):
+                    take(forces[i, d * (1 + 2 * k) : d * (3 + 2 * k)])
+        take(moments[len(start) :])
+        return nodes, forces, moments, count
+
+    def steps(self, solution: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Increments of turns, places, forces and moments in a solution (N,); zero where held."""
+        nodes, forces, moments, _ = self._places
+        known = np.append(solution, 0.0)
+        return known[nodes[:, : self.b]], known[nodes[:, self.b :]], known[forces], known[moments]
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self._places[3]
+
+    @cached_property
+    def _index(self) -> tuple[IntArray, IntArray]:
+        """Unknowns of each segment (n_segments, L), of the ends (2 b + moments,); -1 for none."""
+        nodes, forces, moments, _ = self._places
+        b = self.b
+        first, last = nodes[:-1], nodes[1:]
+        of_segment = np.hstack([first[:, :b], last[:, :b], first[:, b:], last[:, b:], forces])
+        return of_segment, np.concatenate([nodes[0, :b], nodes[-1, :b], moments])
+
+    @cached_property
+    def width(self) -> int:
+        """Half width of the band."""
+        widest = 0
+        of_segment, at_ends = self._index
+        start = len(self._condition_rows[0])
+        b = self.b
+        sides = (
+            np.concatenate([at_ends[:b], at_ends[2 * b : 2 * b + start]]),
+            np.concatenate([at_ends[b : 2 * b], at_ends[2 * b + start :]]),
+        )
+        for row in (*of_segment, *sides):
+            known = row[row >= 0]
+            widest = max(widest, int(np.ptp(known)))
+        return widest
+
+    @cached_property
+    def _scatter(self) -> tuple[IntArray, IntArray]:
+        """Flat places in the band of the matrices of segments and ends; the last one for none."""
+        own = []
+        for index in (self._index[0], self._index[1][None]):
+            rows, columns = index[:, :, None], index[:, None, :]
+            inside = (rows >= 0) & (columns >= 0) & (np.abs(rows - columns) <= self.width)
+            flat = (2 * self.width + rows - columns) * self.size + columns
+            own.append(np.where(inside, flat, (3 * self.width + 1) * self.size).ravel())
+        return own[0], own[1]
+
+    # ---- evaluation ----------------------------------------------------------------------------
+
+    @cached_property
+    def _numbers(self) -> list[FloatArray]:
+        """Arguments of the segments that do not change in motion."""
+        chain, count = self.model.chain, self.n_segments
+        rest = chain.rest_inside(self.rest[:, None])[..., 0]
+        place, deviation = chain.layout.segments, np.zeros(len(self.model.deviation_names))
+        rows = [np.tile(self.p, (count, 1)), rest, place, np.tile(deviation, (count, 1))]
+        return [*rows, self.springs_on, self.still]
+
+    def arguments(self, state: State) -> list[FloatArray]:
+        """Arguments (n_segments, ...) of the functions of `MovingSegment`."""
+
+        def both(rows: FloatArray) -> FloatArray:
+            return np.concatenate([rows[:-1], rows[1:]], axis=1)
+
+        moving = (state.x, state.r, state.w, state.v, state.alpha, state.a)
+        return [*map(both, moving), state.force, *self._numbers]
+
+    def segments(self, name: str, state: State, *more: FloatArray) -> list[FloatArray]:
+        """Evaluate a function of `MovingSegment` for all segments (n_segments, rows, columns)."""
+        rows = [*self.arguments(state), *more]
+        return [out[0] for out in self.segment.mapped(name)(*(row[None] for row in rows))]
+
+    def _at_ends(self, state: State, fixtures: Fixtures) -> list[FloatArray]:
+        """Lagrangian of the ends, its gradient and Hessian, without forces on places."""
+        model, (start, end) = self.model, self._condition_rows
+        lam = np.zeros(model.n_lam)
+        lam[[*start, *end]] = state.moment
+        both = np.concatenate([state.x[0], state.x[-1]])
+        deviation = np.zeros(len(model.deviation_names))
+        rows = (both, lam, self.p, fixtures.pose, deviation)
+        found = functions_of(model).mapped("at_ends")(*(row[None, None] for row in rows))
+        return [out[0, 0] for out in found]
+
+    def energy_of_ends(self, state: State, fixtures: Fixtures) -> float:
+        """Potential energy [J] of the holders, and of dead loads at the start."""
+        value = self._at_ends(state, fixtures)[0]
+        nowhere = np.zeros(self.d)
+        # Springs have theirs with the segments, see `MovingSegment`.
+        return float(value[0, 0]) - float(self._springs_at(self.p, nowhere))
+
+    @cached_property
+    def _springs_at(self) -> ca.Function:
+        """(p, place) -> energy [J] of all springs at that place."""
+        place, springs = ca.SX.sym("place", self.d), self.segment.terms.springs
+        energy = sum((spring.energy(place) for spring in springs), start=ca.SX(0))
+        return ca.Function("springs_at", [self.segment.p, place], [energy])
+
+    def power_of_ends(self, state: State) -> float:
+        """Power [W] that friction at the ends takes."""
+        if self._rubs is None:
+            return 0.0
+        rates = np.concatenate([state.w[0], state.w[-1]])
+        return float(rates @ np.array(self._rubs(rates, self.p)[0]).ravel())
+
+    def _ends(self, state: State, fixtures: Fixtures) -> list[FloatArray]:
+        """Gradient, Hessian and damping of the ends, by the unknowns of `_index`."""
+        b, (start, end) = self.b, self._condition_rows
+        _, gradient, hessian = self._at_ends(state, fixtures)
+        kept = [*range(2 * b), *(2 * b + row for row in (*start, *end))]
+        damping = np.zeros((len(kept), len(kept)))
+        gradient, hessian = gradient[kept, 0], hessian[np.ix_(kept, kept)]
+        if self._rubs is not None:
+            rates = np.concatenate([state.w[0], state.w[-1]])
+            pulled, by_rates = (np.array(x) for x in self._rubs(rates, self.p))
+            gradient[: 2 * b] += pulled[:, 0]
+            damping[: 2 * b, : 2 * b] += by_rates
+        return [gradient, hessian, damping]
+
+    @cached_property
+    def _rubs(self) -> ca.Function | None:
+        """(body rates of both ends, p) -> moments against them, and their derivatives."""
+        effects = self.segment.terms.effects_of(Damping)
+        rates = ca.SX.sym("rates", 2 * self.b)
+        sides = zip((self.model.start, self.model.end), ca.vertsplit(rates, self.b), strict=True)
+        total = ca.SX(0)
+        for kind, turning in sides:
+            if kind.turns:
+                total += sum((x.at_pin(turning, local) for x, local in effects), start=ca.SX(0))
+        if total.is_zero():
+            return None
+        hessian, gradient = ca.hessian(total, rates)
+        outputs = [ca.densify(gradient), ca.densify(hessian)]
+        return ca.Function("rubs", [rates, self.segment.p], outputs)
+
+    def evaluated(
+        self, state: State, fixtures: Fixtures, c: tuple[float, float] = (0.0, 0.0)
+    ) -> Balance:
+        """The balance of a state, with its derivatives K and c_1 C + c_2 M."""
+        factors = np.broadcast_to(np.array(c), (self.n_segments, 2))
+        rows, stiff, damp = self.segments("motion", state, factors)
+        gradient, hessian, rubbing = self._ends(state, fixtures)
+        residual = self.gathered(rows[..., 0], gradient)
+        return Balance(self, residual, (stiff, hessian), (damp, c[0] * rubbing))
+
+    def gathered(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
+        """Rows (N,) summed over the segments (n_segments, L) and the ends."""
+        index = np.concatenate([self._index[0].ravel(), self._index[1]])
+        values = np.concatenate([segments.ravel(), ends])
+        total = np.bincount(index % (self.size + 1), values, self.size + 1)
+        return np.asarray(total[: self.size], dtype=float)
+
+    def band(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
+        """Band (3 width + 1, N) summed over the segments (n_segments, L, L) and the ends."""
+        height = 3 * self.width + 1
+        total = np.bincount(self._scatter[0], segments.ravel(), height * self.size + 1)
+        total = total + np.bincount(self._scatter[1], ends.ravel(), height * self.size + 1)
+        return np.asarray(total[:-1].reshape(height, self.size), dtype=float)
+
+    def handles(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Handles (n_segments, 4, d) [m], derivative (n_segments, 4 d, ...) by turns and places."""
+        x, r, *_ = self.arguments(state)
+        p, _, place = self._numbers[:3]
+        z, by_place = self.segment.mapped("curve")(*(row[None] for row in (x, r, p, place)))
+        return z[0].reshape((-1, 4, self.d)), by_place[0]
+
+    def moved_handles(self, by_place: FloatArray, solution: FloatArray) -> FloatArray:
+        """Change (n_segments, 4, d) of the handles along a solution (N,)."""
+        turned, shifted, _, _ = self.steps(solution)
+        both = [turned[:-1], turned[1:], shifted[:-1], shifted[1:]]
+        moved = by_place @ np.concatenate(both, axis=1)[..., None]
+        return np.asarray(moved.reshape((-1, 4, self.d)))
+
+    @property
+    def slowest(self) -> float:
+        """Order of magnitude of the slowest mode [rad/s]: that of a hanging or bent cable."""
+        cable = self.model.cable
+        stiffness = self.p[self.model.stiffness_indices[0]]
+        bent = stiffness / (cable.mass * cable.length**3)
+        return float(np.sqrt(bent + np.linalg.norm(self.model.gravity) / cable.length))
+
+    @property
+    def n_moments(self) -> int:
+        """Number of directions that the ends hold."""
+        return len(self._places[2])
+
+    # ---- states --------------------------------------------------------------------------------
+
+    def fixtures(
+        self,
+        pose: FloatArray,
+        velocities: FloatArray | None = None,
+        accelerations: FloatArray | None = None,
+    ) -> Fixtures:
+        """The fixtures in a declared pose (n_pose,), at rest by default."""
+        size, d = EndConditions.size(self.model.node), self.d
+        deviation = np.zeros(len(self.model.deviation_names))
+        true, _ = self.segment.terms.true_ends_and_length(self.p, pose[:size], deviation)
+        places = np.array(true).ravel()[: 2 * d].reshape(2, d)
+        none = np.zeros((2, d))
+        moving = (none if x is None else x for x in (velocities, accelerations))
+        return Fixtures(pose, places, *moving)
+
+    def at_rest(self, eq: Equilibrium, fixtures: Fixtures) -> State:
+        """The state in an equilibrium."""
+        model, d = self.model, self.d
+        force = np.zeros((self.n_segments, d * (1 + 2 * model.n_springs)))
+        lam = eq.multipliers
+        if model.end_pull:
+            force[:, :d] = lam[model.end_pull]
+        for k in range(model.n_springs):
+            on = self.springs_on[:, k] > 0
+            rows = model.pulls[k]
+            force[on, d * (1 + 2 * k) : d * (2 + 2 * k)] = lam[[row - d for row in rows]]
+            force[on, d * (2 + 2 * k) : d * (3 + 2 * k)] = lam[rows]
+            before = np.cumsum(on[::-1])[::-1].astype(bool) & ~on
+            force[before, :d] += lam[rows]
+        start, end = self._condition_rows
+        state = self.still_state(eq.x, force, lam[[*start, *end]])
+        return self.with_places(state, fixtures)
+
+    def still_state(self, x: FloatArray, force: FloatArray, moment: FloatArray) -> State:
+        """Nodes at rest, all at the origin."""
+        none, place = np.zeros((self.n_nodes, self.b)), np.zeros((self.n_nodes, self.d))
+        return State(x, place, none, place, none, place, force, moment)
+
+    def with_places(self, state: State, fixtures: Fixtures) -> State:
+        """The state with the places that follow from the frames and forces, start to end."""
+        rows, *_ = self.segments("motion", state, np.zeros((self.n_segments, 2)))
+        first = 2 * self.b + 2 * self.d
+        advance = rows[:, first : first + self.d, 0] + np.diff(state.r, axis=0)
+        r = np.concatenate([[fixtures.places[0]], advance]).cumsum(axis=0)
+        if self.model.end.place:
+            r[-1] = fixtures.places[1]
+        return State(**{**vars(state), "r": r})
+
+
+def _refuse(model: CableModel) -> None:
+    """Raise an error where a model cannot move yet."""
+    what = ""
+    if model.surfaces:
+        what = "obstacles: contact in motion is not known"
+    elif model.end.slides:
+        what = "a sliding end: a cable in motion is not fed"
+    elif not model.chain.kind.smooth:
+        what = f"elements of the kind {model.element!r}: try 'quadratic'"
+    elif model.clips:
+        what = "clips: a cable in motion is held at its ends alone"
+    if what:
+        raise DloError(f"{model.cable.name!r} has {what}")
