@@ -26,8 +26,6 @@ LEAST_NOISE_DEGREES = 4.0
 # Smallest share of the noise's variance left in a direction of the residual; below it the
 # direction is the fit's own. With 0.001 or 0.2, p in a complete session changes by less than 0.03.
 KEPT_VARIANCE = 0.05
-# The same for displacement fields, whose information is not whitened: a bound on rounding only.
-KEPT_INFORMATION = 1e-6
 
 # ---- choice among candidates -------------------------------------------------------------------
 

@@ -33,7 +33,8 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import explains
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import NO_INFORMATION, Values
+from dlo_casadi.estimation.unknowns import Values
+from dlo_casadi.linear_mixed import NO_INFORMATION, Normal, log_density
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.thresholds import EVIDENCE_APART
@@ -133,14 +134,8 @@ def cross_validate(fit: Fit) -> CrossValidation:
     """
     if len(fit.problem.used) == 1:
         return _stretches(fit)
-    problem, lin = fit.problem, fit.linearization
-    steps, total = [], fit.normal
-    for k, (block, cross, slope) in enumerate(total.inner):
-        a, e = lin.by_theta[k], lin.residuals[k]
-        solved = np.linalg.solve(block, np.column_stack([cross, slope]))
-        h_j = a.T @ a - cross.T @ solved[:, :-1]
-        g_j = a.T @ e - cross.T @ solved[:, -1]
-        steps.append(_without(fit, total.hessian - h_j, total.gradient - g_j))
+    problem, mixed = fit.problem, fit.mixed
+    steps = [_stepped(fit, mixed.without(k)) for k in range(len(problem.used))]
     thetas, covariances = zip(*steps, strict=True)
     predicted = _predicted(fit, dict(enumerate(thetas)))
     near = _at_own_deviations(fit, dict(enumerate(thetas)), predicted)
@@ -235,10 +230,8 @@ def _density(fit: Fit, k: int, off: FloatArray, covariance: FloatArray) -> float
 
     `covariance`: of the unknowns without it, to first order about the fit.
     """
-    a, own = fit.linearization.by_theta[k], fit.linearization.by_deviation[k]
-    ways = np.concatenate([a @ root_of(covariance), own * fit.problem.deviation_std], axis=1)
-    whitening = fit.problem.whitening[k]
-    return _log_density(off, ways) + float(np.linalg.slogdet(whitening)[1])
+    white = float(np.linalg.slogdet(fit.problem.whitening[k])[1])
+    return fit.mixed.density(k, off, covariance) + white
 
 
 def _density_of(fit: Fit, k: int, seen: Observed | None, covariance: FloatArray) -> float:
@@ -254,13 +247,6 @@ def _density_of(fit: Fit, k: int, seen: Observed | None, covariance: FloatArray)
     return _density(fit, k, off, covariance)
 
 
-def _log_density(white: FloatArray, ways: FloatArray) -> float:
-    """Log density of whitened residuals (R,) with covariance 1 + ways ways^T, constants dropped."""
-    factor = np.linalg.cholesky(np.eye(ways.shape[1]) + ways.T @ ways)
-    shared = np.linalg.solve(factor, ways.T @ white)
-    return float((shared @ shared - white @ white) / 2 - np.log(np.diag(factor)).sum())
-
-
 def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> CrossValidation:
     """Validation from each fold's errors [m] of points and wrenches; None if not predicted."""
     both = [np.zeros(1) if fold is None else np.concatenate(fold) for fold in errors]
@@ -271,14 +257,14 @@ def _validation(errors: Sequence[tuple[FloatArray, FloatArray] | None]) -> Cross
     return CrossValidation(squares, np.array([float(len(fold)) for fold in both]), rmse)
 
 
-def _without(fit: Fit, hessian: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unknowns after one step without part of the data, and their covariance."""
+def _stepped(fit: Fit, normal: Normal) -> tuple[FloatArray, FloatArray]:
+    """Unknowns after one step of normal equations without part of the data; their covariance."""
     unknowns = fit.problem.unknowns
     lower, upper = unknowns.bounds
     # A direction without information (e.g. the place of a mass of zero) has its bounds as prior.
     ridge = 1e-9 * np.diag(np.diag(fit.normal.hessian)) + np.diag(1 / unknowns.widest**2)
-    covariance = np.linalg.inv(hessian + ridge)
-    return np.clip(fit.point.theta - covariance @ gradient, lower, upper), covariance
+    covariance = np.linalg.inv(normal.hessian + ridge)
+    return np.clip(fit.point.theta - covariance @ normal.gradient, lower, upper), covariance
 
 
 def _at_own_deviations(
@@ -327,14 +313,10 @@ def _predicted(
 
 def _stretches(fit: Fit) -> CrossValidation:
     """Cross-validation along the arc of a single pose."""
-    problem, lin = fit.problem, fit.linearization
-    (item,) = problem.fit_poses
+    problem, lin, size = fit.problem, fit.linearization, fit.problem.unknowns.size
+    (item,), (raw,) = problem.fit_poses, lin.raw
     points = np.argsort(fit.point.projections[0], kind="stable")  # a stretch of all photographs
-    size, n_dev = problem.unknowns.size, lin.by_deviation[0].shape[1]
-    prior = np.zeros((size + n_dev, size + n_dev))
-    prior[:size, :size] = problem.precision
-    prior[size:, size:] = np.diag(1 / problem.deviation_std**2)
-    pull = np.concatenate([fit.point.theta - problem.mean, fit.own_deviations[0]])
+    by_theta, by_own = np.split(lin.raw_directions[0], [size], axis=1)
     root = np.linalg.inv(problem.whitening[0])
     noise = root @ root.T
     errors: list[tuple[FloatArray, FloatArray] | None] = []
@@ -344,21 +326,25 @@ def _stretches(fit: Fit) -> CrossValidation:
         kept[item.on_points] = ~np.isin(item.point_of, left_out)
         # Correlated noise: the fit's weights would mix left-out points into those beside them.
         white = _whitening(noise[np.ix_(kept, kept)])
-        a, e = white @ lin.raw_directions[0][kept], white @ lin.raw[0][kept]
-        hessian = a.T @ a + prior
-        hessian += 1e-9 * np.diag(np.diag(hessian)) + NO_INFORMATION * np.eye(len(hessian))
-        step = -np.linalg.solve(hessian, a.T @ e + prior @ pull)
+        e, a, b = ([white @ part[kept]] for part in (raw, by_theta, by_own))
+        normal = replace(fit.mixed, residuals=e, by_shared=a, by_own=b).normal
+        hessian = normal.hessian + 1e-9 * np.diag(np.diag(normal.hessian))
+        covariance = np.linalg.inv(hessian + NO_INFORMATION * np.eye(size))
+        step = -covariance @ normal.gradient
+        both = np.append(step, 1.0), np.pad(covariance, (0, 1))
+        (mean,), (covariance,) = normal.own.joint(*both)
         lower, upper = problem.unknowns.bounds
-        theta = np.clip(fit.point.theta + step[:size], lower, upper)
+        theta = np.clip(fit.point.theta + step, lower, upper)
         seen = _predicted(fit, {0: theta})[0]
         missed = None if seen is None else item.misses(seen.curve)[left_out]
         errors.append(None if missed is None else (missed, np.zeros(0)))
-        off: FloatArray = lin.raw[0] + lin.raw_directions[0] @ step
+        columns = np.column_stack([by_own, by_theta, raw])
+        off: FloatArray = columns @ mean
         if seen is not None:
             off = item.residual(seen, item.located(seen, fit.point.projections[0]))
-        ways = lin.raw_directions[0][~kept] @ root_of(np.linalg.inv(hessian))
+        ways = columns[~kept] @ root_of(covariance)
         white = _whitening(noise[np.ix_(~kept, ~kept)])
-        told = _log_density(white @ off[~kept], white @ ways)
+        told = log_density(white @ off[~kept], white @ ways)
         densities.append(told + float(np.linalg.slogdet(white)[1]))
     return replace(_validation(errors), densities=np.array(densities))
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import reduce
 
 import numpy as np
 from scipy.special import chdtrc, fdtrc
@@ -34,7 +34,8 @@ from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.relaxation import Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import with_springs_in_place
-from dlo_casadi.estimation.unknowns import NO_INFORMATION, Linearization, Point, Values
+from dlo_casadi.estimation.unknowns import Values
+from dlo_casadi.linear_mixed import LinearMixed, Normal, Score
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.runtime.executors import InProcess
@@ -124,45 +125,70 @@ def _scan(candidates: Sequence[Candidate], k: int) -> dict[str, float]:
 
 
 def _moved_together(listed: Sequence[Candidate], k: int) -> list[list[Candidate]]:
-    """Groups of candidates that share a model; in each some have a k-th scan.
+    """Groups of candidates that share a model: at scan 0 all, then those that have a k-th scan.
 
     Effects on the state act through all later poses, which costs more: they have their own model.
     """
+    if k == 0:
+        return [list(listed)] if listed else []
     several = [c for c in listed if len(c.scans) > 1]
     apart = ([c for c in several if isinstance(c.effect, StateEffect) == s] for s in (False, True))
     return [group for group in apart if any(k < len(c.scans) for c in group)]
 
 
-def _derivatives(
-    fit: Fit, listed: Sequence[Candidate], scans: Sequence[int]
-) -> list[dict[tuple[str, ...], list[FloatArray]]]:
-    """For each scan: derivatives by the parameters named; none for scan 0, where they are known."""
+# Whitened columns (R_j, q) of each pose, by the label of the candidate.
+Columns = dict[str, list[FloatArray]]
+
+
+def _columns(fit: Fit, listed: Sequence[Candidate], scans: Sequence[int]) -> list[Columns]:
+    """For each scan the columns of the candidates that have one; of a nuisance those of the fit."""
+    names, lin = fit.problem.unknowns.names, fit.linearization
     moving: dict[tuple[str, ...], _Moving] = {}
     out = []
     for k in scans:
-        found = {}
-        for group in _moved_together(listed, k) if k > 0 else ():
-            key = tuple(candidate.name for candidate in group)
+        found: Columns = {}
+        for nuisance in (c for c in listed if c.nuisance and k == 0):
+            own = [names.index(name) for name in nuisance.screened]
+            found[nuisance.effect.label] = [by_theta[:, own] for by_theta in lin.by_theta]
+        for group in _moved_together([c for c in listed if not c.nuisance], k):
+            key = tuple(candidate.effect.label for candidate in group)
             if key not in moving:
                 moving[key] = _Moving.of(fit, group)
-            found[moving[key].names] = moving[key].by_names(_scan(group, k))
+            rows = moving[key].by_names(_scan(group, k))
+            ends = np.cumsum([len(candidate.screened) for candidate in group])[:-1]
+            parts = zip(*(np.split(row, ends, axis=1) for row in rows), strict=True)
+            each = zip(group, parts, strict=True)
+            found |= {c.effect.label: list(part) for c, part in each if k < len(c.scans)}
         out.append(found)
     return out
 
 
 @dataclass(frozen=True)
 class AtScan:
-    """Normal equations of a model with candidates, those `active` at their scan `k`."""
+    """Normal equations of a fit and, beside it, candidates at their scan `k`, each at `places`."""
 
-    active: list[Candidate]
     k: int
-    hessian: FloatArray
-    gradient: FloatArray
-    names: tuple[str, ...]
+    normal: Normal
+    known: int
+    places: dict[str, list[int]]
+
+    @classmethod
+    def of(cls, k: int, mixed: LinearMixed, columns: Columns) -> AtScan:
+        """From the columns of the candidates; a nuisance's are the fit's own, without a prior."""
+        known = len(mixed.gap)
+        ends = known + np.cumsum([0, *(part[0].shape[1] for part in columns.values())])
+        places = {x: [*range(*ends[i : i + 2])] for i, x in enumerate(columns)}
+        every = [np.hstack(parts) for parts in zip(*columns.values(), strict=True)]
+        return cls(k, mixed.beside(every).normal, known, places)
+
+    def beside(self, candidate: Candidate) -> Normal:
+        """Normal equations of the fit's unknowns and one candidate's parameters."""
+        kept = [*range(self.known), *self.places[candidate.effect.label]]
+        return Normal(self.normal.hessian[np.ix_(kept, kept)], self.normal.gradient[kept])
 
 
 class Screen:
-    """All candidates in one model, evaluated at a fit."""
+    """All candidates beside a fit."""
 
     # Whether a likely candidate is also scanned between the first scans, next to its best one.
     between = True
@@ -170,38 +196,16 @@ class Screen:
     def __init__(self, fit: Fit, listed: Sequence[Candidate]) -> None:
         self.fit = fit
         self.listed = list(listed)
-        self.model = extended(fit, listed)
+        self.unknowns = fit.problem_in(extended(fit, listed)).unknowns
 
     def normals(self, executor: Executor, scans: Sequence[int]) -> Iterator[AtScan]:
-        """Normal equations at scans.
-
-        If the first scan is among them it has to come first: later ones overwrite its derivatives.
-        Scans are split into one part per worker, because each part has a fixed cost.
-        """
+        """Normal equations at scans; these are split into one part per worker."""
         workers = max(1, min(workers_of(executor), len(scans)))
         parts = [scans[i::workers] for i in range(workers)]
-        begun = [begin(executor, _derivatives, self.fit, self.listed, part) for part in parts[1:]]
-        problem, point, lin = self._linearized
-        names = problem.unknowns.names
-        moved = [_derivatives(self.fit, self.listed, parts[0]), *(found() for found in begun)]
+        begun = [begin(executor, _columns, self.fit, self.listed, part) for part in parts[1:]]
+        found = [_columns(self.fit, self.listed, parts[0]), *(wait() for wait in begun)]
         for i, k in enumerate(scans):
-            for own, found in moved[i % workers][i // workers].items():
-                columns = [names.index(name) for name in own]
-                for by_theta, change in zip(lin.by_theta, found, strict=True):
-                    by_theta[:, columns] = change
-            normal = problem.normal_equations(point, lin)
-            active = [c for c in self.listed if k < len(c.scans)]
-            yield AtScan(active, k, normal.hessian, normal.gradient, names)
-
-    @cached_property
-    def _linearized(self) -> tuple[Problem, Point, Linearization]:
-        """The fit's model with candidates at their nominal values, linearised at the fit."""
-        # Nuisances that are candidates appear twice: with their prior, and without.
-        larger = self.fit.problem_in(self.model, _scan(self.listed, 0))
-        theta = larger.unknowns.pack(larger.unknowns.fixed, self.fit.coefficients)
-        point = replace(self.fit.point, theta=theta, shapes=carried_shapes(larger, self.fit))
-        point = replace(point, shapes=with_springs_in_place(larger, point).shapes)
-        return larger, point, larger.linearize(point)
+            yield AtScan.of(k, self.fit.mixed, found[i % workers][i // workers])
 
     def run(self, noise_dof: float, executor: Executor | None = None) -> list[Screened]:
         """Score all candidates, best first.
@@ -214,7 +218,9 @@ class Screen:
 
         def improved(scans: Sequence[int]) -> None:
             for normal in self.normals(executor or InProcess(), scans) if scans else ():
-                for candidate in normal.active:
+                for candidate in self.listed:
+                    if candidate.effect.label not in normal.places:
+                        continue
                     tried = self._score(candidate, normal, noise_dof)
                     known = best.get(candidate.name)
                     if known is None or tried.score > known[0].score:
@@ -237,44 +243,23 @@ class Screen:
         names = [name for name in STIFFNESSES if name in self.fit.problem.unknowns.names]
         if not self.between or not names:
             return
-        equations, larger = (normal.hessian, normal.gradient), self._linearized[0].unknowns
-        found = Widened.of(self.fit, candidate, normal.k, equations, larger)
+        found = Widened.of(self.fit, candidate, normal.k, normal.beside(candidate), self.unknowns)
         for name in names:
             width = found.width(name)
             if name not in known or width > known[name][0]:
                 known[name] = width, found
 
     def _score(self, candidate: Candidate, normal: AtScan, noise_dof: float) -> Screened:
-        hessian, gradient, names = normal.hessian, normal.gradient, normal.names
-        base = [i for i, name in enumerate(names) if name in self.fit.problem.unknowns.names]
-        columns = [names.index(name) for name in candidate.screened]
-        h_bb = hessian[np.ix_(base, base)] + NO_INFORMATION * np.eye(len(base))
-        h_cb = hessian[np.ix_(columns, base)]
-        h_cc = hessian[np.ix_(columns, columns)]
-        u = -gradient[columns]
-        if candidate.nuisance:
-            # The same direction again, without its prior.
-            prior = self.fit.problem.precision
-            own = [self.fit.problem.unknowns.names.index(name) for name in candidate.screened]
-            h_cc = h_cc - prior[np.ix_(own, own)]
-            h_cb = h_cb - prior[own]
-            gap = self.fit.point.theta - self.fit.problem.mean
-            u = u + prior[own] @ gap
-        solved = np.linalg.solve(h_bb, np.column_stack([h_cb.T, gradient[base]]))
-        information = h_cc - h_cb @ solved[:, :-1]
-        u = u + h_cb @ solved[:, -1]
-        scale = np.sqrt(np.maximum(np.diag(h_cc), 1e-300))
-        scaled = information / np.outer(scale, scale)
-        score, step, dof = _best_step((scaled + scaled.T) / 2, u / scale)
-        parameters = [self.model.parameters[self.model.names.index(q)] for q in candidate.screened]
+        found, model = Score.of(normal.beside(candidate), normal.known), self.unknowns.model
+        score, step, dof = found.scaled.gain(COLLINEAR)
+        parameters = [model.parameters[model.names.index(q)] for q in candidate.screened]
         # Not below a bound at which a parameter vanishes; other bounds are left to the refit.
         vanish = np.array([q.lower == q.nominal for q in parameters], dtype=bool)
-        inside = ~(vanish & (step / scale < 0))
+        inside = ~(vanish & (step < 0))
         if not inside.all():
-            part = scaled[np.ix_(inside, inside)]
-            score, step[inside], _ = _best_step((part + part.T) / 2, (u / scale)[inside])
+            score, step[inside], _ = found.scaled.among(inside).gain(COLLINEAR)
             step[~inside] = 0.0
-        step = step / scale
+        step = step / found.size
         n_places = max(1.0, len(candidate.scans) / SCANS_PER_TEST)
         single = survival(score, max(dof, 1), noise_dof)
         p_value = sidak(single, n_places * candidate.alike)
@@ -283,7 +268,7 @@ class Screen:
         # that has one returns to its mean.
         for name, q, change in zip(candidate.screened, parameters, step, strict=True):
             values[name] = float(np.clip(q.nominal + change * q.scale, q.lower, q.upper))
-        return Screened(candidate, score, p_value, candidate.of_linear(self.model.cable, values))
+        return Screened(candidate, score, p_value, candidate.of_linear(model.cable, values))
 
 
 class RelaxedScreen(Screen):
@@ -307,23 +292,20 @@ class RelaxedScreen(Screen):
         """Normal equations at scans, with each pose's own unknowns eliminated."""
         begun: dict[tuple[str, ...], _Moving] = {}
         for k in scans:
-            for group in _moved_together(self.listed, k) if k > 0 else [self.listed]:
-                names = tuple(candidate.name for candidate in group)
-                if names not in begun:
-                    begun[names] = _Moving.of(self.fit, group, relaxed=True)
-                problem, values = begun[names].problem, begun[names].at(_scan(group, k))
-                normal = Relaxation(problem, self.softness).normal(values)
-                active = [c for c in group if k < len(c.scans)]
-                yield AtScan(active, k, normal.hessian, normal.gradient, problem.unknowns.names)
-
-
-def _best_step(information: FloatArray, slope: FloatArray) -> tuple[float, FloatArray, int]:
-    """Largest gain of 2 slope . x - x . information x: (gain, x, number of directions seen)."""
-    values, vectors = np.linalg.eigh(information)
-    seen = values > COLLINEAR
-    along = vectors.T @ slope
-    step = vectors[:, seen] @ (along[seen] / values[seen])
-    return float((along[seen] ** 2 / values[seen]).sum()), step, int(seen.sum())
+            for group in _moved_together(self.listed, k):
+                key = tuple(candidate.effect.label for candidate in group)
+                if key not in begun:
+                    begun[key] = _Moving.of(self.fit, group, relaxed=True)
+                problem, values = begun[key].problem, begun[key].at(_scan(group, k))
+                mixed = Relaxation(problem, self.softness).mixed(values)
+                (rows,), every = mixed.by_shared, problem.unknowns.names
+                columns = {
+                    c.effect.label: [rows[:, [every.index(name) for name in c.screened]]]
+                    for c in group
+                    if k < len(c.scans)
+                }
+                own = [every.index(name) for name in self.fit.problem.unknowns.names]
+                yield AtScan.of(k, mixed.among(own), columns)
 
 
 def sidak(p_value: float, tried: float) -> float:

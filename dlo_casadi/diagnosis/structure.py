@@ -17,7 +17,7 @@ from dlo_casadi.estimation.variances import pose_scatter_of
 from dlo_casadi.sensing.noise import SLOW_MODES, smooth_modes
 from dlo_casadi.thresholds import (
     ALIKE,
-    KEPT_INFORMATION,
+    COLLINEAR,
     KEPT_VARIANCE,
     LEAST_NOISE_DEGREES,
     REPEATS,
@@ -100,26 +100,16 @@ def screening_degrees(fit: Fit) -> float:
 
 def structure_of(fit: Fit, noise_dof: float) -> Structure:
     """Test the residual of a fit for what noise with these degrees of freedom cannot explain."""
-    problem, lin, normal = fit.problem, fit.linearization, fit.normal
-    model = fit.model
-    coefficients, own, arms = [], [], []
+    problem, lin, mixed, model = fit.problem, fit.linearization, fit.mixed, fit.model
+    bases = []
     for k, (item, s) in enumerate(zip(problem.fit_poses, fit.point.projections, strict=True)):
         modes = smooth_modes(s, model.cable.length, SLOW_MODES, not model.end.place)
-        basis, _ = np.linalg.qr(problem.whitening[k] @ item.slow_rows(modes))
-        a, b = basis.T @ lin.by_theta[k], basis.T @ lin.by_deviation[k]
-        block, cross, _ = normal.inner[k]
-        solved = np.linalg.solve(block, np.column_stack([b.T, cross]))
-        coefficients.append(basis.T @ lin.residuals[k])
-        own.append(np.eye(basis.shape[1]) - b @ solved[:, : len(b)])
-        arms.append(a - b @ solved[:, len(b) :])
-    arm = np.concatenate(arms)
-    covariance = block_diag(*own) - arm @ fit.covariance @ arm.T
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    along, dof = vectors.T @ np.concatenate(coefficients), int((values > KEPT_VARIANCE).sum())
-    statistic = float((along[-dof:] ** 2 / values[-dof:]).sum()) if dof else 0.0
+        bases.append(np.linalg.qr(problem.whitening[k] @ item.slow_rows(modes))[0])
+    ends = np.cumsum([len(basis) for basis in bases])[:-1]
+    score = mixed.score(np.split(block_diag(*bases), ends))
+    statistic, _, dof = score.gain(KEPT_VARIANCE)
     p_value = survival(statistic, max(dof, 1), noise_dof)
-    shares = zip(coefficients, own, strict=True)
-    energies = np.array([float((c**2).sum()) / max(float(np.trace(v)), 0.1) for c, v in shares])
+    energies = np.array([_energy(fit, k, basis) for k, basis in enumerate(bases)])
     items = problem.fit_poses
     pairs = zip(items, lin.residuals, strict=True)
     series = [one for item, e in pairs for one in item.along(e)]
@@ -138,37 +128,25 @@ def structure_of(fit: Fit, noise_dof: float) -> Structure:
     )
 
 
+def _energy(fit: Fit, k: int, basis: FloatArray) -> float:
+    """Energy of the k-th pose's residual in slow modes (R_k, q) over that of its noise."""
+    free = float((basis * fit.mixed.taken(k, basis)).sum())
+    return float(((basis.T @ fit.linearization.residuals[k]) ** 2).sum()) / max(free, 0.1)
+
+
 def _position_score(fit: Fit, noise_dof: float) -> float:
     """Score test of a displacement field's terms of first and second degree: ten in the plane."""
-    problem, lin, inner = fit.problem, fit.linearization, fit.normal.inner
+    problem, columns = fit.problem, []
     observed = problem.observed(fit.point)
     d = observed[0].curve.d
     pairs = list(combinations_with_replacement(range(d), 2))
-    size = d * (d + len(pairs))
-    information: FloatArray = np.zeros((size, size))
-    cross: FloatArray = np.zeros((size, len(fit.point.theta)))
-    slope: FloatArray = np.zeros(size)
     for k, (j, s) in enumerate(zip(problem.used, fit.point.projections, strict=True)):
         item = problem.measured[j]
         x = item.points / fit.model.cable.length
         terms = np.column_stack([x, *(x[:, a] * x[:, b] for a, b in pairs)])
-        moved = np.einsum("dc,kt->kdct", np.eye(d), terms).reshape((len(x), d, size))
-        seen = problem.whitening[k] @ item.components(observed[j].curve, s, moved)
-        information += seen.T @ seen
-        cross += seen.T @ lin.by_theta[k]
-        slope += seen.T @ lin.residuals[k]
-        block, by_theta, gradient = inner[k]
-        along = lin.by_deviation[k].T @ seen
-        taken = np.linalg.solve(block, along)
-        information -= along.T @ taken
-        cross -= taken.T @ by_theta
-        slope -= taken.T @ gradient
-    information -= cross @ fit.covariance @ cross.T
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    kept = values > KEPT_INFORMATION
-    along = vectors[:, kept].T @ (slope * scale)
-    score, dof = float((along**2 / values[kept]).sum()), int(kept.sum())
+        moved = np.einsum("dc,kt->kdct", np.eye(d), terms).reshape((len(x), d, -1))
+        columns.append(problem.whitening[k] @ item.components(observed[j].curve, s, moved))
+    score, _, dof = fit.mixed.score(columns).scaled.gain(COLLINEAR)
     p_value = survival(score, max(dof, 1), noise_dof)
     return -float(ndtri(np.clip(p_value, _TAIL, 1 - _TAIL)))
 

@@ -18,6 +18,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.linear_mixed import Normal
 from dlo_casadi.thresholds import NORMAL_95
 
 # Number of equally likely values that stand for a parameter with a bound.
@@ -31,7 +32,8 @@ class Widened:
     Parameters
     ----------
     names : tuple of str
-        Of the unknowns, those of the candidate last, or among the fit's if it is a nuisance.
+        Of the unknowns, those of the candidate last; those of a nuisance are among the fit's, too,
+        and their difference is the sum of both.
     mean, covariance : (m,), (m, m)
         Of their differences from the fit and from zero, scaled as the unknowns are.
     bounded : int or None
@@ -51,31 +53,22 @@ class Widened:
         fit: Fit,
         candidate: Candidate,
         scan: int,
-        normal: tuple[FloatArray, FloatArray],
+        normal: Normal,
         larger: Unknowns,
     ) -> Widened:
-        """From Hessian and gradient of a model with all candidates, of `larger` unknowns."""
-        own, every = fit.problem.unknowns.names, larger.names
-        total = normal[0] + np.diag(1 / larger.widest**2)
-        slope, names = normal[1].copy(), own
-        columns = [every.index(name) for name in candidate.screened]
-        if candidate.nuisance:
-            # Its directions are the fit's own: without their priors.
-            known = [own.index(name) for name in candidate.screened]
-            prior = fit.problem.precision[known]
-            total[np.ix_(columns, columns)] -= prior[:, known]
-            slope[columns] -= prior @ (fit.point.theta - fit.problem.mean)
-        else:
-            names += candidate.screened
-        kept = [every.index(name) for name in names]
-        part = total[np.ix_(kept, kept)]
-        size = np.sqrt(np.diag(part))
-        inverse = np.linalg.pinv(part / np.outer(size, size), hermitian=True)
+        """From normal equations of a fit and a candidate, of `larger` unknowns with all of them."""
+        every = larger.names
+        names = (*fit.problem.unknowns.names, *candidate.screened)
+        bounds = 1 / larger.widest[[every.index(name) for name in names]] ** 2
+        total = normal.hessian + np.diag(bounds)
+        size = np.sqrt(np.diag(total))
+        inverse = np.linalg.pinv(total / np.outer(size, size), hermitian=True)
         covariance = inverse / np.outer(size, size)
         parameters = {q.name: q for q in larger.model.parameters}
-        vanish = (q for q in candidate.screened if parameters[q].lower == parameters[q].nominal)
-        bounded = next((names.index(q) for q in vanish), None)
-        mean = -covariance @ slope[kept]
+        vanish = [parameters[q].lower == parameters[q].nominal for q in candidate.screened]
+        known = len(names) - len(vanish)
+        bounded = known + vanish.index(True) if any(vanish) else None
+        mean = -covariance @ normal.gradient
         return cls(candidate, candidate.scans[scan], names, mean, covariance, bounded)
 
     @property
@@ -114,4 +107,5 @@ class Widened:
         k = self.names.index(name)
         way = self.covariance[:, k] / self.covariance[k, k]
         moved = self.mean + way * (difference - self.mean[k])
-        return {q: float(moved[self.names.index(q)]) for q in self.candidate.screened}
+        names = np.array(self.names)
+        return {q: float(moved[names == q].sum()) for q in self.candidate.screened}

@@ -14,7 +14,8 @@ from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import NO_INFORMATION, Normal, Point, Unknowns, Values
+from dlo_casadi.estimation.unknowns import Point, Unknowns, Values
+from dlo_casadi.linear_mixed import NO_INFORMATION, Normal
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import forces_on_other_mesh

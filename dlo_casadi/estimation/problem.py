@@ -14,7 +14,7 @@ another problem of the same poses with `replace`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -26,7 +26,8 @@ from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.unknowns import Linearization, Normal, Point, Unknowns, Values
+from dlo_casadi.estimation.unknowns import Linearization, Point, Unknowns, Values
+from dlo_casadi.linear_mixed import LinearMixed, Normal
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.model.pose_scatter import PoseScatter
@@ -358,50 +359,28 @@ class Problem:
             out.raw_directions.append(directions)
         return out
 
-    def normal_equations(self, point: Values, lin: Linearization) -> Normal:
-        """Gauss-Newton normal equations of theta, each pose's deviations eliminated."""
-        each = lin.residuals, lin.by_theta, lin.by_deviation, self.own_deviations(point)[:, None]
-        return self._eliminated(point, zip(*each, strict=True))
+    def mixed(self, point: Values, lin: Linearization, *, joined: bool = False) -> LinearMixed:
+        """The fit to first order; what the poses have of their own are their deviations.
+
+        `joined`: whether all poses are one group where they carry a state, by which a deviation
+        also moves all later poses.
+        """
+        e, a, b = lin.residuals, lin.by_theta, lin.by_deviation
+        own, std = self.own_deviations(point), self.deviation_std
+        if joined and lin.by_all:
+            e, a, b = ([np.concatenate(rows)] for rows in (e, a, lin.by_all))
+            own, std = own.reshape((1, -1)), np.tile(std, len(own))
+        return LinearMixed(e, a, b, own, std, point.theta - self.mean, self.precision)
 
     def step_equations(self, point: Values, lin: Linearization) -> Normal:
-        """Normal equations of a descent: with a state, a deviation also moves all later poses.
-
-        `inner` has one block, of all fitted poses' deviations.
-        """
-        if not lin.by_all:
-            return self.normal_equations(point, lin)
-        e, a, b = (np.concatenate(x) for x in (lin.residuals, lin.by_theta, lin.by_all))
-        return self._eliminated(point, [(e, a, b, self.own_deviations(point))])
-
-    def _eliminated(self, point: Values, groups: Iterable[tuple[FloatArray, ...]]) -> Normal:
-        """Normal equations of groups of poses: residuals, derivatives by theta and by deviations.
-
-        The last array of a group has the deviations (poses, n_deviations) themselves.
-        """
-        hessian = self.precision.copy()
-        gradient = self.precision @ (point.theta - self.mean)
-        inner: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        for e, a, b, own in groups:
-            precision = np.tile(1 / self.deviation_std**2, len(own))
-            block, cross = b.T @ b + np.diag(precision), b.T @ a
-            slope = b.T @ e + precision * own.ravel()
-            try:
-                solved = np.linalg.solve(block, np.column_stack([cross, slope]))
-            except np.linalg.LinAlgError as error:
-                message = "a pose of the fit has come to a fold of its equilibria"
-                raise EstimationError(message) from error
-            hessian += a.T @ a
-            hessian -= cross.T @ solved[:, :-1]
-            gradient += a.T @ e
-            gradient -= cross.T @ solved[:, -1]
-            inner.append((block, cross, slope))
-        return Normal(hessian, gradient, inner)
+        """Normal equations of a descent."""
+        return self.mixed(point, lin, joined=True).normal
 
     def moved(self, along: Tangents, normal: Normal, step: FloatArray) -> tuple[Vector, FloatArray]:
         """Change of shapes (one column) and deviations (m, n_deviations) by a step of theta."""
         own = np.zeros((self.equilibria.m, len(self.equilibria.used_deviations)))
-        found = [-np.linalg.solve(b, cross @ step + slope) for b, cross, slope in normal.inner]
-        own[self.used] = np.reshape(found, (len(self.used), -1))
+        found = -normal.own.arm @ np.append(step, 1.0)
+        own[self.used] = found.reshape((len(self.used), -1))
         coupled = along.p.shape[2] > len(step) + own.shape[1]
         each = np.broadcast_to(own.ravel(), (len(own), own.size)) if coupled else own
         both = np.concatenate([np.broadcast_to(step, (len(own), len(step))), each], axis=1)

@@ -28,7 +28,8 @@ from scipy.optimize import lsq_linear
 from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.problem import Problem
-from dlo_casadi.estimation.unknowns import NO_INFORMATION, Normal, Values
+from dlo_casadi.estimation.unknowns import Values
+from dlo_casadi.linear_mixed import NO_INFORMATION, LinearMixed
 from dlo_casadi.model.assembly import Assembly, Shapes, Tangents
 from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.model.contact import gap_per_force
@@ -80,12 +81,14 @@ class _Linearized:
 class _Reduced:
     """Triangular factors of a Gauss-Newton step: each pose's own unknowns, and the rest for theta.
 
-    It also holds the states' derivatives by the free unknowns, without their target.
+    It also holds the states' derivatives by the free unknowns, without their target, and the rows
+    for theta alone, without its prior and damping.
     """
 
     own: list[FloatArray]
     states: list[FloatArray]
     shared: FloatArray
+    rows: FloatArray
 
 
 @dataclass(frozen=True)
@@ -194,10 +197,13 @@ class Relaxation:
         total = float(each.sum()) + prior
         return total if np.isfinite(total) else np.inf
 
-    def normal(self, values: Values) -> Normal:
-        """Gauss-Newton normal equations of theta, with the poses' own unknowns eliminated."""
-        rows = self._reduced(self._linearized(values), 0.0).shared
-        return Normal(rows[:, :-1].T @ rows[:, :-1], -rows[:, :-1].T @ rows[:, -1], [])
+    def mixed(self, values: Values) -> LinearMixed:
+        """The fit to first order, with the poses' own unknowns eliminated: one group of rows."""
+        rows, none = self._reduced(self._linearized(values), 0.0).rows, np.zeros((1, 0))
+        gap = values.theta - self.problem.mean
+        own = [np.zeros((len(rows), 0))]
+        given = none, none[0], gap, self.problem.precision
+        return LinearMixed([-rows[:, -1]], [rows[:, :-1]], own, *given)
 
     def _along(self, values: Values) -> Tangents:
         """Directions: each own unknown of a pose, then of its state, then of theta."""
@@ -320,7 +326,7 @@ class Relaxation:
         more = OF_UNKNOWNS * damping * np.eye(int(free.sum()), int(free.sum()) + 1)
         shared = [later[:, known:], linearized.prior[:, np.append(free, True)], more]
         left_over: FloatArray = np.asarray(np.linalg.qr(np.concatenate(shared), mode="r"))
-        return _Reduced(triangles, [state[:, :-1] for state in states], left_over)
+        return _Reduced(triangles, [x[:, :-1] for x in states], left_over, later[:, known:])
 
     @cached_property
     def _prior(self) -> FloatArray:

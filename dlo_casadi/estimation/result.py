@@ -13,14 +13,8 @@ import numpy as np
 from dlo_casadi.arrays import BoolArray, Brief, FloatArray
 from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.problem import FIRST_ROUGHNESS, Priors, Problem
-from dlo_casadi.estimation.unknowns import (
-    NO_INFORMATION,
-    REST_TURNS_STD,
-    Linearization,
-    Normal,
-    Point,
-    Unknowns,
-)
+from dlo_casadi.estimation.unknowns import REST_TURNS_STD, Linearization, Point, Unknowns
+from dlo_casadi.linear_mixed import NO_INFORMATION, LinearMixed, Normal
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import LEAST_NOISE_DEGREES
@@ -115,9 +109,14 @@ class Fit(Brief):
         return self.problem.linearize(self.point)
 
     @cached_property
+    def mixed(self) -> LinearMixed:
+        """The fit to first order about the minimum."""
+        return self.problem.mixed(self.point, self.linearization)
+
+    @property
     def normal(self) -> Normal:
         """Normal equations at the minimum."""
-        return self.problem.normal_equations(self.point, self.linearization)
+        return self.mixed.normal
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -189,34 +188,17 @@ class Fit(Brief):
     @cached_property
     def determined_unknowns(self) -> float:
         """Effective number of unknowns that the residuals determine, given the priors."""
-        problem = self.problem
-        known = problem.precision + self._by_bounds
-        effective = problem.unknowns.size - float(np.trace(self.covariance @ known))
-        precision = np.diag(1 / problem.deviation_std**2)
-        own = self.normal.own_covariances(self.covariance)
-        return effective + sum(len(full) - float(np.trace(full @ precision)) for full in own)
+        return float(sum(each.sum() for each in self.leverages))
 
     @cached_property
     def leverages(self) -> list[FloatArray]:
         """Share, 0 to 1, of each fitted residual (R_j,) that the unknowns absorb."""
-        out = []
-        rows = zip(self._taken, self.linearization.by_deviation, self.normal.inner, strict=True)
-        for taken, b, (block, _, _) in rows:
-            own = (b * np.linalg.solve(block, b.T).T).sum(axis=1)
-            out.append(((taken @ self.covariance) * taken).sum(axis=1) + own)
-        return out
+        return self.mixed.leverages(self.covariance)
 
     @property
     def own_deviations(self) -> FloatArray:
         """Deviations (fitted poses, n_deviations) of each fitted pose's own."""
         return self.problem.own_deviations(self.point)
-
-    @property
-    def _taken(self) -> list[FloatArray]:
-        """Derivatives (R_j, size) of whitened residuals by theta, with own deviations refitted."""
-        lin = self.linearization
-        rows = zip(lin.by_theta, lin.by_deviation, self.normal.inner, strict=True)
-        return [a - b @ np.linalg.solve(block, cross) for a, b, (block, cross, _) in rows]
 
     def variance_degrees(self, name: str) -> float:
         """Degrees of freedom with which the variance of a parameter's estimate is known.
@@ -235,8 +217,8 @@ class Fit(Brief):
         index = problem.unknowns.names.index(name)
         column = self.covariance[index]
         errors, own = 0.0, 0.0
-        for taken, white, way in zip(self._taken, problem.whitening, self._own_errors, strict=True):
-            by_errors = taken @ column
+        for k, (white, way) in enumerate(zip(problem.whitening, self._own_errors, strict=True)):
+            by_errors = self.mixed.taken(k, self.linearization.by_theta[k] @ column[:, None])[:, 0]
             errors += float(by_errors @ by_errors)
             own += float(((by_errors @ white @ way) ** 2).sum())
         # The weights contain a random rest curvature; all else is an unknown of each pose.
@@ -429,20 +411,6 @@ class Fit(Brief):
 
     @cached_property
     def log_evidence(self) -> float:
-        """Laplace's approximation of the log marginal likelihood, constants dropped.
-
-        -objective + 1/2 log|P+| - 1/2 log|H| - 1/2 sum log|block| + sum log|W|
-
-        with the whitening matrices W. A direction known worse than its scale counts as known to it.
-        """
-        problem = self.problem
-        eigen = np.linalg.eigvalsh(problem.precision)
-        prior = float(np.log(eigen[eigen > 1e-12]).sum())
-        values = np.linalg.eigvalsh(self.normal.hessian)
-        hessian = float(np.log(np.maximum(values, 1.0)).sum())
-        white = sum(float(np.linalg.slogdet(weight)[1]) for weight in problem.whitening)
-        inner = sum(
-            float(np.linalg.slogdet(block)[1]) + 2 * float(np.log(problem.deviation_std).sum())
-            for block, _, _ in self.normal.inner
-        )
-        return -self.point.objective + (prior - hessian - inner) / 2 + white
+        """Log marginal likelihood by Laplace's approximation, see `LinearMixed.log_evidence`."""
+        white = sum(float(np.linalg.slogdet(weight)[1]) for weight in self.problem.whitening)
+        return self.mixed.log_evidence + white

@@ -31,6 +31,7 @@ from scipy.linalg import block_diag
 from scipy.special import chdtrc, chdtri
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.linear_mixed import OBSERVED, eliminated
 from dlo_casadi.model.pose_scatter import REST_CURVATURE, SMOOTHNESS, PoseScatter
 from dlo_casadi.sensing.noise_estimate import Deviance, most_likely
 from dlo_casadi.thresholds import SIGNIFICANCE
@@ -128,15 +129,10 @@ class ScatterLikelihood:
         )
         left = left[:, values > 1e-6 * max(values[:1].max(initial=0.0), 1e-300)]
         blocks = np.split(left, np.cumsum([len(sample.e) for sample in samples])[:-1])
-        # Products of each pose's columns (Z, X, y), and of U with them; U is rotated so that its
-        # columns are orthogonal, with squares `own`.
         both = zip(samples, blocks, strict=True)
-        columns = [np.column_stack([one.random, x, one.e]) for one, x in both]
-        self.products = np.array([a.T @ a for a in columns])
-        own, turns = np.linalg.eigh(np.array([one.own.T @ one.own for one in samples]))
-        self.own = np.maximum(own, 0.0)  # rounding makes some of them negative
-        crossed = [one.own.T @ a for one, a in zip(samples, columns, strict=True)]
-        self.crossed = turns.swapaxes(1, 2) @ np.array(crossed)
+        columns = [np.column_stack([one.own, one.random, x, one.e]) for one, x in both]
+        self.own, self.shared = samples[0].own.shape[1], left.shape[1]
+        self.products = np.array([a.T @ a for a in columns])  # of (U, Z, X, y)
         self.distances = distances
         square = (distances**2).sum() / max(self.m * (self.m - 1), 1)
         # If all poses are repeats of one, they are alike at any range.
@@ -147,72 +143,62 @@ class ScatterLikelihood:
     ) -> InformedDeviance:
         """Restricted deviance by the logarithms of the three sizes, see `Deviance`.
 
-            V = V_0 + Z B Z^T,   V_0 = noise^2 1 + U U^T,   P = V^-1 - V^-1 X (...)^-1 X^T V^-1
+            V = noise^2 1 + U U^T + Z (K x sizes^2) Z^T,   K = std^2 1 + systematic^2 alike
 
-        by Woodbury's identity, first for the other quantities U of each pose alone, then for the
-        random ones Z: pose by pose, or in one block of all poses if these are correlated.
+        The other quantities U of each pose are integrated out first, then the random ones, pose by
+        pose, or in one block of all poses if these are correlated; then what all poses share. The
+        slopes are means over all of these of the slopes of their joint density (Fisher's identity).
         """
-        m, r, variance = self.m, self.modes, noise**2
-        weights = 1 / (variance + self.own)
-        first = self._without_own(weights) / variance  # (Z, X, y)^T V_0^-1 (Z, X, y)
-        twice = weights * (2 - self.own * weights)
-        second = self._without_own(twice) / variance**2  # (Z, X, y)^T V_0^-2 (Z, X, y)
-        sizes = PoseScatter(1.0, smoothness, source=self.source).sizes(r) ** 2
+        m, r, a = self.m, self.modes, self.own
+        sizes = PoseScatter(1.0, smoothness, source=self.source).sizes(r)
         joined = systematic > 0 and m > 1
-        alike = np.exp(-((self.distances / range_) ** 2) / 2) if joined else np.eye(m)
-        poses = std**2 * np.eye(m) + systematic**2 * joined * alike  # B = poses x sizes
-        inside, cross, between = first[:, :r, :r], first[:, :r, r:], std**2 * np.diag(sizes)
-        if joined:
-            inside, cross = block_diag(*inside)[None], cross.reshape((1, m * r, -1))
-            between = np.kron(poses, np.diag(sizes))
-        count = len(between)
-        matrix = np.eye(count) + inside @ between
-        solved = np.linalg.solve(matrix, np.concatenate([inside, cross], axis=2))
-        inside, taken = solved[:, :, :count], solved[:, :, count:]  # Z^T V^-1 Z, Z^T V^-1 (X, y)
-        moved = between @ taken
-        gram = first[:, r:, r:].sum(axis=0) - (cross.transpose(0, 2, 1) @ moved).sum(axis=0)
-        x, y = gram[:-1, :-1], gram[:-1, -1]
-        root = np.linalg.cholesky(x + 1e-9 * np.trace(x) / max(len(x), 1) * np.eye(len(x)))
-        half = np.linalg.inv(root)
-        explained = half @ y
-        quadratic = float(gram[-1, -1] - explained @ explained)
-        logdet = 2 * float(np.log(root.diagonal()).sum()) - float(np.log(weights).sum())
-        logdet += (self.count - weights.size) * float(np.log(variance))
-        logdet += float(np.linalg.slogdet(matrix)[1].sum())
+        alike = np.exp(-((self.distances / range_) ** 2) / 2) if joined else np.zeros((m, m))
+        between = std**2 * np.eye(m) + systematic**2 * alike
+        inverse = np.linalg.inv(between)
+        scales = np.concatenate([np.ones(a), sizes, np.ones(self.shared + 1)]) / noise
+        own = eliminated(self.products * np.outer(scales, scales), np.eye(a))
+        known = np.kron(inverse, np.eye(r)) if joined else np.eye(r) / std**2
+        random = eliminated(self._in_one(own.left) if joined else own.left, known)
+        gram = random.left.sum(axis=0)
+        ridge = 1e-9 * np.trace(gram[:-1, :-1]) / max(self.shared, 1)
+        shared = eliminated(gram, ridge * np.eye(self.shared))
+        quadratic = float(shared.left[0, 0])
+        value = quadratic + own.logdet + random.logdet + shared.logdet
+        value += r * float(np.linalg.slogdet(between)[1]) + 2 * self.count * float(np.log(noise))
 
-        # The noise: trace(P) and |P y|^2, with the diagonal blocks of B - B (Z^T V^-1 Z) B.
-        within = std**4 * inside
+        # Second moments of the random quantities by pairs of poses, and of all others' energy.
+        mean, covariance = random.joint(*shared.joint(*OBSERVED))
+        spread = covariance[:, : len(known), : len(known)]
         if joined:
-            apart = np.tensordot(poses, inside.reshape((m, r, m, r)), axes=1)
-            within = (poses[:, None, :, None] * apart).sum(axis=2)
-        within = poses.diagonal()[:, None, None] * np.diag(sizes) - sizes[:, None] * within * sizes
-        unit = np.broadcast_to(np.eye(len(gram)), (m, *gram.shape))
-        rows = np.concatenate([-moved.reshape((m, r, -1)), unit], axis=1)
-        square = (rows.transpose(0, 2, 1) @ second @ rows).sum(axis=0)  # (X, y)^T V^-2 (X, y)
-        fitted = np.append(-(half.T @ explained), 1.0)
-        trace = (self.count - (self.own * weights).sum()) / variance
-        trace -= (within * second[:, :r, :r]).sum() + ((half @ square[:-1, :-1]) * half).sum()
-        by_noise = 2 * variance * float(trace - fitted @ square @ fitted)
-        # The random parts: Z^T P Z and Z^T P y, summed over the modes, by pairs of poses.
-        hidden = half @ taken[:, :, :-1].transpose(0, 2, 1)
-        left = inside - hidden.transpose(0, 2, 1) @ hidden
-        pull = taken[:, :, -1] - (explained @ hidden)
-        each = pull.reshape((m, r))
-        pairs = np.diag(left.diagonal(axis1=1, axis2=2).reshape((m, r)) @ sizes)
-        if joined:
-            pairs = left.reshape((m, r, m, r)).diagonal(axis1=1, axis2=3) @ sizes
-        excess = pairs - (each * sizes) @ each.T
-        by_std = 2 * std**2 * float(np.trace(excess))
-        by_systematic = 2 * systematic**2 * joined * float((alike * excess).sum())
+            spread = np.trace(spread.reshape((m, r, m, r)), axis1=1, axis2=3)
+            after = np.tile(np.arange(m * r, mean.shape[1]), (m, 1))
+            rows = np.hstack([np.arange(m * r).reshape((m, r)), after])
+            mean, covariance = mean[0, rows], covariance[0, rows[:, :, None], rows[:, None]]
+        else:
+            spread = np.diag(np.trace(spread, axis1=1, axis2=2))
+        moments = mean[:, :r] @ mean[:, :r].T + spread
+        others, variance = own.joint(mean, covariance)
+        energy = (others[:, :a] ** 2).sum() + variance[:, range(a), range(a)].sum()
+        unknowns = m * (a + r) + self.shared
+        by_noise = 2 * (self.count - unknowns - quadratic + energy + (inverse * moments).sum())
+        excess = inverse @ (r * between - moments) @ inverse
+        by_std = 2 * std**2 * np.trace(excess)
+        by_systematic = 2 * systematic**2 * (alike * excess).sum()
+
         # The derivative of V by log(std), times P y, is Z way.
-        way = 2 * std**2 * (each * sizes).reshape(pull.shape)[:, :, None]
-        information = float((way * (inside @ way)).sum() - ((hidden @ way).sum(axis=0) ** 2).sum())
-        gradient = np.array([by_noise, by_std, by_systematic])
-        return InformedDeviance(logdet + quadratic, gradient, information)
+        way = 2 * std**2 * (inverse @ mean[:, :r]).reshape((-1, len(known), 1))
+        pull = known @ way
+        cross = (random.arm[:, :, :-1].swapaxes(1, 2) @ pull).sum(axis=0)
+        information = (pull * (way - np.linalg.solve(random.block, pull))).sum()
+        information -= (cross * np.linalg.solve(shared.block, cross)).sum()
+        gradient = np.array([by_noise, by_std, by_systematic], dtype=float)
+        return InformedDeviance(value, gradient, float(information))
 
-    def _without_own(self, weights: FloatArray) -> FloatArray:
-        """Products (m, c, c) of (Z, X, y), minus the weighted part (m, a) that U explains."""
-        return self.products - self.crossed.transpose(0, 2, 1) @ (weights[..., None] * self.crossed)
+    def _in_one(self, products: FloatArray) -> FloatArray:
+        """Products (m, k, k) of all poses in one group, whose random quantities are apart."""
+        r = self.modes
+        apart, cross = block_diag(*products[:, :r, :r]), np.concatenate(products[:, :r, r:])
+        return np.block([[apart, cross], [cross.T, products[:, r:, r:].sum(axis=0)]])[None]
 
     def best(
         self,

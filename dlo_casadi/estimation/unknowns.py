@@ -28,8 +28,6 @@ LARGEST_REST = 20.0
 # Largest change of a logarithm in one step: a factor of 20. Without it, where shapes hardly
 # determine a stiffness, a step led to bounds at which rounding loses equilibria: 40 steps, not 7.
 FARTHEST = 3.0
-# Precision in scaled units below which a direction counts as undetermined.
-NO_INFORMATION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -294,44 +292,3 @@ class Linearization:
     raw: list[FloatArray]
     raw_directions: list[FloatArray]
     shapes: Tangents
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Normal equations with the deviations eliminated: hessian @ step = -gradient.
-
-    `inner`: for each fitted pose the block of its own deviations, its coupling to theta, and its
-    gradient; of size zero if the model has no deviations.
-    """
-
-    hessian: FloatArray
-    gradient: FloatArray
-    inner: list[tuple[FloatArray, FloatArray, FloatArray]]
-
-    def own_covariances(self, covariance: FloatArray) -> list[FloatArray]:
-        """Covariance of each fitted pose's own deviations, given that of theta (size, size)."""
-        out: list[FloatArray] = []
-        for block, cross, _ in self.inner:
-            inverse = np.linalg.inv(block)
-            arm = inverse @ cross
-            out.append(inverse + arm @ covariance @ arm.T)
-        return out
-
-    def promised(self, damping: float = 0.0) -> float:
-        """Decrease of the objective predicted for a damped step, deviations included."""
-        step = np.linalg.solve(self.damped(damping), self.gradient)
-        held = damping * self.scale @ step**2
-        own = (slope @ np.linalg.solve(block, slope) for block, _, slope in self.inner)
-        return float(self.gradient @ step + held) / 2 + float(sum(own)) / 2
-
-    @property
-    def scale(self) -> FloatArray:
-        """Diagonal of the Hessian, positive."""
-        return np.maximum(np.diag(self.hessian), 1e-12)
-
-    def damped(self, damping: float) -> FloatArray:
-        """Hessian for damped steps.
-
-        A direction without information, such as the place of a mass of zero, does not move.
-        """
-        return self.hessian + np.diag(damping * self.scale + NO_INFORMATION)

@@ -202,10 +202,19 @@ def reading_noise_of(fit: Fit) -> ReadingNoise:
 
     def std(kind: str, first: float) -> float:
         of = kinds == kind
-        return float(np.sqrt((square[of].sum() + first**2) / (free[of].sum() + 1)))
+        return updated(square[of].sum(), free[of].sum(), 1.0, first)
 
     unknown = [x for x in QUANTITIES if not own.known(x)]
     return own.with_std({x: std(x.name, guess.of(x)) for x in unknown})
+
+
+def updated(square: float, known: float, more: float = 0.0, std: float = 0.0) -> float:
+    """Size of a random part by one step of MacKay's fixed point.
+
+    `square`: sum of squares of its components, of which the data determine `known`. `more`: number
+    of further components of a size that is known, `std`.
+    """
+    return float(np.sqrt((square + more * std**2) / (known + more)))
 
 
 def pose_scatter_of(fit: Fit, noise: NoiseModel) -> ScatterEstimate:
@@ -331,7 +340,7 @@ def roughness_of(fit: Fit) -> float:
     prior = rough.T @ rough / roughness_std**2
     well_determined = len(rough) - float(np.trace(covariance @ prior))
     energy = float(((rough @ fit.point.theta[rest]) ** 2).sum())
-    return float(max(np.sqrt(energy / max(well_determined, 1e-2)), ROUGHNESS_FLOOR))
+    return max(updated(energy, max(well_determined, 1e-2)), ROUGHNESS_FLOOR)
 
 
 def scatter_of(fit: Fit) -> FloatArray:
@@ -344,14 +353,15 @@ def scatter_of(fit: Fit) -> FloatArray:
     small, and so were intervals: of ten random cables in space five lay more than two std off, one
     4.6; with the tolerance none of these and nine more does, at most 1.85.
     """
-    problem, normal = fit.problem, fit.normal
+    problem = fit.problem
     columns = problem.equilibria.used_deviations
     if not columns or len(problem.used) == 1:
         return problem.priors.scatter
-    covariance = np.linalg.pinv(normal.hessian, hermitian=True)
-    variance = [np.diag(full) for full in normal.own_covariances(covariance)]
+    covariance = np.linalg.pinv(fit.normal.hessian, hermitian=True)
+    each = range(len(columns))
+    variance = fit.mixed.covariances(covariance)[:, each, each]
     square = (fit.own_deviations**2).sum(axis=0)
-    determined = (1 - np.array(variance) / problem.deviation_std**2).sum(axis=0)
+    determined = (1 - variance / problem.deviation_std**2).sum(axis=0)
     scatter = problem.priors.scatter.copy()
     node = problem.unknowns.model.node
     limits = problem.priors.tolerances.deviation(problem.unknowns.model)
@@ -366,7 +376,6 @@ def scatter_of(fit: Fit) -> FloatArray:
             known = max(determined[members].sum(), 0.0)
             unknown = max(1 - known / (len(members) * len(problem.used)), 1e-6)
             for column in group:
-                total = square[members].sum() + unknown * limits[column] ** 2
-                found = np.sqrt(total / (known + unknown))
+                found = updated(square[members].sum(), known, unknown, limits[column])
                 scatter[column] = np.clip(found, SCATTER_FLOOR * limits[column], limits[column])
     return scatter

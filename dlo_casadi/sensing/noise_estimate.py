@@ -12,6 +12,7 @@ from scipy.special import expit
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import EstimationError
+from dlo_casadi.linear_mixed import OBSERVED, eliminated
 from dlo_casadi.sensing.noise import SLOW_MODES, Count, Kernel, NoiseModel, smooth_modes
 
 KERNELS: tuple[Kernel, ...] = ("exponential", "matern", "gaussian")
@@ -98,8 +99,8 @@ class NoiseSample:
 
     @cached_property
     def scaled(self) -> FloatArray:
-        """Residuals, shared and own directions (K, per_point, 1 + b + a), over the weights."""
-        stacked = np.column_stack([self.residuals, self.shared, self.own])
+        """Own and shared directions, residuals (K, per_point, a + b + 1), over the weights."""
+        stacked = np.column_stack([self.own, self.shared, self.residuals])
         by_point = stacked.reshape((len(self.places), self.per_point, -1))
         return np.asarray(by_point / self.weight[:, None, None])
 
@@ -182,40 +183,33 @@ def restricted_deviance(unit: NoiseModel, samples: list[NoiseSample]) -> Profile
     The directions of the fitted curves are projected out, and the degrees of freedom are reduced
     accordingly, so that a good fit does not make the noise look smaller.
     """
-    logdet, count, kept = 0.0, 0, []
+    logdet, count, groups = 0.0, 0, []
     gram = np.zeros((samples[0].shared.shape[1] + 1,) * 2)
     for sample in samples:
         points, each, columns = sample.scaled.shape
         at = (sample.distance, sample.correlation_length, sample.count)
         factor = np.linalg.cholesky(unit.correlation(*at))
-        white, k = dtrtri(factor, lower=1)[0], len(gram)
-        y = (white @ sample.scaled.reshape((points, -1))).reshape((points * each, columns))
-        logdet += 2 * each * float(np.log(factor.diagonal() * sample.weight).sum())
-        own, left = y[:, k:], y[:, :k]
-        if columns > k:
-            root = np.linalg.cholesky(own.T @ own)
-            logdet += 2 * float(np.log(root.diagonal()).sum())
-            own = own @ dtrtri(root, lower=1)[0].T
-            left = left - own @ (own.T @ left)
-        gram += left.T @ left
-        count += len(y) - own.shape[1]
-        kept.append((white, left, own, unit.correlation_slopes(*at)))
-    shared, cross = gram[1:, 1:], gram[1:, 0]
-    if len(shared):
-        shared = shared + 1e-9 * np.trace(shared) / len(shared) * np.eye(len(shared))
-    root = np.linalg.inv(np.linalg.cholesky(shared)).T
-    logdet -= 2 * float(np.log(root.diagonal()).sum())
-    explained = root @ (root.T @ cross)
-    count -= len(shared)
-    variance = float(gram[0, 0] - cross @ explained) / count
-    gradient = np.zeros(len(kept[0][-1]))
-    for white, left, own, slopes in kept if len(gradient) else ():
-        # Orthonormal basis of the directions projected out; last column: the residuals.
-        basis = np.column_stack([left[:, 1:] @ root, own, left[:, 0] - left[:, 1:] @ explained])
-        weighed = white.T @ basis.reshape((len(white), -1))
-        products = (weighed * (slopes @ weighed)).reshape((len(slopes), len(basis), -1)).sum(axis=1)
-        trace = len(basis) // len(white) * (white.T @ white * slopes).sum(axis=(1, 2))
-        gradient += trace - products[:, :-1].sum(axis=1) - products[:, -1] / variance
+        white = dtrtri(factor, lower=1)[0]
+        seen = (white @ sample.scaled.reshape((points, -1))).reshape((points * each, columns))
+        own = eliminated(seen.T @ seen, np.zeros((columns - len(gram),) * 2))
+        logdet += 2 * each * float(np.log(factor.diagonal() * sample.weight).sum()) + own.logdet
+        gram += own.left
+        count += len(seen) - len(own.block)
+        groups.append((white, seen, own, unit.correlation_slopes(*at)))
+    ridge = 1e-9 * np.trace(gram[:-1, :-1]) / max(len(gram) - 1, 1)
+    shared = eliminated(gram, ridge * np.eye(len(gram) - 1))
+    count -= len(gram) - 1
+    variance = float(shared.left[0, 0]) / count
+    known, gradient = shared.joint(*OBSERVED), np.zeros(len(groups[0][-1]))
+    for white, seen, own, slopes in groups if len(gradient) else ():
+        # Second moments of the coefficients, hence of the noise: Fisher's identity.
+        mean, covariance = own.joint(*known)
+        weighed = (white.T @ seen.reshape((len(white), -1))).reshape((len(white), -1, len(mean)))
+        moved = weighed @ (covariance + np.outer(mean, mean) / variance)
+        error = moved.reshape((len(white), -1)) @ weighed.reshape((len(white), -1)).T
+        each = len(seen) // len(white)
+        gradient += ((each * white.T @ white - error) * slopes).sum(axis=(1, 2))
+    logdet += shared.logdet
     return Profile(count * np.log(variance) + logdet, gradient, float(np.sqrt(variance)))
 
 

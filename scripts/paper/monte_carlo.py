@@ -144,7 +144,7 @@ def bound(fit: Fit, truth: Truth) -> tuple[float, FloatArray]:
         raise DloError("the true parameters have no equilibria near the fitted ones")
     point = Values(theta, shapes, fit.point.projections)
     problem = problem.weighed(point)
-    hessian = problem.normal_equations(point, problem.linearize(point)).hessian
+    hessian = problem.mixed(point, problem.linearize(point)).normal.hessian
     covariance = np.linalg.inv(hessian)
     tail = slice(unknowns.n_parameters, unknowns.size)
     basis = fit.model.rest.basis(places()) * fit.model.cable.curvature_scale

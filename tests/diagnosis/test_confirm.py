@@ -11,7 +11,7 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
-from dlo_casadi.diagnosis.screening import Screen, sidak
+from dlo_casadi.diagnosis.screening import Screen, _Moving, sidak
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.diagnosis.trials import Trials, judged_again
 from dlo_casadi.diagnosis.unknown_force import _Search
@@ -84,9 +84,11 @@ def test_a_fixed_effect_stays_when_another_is_added_and_dropped(base):
 
 def test_a_score_is_the_gain_of_least_squares_with_the_candidate(base):
     """To first order: what residuals and priors leave without it, less what they leave with it."""
-    screen = Screen(base, [taper_of(base.model)])
-    (found,) = screen.run(np.inf)
-    problem, point, lin = screen._linearized
+    taper = taper_of(base.model)
+    (found,) = Screen(base, [taper]).run(np.inf)
+    moving = _Moving.of(base, [taper])
+    problem, point = moving.problem, moving.at({})
+    lin = problem.linearize(point)
     std, columns = problem.deviation_std, problem.equilibria.used_deviations
     sizes, vectors = np.linalg.eigh(problem.precision)
     root = np.sqrt(np.maximum(sizes, 0.0))[:, None] * vectors.T

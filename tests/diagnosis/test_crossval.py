@@ -13,6 +13,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.linear_mixed import log_density
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
@@ -74,7 +75,7 @@ def test_density_of_residuals_is_that_of_their_covariance():
     covariance = np.eye(9) + ways @ ways.T
     energy = white @ np.linalg.solve(covariance, white)
     expected = -(energy + np.linalg.slogdet(covariance)[1]) / 2
-    assert crossval._log_density(white, ways) == pytest.approx(expected, rel=1e-9)
+    assert log_density(white, ways) == pytest.approx(expected, rel=1e-9)
 
 
 def test_points_of_a_left_out_stretch_do_not_move_what_predicts_it(monkeypatch):

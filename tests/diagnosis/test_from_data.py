@@ -208,7 +208,7 @@ def test_a_pose_at_a_fold_ends_a_fit_with_an_error_that_says_so(base):
     lin = base.linearization
     beyond = [np.full_like(b, 1e27) for b in lin.by_deviation]
     with pytest.raises(EstimationError, match="fold"):
-        base.problem.normal_equations(base.point, replace(lin, by_deviation=beyond))
+        _ = base.problem.mixed(base.point, replace(lin, by_deviation=beyond)).normal
 
 
 @pytest.mark.parametrize("count", [6, pytest.param(10, marks=pytest.mark.long)])

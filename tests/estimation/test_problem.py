@@ -32,8 +32,9 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.estimation.unknowns import Normal, Point, Unknowns, Values
+from dlo_casadi.estimation.unknowns import Point, Unknowns, Values
 from dlo_casadi.estimation.variances import scatter_of
+from dlo_casadi.linear_mixed import Normal, eliminated
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.rod.ends import deviation_names
@@ -391,8 +392,9 @@ def test_what_residuals_determine_is_that_of_all_unknowns_at_once():
     n, std = len(of_theta), np.sqrt(np.diag(whole)[: len(of_theta)])
     apart = (fit.covariance - whole[:n, :n]) / np.outer(std, std)
     np.testing.assert_allclose(apart, 0, atol=1e-6)
-    own = block_diag(*fit.normal.own_covariances(fit.covariance))
-    np.testing.assert_allclose(np.diag(own), np.diag(whole)[n:], rtol=1e-6)
+    own = fit.mixed.covariances(fit.covariance)[:, : len(lin.by_deviation[0][0])]
+    variances = np.ravel([np.diag(each) for each in own])
+    np.testing.assert_allclose(variances, np.diag(whole)[n:], rtol=1e-6)
     leverages = ((rows @ whole) * rows).sum(axis=1)
     np.testing.assert_allclose(np.concatenate(fit.leverages), leverages, rtol=1e-6)
     assert fit.determined_unknowns == pytest.approx(leverages.sum(), rel=1e-6)
@@ -403,7 +405,8 @@ def test_scatter_of_the_ends_is_that_of_those_that_are_known():
     fit, *_ = round_trip("arc")
     problem, limit = fit.problem, Tolerances().end
     known = problem.deviation_std
-    variances = np.array([np.diag(x) for x in fit.normal.own_covariances(fit.covariance)])
+    own = fit.mixed.covariances(fit.covariance)[:, : len(known)]
+    variances = np.array([np.diag(each) for each in own])
     determined = (1 - variances / known**2).sum()
     share, square = 1 - determined / 16, (fit.own_deviations**2).sum()
     assert 0.1 < share < 0.9
@@ -567,8 +570,10 @@ def test_a_step_changes_a_stiffness_by_a_factor_of_twenty_at_most():
 def test_the_promised_decrease_is_that_of_the_quadratic_model(damping):
     root = np.random.default_rng(1).normal(size=(5, 3))
     hessian, gradient = 1e4 * root.T @ root, np.array([30.0, -200.0, 100.0])
-    own = (np.array([[4.0]]), np.zeros((1, 3)), np.array([2.0]))
+    products = np.zeros((5, 5))
+    products[0, 0], products[0, 4], products[4, 0] = 4.0, 2.0, 2.0
+    own = eliminated(products[None], np.zeros((1, 1)))
     step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
     decrease = -(gradient @ step + step @ hessian @ step / 2)
-    found = Normal(hessian, gradient, [own]).promised(damping)
+    found = Normal(hessian, gradient, own).promised(damping)
     assert found == pytest.approx(decrease + 0.5, rel=1e-6)

@@ -136,7 +136,7 @@ def test_normal_equations_are_those_of_differences(rolled):
     values = replace(values, theta=values.theta + 0.02)
     for _ in range(5):
         values = relaxation.solve(values, fixed, steps=40)
-    gradient = relaxation.normal(values).gradient
+    gradient = relaxation.mixed(values).normal.gradient
     step, differences = 1e-4, []
     for k in range(len(start)):
         sides = []
