@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
 from dlo_casadi.config import (
@@ -820,6 +821,25 @@ def test_readings_of_a_pose(tmp_path):
     assert pose.readings == {"end_force": (1.0, -2.0), "start_moment": (0.1,)}
     assert set(declared_setup(config).readings) == {"end_force", "start_moment"}
     assert config.experiment.poses[0].readings == {}
+
+
+def test_moments_about_directions_that_nothing_holds_are_questioned(tmp_path):
+    """In a plane a pin has none; in space a swivel has none about the cable's axis."""
+    (said,) = read_at(tmp_path, "end_moment: 0.2").warnings
+    assert said.startswith("end_moment of b: 0.2 N m, but a pinned end lets the cable turn there")
+    assert "Try: boundary.end: clamped" in said
+    assert not read_at(tmp_path, "end_moment: 1e-4").warnings
+
+    turned = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])  # the cable ends along y
+    held = {"start_orientation": turned, "end_orientation": turned}
+    for moment, count in (((0.2, 0.0, 0.2), 0), ((0.0, 0.2, 0.0), 1)):
+        points = [[0, 0, 0], [0.2, 0.1, 0], [0.5, 0.1, 0]]
+        pose = dlo.Pose((0, 0, 0), points[-1], points=points, end_moment=moment, **held)
+        cable = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
+        swivels = {"gravity": (0, 0, -9.81), "boundary": ("swivel", "swivel")}
+        found = [x for x in dlo.Session(cable, [pose], **swivels).warnings if "end_moment" in x]
+        assert len(found) == count
+        assert all("0.2 N m about the cable's axis, but a swivel end" in x for x in found)
 
 
 @pytest.mark.parametrize(

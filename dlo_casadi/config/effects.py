@@ -90,13 +90,17 @@ def without_values(config: Config) -> Iterator[ConfigProblem]:
             yield ConfigProblem((), f"model.effects: {text}")
 
 
+def has_pin_spring(config: Config) -> bool:
+    """Whether a spring at a pinned end is declared."""
+    names = (item.name for item in config.model.effects)
+    return any(issubclass(EFFECTS.get(name, Effect), PinSpring) for name in names)
+
+
 def wrong_limits(config: Config) -> list[ConfigProblem]:
     """Find limits that are meaningless for this cable."""
     given, ends = config.experiment, config.experiment.boundary
     held = {ends.start, ends.end, *(clip.kind for x in given.poses for clip in x.clips)}
-    sprung = any(
-        issubclass(EFFECTS.get(item.name, Effect), PinSpring) for item in config.model.effects
-    )
+    sprung = has_pin_spring(config)
     avoided = any(one.touch == "avoided" for one in given.obstacles)
     length, limits = config.cable.length, config.limits
     found = limits.problems(sorted(held), sprung, given.in_space, length, avoided)

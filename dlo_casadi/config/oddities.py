@@ -3,7 +3,11 @@
 import math
 from collections.abc import Iterator
 
-from dlo_casadi.config.sections import Config
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dlo_casadi.config.effects import has_pin_spring
+from dlo_casadi.config.sections import Config, Experiment, Pose
 from dlo_casadi.config.supports import unused_directions
 from dlo_casadi.config.values import EARTH
 from dlo_casadi.errors import counted
@@ -17,6 +21,8 @@ _COARSE = {4: 10, 2: 20}
 _FINE = 160
 # Time of COBYLA for one pose: 1 s measured for 10 links, 4 s for 20; it grows with the square.
 _COBYLA_LINKS = 20
+# Standard deviations above which a moment is read although nothing there takes one.
+_FELT = 5.0
 # Largest relative difference from gravity on Earth that passes without a question: 10 m/s^2 does.
 _OTHER_GRAVITY = 0.03
 
@@ -74,6 +80,41 @@ def oddities(config: Config) -> Iterator[str]:
                     f"holds what clamped holds. Try: {key}: clamped; or three numbers of gravity, "
                     "for a cable in space"
                 )
+    if not has_pin_spring(config):
+        yield from _moments_of_free_turns(experiment)
     for key in unused_directions(experiment.boundary.start, experiment.boundary.end):
         if given := [p.name for p in experiment.poses if getattr(p, key) is not None]:
             yield f"{key} is not used, the {key.partition('_')[0]} is pinned: {', '.join(given)}"
+
+
+def _moments_of_free_turns(experiment: Experiment) -> Iterator[str]:
+    """Readings of moments about directions in which a support lets the cable turn: there are none.
+
+    Friction, at most: a few standard deviations of the sensor pass.
+    """
+    known = experiment.measurement.moment_std or 0.0
+    noise = math.hypot(known, experiment.tolerances.moment_bias)
+    for side in ("start", "end"):
+        kind = getattr(experiment.boundary, side)
+        read = [pose for pose in experiment.poses if getattr(pose, f"{side}_moment") is not None]
+        sizes = {pose.name: abs(_about_free_turns(experiment, pose, side)) for pose in read}
+        largest = max(sizes, key=lambda name: sizes[name], default=None)
+        if largest is not None and sizes[largest] > _FELT * noise:
+            about = " about the cable's axis" if kind.direction else ""
+            yield (
+                f"{side}_moment of {largest}: {sizes[largest]:.3g} N m{about}, but a {kind} {side} "
+                f"lets the cable turn there, so that the model has none (a sensor's std and offset "
+                f"are {noise:.2g} N m). Try: boundary.{side}: clamped, or moments about the "
+                f"{side} itself, not about the sensor's origin"
+            )
+
+
+def _about_free_turns(experiment: Experiment, pose: Pose, side: str) -> float:
+    """Size [N m] of the part of a pose's moment at an end about what its support leaves free."""
+    kind, moment = getattr(experiment.boundary, side), np.ravel(getattr(pose, f"{side}_moment"))
+    if not kind.direction:
+        return float(np.linalg.norm(moment))
+    if kind.roll or not experiment.in_space:
+        return 0.0
+    axis = Rotation.from_quat(getattr(pose, f"{side}_orientation")).apply([1.0, 0.0, 0.0])
+    return float(axis @ moment)

@@ -79,7 +79,8 @@ def test_a_diagnosis_that_is_switched_off_is_no_verdict(outcome, page):
     assert (data["verdict"], data["verdict_word"]) == ("off", "Not diagnosed")
     assert data["sentence"].startswith("Nothing was looked for")
     assert "What the declared model may lack" not in page
-    doubted = context("verdict", replace(outcome, doubts=("poses are predicted far off",)))
+    far = {"verdict": "unexplained", "doubts": ("poses are predicted far off",)}
+    doubted = context("verdict", replace(outcome, **far))
     assert (doubted["verdict"], doubted["verdict_word"]) == ("unexplained", "Unexplained")
 
 

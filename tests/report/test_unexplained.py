@@ -40,7 +40,8 @@ def test_a_doubt_takes_the_verdict_and_the_intervals(outcome, verdict, monkeypat
     found = judged(outcome, verdict)
     assert (found.verdict, found.doubts) == ("unexplained", ("not converged",))
     assert found.stages[-1].parameters["bending_stiffness"].interval_95 is None
-    assert judged(outcome, None).verdict is None
+    # Also where nothing was diagnosed: report.json says what page and terminal say.
+    assert judged(outcome, None).verdict == "unexplained"
 
 
 def test_tables_and_page_have_no_interval(unexplained):
