@@ -55,7 +55,7 @@ class Result(Outcome):
     Attributes
     ----------
     verdict : "complete", "effect_found", "unexplained" or None
-        None without a diagnosis.
+        None without a diagnosis, unless there are `doubts`.
     effects : tuple of FoundEffect
         Effects added to the declared model: name, parameters, p_value, indistinguishable_from.
     stages : tuple of Stage
