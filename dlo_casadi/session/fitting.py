@@ -17,6 +17,7 @@ from dlo_casadi.config import (
     wrong_effects,
 )
 from dlo_casadi.diagnosis.candidates import setup_of
+from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.effects import EFFECTS, NUISANCES, UNKNOWN_MASS
 from dlo_casadi.equilibrium.equilibrium import NEARBY
 from dlo_casadi.errors import ConfigError, EstimationError
@@ -168,16 +169,31 @@ def fit_declared(config: Config, declared: Declared, measured: Sequence[Measured
     if config.estimation.rest_curvature_coefficients is None:
         model = replace(model, n_rest=min(model.n_rest, carried_coefficients(model, measured)))
     measurement = config.experiment.measurement
-    fit = fit_model(
-        model,
-        measured,
-        declared.tolerances,
-        measurement.std,
-        free=declared.free,
-        values=declared.start,
-        readings=first_reading_noise(model, measurement.force_std, measurement.moment_std),
-    )
-    return refine_mesh(fit, finest) if finest else fine_enough(fit, first)
+
+    def fitted(model: CableModel) -> Fit:
+        fit = fit_model(
+            model,
+            measured,
+            declared.tolerances,
+            measurement.std,
+            free=declared.free,
+            values=declared.start,
+            readings=first_reading_noise(model, measurement.force_std, measurement.moment_std),
+        )
+        return refine_mesh(fit, finest) if finest else fine_enough(fit, first)
+
+    shown = any(item.has_points for item in measured)
+    if shown and model.may_spin and not model.cable.straight:
+        # A cable that may roll turns its rest curvature into the plane in which it is bent, however
+        # small that is: shapes depend on its size, with a cusp at zero, where a fit goes astray.
+        with suppress(EstimationError):
+            fit = fitted(replace(model, cable=replace(model.cable, straight=True)))
+            noise = structure_of(fit, noise_degrees(fit)).p_noise
+            # What differs from pose to pose may be a rest curvature, turned another way in each.
+            known = fit.noise.source != "misfit" and not fit.scatters
+            if known and noise >= config.diagnosis.significance:
+                return fit
+    return fitted(model)
 
 
 def first_mesh(model: CableModel) -> int:

@@ -20,6 +20,11 @@ CUT_OFF = (
     "declare what is known of the setup under model.effects or experiment.tolerances; "
     "diagnosis.exclude for effects that cannot be"
 )
+TAKEN_AS_STRAIGHT = (
+    "the cable is taken as straight at rest: it may roll about its axis, and straight it explains "
+    "these measurements down to their noise. The intervals leave out what a slight rest curvature "
+    "would change. Try: an end that is clamped, if the rest shape matters"
+)
 
 
 def reading_warnings(inputs: Sequence[PoseInput], skipped: Sequence[SkippedPose]) -> list[str]:

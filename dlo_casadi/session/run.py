@@ -269,6 +269,8 @@ def judged(outcome: Outcome) -> Outcome:
     said = fit_warnings(fit, outcome.mesh_error, declared, poses)
     said += remarks.worse_than_simpler(stages)
     said += [remarks.CUT_OFF] if outcome.cut_off else []
+    if fit.model.cable.straight and outcome.config.cable.rest_shape == "curved":
+        said.append(remarks.TAKEN_AS_STRAIGHT)
     told = (*doubts, *remarks.branch_warnings(stages))
     far = remarks.far_off(stages[-1], outcome.poses, told)
     said += far
