@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import EstimatedCable
+from dlo_casadi.cable.estimate import Estimate, EstimatedCable
 from dlo_casadi.cable.held import held_pose
-from dlo_casadi.effects import MeasurementEffect
+from dlo_casadi.effects import IN_MOTION, MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import DAMPING_TIME
 from dlo_casadi.motion.modes import damped_modes, displacements
 from dlo_casadi.motion.path import FixturePath
-from dlo_casadi.motion.system import MovingCable, State
+from dlo_casadi.motion.state import State
+from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.motion.trajectory import TOLERANCE, Way, way_of
 
 # Number of points along a cable.
 POINTS = 101
+# Distance [lengths] and angle [rad] between a shape and its fixtures from which it is another one.
+_OFF, _ASKEW = 0.01, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +120,7 @@ class ShapeInMotion:
         """
         if not isinstance(count, int | np.integer) or count < 1:
             raise DloError(f"modes: a number of modes belongs here, found {count!r}")
-        moving = moving_cable(self.cable)
+        moving = moving_cable(self.cable).about(self.equilibrium)
         fixtures = moving.fixtures(self.pose.vector)
         state = moving.at_rest(self.equilibrium, fixtures)
         roots, vectors = damped_modes(moving, state, fixtures, int(count))
@@ -128,6 +133,43 @@ class ShapeInMotion:
 
 class CableInMotion(EstimatedCable):
     """A fitted cable that moves."""
+
+    def with_damping(self, damping_time: float | None = None, **effects: float) -> Self:
+        """The cable with known values of what only its motion shows.
+
+        Parameters
+        ----------
+        damping_time : float [s], optional
+            tau of M = EI (kappa - kappa_0 + tau dkappa/dt).
+        **effects : float
+            Effects of motion by name, each with its only parameter: `air_drag=1.1`.
+
+        Raises
+        ------
+        DloError
+            If there is no such effect, if the cable has it already, or if a value is impossible.
+        """
+        known = dict(zip(self.model.names, self.p.tolist(), strict=True))
+        model, added = self.model, {}
+        if damping_time is not None:
+            model = replace(model, cable=replace(model.cable, damping_time=0.0))
+            added[DAMPING_TIME] = damping_time
+        for name, value in effects.items():
+            if name not in IN_MOTION:
+                raise DloError(f"{name!r} is no effect of motion.\n  Try: {', '.join(IN_MOTION)}")
+            effect = IN_MOTION[name]()
+            (own,) = effect.parameters(model.cable)
+            model, added[f"{name}.{own.name}"] = model.with_effect(effect), value
+        for q in model.parameters:
+            low, high = q.bounds(estimated=False)
+            if q.name in added and not low <= float(added[q.name]) <= high:
+                raise DloError(f"{q.name} lies between {low:g} and {high:g}, found {added[q.name]}")
+        values = known | added
+        units = {q.name: q.unit for q in model.parameters}
+        new = {k: Estimate(float(x), 0.0, units[k], fixed=True) for k, x in added.items()}
+        metadata = replace(self.metadata, params={**self.metadata.params, **new})
+        p = np.array([values[name] for name in model.names])
+        return replace(self, model=model, p=p, metadata=metadata)
 
     def simulate(
         self,
@@ -183,37 +225,66 @@ class CableInMotion(EstimatedCable):
         moving = {key.replace(direction, "frame"): x for key, x in rows.items() if x.ndim > 1}
         path = FixturePath.of(pose, times, moving)
         cable = moving_cable(self)
-        state = _begun(self, cable, pose, begins)
+        rest = solve_equilibrium(cable.model, cable.p, cable.rest, pose)
+        cable = cable.about(rest)
+        state = _begun(self, cable, pose, rest, begins)
         way = way_of(cable, state, path, (times[0], times[-1]), tolerance)
         return Motion(self, times, way)
 
 
-def moving_cable(cable: EstimatedCable, still: FloatArray | None = None) -> MovingCable:
+def moving_cable(cable: EstimatedCable) -> MovingCable:
     """The cable in motion, without effects of the camera."""
     model, p = cable.model.without_kind(MeasurementEffect, cable.p)
-    return MovingCable(model, p, cable.rest, still)
+    return MovingCable(model, p, cable.rest)
 
 
 def _begun(
     cable: EstimatedCable,
     moving: MovingCable,
     pose: HeldPose,
+    rest: Equilibrium,
     begins: ShapeInMotion | Motion | None,
 ) -> State:
     """The state from which a motion begins."""
     if isinstance(begins, Motion):
         return begins.way.states[-1]
     if begins is None:
-        found = solve_equilibrium(moving.model, moving.p, moving.rest, pose)
-        return moving.at_rest(found, moving.fixtures(pose.vector))
+        return moving.at_rest(rest, moving.fixtures(pose.vector))
     x, places = begins.equilibrium.x, moving.model.chain.places
     if x.shape[1] != moving.model.node.coordinates:
         raise DloError("begins: a shape in space cannot move in a plane, nor the reverse")
     known = np.linspace(0.0, cable.length, len(x))
-    x = moving.model.node.interpolated(places, known, x)
+    nodes = moving.model.node.interpolated(places, known, x)
+    _check_ends(moving, pose, begins, nodes)
+    near = CubicSpline(known, begins.equilibrium.points)(places)
     force = np.zeros((moving.n_segments, moving.d * (1 + 2 * moving.model.n_springs)))
-    moment = np.zeros(moving.n_moments)
-    return moving.with_places(moving.still_state(x, force, moment), moving.fixtures(pose.vector))
+    state = moving.still_state(nodes, force, np.zeros(moving.n_moments))
+    return moving.with_places(state, moving.fixtures(pose.vector), near)
+
+
+def _check_ends(
+    moving: MovingCable, pose: HeldPose, begins: ShapeInMotion, nodes: FloatArray
+) -> None:
+    """Raise an error if fixtures hold the cable elsewhere than the shape is."""
+    model, points = moving.model, begins.equilibrium.points
+    sides = zip(("start", "end"), (model.start, model.end), (0, -1), pose.frames, strict=True)
+    for side, kind, k, frame in sides:
+        place = getattr(pose, side)
+        if (
+            kind.place
+            and (off := float(np.linalg.norm(points[k] - place))) > _OFF * model.cable.length
+        ):
+            raise DloError(
+                f"begins: the {side} of the shape is {1e3 * off:.3g} mm from its fixture.\n"
+                f"  Try: {side}={tuple(np.round(points[k], 6).tolist())} at the first instant."
+            )
+        turn = model.node.difference(frame, nodes[k])[kind.rotations(model.node)]
+        if np.abs(turn).max(initial=0.0) > _ASKEW:
+            raise DloError(
+                f"begins: the shape leaves its clamp at the {side} turned by "
+                f"{np.abs(turn).max():.3g} rad.\n  Try: the clamp's direction of the shape, at the "
+                "first instant."
+            )
 
 
 def _times(t: ArrayLike) -> FloatArray:

@@ -9,7 +9,7 @@ from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle, ClampCompliance, ClampRotation
 from dlo_casadi.effects.clips import ClipAngle, ClipOffset, ClipSlip
 from dlo_casadi.effects.contact import ContactPlane, ObstacleOffset
-from dlo_casadi.effects.damping import AirDrag, Damping, PinFriction, ViscousDrag
+from dlo_casadi.effects.damping import AirDrag, Damping, PinFriction, TurningLoss, ViscousDrag
 from dlo_casadi.effects.effect import (
     BoundaryEffect,
     ContactEffect,
@@ -100,7 +100,7 @@ EFFECTS = Registry(
 
 # Effects that still shapes do not know.
 IN_MOTION: dict[str, type[Effect]] = {
-    kind.name: kind for kind in (AirDrag, ViscousDrag, PinFriction, DynamicStiffness)
+    kind.name: kind for kind in (AirDrag, ViscousDrag, PinFriction, TurningLoss, DynamicStiffness)
 }
 
 # Effect that estimates the mass if it is not declared.

@@ -41,6 +41,10 @@ class Damping(Effect):
         """
         return 0.0
 
+    def of_turning(self, params: Params) -> ca.SX | float:
+        """Share of the internal damping that also opposes a turning of the bending plane."""
+        return 0.0
+
     def at_pin(self, turning: ca.SX, params: Params) -> ca.SX | float:
         """Dissipation function [W] of the cable's rate of turning (increment,) [rad/s] at a pin."""
         return 0.0
@@ -126,3 +130,28 @@ class PinFriction(Damping):
     def at_pin(self, turning: ca.SX, params: Params) -> ca.SX:
         """M (sqrt(w^2 + w_0^2) - w_0)."""
         return params["moment"] * (ca.sqrt(ca.sumsqr(turning) + _ROUNDED**2) - _ROUNDED)
+
+
+class TurningLoss(Damping):
+    """Internal damping that opposes a turning of the plane in which the cable is bent.
+
+        D = (1 - share) D_section + share EI tau / 2 int |d/dt (t x dt/ds)|^2 ds
+
+    With the share 0 the rates of strain are those that the section sees; a cable that turns as a
+    whole loses nothing. With 1 they are those of the curvature's vector in the world's axes: a loop
+    that turns about its chord is braked. Simulators of point masses, which know no section, often
+    damp in this way. The rest curvature is not asked.
+
+    Parameters
+    ----------
+    share : scalar, 0 to 1
+        Vanishes at 0.
+    """
+
+    name = "turning_loss"
+    dimensions = (3,)
+    declared = (Parameter("share", scale=0.3, lower=0.0, upper=1.0),)
+
+    def of_turning(self, params: Params) -> ca.SX:
+        """The share."""
+        return params["share"]

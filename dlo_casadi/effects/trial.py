@@ -137,6 +137,7 @@ class Trial:
         if isinstance(effect, Damping):
             velocity, tangent = sym("velocity", np.zeros(d)), sym("tangent", np.eye(d)[0])
             yield _Law("density", (velocity, tangent, cable, params), _number)
+            yield _Law("of_turning", (params,), _number)
             turning = sym("turning", np.zeros(self.node.increment))
             yield _Law("at_pin", (turning, params), _number)
         if isinstance(effect, BoundaryEffect):

@@ -23,7 +23,8 @@ from scipy.sparse import dia_array
 from dlo_casadi.arrays import ComplexArray, FloatArray
 from dlo_casadi.errors import DloError
 from dlo_casadi.motion.handles import between
-from dlo_casadi.motion.system import Banded, Fixtures, MovingCable, State
+from dlo_casadi.motion.state import Banded, Fixtures, State
+from dlo_casadi.motion.system import MovingCable
 
 # Damping ratio of a mode beyond which it is not followed: near 1 two real values meet.
 _HEAVY = 0.9

@@ -11,7 +11,8 @@ from scipy.interpolate import CubicSpline
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.motion.system import Fixtures, MovingCable
+from dlo_casadi.motion.state import Fixtures
+from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.rod.quaternions import same_sign
 
 

@@ -24,12 +24,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.motion.system import Fixtures, MovingCable, State
+from dlo_casadi.motion.state import Banded, Fixtures, State
+from dlo_casadi.motion.system import MovingCable
 
 # Factor by which the highest frequencies decay in a step.
 RHO = 0.8
-# Newton's steps in one step of time, and the size [rad, lengths] of the last one.
-NEWTON_STEPS, LAST_STEP = 12, 1e-9
+# Newton's steps in one step of time, and the size [rad, lengths] of the last one: what is left is
+# a tenth of that at most.
+NEWTON_STEPS, LAST_STEP = 12, 1e-7
+# Ratio of two steps from which a kept matrix is made anew.
+_SLOW = 0.1
 # Longest step of Newton's method [rad]: farther, the Cayley map is no guide.
 _LONGEST = 1.0
 
@@ -91,62 +95,114 @@ class Moving:
         return Moving(self.state, known + factor * (self.own - known))
 
 
-def step(
-    cable: MovingCable, before: Moving, fixtures: Fixtures, dt: float, scheme: Scheme
-) -> Moving | None:
-    """One step of time to where `fixtures` are at its end; None if Newton's method fails."""
-    b, held = cable.b, _held(cable)
-    start, rates, known = before.state, before.rates, before.accelerations
-    c = scheme.factors(dt)
-    # Accelerations and rates are affine in X.
-    own_0 = -(rates / dt + (0.5 - scheme.beta) * before.own) / scheme.beta
-    by_x = 1 / (scheme.beta * dt**2)
+class Stepper:
+    """Steps of one cable by one scheme; it keeps the last factorised matrix for the next step.
 
-    def at(moved: FloatArray) -> Moving:
-        own = own_0 + by_x * moved
+    Newton's method with a kept matrix needs residuals alone, a fraction of the work; the matrix is
+    made anew where that converges slowly, and for another length of the step.
+    """
+
+    def __init__(self, cable: MovingCable, scheme: Scheme) -> None:
+        self.cable, self.scheme = cable, scheme
+        self._solver: Banded | None = None
+        self._dt = 0.0
+
+    def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
+        """The state dt later, where fixtures are as given; None if Newton's method fails."""
+        trial = _Trial(self.cable, self.scheme, before, fixtures, dt)
+        if dt != self._dt:
+            self._solver, self._dt = None, dt
+        found = self._solved(trial) if self._solver is not None else None
+        if found is None:
+            self._solver = None
+            trial = _Trial(self.cable, self.scheme, before, fixtures, dt)
+            found = self._solved(trial)
+        return found
+
+    def _solved(self, trial: _Trial) -> Moving | None:
+        last, length = np.inf, self.cable.model.cable.length
+        for _ in range(NEWTON_STEPS):
+            if self._solver is None:
+                residual, self._solver = trial.balance()
+            else:
+                residual = trial.residual()
+            found = self._solver.solve(-residual)
+            if self._solver.singular or not np.isfinite(found).all():
+                self._solver = None
+                return None
+            size = trial.move(found, length)
+            if size < LAST_STEP:
+                return trial.state
+            if size > _SLOW * last:
+                self._solver = None
+            last = size
+        self._solver = None
+        return None
+
+
+class _Trial:
+    """The unknowns of one step: increments X of the nodes, forces and moments."""
+
+    def __init__(
+        self,
+        cable: MovingCable,
+        scheme: Scheme,
+        before: Moving,
+        fixtures: Fixtures,
+        dt: float,
+    ) -> None:
+        self._cable, self._scheme, self._before = cable, scheme, before
+        self._fixtures, self._dt, self._held = fixtures, dt, _held(cable)
+        # As if the method's accelerations stayed the same.
+        self._moved = dt * before.rates + dt**2 / 2 * before.own
+        self._force, self._moment = before.state.force, before.state.moment
+
+    @property
+    def state(self) -> Moving:
+        """The state with these unknowns."""
+        scheme, before, dt, b = self._scheme, self._before, self._dt, self._cable.b
+        # Accelerations and rates are affine in X.
+        own = (self._moved / dt - before.rates) / dt - (0.5 - scheme.beta) * before.own
+        own /= scheme.beta
         share = (1 - scheme.alpha_m) * own + scheme.alpha_m * before.own
-        changed = (share - scheme.alpha_f * known) / (1 - scheme.alpha_f)
-        velocity = rates + dt * ((1 - scheme.gamma) * before.own + scheme.gamma * own)
-        r, v, a = start.r + moved[:, b:], velocity[:, b:], changed[:, b:]
-        for k, node in held:
+        changed = (share - scheme.alpha_f * before.accelerations) / (1 - scheme.alpha_f)
+        rates = before.rates + dt * ((1 - scheme.gamma) * before.own + scheme.gamma * own)
+        start, fixtures = before.state, self._fixtures
+        r, v, a = start.r + self._moved[:, b:], rates[:, b:], changed[:, b:]
+        for k, node in self._held:
             r[node], v[node], a[node] = (
                 x[k] for x in (fixtures.places, fixtures.velocities, fixtures.accelerations)
             )
-        x = np.asarray(cable.model.node.moved(start.x, moved[:, :b]))
-        return Moving(State(x, r, velocity[:, :b], v, changed[:, :b], a, force, moment), own)
+            own[node, b:] = a[node]
+        x = np.asarray(self._cable.model.node.moved(start.x, self._moved[:, :b]))
+        w, alpha = rates[:, :b], changed[:, :b]
+        return Moving(State(x, r, w, v, alpha, a, self._force, self._moment), own)
 
-    # As if the method's accelerations stayed the same.
-    moved = dt * rates + dt**2 / 2 * before.own
-    force, moment = start.force, start.moment
-    length = cable.model.cable.length
-    for _ in range(NEWTON_STEPS):
-        now = at(moved)
-        balance = cable.evaluated(now.state, fixtures, c)
-        solver = balance.stepped(_turns(moved[:, :b]))
-        found = solver.solve(-balance.residual)
-        if solver.singular or not np.isfinite(found).all():
-            return None
-        turned, shifted, pulled, twisted = cable.steps(found)
+    def residual(self) -> FloatArray:
+        """Residual of the balance at the end of the step."""
+        return self._cable.residual(self.state.state, self._fixtures)
+
+    def balance(self) -> tuple[FloatArray, Banded]:
+        """The residual, and its derivative by the unknowns."""
+        factors = self._scheme.factors(self._dt)
+        balance = self._cable.evaluated(self.state.state, self._fixtures, factors)
+        return balance.residual, balance.stepped(_turns(self._moved[:, : self._cable.b]))
+
+    def move(self, solution: FloatArray, length: float) -> float:
+        """Add a step of Newton's method; return its size [rad, lengths]."""
+        b, (turned, shifted, pulled, twisted) = self._cable.b, self._cable.steps(solution)
         size = max(float(np.abs(turned).max()), float(np.abs(shifted).max()) / length)
         share = min(1.0, _LONGEST / size) if size else 1.0
-        moved = np.hstack([_composed(moved[:, :b], share * turned), moved[:, b:] + share * shifted])
-        force, moment = force + share * pulled, moment + share * twisted
-        if size < LAST_STEP:
-            return _with_fixtures(at(moved), held, fixtures)
-    return None
+        turns = _composed(self._moved[:, :b], share * turned)
+        self._moved = np.hstack([turns, self._moved[:, b:] + share * shifted])
+        self._force = self._force + share * pulled
+        self._moment = self._moment + share * twisted
+        return size
 
 
 def _held(cable: MovingCable) -> list[tuple[int, int]]:
     """Which fixture holds the place of which node."""
     return [(0, 0), (1, cable.n_nodes - 1)] if cable.model.end.place else [(0, 0)]
-
-
-def _with_fixtures(now: Moving, held: list[tuple[int, int]], fixtures: Fixtures) -> Moving:
-    """Own accelerations of held places are the fixtures'."""
-    own, d = now.own.copy(), fixtures.places.shape[1]
-    for k, node in held:
-        own[node, -d:] = fixtures.accelerations[k]
-    return replace(now, own=own)
 
 
 def _composed(x: FloatArray, turned: FloatArray) -> FloatArray:
@@ -176,13 +232,14 @@ def started(
     fixtures jump as in an impact.
     """
     soon = replace(now, places=now.places + _INSTANT * now.velocities)
-    after = step(cable, _without_acceleration(state), soon, _INSTANT, FIRST)
+    first = Stepper(cable, FIRST)
+    after = first.step(_without_acceleration(state), soon, _INSTANT)
     if after is None:
         return None
     turned, moved = after.state.w - state.w, after.state.v - state.v
     if max(np.abs(turned).max(), np.abs(moved).max() / cable.model.cable.length) > _JUMP:
         state = replace(state, w=after.state.w, v=after.state.v)
-    after = step(cable, _without_acceleration(state), later, dt, FIRST)
+    after = first.step(_without_acceleration(state), later, dt)
     if after is None:
         return None
     found = after.state

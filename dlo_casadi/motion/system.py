@@ -7,12 +7,11 @@ that a fixture holds are known functions of time and no unknowns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import lapack
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.effects import Damping
@@ -21,79 +20,25 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.motion.segment import MovingSegment, moving_segment
+from dlo_casadi.motion.state import Banded, Fixtures, State
 from dlo_casadi.rod.ends import EndConditions
 
-
-@dataclass(frozen=True, eq=False)
-class Fixtures:
-    """Where the fixtures are at one instant.
-
-    Parameters
-    ----------
-    pose : (n_pose,)
-        See `HeldPose.vector`.
-    places, velocities, accelerations : (2, dimension) [m, m/s, m/s^2]
-        True ones of the cable's start and end; of a free end they mean nothing.
-    """
-
-    pose: FloatArray
-    places: FloatArray
-    velocities: FloatArray
-    accelerations: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """A cable in motion at one instant.
-
-    Parameters
-    ----------
-    x, r : (n_nodes, coordinates), (n_nodes, dimension) [m]
-        Frames and places of the nodes.
-    w, v : (n_nodes, increment) [rad/s], (n_nodes, dimension) [m/s]
-        Body rates and velocities.
-    alpha, a : likewise [rad/s^2], [m/s^2]
-    force : (n_segments, dimension (1 + 2 n_springs))
-        See `MovingSegment`.
-    moment : (n_n_multipliers,) [N m]
-        Multipliers of the directions that the ends hold: of the start, then of the end.
-    """
-
-    x: FloatArray
-    r: FloatArray
-    w: FloatArray
-    v: FloatArray
-    alpha: FloatArray
-    a: FloatArray
-    force: FloatArray
-    moment: FloatArray
-
-
-class Banded:
-    """A banded matrix, factorised for any number of right-hand sides."""
-
-    def __init__(self, band: FloatArray, width: int) -> None:
-        self._width = width
-        self._lu, self._pivots, self.singular = lapack.dgbtrf(band, width, width)
-
-    def solve(self, right: FloatArray, *, transposed: bool = False) -> FloatArray:
-        """Solution of right-hand sides (N,) or (N, q)."""
-        rows = right if right.ndim == 2 else right[:, None]
-        found, _ = lapack.dgbtrs(
-            self._lu, self._width, self._width, rows, self._pivots, trans=int(transposed)
-        )
-        return np.asarray(found.reshape(right.shape))
+# Newton steps that bow segments to known places, and the share of the softest direction of a force
+# below which a direction counts as stiff: along a segment it cannot give way.
+_BOWED, _STIFF = 3, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Balance:
     """Residual (N,) of the equations of motion, and its derivatives.
 
-    `stiffness`, `damping`: K, and c_1 C + c_2 M, of segments (n_segments, L, L) and of the ends.
+    `rows`: of the segments (n_segments, L), before they are summed. `stiffness`, `damping`: K, and
+    c_1 C + c_2 M, of the segments (n_segments, L, L) and of the ends.
     """
 
     cable: MovingCable
     residual: FloatArray
+    rows: FloatArray
     stiffness: tuple[FloatArray, FloatArray]
     damping: tuple[FloatArray, FloatArray]
 
@@ -336,7 +281,12 @@ class MovingCable:
         rows, stiff, damp = self.segments("motion", state, factors)
         gradient, hessian, rubbing = self._ends(state, fixtures)
         residual = self.gathered(rows[..., 0], gradient)
-        return Balance(self, residual, (stiff, hessian), (damp, c[0] * rubbing))
+        return Balance(self, residual, rows[..., 0], (stiff, hessian), (damp, c[0] * rubbing))
+
+    def residual(self, state: State, fixtures: Fixtures) -> FloatArray:
+        """Residual (N,) alone."""
+        (rows,) = self.segments("residual", state)
+        return self.gathered(rows[..., 0], self._ends(state, fixtures)[0])
 
     def gathered(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
         """Rows (N,) summed over the segments (n_segments, L) and the ends."""
@@ -414,20 +364,47 @@ class MovingCable:
         state = self.still_state(eq.x, force, lam[[*start, *end]])
         return self.with_places(state, fixtures)
 
+    def about(self, eq: Equilibrium) -> MovingCable:
+        """The same cable; a dynamic stiffness acts on changes from an equilibrium."""
+        means = eq.curvature if not self.model.node.twists else np.append(eq.twist, eq.curvature)
+        inside = self.model.chain.rest_inside(means[:, None])[..., 0]
+        still = np.hstack([inside[:, ::3], inside[:, 1::3]])
+        return MovingCable(self.model, self.p, self.rest, still)
+
     def still_state(self, x: FloatArray, force: FloatArray, moment: FloatArray) -> State:
         """Nodes at rest, all at the origin."""
         none, place = np.zeros((self.n_nodes, self.b)), np.zeros((self.n_nodes, self.d))
         return State(x, place, none, place, none, place, force, moment)
 
-    def with_places(self, state: State, fixtures: Fixtures) -> State:
-        """The state with the places that follow from the frames and forces, start to end."""
-        rows, *_ = self.segments("motion", state, np.zeros((self.n_segments, 2)))
-        first = 2 * self.b + 2 * self.d
-        advance = rows[:, first : first + self.d, 0] + np.diff(state.r, axis=0)
+    def with_places(
+        self, state: State, fixtures: Fixtures, near: FloatArray | None = None
+    ) -> State:
+        """The state with the places that follow from the frames and forces, start to end.
+
+        `near` (n_nodes, dimension) [m]: known places; forces are then those that bow the segments
+        so that they lead from one to the next.
+        """
+        first, still = 2 * self.b + 2 * self.d, replace(state, r=np.zeros_like(state.r))
+        own = slice(first, first + self.d)
+        if near is not None:
+            still = self._bowed(still, fixtures, np.diff(near, axis=0), own)
+        advance = self.evaluated(still, fixtures).rows[:, own]
         r = np.concatenate([[fixtures.places[0]], advance]).cumsum(axis=0)
         if self.model.end.place:
             r[-1] = fixtures.places[1]
-        return State(**{**vars(state), "r": r})
+        return replace(still, r=r)
+
+    def _bowed(self, state: State, fixtures: Fixtures, chords: FloatArray, own: slice) -> State:
+        """The state with forces that bow segments to chords (n_segments, dimension) [m]."""
+        for _ in range(_BOWED):
+            balance = self.evaluated(state, fixtures)
+            gap = (chords - balance.rows[:, own])[..., None]
+            by_force = balance.stiffness[0][:, own, own]
+            change = np.linalg.pinv(by_force, rcond=_STIFF, hermitian=True) @ gap
+            force = state.force.copy()
+            force[:, : self.d] += change[..., 0]
+            state = replace(state, force=force)
+        return state
 
 
 def _refuse(model: CableModel) -> None:

@@ -12,11 +12,12 @@ from dlo_casadi.errors import MotionError
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.motion.handles import between
 from dlo_casadi.motion.path import FixturePath
-from dlo_casadi.motion.steps import RHO, Moving, Scheme, started, step
-from dlo_casadi.motion.system import Fixtures, MovingCable, State
+from dlo_casadi.motion.state import Fixtures, State
+from dlo_casadi.motion.steps import RHO, Moving, Scheme, Stepper, started
+from dlo_casadi.motion.system import MovingCable
 
 # Largest error of the places in one step, relative to the cable's length, unless asked otherwise.
-TOLERANCE = 1e-5
+TOLERANCE = 3e-6
 # Shares of the time: of the first step, and of the shortest one that is tried.
 _FIRST, _SHORTEST = 1e-3, 1e-9
 # A step is changed by these factors at most, and kept between the inner ones.
@@ -164,7 +165,7 @@ def way_of(
     MotionError
         If a step has no solution, however short.
     """
-    scheme, (now, until) = Scheme.of(rho), t
+    stepper, (now, until) = Stepper(cable, Scheme.of(rho)), t
     h = dt or _FIRST * (until - now)
     first = path.at(now, cable)
     while (begun := started(cable, state, first, path.at(now + h, cable), h)) is None:
@@ -174,11 +175,11 @@ def way_of(
         # The last two steps share what is left, so that none is tiny.
         left = until - now
         h = left if h > left * (1 - 1e-9) else min(h, max(left / 2, left - h))
-        after = step(cable, moving.for_step(h / before), path.at(now + h, cable), h, scheme)
+        after = stepper.step(moving.for_step(h / before), path.at(now + h, cable), h)
         if after is None:
             h = _halved(h, now, t, cable)
             continue
-        factor = 1.0 if dt else _factor(_error(cable, moving, after, h, scheme), tolerance)
+        factor = 1.0 if dt else _factor(_error(stepper, moving, after, h), tolerance)
         if factor < _REPEATED and h > _SHORTEST * (until - t[0]):
             h *= factor
             continue
@@ -189,11 +190,11 @@ def way_of(
     return Way(cable, path, np.array(times), tuple(states))
 
 
-def _error(cable: MovingCable, before: Moving, after: Moving, dt: float, scheme: Scheme) -> float:
+def _error(stepper: Stepper, before: Moving, after: Moving, dt: float) -> float:
     """Error of the places in a step over the length: root of the mean square of the nodes."""
-    change = scheme.error * dt**2 * (after.state.a - before.state.a)
+    change = stepper.scheme.error * dt**2 * (after.state.a - before.state.a)
     mean = float(np.sqrt((change**2).sum(axis=1).mean()))
-    return mean / cable.model.cable.length
+    return mean / stepper.cable.model.cable.length
 
 
 def _factor(error: float, tolerance: float) -> float:
