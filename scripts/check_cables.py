@@ -35,7 +35,6 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.equilibrium.spans import first_guesses
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import held_nodes
 
 # Least difference of energies that are not the same, relative to m g L + EI/L.
 SAME_ENERGY = 1e-8
@@ -92,7 +91,7 @@ def minima_of(case: Case) -> Iterator[float]:
         found = [by_ipopt(model, model.nominal, rest, pose, x[:, 0]) for x in case.starts]
         yield from (own.energy for own in found if own is not None and own.stable)
         return
-    solver = Ipopt(model, held_nodes(model.chain, pose.clips))
+    solver = Ipopt(model)
     for one in solver.solve(model.nominal, rest, pose, case.starts, case.slid):
         (eq,) = solve_equilibria(model, model.nominal, rest, [pose], [one.frames])
         same = isinstance(eq, Equilibrium) and np.isclose(eq.energy, one.energy, rtol=1e-6)

@@ -25,6 +25,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.equilibrium import curvatures_along
+from dlo_casadi.equilibrium.eyelets import slid
 from dlo_casadi.equilibrium.guess_table import guess_table
 from dlo_casadi.equilibrium.limits import places_of, sizes_of
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -35,7 +36,8 @@ from dlo_casadi.errors import ConfigError, EquilibriumError
 from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clipped import Clipped
-from dlo_casadi.model.clips import HeldClip, held_nodes
+from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Frame, Heading
@@ -230,7 +232,9 @@ def test_ipopts_statement_in_space_has_the_same_energy_and_conditions():
         IN_SPACE, (0.7, 0.2, 0.1), 10, LOOM, gravity=(0.0, 0.0, -9.81), start="clamped",
         start_orientation=turned(0, 0.2, 0.1),
     )  # fmt: skip
-    problem = potential(model, held_nodes(model.chain, pose.clips))
+    given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), pose.vector[None])
+    nodes = Assembly(model, eq.shapes, given).clipped.nodes[0]
+    problem = potential(model)
     held, lam = model.are_multipliers, ca.DM(eq.multipliers)
     total = problem.energy + ca.dot(lam[np.flatnonzero(held).tolist()], problem.conditions)
     inner = problem.coordinates[eq.x.size + (~held).sum() :]
@@ -238,7 +242,8 @@ def test_ipopts_statement_in_space_has_the_same_energy_and_conditions():
     stated = ca.Function("stated", [problem.coordinates, problem.parameters], outputs)
     x = np.concatenate([eq.x.ravel(), eq.multipliers[~held], np.zeros(inner.numel())])
     rest, still = np.zeros(model.chain.n_rests), np.zeros(len(model.deviation_names))
-    given = np.concatenate([model.nominal, rest, pose.vector, still])
+    moved = np.ravel(np.arange(model.chain.n_nodes) == nodes[:, None], order="F")
+    given = np.concatenate([model.nominal, rest, pose.vector, still, moved])
     value, slope, bend = (np.array(block) for block in stated(x, given))
     least = value - slope.T @ np.linalg.solve(bend, slope) / 2
     assert least.item() == pytest.approx(eq.energy, rel=1e-9)
@@ -263,6 +268,51 @@ def test_the_tangent_is_the_derivative_of_the_balance():
             moved = replace(eq.shapes, x=x, lam=lam)
             rows.append(Assembly(model, moved, given).imbalance().rows[0, :, 0])
         assert dense[:, column] == pytest.approx((rows[0] - rows[1]) / (2 * step), abs=1e-5)
+
+
+def test_two_eyelets_with_one_element_between_them_act_on_each_other():
+    """The element gets longer by one and shorter by the other: exact to second order."""
+    rings = [HeldClip("eyelet", (0.42, 0.12)), HeldClip("eyelet", (0.5, 0.11))]
+    model, pose, eq = solved(rings, (0.7, 0.25), 10)
+    given = Inputs.of(model.nominal, np.zeros(10), pose.vector[None])
+    here = Assembly(model, eq.shapes, given)
+    assert np.diff(here.clipped.nodes[0]).tolist() == [1]
+    dense, step = here.balance()[2].dense()[0], 1e-6
+    for row in model.sliding.values():
+        sides = []
+        for h in (step, -step):
+            lam = eq.multipliers[None].copy()
+            lam[0, row] += h
+            moved = replace(eq.shapes, lam=lam)
+            sides.append(Assembly(model, moved, given).imbalance().rows[0, :, 0])
+        column = dense[:, model.chain.n_nodes + row]
+        assert column == pytest.approx((sides[0] - sides[1]) / (2 * step), abs=1e-6)
+
+
+def test_nodes_follow_an_eyelet_and_do_not_turn_back():
+    """Beyond two thirds of an element another node is moved; the cable stays where it is."""
+    model, pose, eq = solved([HeldClip("eyelet", (0.42, 0.12))], (0.7, 0.25), 40)
+    given, row = Inputs.of(model.nominal, np.zeros(40), pose.vector[None]), model.sliding[0]
+    here = Assembly(model, eq.shapes, given)
+    node, h = int(here.clipped.nodes[0, 0]), model.chain.h
+
+    def at(s, before):
+        lam = before.shapes.lam.copy()
+        lam[0, row] = s * h
+        return replace(before, shapes=slid(before, replace(before.shapes, lam=lam)))
+
+    near = at(node + 0.6, at(node, here))
+    far = at(node + 0.8, near)
+    back = at(node + 0.4, far)
+    chosen = [one.clipped.nodes[0, 0] for one in (near, far, back)]
+    assert chosen == [node, node + 1, node + 1]
+    assert at(node + 0.2, back).clipped.nodes[0, 0] == node
+    at_end = at(50.0, here).clipped
+    assert at_end.nodes[0, 0] == 39
+    assert at_end.in_order.all()
+    places = near.clipped.places[0], far.clipped.places[0]
+    x = np.interp(places[1], places[0], near.shapes.x[0, :, 0])
+    np.testing.assert_allclose(far.shapes.x[0, :, 0], x, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -380,19 +430,23 @@ def test_places_and_directions_at_even_arc_lengths_are_exact_for_cubics():
 
 def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():
     """kappa_0 = a + b s + c s^2: mean, slope and bend times the width, of the moved cells."""
-    chain, (a, b, c) = Chain(LENGTH, 10), (1.0, -4.0, 9.0)
+    model, (a, b, c) = CableModel(CABLE, 10, n_rest=0, clips=("pinned",) * 2), (1.0, -4.0, 9.0)
     held, at = np.zeros((1, 2, 4)), np.array([[0.17, 0.74]])
     held[..., -1] = at
-    clipped = Clipped.of(chain, (CLAMPED,) * 2, held, at, np.zeros((2, 1)), np.zeros((1, 11, 1)))
+    none = np.zeros((2, 1)), np.zeros((1, 11, 1))
+    clipped = Clipped.of(model.chain, model.clips, held, at, *none)
 
     def inside(cells):
         middle, width = cells.mean(axis=1), np.diff(cells, axis=1)[:, 0]
         mean = a + b * middle + c * (middle**2 + width**2 / 12)
         return np.stack([mean, (b + 2 * c * middle) * width, c * width**2], axis=1)
 
-    even = chain.rest_inside(inside(chain.cells)[:, :1])
-    found = clipped.rest(even[None])[0, ..., 0]
-    np.testing.assert_allclose(found, inside(clipped.cells[0]), atol=1e-13)
+    terms = lagrangian_of(model)
+    segment = terms.segment(ca.SX(1), terms.inner, ca.SX(0))
+    rest = ca.Function("rest", [terms.rest_strains, terms.place], [segment.rest])
+    even = model.chain.rest_inside(inside(model.chain.cells)[:, :1])
+    found = rest(even.T if even.ndim == 2 else even[..., 0].T, clipped.segments()[0].T)
+    np.testing.assert_allclose(np.array(found).T, inside(clipped.cells[0]), atol=1e-13)
 
 
 @pytest.mark.parametrize(

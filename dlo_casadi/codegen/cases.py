@@ -137,7 +137,7 @@ class Case:
     @cached_property
     def meshes(self) -> dict[str, Kernels]:
         """Kernels of its meshes by their names in C, the cable's own first."""
-        moved = Moved.SOME if self.model.moves_nodes else Moved.NONE
+        moved = Moved.SOME if self.model.clips else Moved.NONE
         return {"kernel": self.kernels(self.model, self.rest, moved)}
 
     def kernels(self, model: CableModel, rest: FloatArray, moved: Moved) -> Kernels:
@@ -156,9 +156,9 @@ class Case:
                 "no solver can be generated for a cable of links with a tether\n"
                 "  Try: another element, --element quadratic"
             )
-        slides = bool(self.model.sliding)
-        inside = slides or bool(self.tethers)
-        return kernels_of(bare, p, rest, self.inline, Holding(moved, inside, slides))
+        tethers = [x for x in model.effects if x not in others]
+        held = Holding(moved, bool(model.sliding), tethers[0] if tethers else None)
+        return kernels_of(bare, p, rest, self.inline, held)
 
     @property
     def holds(self) -> int:

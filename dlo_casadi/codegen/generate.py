@@ -161,7 +161,6 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "CLIPS": len(model.clips),
             "CLIP_KINDS": ", ".join(model.clips),
             "CLAMPS": sum(kind.direction for kind in model.clips),
-            "AT_NODES": sum(not kind.slides for kind in model.clips),
             "CLAMP_KINDS": ", ".join(str(kind.direction * (1 + (not kind.roll))) for kind in held)
             or "0",
             "EYELETS": len(model.sliding),

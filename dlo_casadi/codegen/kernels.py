@@ -13,6 +13,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.c_text import ends_text, helpers_of, statements
+from dlo_casadi.effects import Effect
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.framed import SegmentNumbers, in_frame
 from dlo_casadi.model.functions import functions_of
@@ -55,8 +56,8 @@ class Kernel:
         {name}(x + {state} * j, FORCE, {row}, table,
         {" " * len(name)} segment + SEGMENT * j);"""
 
-    def at_holder(self, name: str) -> str:
-        """C statement that calls it for segment j, inside which something holds the cable."""
+    def alone(self, name: str) -> str:
+        """C statement that calls it for segment j alone."""
         return f"    {name}(x + {self.function.numel_in(0) // 2} * j, lam, row, table, out);"
 
     def text(self, name: str) -> str:
@@ -82,8 +83,8 @@ class Kernels:
     `segments` are in the order of the cable. `ends` is the energy of the holders, if any, as a
     function of the first and last node. `shared` (n_parameters,) or (0,) are the parameters in the
     table, before the segments' rows. `even` (n, k): rows of all segments between even nodes, from
-    which those between moved ones are made. `holder` is a segment with a clip or a tether inside,
-    at a share of its length that follows its row.
+    which those between moved ones are made. `holder` is a segment with a tether inside, at a share
+    of its length that follows its row; `edges` the derivatives of one by where its ends are.
     """
 
     segments: tuple[Kernel, ...]
@@ -91,11 +92,12 @@ class Kernels:
     shared: FloatArray
     even: FloatArray
     holder: Kernel | None = None
+    edges: Kernel | None = None
 
     @property
     def all(self) -> list[Kernel]:
-        """Kernels of segments, then that of a segment with a holder inside."""
-        return [*self.segments, *([] if self.holder is None else [self.holder])]
+        """Kernels of segments, then those of some alone."""
+        return [*self.segments, *(one for one in (self.holder, self.edges) if one is not None)]
 
     @property
     def table(self) -> list[float]:
@@ -117,13 +119,13 @@ class Kernels:
 def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
     """C text of the kernels of meshes by the mesh's name, as values of the templates' marks.
 
-    LOOPS call the KERNELS for the segments, HELD the one for a segment that holds the cable; rows
-    of segments between even nodes begin at EVEN in their table, of length EXTRA. With two meshes
-    the second one is called if `w->coarse` is set.
+    LOOPS call the KERNELS for the segments, HELD the one for a segment that a tether holds, EDGES
+    that for the ends of a segment; rows of segments between even nodes begin at EVEN in their
+    table, of length EXTRA. With two meshes the second one is called if `w->coarse` is set.
     """
     functions: list[str] = []
     loops: list[str] = []
-    holders: list[str] = []
+    alone: dict[str, list[str]] = {"held": [], "edges": []}
     even: list[str] = []
     at = 0
     for name, kernels in meshes.items():
@@ -132,9 +134,10 @@ def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
             functions.append(kernel.text(f"{name}_{k}"))
             statements.append(kernel.loop(f"{name}_{k}", at))
             at += kernel.rows.size
-        if kernels.holder is not None:
-            functions.append(kernels.holder.text(f"{name}_held"))
-            holders.append(kernels.holder.at_holder(f"{name}_held"))
+        for kind, one in (("held", kernels.holder), ("edges", kernels.edges)):
+            if one is not None:
+                functions.append(one.text(f"{name}_{kind}"))
+                alone[kind].append(one.alone(f"{name}_{kind}"))
         if kernels.even.size:
             even.append(str(at))
             at += kernels.even.size
@@ -144,7 +147,8 @@ def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
     return {
         "KERNELS": "\n".join([*helpers, text]),
         "LOOPS": _by_mesh(loops),
-        "HELD": _by_mesh(holders),
+        "HELD": _by_mesh(alone["held"]),
+        "EDGES": _by_mesh(alone["edges"]),
         "EVEN": f"w->coarse ? {even[1]} : {even[0]}" if len(even) > 1 else "".join(even) or "0",
         "ENDS": ends,
         "EXTRA": at,
@@ -180,13 +184,13 @@ class Moved(Enum):
 class Holding:
     """How a cable is held between its ends.
 
-    `moved`: nodes that are moved to what holds it. `inside`: whether something holds it inside a
-    segment; `slides`: whether the cable may slide through that.
+    `moved`: nodes that are moved to clips; `slides`: whether the cable slides through one;
+    `tether`: an effect that holds it inside a segment.
     """
 
     moved: Moved
-    inside: bool
     slides: bool
+    tether: Effect | None
 
 
 def kernels_of(
@@ -197,86 +201,114 @@ def kernels_of(
     held: Holding | None = None,
 ) -> Kernels:
     """Kernels of a model without clips and tethers; `inline` as in `generate`."""
-    bare, moved = model, Moved.NONE if held is None else held.moved
-    if held is not None:
-        model = replace(model, clips=(SupportKind.PINNED,))
+    moved = Moved.NONE if held is None else held.moved
     places = model.chain.layout.segments
     own = np.column_stack([places[:, 0], model.chain.rest_inside(rest[:, None])[..., 0]])
     parameters = ca.SX(ca.DM(p)) if inline else ca.SX.sym("p", len(p))
     shared = np.zeros(0) if inline else np.asarray(p, float)
     rows = np.insert(own, 1, places[:, 1], axis=1)
     whole, none = (0, len(own)), own[:, :0]
-    holder, beside = None, list[Kernel]()
-    if held is not None and held.inside:
-        inside = partial(_segment_from_row, model, parameters, rows.shape[1], held)
+    beside, width = list[Kernel](), rows.shape[1]
+    holder = edges = None
+    if held is not None and held.tether is not None:
+        inside = partial(_held_inside, model, parameters, width, held)
         holder = Kernel(whole, none, inside)
+    if held is not None and held.slides:
+        edges = Kernel(whole, none, partial(_by_edges, model, parameters, width))
     if moved != Moved.NONE:
-        plain = partial(_segment_from_row, model, parameters, rows.shape[1])
-        beside = [Kernel(whole, none, plain, moved=True)]
-    told = _ends(bare, parameters), shared, none if held is None else rows, holder
+        beside = [Kernel(whole, none, partial(_from_row, model, parameters, width), moved=True)]
+    even = none if held is None else rows
+    told = _ends(model, parameters), shared, even, holder, edges
     if moved == Moved.ALL:
         return Kernels(tuple(beside), *told)
     kinds = places[:, 1:] - [0, 1, 0, 0, 0] * places[:, :1]
     # A point force acts on a whole segment, on none of it, or from a place inside it.
-    shares = np.array([np.array(lagrangian_of(bare).shares(p, place)).ravel() for place in places])
+    shares = np.array([np.array(lagrangian_of(model).shares(p, place)).ravel() for place in places])
     within = (shares > 0) & (shares < 1)
     alone = np.arange(len(own))[:, None] * within
     alike = (
         np.column_stack([kinds.round(14), shares * ~within, alone]) if inline else kinds.round(14)
     )
-    edges = [0, *(np.flatnonzero(np.any(np.diff(alike, axis=0), axis=1)) + 1), len(own)]
+    first_ones = [0, *(np.flatnonzero(np.any(np.diff(alike, axis=0), axis=1)) + 1), len(own)]
     segments = tuple(
-        _kernel(bare, parameters, places[first], own[first:last], (first, last), inline)
-        for first, last in pairwise(edges)
+        _kernel(model, parameters, places[first], own[first:last], (first, last), inline)
+        for first, last in pairwise(first_ones)
     )
     return Kernels((*segments, *beside), *told)
 
 
-def _segment_from_row(
-    model: CableModel, p: ca.SX, width: int, held: Holding | None = None
-) -> ca.Function:
+def _from_row(model: CableModel, p: ca.SX, width: int) -> ca.Function:
     """(x, lam, row, p) -> results of a segment whose numbers are in a row, see `_in_order`.
 
-    `row` has the arc length of its start, its length [m] and rest strains (width,), and with `held`
-    the share of the segment before the held place. `lam` has the force beyond the segment, and with
-    `held` that on the clip. With `held` these derivatives follow:
-
-    - by the clip's force: first ones, mixed ones with the first node, the last node and the force
-      beyond, second ones;
-    - by the arc length of the held place [1/m]: of the Lagrangian; if the cable slides also of its
-      gradient by the first node, the last node, the force beyond and that on the clip, and the
-      second one.
+    `row` (width,) has the arc length of its start, its length [m] and rest strains.
     """
-    d, terms, inside = model.node.dimension, lagrangian_of(model), held is not None
-    row, lam, own = (ca.SX.sym("i", size) for size in (width + inside, d, d))
-    x = ca.SX.sym("x", 2 * model.node.coordinates)
-    start, length, share = row[0], row[1], row[width] if inside else ca.SX(0)
-    has_cell, mesh = model.chain.layout.segments[0, 4:]
-    length = ca.SX(mesh) if held is not None and held.moved == Moved.NONE else length
-    place = ca.vertcat(start, length, start, length, has_cell, mesh, start + share * length)
+    row, (has_cell, mesh) = ca.SX.sym("row", width), model.chain.layout.segments[0, 4:]
+    place = ca.vertcat(row[0], row[1], row[0], row[1], has_cell, mesh)
     still = ca.SX.zeros(len(model.deviation_names))
-    shares = ca.vertcat(*ca.vertsplit(terms.shares(p, place))[:-1], share)
+    shares = ca.SX(lagrangian_of(model).shares(p, place))
+    return _plain(model, SegmentNumbers(p, row[2:], place, still, shares), row)
+
+
+def _held_inside(model: CableModel, p: ca.SX, width: int, held: Holding) -> ca.Function:
+    """As `_from_row`, of a segment that is held at a share of it, which follows its row.
+
+    `lam` has the force beyond the segment, then that on what holds it. Derivatives by the latter
+    follow the results: first ones, mixed ones with the first node, the last node and the force
+    beyond, second ones.
+    """
+    assert held.tether is not None
+    d, more = model.node.dimension, len(held.tether.parameters(model.cable))
+    model = replace(model, effects=(*model.effects, held.tether))
+    p, terms = ca.vertcat(p, ca.SX.zeros(more)), lagrangian_of(model)
+    row, lam = ca.SX.sym("row", width + 1), ca.SX.sym("lam", 2 * d)
+    x = ca.SX.sym("x", 2 * model.node.coordinates)
+    has_cell, mesh = model.chain.layout.segments[0, 4:]
+    length = ca.SX(mesh) if held.moved == Moved.NONE else row[1]
+    place = ca.vertcat(row[0], length, row[0], length, has_cell, mesh)
+    still, count = ca.SX.zeros(len(model.deviation_names)), model.n_springs
+    shares = ca.SX(terms.shares(p, place))
+    shares[-count:] = row[width]
     numbers = SegmentNumbers(p, row[2:width], place, still, shares)
-    found = _derivatives(model, x, ca.vertcat(lam, own), numbers)
+    found = _derivatives(model, x, lam, numbers)
     beyond = replace(
         found,
         by_lam=found.by_lam[:d],
         mixed=(found.mixed[0][:, :d], found.mixed[1][:, :d]),
         lam_lam=found.lam_lam[:d, :d],
     )
-    outputs = _in_order(beyond)
-    if inside:
-        outputs += [found.by_lam[d:], *(_rows(part[:, d:]) for part in found.mixed)]
-        outputs += [_rows(found.lam_lam[:d, d:]), _triangle(found.lam_lam[d:, d:])]
-        slopes = [found.value]
-        slopes += [*found.slopes, found.by_lam] if held is not None and held.slides else []
-        by_place = ca.jacobian(ca.vertcat(*slopes), share) / length
-        outputs += [by_place, ca.jacobian(by_place[0], share) / length][: len(slopes)]
-    else:
-        outputs = ca.substitute(outputs, [own], [ca.SX.zeros(d)])
+    outputs = [*_in_order(beyond), found.by_lam[d : 2 * d]]
+    outputs += [_rows(part[:, d : 2 * d]) for part in found.mixed]
+    outputs += [_rows(found.lam_lam[:d, d : 2 * d])]
+    outputs += [_triangle(found.lam_lam[d : 2 * d, d : 2 * d])]
     told = ca.cse([ca.densify(ca.vertcat(*outputs))])
-    forces = ca.vertcat(lam, own) if inside else lam
-    return ca.Function("kernel", [x, forces, row, _symbols(p)], told)
+    return ca.Function("kernel", [x, lam, row, _symbols(p[: p.numel() - more])], told)
+
+
+def _by_edges(model: CableModel, p: ca.SX, width: int) -> ca.Function:
+    """(x, lam, row, p) -> derivatives of a segment's Lagrangian by the arc lengths of its ends.
+
+    `row` has these, then the row of the even segment of which it has the rest strains. For each end
+    [N]: of the Lagrangian, of its gradient by the first node, the last node, and the force beyond;
+    then the second ones, 00, 01, 11.
+    """
+    model = replace(model, clips=(SupportKind.PINNED,))
+    row, lam = ca.SX.sym("row", 2 + width), ca.SX.sym("lam", model.node.dimension)
+    x, ends = ca.SX.sym("x", 2 * model.node.coordinates), row[:2]
+    place = ca.vertcat(ends, model.chain.layout.segments[0, 5], row[2])
+    still = ca.SX.zeros(len(model.deviation_names))
+    shares = ca.SX(lagrangian_of(model).shares(p, place))
+    numbers = SegmentNumbers(p, row[4:], place, still, shares)
+    found = _derivatives(model, x, lam, numbers)
+    if model.node.increment > 1:
+        first, last, by_lam = in_frame(lagrangian_of(model), x, lam, numbers).by_numbers(ends)
+        mixed = ca.vertcat(found.turn @ first, found.turn @ last, by_lam)
+    else:
+        mixed = ca.jacobian(ca.vertcat(*found.slopes, found.by_lam), ends)
+    slope = ca.gradient(found.value, ends)
+    twice = ca.jacobian(slope, ends)
+    outputs = [slope[0], mixed[:, 0], slope[1], mixed[:, 1], _triangle(twice)]
+    told = ca.cse([ca.densify(ca.vertcat(*outputs))])
+    return ca.Function("kernel", [x, lam, row, _symbols(p)], told)
 
 
 def _kernel(
@@ -318,17 +350,19 @@ def _derivatives(
 ) -> SegmentDerivatives:
     """Derivatives of a segment's Lagrangian; in space by rotations about the world's axes.
 
-    x: states of both nodes. lam [N]: force on the holder of the end, also for a free end, then that
-    of a clip.
+    x: states of both nodes. lam [N]: force beyond the segment, also for a free end, then that on
+    what holds it inside.
     """
+    terms = lagrangian_of(model)
     if model.node.increment > 1:
-        forces = ca.reshape(lam, 3, lam.numel() // 3)
-        found = in_frame(lagrangian_of(model), x, forces, numbers).derivatives()
+        none = ca.SX.zeros(3, 1 + len(terms.pulls) - lam.numel() // 3)
+        forces = ca.horzcat(ca.reshape(lam, 3, lam.numel() // 3), none)
+        found = in_frame(terms, x, forces, numbers).derivatives()
         return found.about(found.turn, found.turn)
     # At a free end lam is zero, but the derivative with respect to it is still the advance.
-    free = not model.end.place
+    free = not terms.end_pull
     multipliers = ca.SX.zeros(model.n_lam)
-    for rows, own in zip((model.end_pull, *model.pulls), ca.vertsplit(lam, 2), strict=True):
+    for rows, own in zip((terms.end_pull, *terms.pulls), ca.vertsplit(lam, 2), strict=False):
         multipliers[rows] = own[: len(rows)]
     arguments = [x, multipliers, numbers.p, numbers.rest, numbers.place, numbers.deviation]
     both: Any = functions_of(model).segment_by_share(

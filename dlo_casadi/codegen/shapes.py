@@ -58,7 +58,7 @@ class CompiledShape:
     clip_moments : (n_clips + n_tethers, increment) [N m]
         With clamped clips: of the cable on them; in space about the world's axes.
     places : (n + 1,)
-        With clips: arc lengths over length of points and nodes; one is moved to each but eyelets.
+        With clips or tethers: arc lengths over length of points and nodes; clips have one each.
     contact_forces : (obstacles, 4 n) [N]
         Magnitudes of the forces on each obstacle, normal to its surface, at places of the cable; 0
         without contact.
@@ -231,8 +231,8 @@ def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
     forces: dict[str, tuple[int, ...]] = {"start_force": (d,), "end_force": (d,)}
     forces |= {"clip_forces": (holds, d), "clip_grip": (holds,), "clip_at": (holds,)}
     forces |= {
+        "places": (n * bool(holds),),
         "clip_moments": (holds * clamps, turn),
-        "places": (n * bool(clips),),
         "contact_forces": (n_obstacles, 4 * model.n),
         "contact_places": (n_obstacles, 4 * model.n),
         "obstacle_forces": (n_obstacles, d),
@@ -242,7 +242,7 @@ def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
     scalars += ["end_error", "imbalance"]
     slope: dict[str, tuple[int, ...]] = {"points": (n, d, k), "rotations": (nodes, turn, k)}
     slope |= {"end_force": (d, k), "clip_forces": (holds, d, k), "clip_at": (holds, k)}
-    slope |= {"clip_moments": (holds * clamps, turn, k), "places": (n * bool(clips), k)}
+    slope |= {"places": (n * bool(holds), k), "clip_moments": (holds * clamps, turn, k)}
     slope |= {"energy_by_at": (clips,), "obstacle_forces": (n_obstacles, d, k)}
     slope |= {"moments": (2, turn, k)}
     slope |= {"min_bend_radius": (k,), "max_twist": (k,)}

@@ -80,13 +80,13 @@ class BatchEquilibrium:
 
     def at(self, shapes: Shapes, p: FloatArray, rest: FloatArray) -> Assembly:
         """The model at shapes; `rest` (n_rests,) before the first pose, or (m, n_rests) each's."""
-        inputs = shapes.x, shapes.lam, shapes.deviation, p, rest
+        inputs = shapes.x, shapes.lam, shapes.deviation, shapes.near, p, rest
         # The same shapes are evaluated, observed and linearised. Replaced as a whole: threads may
         # share a batch.
         last = self._last
         if last is None or not all(map(np.array_equal, last[0], inputs)):
             known = tuple(part.copy() for part in inputs)
-            shapes, (p, rest) = Shapes(*known[:3]), known[3:]
+            shapes, (p, rest) = Shapes(*known[:4]), known[4:]
             given = Inputs.of(p, self._rests(shapes, p, rest), self._ends)
             self._last = last = known, Assembly(self.model, shapes, given, SOFT_DEPTH)
         return last[1]
@@ -179,7 +179,7 @@ class BatchEquilibrium:
             The shapes, and whether each pose has converged; the others are as at the start. If a
             state couples the poses, either all have converged or none.
         """
-        now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
+        now = shapes
         converged = np.zeros(self.m, dtype=bool)
         coupled = self._coupled(rest)
         active, last = np.arange(self.m), np.full(self.m, np.inf)
@@ -197,7 +197,7 @@ class BatchEquilibrium:
             if coupled:
                 size[:] = size.max()
             there = stepped(here, *damped(self.model, step, size, last[active])).shapes
-            now.x[active], now.lam[active] = there.x, there.lam
+            now = now.replaced(active, there)
             done = _settled(size, last[active], tolerance, fresh)
             # Of conditions that depend on each other a step leaves what they contradict.
             ended = np.flatnonzero(done)
@@ -215,8 +215,7 @@ class BatchEquilibrium:
             active = active[~(done | lost)]
             if not len(active):
                 break
-        now.x[~converged], now.lam[~converged] = shapes.x[~converged], shapes.lam[~converged]
-        return now, converged
+        return now.replaced(~converged, shapes.subset(~converged)), converged
 
     def solve_or_descend(
         self, shapes: Shapes, p: FloatArray, rest: FloatArray, **options: Any

@@ -20,12 +20,12 @@ from dlo_casadi.equilibrium.equilibrium import (
     Equilibrium,
     equilibria_of,
 )
+from dlo_casadi.equilibrium.eyelets import slid
 from dlo_casadi.equilibrium.minima import descend
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import held_nodes
 from dlo_casadi.model.contact import outwards
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.band import BandMatrix, Vector
@@ -35,6 +35,9 @@ from dlo_casadi.runtime.executors import interrupts_held
 NEWTON_STEPS = 8
 # Maximum number of IPOPT iterations: 690 random problems of all boundaries took 7 (median) to 84.
 IPOPT_ITERATIONS = 300
+# Share of the segments beside an eyelet by which it slides before another node is moved to it, and
+# maximum number of such changes.
+MOST_SLID, NODE_CHANGES = 0.8, 8
 # Distance within which a joint is at its bound [rad].
 AT_BOUND = 1e-6
 
@@ -55,8 +58,8 @@ def ipopt(name: str, problem: dict[str, ca.SX], tolerance: float, iterations: in
 
 
 @lru_cache(maxsize=32)
-def _solver(model: CableModel, clamped: tuple[int, ...]) -> ca.Function:
-    problem, count, gaps = potential(model, clamped), model.chain.n_nodes, []
+def _solver(model: CableModel) -> ca.Function:
+    problem, count, gaps = potential(model), model.chain.n_nodes, []
     x, start = problem.coordinates, problem.parameters[len(model.names) + model.chain.n_rests :][:2]
     if model.surfaces:
         touching = model.n_contacts // len(model.surfaces)
@@ -97,33 +100,55 @@ def by_ipopt(
         As in `solve.solve_equilibrium`.
     phi : (n_nodes,) [rad]
     """
+    border, still = border_of(model, pose, phi[:, None]), np.zeros((1, len(model.deviation_names)))
+    given = Inputs.of(p, rest, pose.vector[None])
+    now, iterations = Assembly(model, Shapes(phi[None, :, None], border[None], still), given), 0
+    for _ in range(NODE_CHANGES if model.sliding else 1):
+        there, bounded, count = _minimised(now)
+        iterations += count
+        now = replace(there, shapes=slid(there, there.shapes)) if model.sliding else there
+        if not model.sliding or np.array_equal(now.clipped.nodes, there.clipped.nodes):
+            break
+    if model.surfaces:
+        now = replace(now, shapes=descend(now).shapes)
+    return _balanced(now, bounded, iterations)
+
+
+def _minimised(start: Assembly) -> tuple[Assembly, FloatArray, int]:
+    """What IPOPT reaches from the shape of one pose, multipliers of joint bounds, iterations.
+
+    The nodes that are moved to clips stay the same.
+    """
+    model, given, clipped = start.model, start.given, start.clipped
     count, touching = model.chain.n_nodes, model.n_contacts
-    conditions = model.n_multipliers - touching
-    solver = _solver(model, held_nodes(model.chain, pose.clips))
-    deviation = np.zeros(len(model.deviation_names))
-    others = border_of(model, pose, phi[:, None])[~model.are_multipliers]
+    conditions, places = model.n_multipliers - touching, ~model.are_multipliers
     rows, most = np.flatnonzero(model.are_multipliers)[:conditions], np.full(touching, np.inf)
     held = np.where(np.isin(rows, model.no_pull), np.inf, 0.0)
     bent = np.full(count - 1, JOINT_BOUND)
     lower = np.concatenate([-held, -bent, np.zeros(touching)])
     upper = np.concatenate([held, bent, most])
-    numbers, given = (p, rest, pose.vector), Inputs.of(p, rest, pose.vector[None])
-    first = Shapes(phi[None, :, None], np.zeros((1, model.n_border)), deviation[None])
-    clipped, x0 = Assembly(model, first, given).clipped, np.zeros(solver.size1_in("x0"))
-    x0[:count], x0[count : count + len(others)] = clipped.in_frames(first.x)[0, :, 0], others
+    solver, others = _solver(model), start.shapes.lam[0, places]
+    x0 = np.zeros(solver.size1_in("x0"))
+    x0[:count] = clipped.in_frames(start.shapes.x)[0, :, 0]
+    x0[count : count + len(others)] = others
     room = np.where(np.isin(np.arange(len(x0)), clipped.clamped[0]), 0.0, np.inf)
     bounds = {"lbx": x0 - room, "ubx": x0 + room, "lbg": lower, "ubg": upper}
-    out, stats = run_ipopt(solver, x0=x0, p=np.concatenate([*numbers, deviation]), **bounds)
+    for k, row in model.sliding.items():
+        back, ahead = MOST_SLID * np.diff(clipped.places[0])[clipped.beside(k)[1][0]]
+        at = count + int(places[:row].sum())
+        bounds["lbx"][at], bounds["ubx"][at] = x0[at] - back, x0[at] + ahead
+    moved = (np.arange(count) == clipped.nodes[0][:, None]).ravel(order="F")
+    numbers = (given.p[0], given.rest[0], given.poses[0], start.shapes.deviation[0], moved)
+    out, stats = run_ipopt(solver, x0=x0, p=np.concatenate(numbers), **bounds)
     multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))
     border = np.zeros(model.n_border)
     bounded, pressed = np.split(multipliers[conditions:], [count - 1])
     border[model.are_multipliers] = np.concatenate([multipliers[:conditions], -pressed])
-    border[~model.are_multipliers] = coordinates[count:][: np.sum(~model.are_multipliers)]
-    shapes = Shapes(coordinates[None, :count, None], border[None], deviation[None])
-    start = Assembly(model, shapes, given)
-    if model.surfaces:
-        start = replace(start, shapes=descend(start).shapes)
-    return _balanced(start, bounded, stats["iter_count"])
+    border[places] = coordinates[count:][: len(others)]
+    near = clipped.near[:, [*model.sliding]]
+    x = coordinates[None, :count, None]
+    shapes = Shapes(x, border[None], start.shapes.deviation, near)
+    return replace(start, shapes=shapes), bounded, stats["iter_count"]
 
 
 def _balanced(

@@ -1,6 +1,8 @@
 """The equilibrium of a cable in one pose: its shape, forces, energy and stability."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -69,6 +71,8 @@ class Equilibrium:
         Where the cable touches obstacles, from its start to its end.
     fed : float [m]
         Length of the cable that was fed through a sliding end: free minus declared length.
+    near : (number of eyelets,) [m]
+        See `Shapes`.
     """
 
     x: FloatArray
@@ -89,11 +93,12 @@ class Equilibrium:
     clips: tuple[ClipLoad, ...] = ()
     contacts: tuple[Contact, ...] = ()
     fed: float = 0.0
+    near: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def shapes(self) -> Shapes:
         """Stacked unknowns of this one pose, with its ends as declared."""
-        return Shapes.declared(self.x[None], self.multipliers[None], len(self.clips))
+        return stacked([self])
 
     @property
     def phi(self) -> FloatArray:
@@ -108,6 +113,19 @@ class Equilibrium:
     def has_branch(self, branch: Branch | None) -> bool:
         """Whether the cable turns as the branch says, or not at all; always for None."""
         return branch is None or SIGNS[branch] * self.turn > -NO_TURN
+
+
+def stacked(equilibria: Sequence[Equilibrium]) -> Shapes:
+    """Shapes of some equilibria of a model, with their ends as declared."""
+    x, lam, near = zip(*((eq.x, eq.multipliers, eq.near) for eq in equilibria), strict=True)
+    found = Shapes.declared(np.array(x), np.array(lam), len(equilibria[0].clips))
+    return replace(found, near=np.array(near))
+
+
+def with_equilibrium(shapes: Shapes, index: Any, eq: Equilibrium) -> Shapes:
+    """Shapes with an equilibrium for one of the poses, its ends as declared."""
+    still = np.zeros_like(shapes.deviation[:1])
+    return shapes.replaced([index], replace(eq.shapes, deviation=still))
 
 
 def places_along(clipped: Clipped) -> FloatArray:
@@ -200,6 +218,7 @@ def equilibria_of(found: Assembly, *, stable: BoolArray, iterations: IntArray) -
                 clips=on_clips[j],
                 contacts=contacts[j],
                 fed=float(shapes.lam[j, found.model.fed].sum()),
+                near=found.clipped.near[j, [*found.model.sliding]],
             )
         )
     return out

@@ -115,7 +115,7 @@ def _depths(found: Assembly) -> tuple[list[str], FloatArray]:
 def _along(found: Assembly) -> FloatArray:
     """Places (m, K, d) [m] along cables, four per element, interpolated from their nodes."""
     model, points, x = found.model, found.nodes(), found.shapes.x
-    if model.clamped_between:  # nodes of clamped clips are moved to these, `points` are even
+    if model.clips:  # nodes are moved to these, `points` are even
         even, moved = model.chain.places, found.clipped.places
         x = np.array([model.node.interpolated(even, *each) for each in zip(moved, x, strict=True)])
     slopes = model.chain.h * tangents(model.node, x)
@@ -249,7 +249,8 @@ class Varied(Repeats):
         shapes, along = self.held.equilibrium.shapes, self.along
         start = np.repeat(shapes.x, len(z), axis=0)
         x = self.held.model.node.moved(start, np.einsum("nbq,mq->mnb", along.x[0], z))
-        return Shapes(x, shapes.lam + z @ along.lam[0].T, z @ along.deviation[0].T)
+        near = np.repeat(shapes.near, len(z), axis=0)
+        return Shapes(x, shapes.lam + z @ along.lam[0].T, z @ along.deviation[0].T, near)
 
     def _solved(
         self, z: FloatArray, names: tuple[str, ...]

@@ -21,6 +21,7 @@ import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.equilibrium import END_TOLERANCE
+from dlo_casadi.equilibrium.eyelets import slid
 from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import DEPTH, gap_per_force
@@ -115,7 +116,7 @@ def descend(start: Assembly, max_iterations: int = 80) -> Minima:
     """
     model, shapes = start.model, start.shapes
     m, wanted, turns = len(shapes.x), model.n_multipliers, turn_per_slip(model)
-    now = Shapes(shapes.x.copy(), shapes.lam.copy(), shapes.deviation)
+    now = shapes
     balanced, iterations = np.zeros(m, dtype=bool), np.full(m, max_iterations)
     shift, first, last = np.zeros(m), np.full(m, np.inf), np.full(m, np.inf)
     active = np.arange(m)
@@ -137,7 +138,7 @@ def descend(start: Assembly, max_iterations: int = 80) -> Minima:
         taken, length = damped(model, step, size, last[active])
         last[active] = size
         here = _on_their_sides(here, taken, length)
-        now.x[active], now.lam[active] = here.shapes.x, here.shapes.lam
+        now = now.replaced(active, here.shapes)
         # A shift makes steps small even if forces do not balance.
         done = size * (1 + shift[active] / matrix.scale) < TOLERANCE
         balanced[active[done]] = True  # the end conditions are checked below
@@ -167,14 +168,13 @@ def descend_to_contact(
     """As `descend`; each shape skips the first `skipped` (m,) of the depths SOFT."""
     if not start.model.surfaces:
         return descend(start, max_iterations)
-    shapes = start.shapes.subset(np.arange(len(start.shapes.x)))  # a copy
+    shapes = start.shapes
     depths = [depth for depth in SOFT if depth > start.depth]
     for k, depth in enumerate(depths):
         rows = np.flatnonzero(np.broadcast_to(skipped, len(shapes.x)) <= k)
         if len(rows):
             soft = replace(start, shapes=shapes, depth=depth).subset(rows)
-            softer = descend(soft, STEPS_WHILE_SOFT).shapes
-            shapes.x[rows], shapes.lam[rows] = softer.x, softer.lam
+            shapes = shapes.replaced(rows, descend(soft, STEPS_WHILE_SOFT).shapes)
     return _hardened(replace(start, shapes=shapes), depths[-1], max_iterations, HALVINGS)
 
 
@@ -234,9 +234,9 @@ def _hardened(start: Assembly, softer: float, max_iterations: int, halvings: int
     lost, near = lost[half.balanced], half.shapes.subset(half.balanced)
     if len(lost):
         other = _hardened(replace(start.subset(lost), shapes=near), between, *few)
-        parts = ((one.shapes.x, one.shapes.lam, *one[1:]) for one in (found, other))
-        for mine, theirs in zip(*parts, strict=True):
+        for mine, theirs in zip(found[1:], other[1:], strict=True):
             mine[lost] = theirs
+        found = found._replace(shapes=found.shapes.replaced(lost, other.shapes))
     return found
 
 
@@ -286,17 +286,16 @@ def damped(
 def stepped(here: Assembly, step: Vector, size: FloatArray) -> Assembly:
     """Shapes after a step of one column, limited to LONGEST_STEP.
 
-    `size` (m,) [rad] is the longest step of each shape, see `size_of`. Eyelets stay within the
-    cable.
+    `size` (m,) [rad] is the longest step of each shape, see `size_of`. Eyelets stay between what
+    is beside them.
     """
     model, shapes = here.model, here.shapes
     share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
     x = model.node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
     lam = shapes.lam + share[:, None] * step.y[..., 0]
-    for row in model.sliding.values():
-        lam[:, row] = lam[:, row].clip(0.0, model.chain.length)
     lam[:, model.fed] = lam[:, model.fed].clip(-SHORTEST * model.chain.length)
-    return replace(here, shapes=replace(shapes, x=x, lam=lam))
+    moved = replace(shapes, x=x, lam=lam)
+    return replace(here, shapes=slid(here, moved) if model.sliding else moved)
 
 
 def _on_their_sides(here: Assembly, step: Vector, size: FloatArray) -> Assembly:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import compress
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from dlo_casadi.equilibrium.spans import (
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import held_nodes, node_places
+from dlo_casadi.model.clips import placed_nodes
 from dlo_casadi.rod.node import Frame
 
 # Largest move of an end in one step [lengths, rad], so that a shape can be followed up to a fold.
@@ -186,7 +185,8 @@ def _chosen(
     named = None if start is not None or pose.branch == "previous" else pose.branch
     where = "its end free" if pose.end is None else f"its end at {pose.end} m"
     if start is None and found and pose.turns:
-        twists = _twists(model, pose, np.array([eq.twist for eq in found]))
+        at = np.array([[load.at for load in eq.clips] for eq in found])
+        twists = _twists(model, at, np.array([eq.twist for eq in found]))
         kept = [eq for eq, held in zip(found, _holds(pose, twists), strict=True) if held]
         if not kept:
             left = min(zip(twists, found, strict=True), key=lambda pair: pair[1].energy)[0]
@@ -343,7 +343,7 @@ class _PoseSearch:
         x, kept = found.shapes.x, []
         for j, pose in enumerate(poses):
             rows = np.flatnonzero((of == j) & minima.converged)
-            rows = rows[_holds(pose, _twists(coarse, pose, twist[rows]))]
+            rows = rows[_holds(pose, _twists(coarse, found.clipped.at[rows], twist[rows]))]
             rows = rows[on_named_sides(coarse, pose, points[rows])]
             rows = rows[np.argsort(minima.energy[rows], kind="stable")]
             mine = [int(rows[k]) for k in _distinct(model, x[rows])[:FEW]]
@@ -373,14 +373,13 @@ def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> Floa
     return np.concatenate([shares @ part for part in np.split(rest, len(model.node.strains))])
 
 
-def _twists(model: CableModel, pose: HeldPose, twist: FloatArray) -> FloatArray:
-    """Twist (m,) [turns] that the end clamp gives cables, from that of their cells [1/m].
-
-    `twist` (m, n_cells). A clamped clip holds the roll: turns of the end stop there.
-    """
-    rolled = [clip.kind.roll for clip in pose.clips if not clip.kind.slides]
-    first = max(compress(held_nodes(model.chain, pose.clips), rolled), default=0)
-    return twist[:, first:] @ np.diff(node_places(model.chain, pose.clips))[first:] / (2 * np.pi)
+def _twists(model: CableModel, at: FloatArray, twist: FloatArray) -> FloatArray:
+    """Turns (m,) that the end clamp gives cables, from the `twist` (m, n_cells) [1/m] of cells."""
+    # They stop at a clip, of arc lengths `at` (m, k) [m], that holds the roll.
+    nodes, places = placed_nodes(model.chain, at, at)
+    rolled = nodes[:, [kind.roll for kind in model.clips]]
+    beyond = np.arange(twist.shape[1]) >= rolled.max(axis=1, keepdims=True, initial=0)
+    return np.asarray((twist * np.diff(places) * beyond).sum(axis=1) / (2 * np.pi))
 
 
 def _holds(pose: HeldPose, twists: FloatArray) -> BoolArray:

@@ -28,7 +28,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.sides import named_sides
 from dlo_casadi.errors import EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import held_nodes, tangents
+from dlo_casadi.model.clips import tangents
 from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.node import Frame
@@ -341,8 +341,8 @@ def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str,
     if len(pose.clips) >= model.n:
         what = f"{counted(len(pose.clips), 'clip')} on {counted(model.n, 'element')}"
         return f"no equilibrium: {what}, a clip needs a node", "a finer mesh (model.n)."
-    clamped = [held_nodes(model.chain, [x])[0] for x in pose.clips if x.kind.direction]
-    if len(set(clamped)) < len(clamped):
+    clamped = [float(x.at or 0.0) / model.chain.h for x in pose.clips if x.kind.direction]
+    if len({*np.rint(clamped)}) < len(clamped):
         what = f"clamped clips are nearer to each other than an element, {model.chain.h:.4g} m"
         return f"no equilibrium: {what}", "a finer mesh (model.n)."
     held = holders(model, p, pose) if pose.clips and not model.extensible else []

@@ -67,7 +67,7 @@ class SolvedCable:
 
     @property
     def places(self) -> FloatArray:
-        """Arc lengths (n_nodes,) [m] of the model's nodes; those of saddles are moved to these."""
+        """Arc lengths (n_nodes,) [m] of the model's nodes; some are moved to the clips."""
         return self.assembly.clipped.places[0]
 
 

@@ -271,26 +271,27 @@ def carried_shapes(problem: Problem, fit: Fit, *, relaxed: bool = False) -> Shap
     has no equilibrium.
     """
     known = {index: k for k, index in enumerate(fit.problem.indices)}
-    own = fit.point.shapes
+    own, count = fit.point.shapes, len(fit.model.sliding)
     rows = []
     for index in problem.indices:
         if index in known:
             k = known[index]
-            rows.append((own.x[k], own.lam[k], own.deviation[k]))
+            rows.append((own.x[k], own.lam[k], own.deviation[k], own.near_each(count)[k]))
             continue
         pose = problem.history[index].pose
         deviation = np.zeros_like(own.deviation[0])
         try:
             before = (problem.history[index - 1].pose, rows[-1][0]) if rows else None
             found = solve_after(fit.model, fit.p, fit.rest, pose, before)
-            rows.append((found.x, found.multipliers, deviation))
+            rows.append((found.x, found.multipliers, deviation, found.near))
         except EquilibriumError as error:
             if not relaxed:
                 raise EstimationError(error.message) from error
-            rows.append((*next(first_guesses(fit.model, fit.p, fit.rest, pose)), deviation))
-    x, lam, deviation = (np.array(column) for column in zip(*rows, strict=True))
+            guess = next(first_guesses(fit.model, fit.p, fit.rest, pose))
+            rows.append((*guess, deviation, np.full(count, np.nan)))
+    columns = (np.array(column) for column in zip(*rows, strict=True))
     models = fit.problem.equilibria.model, problem.equilibria.model
-    return on_other_mesh(Shapes(x, lam, deviation), *models)
+    return on_other_mesh(Shapes(*columns), *models)
 
 
 def on_other_mesh(shapes: Shapes, model: CableModel, other: CableModel) -> Shapes:

@@ -10,7 +10,12 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import NodeCurve, Observed
-from dlo_casadi.equilibrium.equilibrium import NEARBY, Equilibrium
+from dlo_casadi.equilibrium.equilibrium import (
+    NEARBY,
+    Equilibrium,
+    stacked,
+    with_equilibrium,
+)
 from dlo_casadi.equilibrium.measured_line import line_nodes
 from dlo_casadi.equilibrium.pose import HeldPose, PoseBranch
 from dlo_casadi.equilibrium.solve import (
@@ -176,12 +181,6 @@ def _seen(
     ]
 
 
-def stacked(equilibria: Sequence[Equilibrium]) -> Shapes:
-    """Shapes of some equilibria, held as declared."""
-    x, lam = zip(*((eq.x, eq.multipliers) for eq in equilibria), strict=True)
-    return Shapes.declared(np.array(x), np.array(lam), len(equilibria[0].clips))
-
-
 def predicted_shapes(problem: Problem, values: Values) -> Shapes:
     """Shapes of a problem's poses as predicted from their ends alone.
 
@@ -201,11 +200,10 @@ def predicted_shapes(problem: Problem, values: Values) -> Shapes:
         for one, x in zip(known, shapes.x, strict=True)
     ]
     told = _named_ways(elsewhere)
-    x, lam = shapes.x.copy(), shapes.lam.copy()
     for j, (one, way) in enumerate(zip(known, told, strict=True)):
         if one is not None and way is None:
-            x[j], lam[j] = one.equilibrium.x, one.equilibrium.multipliers
-    return Shapes(x, lam, np.zeros_like(shapes.deviation))
+            shapes = with_equilibrium(shapes, j, one.equilibrium)
+    return replace(shapes, deviation=np.zeros_like(shapes.deviation))
 
 
 def _tells_no_side(found: Prediction) -> bool:

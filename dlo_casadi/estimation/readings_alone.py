@@ -16,7 +16,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.curve import Observed
-from dlo_casadi.equilibrium.equilibrium import NEARBY
+from dlo_casadi.equilibrium.equilibrium import NEARBY, with_equilibrium
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import MISFIT_GAIN, NEARLY, descend
 from dlo_casadi.estimation.measured_shapes import measured_shapes
@@ -26,7 +26,6 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import FOLLOWED, ROLLS, SearchSettings
 from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.estimation.variances import first_reading_noise
-from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import END_ROLL
 
 # Noise of the readings in the first search, relative to the forces in the cable.
@@ -178,7 +177,6 @@ def _nearest(problem: Problem, values: Values, known: bool) -> tuple[Values, boo
     model, (shapes, p, rest) = problem.unknowns.model, problem.state(values)
     if model.has_state and known:
         return values, False
-    x, lam, deviation = shapes.x.copy(), shapes.lam.copy(), shapes.deviation.copy()
     every = predict_every(model, p, rest, [item.pose for item in problem.history])
     own = ((problem.own_deviations(values) / problem.deviation_std) ** 2).sum(axis=1)
     seen, moved = problem.observed(values), False
@@ -188,10 +186,10 @@ def _nearest(problem: Problem, values: Values, known: bool) -> tuple[Values, boo
         least = _misread(problem, k, seen[j]) + float(own[k]) if known else np.inf
         for other in every[problem.fitted[k]]:
             left, eq = _misread(problem, k, other.seen), other.equilibrium
-            if left < least and not (known and model.node.same(eq.x, x[j], NEARBY)):
+            if left < least and not (known and model.node.same(eq.x, shapes.x[j], NEARBY)):
                 least, moved = left, True
-                x[j], lam[j], deviation[j] = eq.x, eq.multipliers, 0.0
-    return replace(values, shapes=Shapes(x, lam, deviation)), moved
+                shapes = with_equilibrium(shapes, j, eq)
+    return replace(values, shapes=shapes), moved
 
 
 def _misread(problem: Problem, k: int, seen: Observed) -> float:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.equilibrium.equilibrium import with_equilibrium
 from dlo_casadi.equilibrium.solve import solve_after
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.estimation.descent import NEARLY, descend
@@ -22,7 +23,6 @@ from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Values
-from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
 from dlo_casadi.model.functions import functions_of
 
@@ -264,12 +264,11 @@ def _from_ends_and_lines(problem: Problem, values: Values, among: BoolArray) -> 
     predicted = predict_each(model, p, rest, [item.pose for item in measured])
     found = []
     for ways in (predicted, measured_elsewhere(model, p, rest, measured, predicted)):
-        x, lam, deviation = shapes.x.copy(), shapes.lam.copy(), shapes.deviation.copy()
+        known = shapes
         for j, one in zip(chosen, ways, strict=True):
             if one is not None:
-                x[j], lam[j] = one.equilibrium.x, one.equilibrium.multipliers
-                deviation[j] = 0.0
-        seen = problem.observed(moved := replace(values, shapes=Shapes(x, lam, deviation)))
+                known = with_equilibrium(known, j, one.equilibrium)
+        seen = problem.observed(moved := replace(values, shapes=known))
         nearest = [problem.measured[j].nearest(seen[j].curve) for j in problem.used]
         found.append(replace(moved, projections=nearest))
     return found

@@ -11,8 +11,9 @@ from scipy.optimize import minimize_scalar
 from dlo_casadi.arrays import FloatArray, chord_lengths
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
+from dlo_casadi.equilibrium.equilibrium import stacked
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses, stacked
+from dlo_casadi.estimation.prediction import measured_elsewhere, predict_poses
 from dlo_casadi.estimation.start import SearchSettings
 from dlo_casadi.estimation.variances import first_reading_noise
 from dlo_casadi.model.assembly import Shapes

@@ -1,137 +1,44 @@
 """A model's functions, evaluated for many poses at once and assembled into band matrices.
 
-One CasADi function of a segment is mapped over the segments of a pose. Its blocks are summed to the
-gradient of the Lagrangian, to its Hessian (block-tridiagonal, with the multipliers as border), and
-to the derivatives of both and of the measured curve.
+Blocks of the segments are summed to the gradient of the Lagrangian, to its Hessian (block-
+tridiagonal, with the multipliers as border), and to the derivatives of both and of the measured
+curve.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clipped import NONE, Clipped, by_axes
-from dlo_casadi.model.clips import ClipLoad, clip_size, tangents
-from dlo_casadi.model.contact import DEPTH, Contact, Touching, outwards
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.model.clipped import NONE, Slide, by_axes, of_own_edge
+from dlo_casadi.model.clips import ClipLoad, tangents
+from dlo_casadi.model.contact import Contact
+from dlo_casadi.model.evaluation import Evaluation
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.model.stacked import Inputs, Mapped, Shapes, Tangents, Unheld, repeated
+from dlo_casadi.model.stacked import Inputs, Shapes, Tangents, repeated
 from dlo_casadi.rod.band import BandMatrix, Vector
-from dlo_casadi.rod.element import LAYOUT_SIZE
 from dlo_casadi.rod.ends import reaction_rows
 
+__all__ = ["Assembly", "Inputs", "Shapes", "Tangents"]
 
-@dataclass(frozen=True, eq=False)
-class Assembly:
-    """A model's functions at the shapes of m poses.
 
-    Parameters
-    ----------
-    depth : float
-        Of the cable in obstacles, see `contact.DEPTH`.
-    everywhere : bool
-        Whether forces of obstacles act whatever the gaps.
-    """
-
-    model: CableModel
-    shapes: Shapes
-    given: Inputs
-    depth: float = DEPTH
-    everywhere: bool = False
-
-    def subset(self, index: Any) -> Assembly:
-        """Some of the poses, with what is known about their contacts."""
-        found = replace(self, shapes=self.shapes.subset(index), given=self.given.subset(index))
-        if touching := vars(self).get("touching"):
-            vars(found)["touching"] = touching.subset(index)
-        return found
+class Assembly(Evaluation):
+    """A model's functions at the shapes of m poses, assembled."""
 
     @cached_property
-    def felt_everywhere(self) -> Assembly:
-        """The same poses; forces of obstacles act whatever the gaps."""
-        return replace(self, everywhere=True)
-
-    @cached_property
-    def clipped(self) -> Clipped:
-        """Where the clips are on the cable."""
-        model, given, x = self.model, self.given, self.shapes.x
-        if not model.clips:
-            return Clipped.none(model.chain, len(x))
-        declared = given.poses[:, given.poses.shape[1] - model.clip_numbers :]
-        declared = declared.reshape((len(declared), len(model.clips), clip_size(model.node)))
-        slips, turns = functions_of(model).clip_slopes
-        at = declared[..., -1] + given.p @ slips.T
-        for k, row in model.sliding.items():
-            at[:, k] = self.shapes.lam[:, row]
-        return Clipped.of(model.chain, model.clips, declared, at, given.p @ turns, x)
-
-    @cached_property
-    def touching(self) -> Touching | None:
-        """Which nodes touch obstacles; None without obstacles."""
-        if not self.model.surfaces:
-            return None
-        d = self.model.node.dimension
-
-        def advances(lam: FloatArray, rows: IntArray) -> FloatArray:
-            return self.subset(rows)._call_segments("segment_curve", lam)[0][:, :, :d, 0]
-
-        shifts = self.given.p @ outwards(self.model).T
-        nodes = self.shapes.lam, self.given.poses[:, :d], shifts
-        return Touching.of(self.model, *nodes, self.depth, self.everywhere, advances)
-
-    # ---- calls ---------------------------------------------------------------------------------
-
-    def _mapped(self, name: str, unheld: bool = False) -> Mapped:
-        return functions_of(self.model, unheld).mapped(name)
-
-    def _call_segments(self, name: str, lam: FloatArray | None = None) -> list[FloatArray]:
-        """Evaluate a function for all segments: outputs (m, n_segments, rows, columns).
-
-        `lam` (m, n_segments, n_lam): forces; by default those of the shapes and contacts.
-        """
-        model, clipped, arguments = self.model, self.clipped, self._arguments(name, lam)
-        if not model.clips:
-            return self._mapped(name)(*arguments)
-        unheld = Unheld.of(model, arguments[4], clipped.segments_at)
-        return unheld.evaluated(name, self._mapped, arguments, 2 * model.node.increment)
-
-    def _arguments(self, name: str, lam: FloatArray | None = None) -> list[FloatArray]:
-        """Arguments (m, n_segments, ...) of a function of segments, see `_call_segments`."""
-        shapes, clipped, count = self.shapes, self.clipped, self.model.chain.n_segments
-        if lam is None:
-            lam = self.touching.lam if self.touching else repeated(shapes.lam, count)
-        own = self._rest_inside
-        if not name.startswith("segment_state"):  # a state is of the even cells
-            own = clipped.rest(own[..., None])[..., 0]
-        p, deviation = (repeated(one, count) for one in (self.given.p, shapes.deviation))
-        both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
-        if self.model.fed:
-            table = np.concatenate([table, lam[..., self.model.fed]], axis=2)
-        return [both, lam, p, own, table, deviation]
-
-    @property
-    def _rest_inside(self) -> FloatArray:
-        """Rest strains inside (m, n_segments, 3 strains) of even segments."""
-        return self.model.chain.rest_inside(self.given.rest[..., None])[..., 0]
-
-    def _both(self, nodes: FloatArray) -> FloatArray:
-        """Rows (m, n_segments, 2 k, ...) of both nodes of segments, from (m, n_nodes, k, ...)."""
-        count = self.model.chain.n_segments
-        following = np.minimum(np.arange(count) + 1, self.model.chain.n_nodes - 1)
-        return np.concatenate([nodes[:, :count], nodes[:, following]], axis=2)
-
-    def _call_ends(self, name: str) -> list[FloatArray]:
-        """Evaluate a function of both ends: outputs (m, rows, columns)."""
-        shapes, given = self.shapes, self.given
-        both = np.concatenate([shapes.x[:, :1], shapes.x[:, -1:]], axis=2)
-        lam = shapes.lam[:, : self.model.n_lam]
-        rows = (both[:, 0], lam, given.p, given.poses, shapes.deviation)
-        return [out[:, 0] for out in self._mapped(name)(*(row[:, None] for row in rows))]
+    def _slides(self) -> list[Slide]:
+        """What moves the cables along their eyelets."""
+        first = 2 * self.model.node.increment
+        return [
+            Slide.of(beside, first + row, outputs)
+            for k, row in self.model.sliding.items()
+            for beside, outputs in [self._call_beside(k, "segment_by_edges")]
+        ]
 
     def _at_nodes(
         self, first: FloatArray, last: FloatArray, start: FloatArray, end: FloatArray
@@ -165,6 +72,10 @@ class Assembly:
     def balance(self) -> tuple[FloatArray, Vector, BandMatrix]:
         """Lagrangian (m,) [J], its gradient by increments and multipliers, and its Hessian."""
         value, gradient, bend = self._call_segments("segment")
+        for slide in self._slides:
+            slide.add(gradient, bend)
+        for pair in pairwise(self._slides):
+            pair[0].add_common(pair[1], bend)
         end_value, end_gradient, end_bend = self._call_ends("at_ends")
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         matrix = self._held(self._band(bend, end_bend))
@@ -192,6 +103,10 @@ class Assembly:
     def _slope(self) -> tuple[FloatArray, Vector]:
         """Gradients of the segments, and their sum with those of the ends, without contacts."""
         (gradient,) = self._call_segments("segment_slope")
+        for k, row in self.model.sliding.items():
+            beside, (slope,) = self._call_beside(k, "edge_slope")
+            row = 2 * self.model.node.increment + row
+            gradient[(*beside, row, 0)] += of_own_edge(slope[..., 0])
         _, end_gradient, _ = self._call_ends("at_ends")
         return gradient, self._added(gradient, end_gradient)
 
@@ -240,6 +155,10 @@ class Assembly:
     def balance_slopes(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the gradient by p, rest and deviation, of each segment and of the ends."""
         (segments,) = self._call_segments("segment_sensitivity")
+        for k, row in self.model.sliding.items():
+            beside, (slope,) = self._call_beside(k, "edge_sensitivity")
+            row = 2 * self.model.node.increment + row
+            segments[(*beside, row)] += of_own_edge(np.moveaxis(slope, 2, 3))
         (ends,) = self._call_ends("end_sensitivity")
         return segments, ends
 
@@ -249,7 +168,8 @@ class Assembly:
         `slopes`: the `balance_slopes` if they are known.
         """
         segments, ends = slopes or self.balance_slopes()
-        changed = self._by_numbers(segments, along) + self._by_slips("segment_by_place", along.p)
+        rate = self._slips(along.p)
+        changed = self._by_numbers(segments, along) + self._by_slips("segment_by_edges", rate)
         at_ends = ends @ np.concatenate([along.p, along.deviation], axis=1)
         turned = self._by_turns(along.p)
         still: FloatArray | None = None
@@ -257,6 +177,10 @@ class Assembly:
             _, gradient, bend = self._call_segments("segment")
             changed += bend[..., : 2 * self.model.node.increment] @ self._both(turned)
             still = by_axes(self._added(gradient, np.zeros_like(at_ends[..., :1])).x, turned)
+        for slide in self._slides:
+            shape = len(rate), self.model.chain.n_nodes, self.model.node.increment, rate.shape[2]
+            nodes = np.broadcast_to(turned, shape), self.clipped.at_nodes(rate)
+            slide.add_along(changed, *map(self._both, nodes))
         total = self._added(changed, at_ends)
         if still is not None:
             total = replace(total, x=total.x + still)
@@ -269,34 +193,33 @@ class Assembly:
         self, blocks: FloatArray, along: Tangents, total: FloatArray | float = 0.0
     ) -> FloatArray:
         """Add the change along p, rest and deviation to a total, given segments' derivatives."""
-        rest = self.clipped.rest(self.model.chain.rest_inside(along.rest))
+        rest = self.model.chain.rest_inside(along.rest)
         n_p, n_r = along.p.shape[1], along.p.shape[1] + rest.shape[2]
         total = total + blocks[..., :n_p] @ along.p[:, None]
         total += blocks[..., n_p:n_r] @ rest
         total += blocks[..., n_r:] @ along.deviation[:, None]
         return np.asarray(total)
 
-    def _by_slips(self, name: str, p: FloatArray) -> FloatArray:
-        """Change (m, n_segments, rows, q) of segments because their clips slip along the cable.
+    def _by_slips(self, name: str, rate: FloatArray) -> FloatArray:
+        """Change (m, n_segments, rows, q) of segments because their clips move along the cable.
 
-        `name`: of a derivative by rest and place; `p` (m, n_parameters, q): directions.
+        `name`: of derivatives by the ends of a segment; `rate` (m, k, q) [m] of the clips.
         """
-        rate, rows = self._slips(p), np.arange(len(p))[:, None]
-        count, total = self.model.chain.n_segments, NONE
+        total = NONE
         for k in np.flatnonzero(rate.any(axis=(0, 2))).tolist():
-            here, change = self.clipped.slid(k, self._rest_inside)
-            if name.startswith("segment_state"):  # a state is of the even cells
-                change[..., : -LAYOUT_SIZE - len(self.model.clips)] = 0.0
-            arguments = (one[rows, here] for one in self._arguments(name))
-            (blocks,) = self._mapped(name)(*arguments)
+            beside, (blocks, *_) = self._call_beside(k, name)
             if total is NONE:
-                total = np.zeros((len(p), count, blocks.shape[2], p.shape[2]))
-            total[rows, here] += (blocks @ change[..., None]) * rate[:, k, None, None]
+                shape = len(rate), self.model.chain.n_segments, blocks.shape[2], rate.shape[2]
+                total = np.zeros(shape)
+            total[beside] += of_own_edge(blocks)[..., None] * rate[:, k, None, None]
         return total
 
-    def _slips(self, p: FloatArray) -> FloatArray:
-        """Change (m, k, q) [m] of the arc lengths of clips along directions of the parameters."""
-        return np.asarray(functions_of(self.model).clip_slopes[0] @ p)
+    def _slips(self, p: FloatArray, lam: FloatArray | None = None) -> FloatArray:
+        """Change (m, k, q) [m] of the arc lengths of clips along directions of p, and of lam."""
+        rate = np.asarray(functions_of(self.model).clip_slopes[0] @ p)
+        if lam is not None:
+            rate[:, [*self.model.sliding]] += lam[:, [*self.model.sliding.values()]]
+        return rate
 
     def _by_turns(self, p: FloatArray) -> FloatArray:
         """Rotations (m, n_nodes, increment, q) of the nodes that clips hold, likewise."""
@@ -318,7 +241,7 @@ class Assembly:
         (advance,) = self._call_segments("segment_curve")
         node, clipped = self.model.node, self.clipped
         places, rates = self._stations(advance[..., 0], self.given.poses[:, : node.dimension])
-        if not clipped.moved:
+        if not clipped.kinds:
             return places
         moved = np.concatenate([places, rates[..., :1] * tangents(node, self.shapes.x)], axis=2)
         return clipped.evenly(moved[..., None])[:, :, : node.dimension, 0]
@@ -347,15 +270,15 @@ class Assembly:
         lam = self.touching.lam_along(along.lam) if self.touching else along.lam[:, None]
         x = clipped.free(along.x) + self._by_turns(along.p)
         steps: FloatArray = by_nodes @ self._both(x) + by_lam @ lam
-        steps = self._by_numbers(by_others, along, steps)
-        steps += self._by_slips("segment_curve_by_place", along.p)
+        steps, rate = self._by_numbers(by_others, along, steps), self._slips(along.p, along.lam)
+        steps += self._by_slips("curve_by_edges", rate)
         start = np.zeros((len(steps), model.node.dimension, steps.shape[3]))
         places, rates = self._stations(steps, start)
         shape = (len(steps), model.chain.n + 1, both, steps.shape[3])
         own = x[:, model.chain.layout.stations].reshape(shape)
         moved = by_station @ np.concatenate([places, rates, own], axis=2)
         change = clipped.evenly(moved + by_p @ along.p[:, None])
-        change += clipped.evenly_along(rows, self._slips(along.p))
+        change += clipped.evenly_along(rows, rate)
         return clipped.evenly(rows)[..., 0], np.asarray(change)
 
     def reactions(self, name: str = "reactions") -> FloatArray:
@@ -403,9 +326,9 @@ class Assembly:
         """
         after, *by = (self._stacked(part) for part in self._call_segments("segment_state"))
         m, n_p = self.given.p.shape
-        if self.model.moves_nodes:
+        if self.model.clips:
             every = np.broadcast_to(np.eye(n_p), (m, n_p, n_p))
-            slipped = self._by_slips("segment_state_by_place", every)
+            slipped = self._by_slips("state_by_edges", self._slips(every))
             by[2] = by[2] + (self._stacked(slipped) if slipped.any() else 0.0)
         return (after[..., 0], *by)
 
@@ -421,4 +344,7 @@ class Assembly:
         both = np.tile(self._both(along.x)[:, chain.layout.bends], (*strains, 1))
         own = np.tile(np.stack(chain.by_strain(along.rest), axis=2), (*strains, 1))
         moved = (by_x[:, :, None] @ both + by_rest[:, :, None] @ own)[:, :, 0]
+        if self.model.sliding:
+            slid = self._by_slips("state_by_edges", self._slips(0 * along.p, along.lam))
+            moved += self._stacked(slid) if slid.any() else 0.0
         return np.asarray(moved + by_p @ along.p + by_deviation @ along.deviation)

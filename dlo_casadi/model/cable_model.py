@@ -372,11 +372,6 @@ class CableModel:
         return [self.border_names.index("end.fed")] if self.end.slides else []
 
     @property
-    def moves_nodes(self) -> bool:
-        """Whether nodes are moved to clips."""
-        return not all(kind.slides for kind in self.clips)
-
-    @property
     def clamped_between(self) -> bool:
         """Whether a clip between the ends holds the direction of the cable."""
         return any(kind.direction for kind in self.clips)

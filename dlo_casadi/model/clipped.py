@@ -1,27 +1,26 @@
 """Where the clips of many poses are on their cables, and what their arc lengths and turns change.
 
-The nearest node is moved to each clip but eyelets, and carries a clamped one's frame: see `clips`.
-If such a clip slips by ds, the two segments beside it change in start, length and rest strains; of
-an eyelet its share of the segment around it changes. If a clamped clip turns, its node turns with
-it. These changes are exact: derivatives of the segments by these numbers are the same as by any
-other.
+The nearest node is moved to each clip, and carries a clamped one's frame: see `clips`. If a clip
+slips, or the cable slides through it, the ends of the two segments beside it move along the cable.
+If a clamped clip turns, its node turns with it. These changes are exact: derivatives of the
+segments by these numbers are the same as by any other.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, cross
-from dlo_casadi.model.clips import BESIDE, ClipLoad, nearest_nodes
+from dlo_casadi.model.clips import ClipLoad, placed_nodes
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
-from dlo_casadi.rod.element import LAYOUT_SIZE
 from dlo_casadi.rod.node import Node
 from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 from dlo_casadi.rod.supports import SupportKind
 
+# Indices of poses (m, 1) and of the two segments beside a clip (m, 2).
+Beside = tuple[IntArray, IntArray]
 # No change of segments or nodes, which broadcasts.
 NONE = np.zeros((1, 1, 1, 1))
 
@@ -51,16 +50,77 @@ class ClampNode:
 
 
 @dataclass(frozen=True)
+class Slide:
+    """What moves m cables along an eyelet: derivatives of the two segments beside it.
+
+    They are by its arc length, the end of the first and the start of the second segment.
+
+    Parameters
+    ----------
+    beside : (m, 1), (m, 2) int
+        See `Clipped.beside`.
+    row : int
+        Of the arc length in derivatives of segments.
+    slope : (m, 2) [N]
+        Of the Lagrangian: their sum is the configurational force.
+    mixed : (m, 2, rows)
+        Of the gradient of the segments.
+    twice : (m, 2, 2)
+        Of `slope` by the start and the end of each segment.
+    """
+
+    beside: Beside
+    row: int
+    slope: FloatArray
+    mixed: FloatArray
+    twice: FloatArray
+
+    @classmethod
+    def of(cls, beside: Beside, row: int, outputs: Sequence[FloatArray]) -> "Slide":
+        """From the outputs of `Functions.segment_by_edges`."""
+        mixed, slope, twice = outputs
+        return cls(beside, row, *map(of_own_edge, (slope[..., 0], mixed, twice)))
+
+    def add(self, gradient: FloatArray, bend: FloatArray) -> None:
+        """Add its row to gradients and Hessians of the segments (m, n_segments, rows, ...)."""
+        gradient[(*self.beside, self.row, 0)] += self.slope
+        bend[(*self.beside, slice(None), self.row)] += self.mixed
+        bend[(*self.beside, self.row)] += self.mixed
+        bend[(*self.beside, self.row, self.row)] += of_own_edge(self.twice)
+
+    def add_common(self, other: "Slide", bend: FloatArray) -> None:
+        """Add what it has in common with the next eyelet, where one segment is between them."""
+        (_, own), (_, next_own) = self.beside, other.beside
+        poses = np.flatnonzero(own[:, 1] == next_own[:, 0])
+        for a, b in ((self.row, other.row), (other.row, self.row)):
+            bend[poses, own[poses, 1], a, b] += self.twice[poses, 1, 1]
+
+    def add_along(self, change: FloatArray, turned: FloatArray, rate: FloatArray) -> None:
+        """Add to the change of gradients (m, n_segments, rows, q) what moves both nodes.
+
+        Rotations (m, n_segments, 2b, q) and arc lengths (m, n_segments, 2, q) of these.
+        """
+        by_turns = self.mixed[:, :, None, : turned.shape[2]] @ turned[self.beside]
+        moved = by_turns + self.twice[:, :, None] @ rate[self.beside]
+        change[(*self.beside, self.row)] += moved[:, :, 0]
+
+
+def of_own_edge(outputs: FloatArray) -> FloatArray:
+    """Of derivatives (m, 2, ..., 2) by both ends of two segments those by where they meet."""
+    return np.stack([outputs[:, 0, ..., 1], outputs[:, 1, ..., 0]], axis=1)
+
+
+@dataclass(frozen=True)
 class Clipped:
     """Where the clips of m poses are on their cables.
 
     Parameters
     ----------
     kinds : (k,) SupportKind
-    at : (m, k) [m]
-        Arc lengths of the clips.
-    nodes : (m, held) int
-        Nodes that are moved to the clips, but to eyelets.
+    at, near : (m, k) [m]
+        Arc lengths of the clips, and those to which their nodes are the nearest ones.
+    nodes : (m, k) int
+        Nodes that are moved to the clips.
     places : (m, n + 1) [m]
         Arc lengths of the nodes.
     """
@@ -68,6 +128,7 @@ class Clipped:
     chain: Chain
     kinds: tuple[SupportKind, ...]
     at: FloatArray
+    near: FloatArray
     nodes: IntArray
     clamps: tuple[ClampNode, ...]
     places: FloatArray
@@ -84,34 +145,27 @@ class Clipped:
     ) -> "Clipped":
         """Clips at the arc lengths `at` (m, k) [m] of shapes x (m, n_nodes, coordinates).
 
-        `declared` (m, k, clip_size) determines the nearest node, which then stays the same while an
-        unknown slip changes. `turn` (k, m, increment) [rad]: of frames from the declared ones.
+        The arc lengths in `declared` (m, k, clip_size) determine the nearest nodes, which then stay
+        the same while an unknown slip changes, or an eyelet's arc length. `turn` (k, m, increment)
+        [rad]: of frames from the declared ones.
         """
-        node, rows = chain.kind.node, np.arange(len(x))
-        places, clamps = np.tile(chain.places, (len(x), 1)), []
-        moved = [k for k, kind in enumerate(kinds) if not kind.slides]
-        nodes = nearest_nodes(chain, declared[:, moved, -1])
-        places[rows[:, None], nodes] = at[:, moved]
-        for k, index in zip(moved, nodes.T, strict=True):
-            if not kinds[k].direction:
+        node, rows, clamps = chain.kind.node, np.arange(len(x)), []
+        nodes, places = placed_nodes(chain, declared[..., -1], at)
+        for k, (kind, index) in enumerate(zip(kinds, nodes.T, strict=True)):
+            if not kind.direction:
                 continue
             frame = node.moved(declared[:, k, node.dimension : -1], turn[k])
-            aligned, held = frame, kinds[k].rotations(node)
+            aligned, held = frame, kind.rotations(node)
             if not held.all():
                 frame = rolled_with(frame, x[rows, index])
             clamps.append(ClampNode(index, frame, held, aligned, turn[k]))
-        return cls(chain, kinds, at, nodes, tuple(clamps), places)
+        return cls(chain, kinds, at, declared[..., -1], nodes, tuple(clamps), places)
 
     @classmethod
     def none(cls, chain: Chain, count: int) -> "Clipped":
         """Cables of `count` poses without clips."""
-        nodes = np.zeros((count, 0), dtype=np.intp)
-        return cls(chain, (), np.zeros((count, 0)), nodes, (), np.tile(chain.places, (count, 1)))
-
-    @property
-    def moved(self) -> list[int]:
-        """Indices of the clips to which nodes are moved."""
-        return [k for k, kind in enumerate(self.kinds) if not kind.slides]
+        none, places = np.zeros((count, 0)), np.tile(chain.places, (count, 1))
+        return cls(chain, (), none, none, none.astype(np.intp), (), places)
 
     @property
     def in_order(self) -> BoolArray:
@@ -122,16 +176,24 @@ class Clipped:
     @property
     def cells(self) -> FloatArray:
         """Bending cells (m, n_cells, 2) [m], between the nodes."""
-        if self.moved:
+        if self.kinds:
             return np.stack([self.places[:, :-1], self.places[:, 1:]], axis=2)
         return np.broadcast_to(self.chain.cells, (len(self.at), *self.chain.cells.shape))
 
     @property
-    def segments_at(self) -> IntArray:
-        """Segment (m, k) inside which each clip is, or the one that begins at its node."""
-        share = (self.at[:, None] - self.places[:, :-1, None]) / np.diff(self.places)[..., None]
-        # A clip at a node counts in one segment only: derivatives by its arc length are one-sided.
-        return np.maximum((share >= -BESIDE).sum(axis=1) - 1, 0)
+    def before(self) -> FloatArray:
+        """1 where a segment is before a clip (m, n_segments, k), else 0."""
+        return (np.arange(self.chain.n_segments)[:, None] < self.nodes[:, None]).astype(float)
+
+    def beside(self, k: int) -> Beside:
+        """Indices, as of arrays (m, n_segments), of the segments that end and begin at clip k."""
+        return np.arange(len(self.at))[:, None], self.nodes[:, k, None] + np.array([-1, 0])
+
+    def at_nodes(self, rate: FloatArray) -> FloatArray:
+        """Changes (m, n_nodes, 1, q) of the nodes' arc lengths with those of clips (m, k, q)."""
+        found = np.zeros((*self.places.shape, 1, rate.shape[2]))
+        found[np.arange(len(rate))[:, None], self.nodes, 0] = rate
+        return found
 
     @property
     def clamped(self) -> IntArray:
@@ -145,14 +207,10 @@ class Clipped:
 
         These are both ends, both sides of each clamped clip, and the other clips.
         """
-        cells, nodes = self.cells, iter(self.nodes.T)
+        cells = self.cells
         found = [(cells[:, 0, 0], np.zeros(len(cells), dtype=np.intp))]
-        for kind, at in zip(self.kinds, self.at.T, strict=True):
-            if not kind.slides:
-                node = next(nodes)
-                found += [(at, node - 1)] * kind.direction + [(at, node)]
-            else:
-                found.append((at, np.maximum((cells[:, :, 0] <= at[:, None]).sum(axis=1) - 1, 0)))
+        for kind, at, node in zip(self.kinds, self.at.T, self.nodes.T, strict=True):
+            found += [(at, node - 1)] * kind.direction + [(at, node)]
         found.append((cells[:, -1, 1], np.full(len(cells), cells.shape[1] - 1)))
         at, beside = zip(*found, strict=True)
         return np.stack(at, axis=1), np.stack(beside, axis=1)
@@ -183,61 +241,14 @@ class Clipped:
         return both
 
     def segments(self) -> FloatArray:
-        """Rows of the layout (m, n_segments, 6 + k), with the arc lengths of the clips."""
+        """Arguments `place` of the segments (m, n_segments, ...), see `Lagrangian`."""
         even = self.chain.layout.segments
-        table = np.broadcast_to(even, (len(self.at), *even.shape))
-        if not self.at.shape[1]:
-            return table
-        table = table.copy()
-        if self.moved:
-            table[..., [0, 2]] = self.places[:, :-1, None]
-            table[..., [1, 3]] = np.diff(self.places)[..., None]
-        at = np.broadcast_to(self.at[:, None], (*table.shape[:2], self.at.shape[1]))
-        return np.concatenate([table, at], axis=2)
-
-    def rest(self, inside: FloatArray) -> FloatArray:
-        """Rest strains inside (m, n_segments, 3 strains, q) of segments between moved nodes.
-
-        m + a x + c (x^2 - 1/12) of an even element, with x = x_0 + w y.
-        """
-        if not self.moved:
-            return inside
-        own, (mean, a, c) = np.empty_like(inside), (inside[:, :, k::3] for k in range(3))
-        for k, part in enumerate(_within(mean, a, c, *self._even())):
-            own[:, :, k::3] = part
-        return own
-
-    def slid(self, k: int, inside: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Segments (m, q) that change with the arc length of clip k, and how they do.
-
-        The changes (m, q, 3 strains + 6 + k) are of `rest`, given rest strains `inside` of even
-        segments (m, n_segments, 3 strains), and of rows of `segments`.
-        """
-        first, rows = self.segments_at[:, k, None], np.arange(len(self.at))[:, None]
-        moved = not self.kinds[k].slides
-        index = np.concatenate([first - 1, first], axis=1) if moved else first
-        size = inside.shape[2]
-        change = np.zeros((*index.shape, size + LAYOUT_SIZE + len(self.kinds)))
-        change[..., size + LAYOUT_SIZE + k] = 1.0
-        if moved:
-            low, width = np.array([0.0, 1.0]), np.array([1.0, -1.0])
-            change[..., [size, size + 2]] = low[:, None]
-            change[..., [size + 1, size + 3]] = width[:, None]
-            x, w = (part[rows, index, 0] for part in self._even())
-            here, h = inside[rows, index], self.chain.h
-            dx, dw = (low + width / 2) / h, width / h
-            a, c = here[..., 1::3], here[..., 2::3]
-            x, w, dx, dw = x, w, dx[:, None], dw[:, None]
-            change[..., :size:3] = (a + 2 * c * x) * dx + c * w * dw / 6
-            change[..., 1:size:3] = (a + 2 * c * x) * dw + 2 * w * c * dx
-            change[..., 2:size:3] = 2 * c * w * dw
-        return index, change
-
-    def _even(self) -> tuple[FloatArray, FloatArray]:
-        """Middles of segments in even ones (m, n_segments, 1, 1), -1/2 to 1/2, and their widths."""
-        low, width = self.places[:, :-1, None, None], np.diff(self.places)[..., None, None]
-        x = (low + width / 2 - self.chain.places[:-1, None, None]) / self.chain.h - 0.5
-        return x, width / self.chain.h
+        if not self.kinds:
+            return np.broadcast_to(even, (len(self.at), *even.shape))
+        table = np.empty((len(self.at), len(even), 4))
+        table[..., 0], table[..., 1] = self.places[:, :-1], self.places[:, 1:]
+        table[..., 2], table[..., 3] = even[:, 5], even[:, 0]
+        return table
 
     def gaps(self, x: FloatArray) -> FloatArray:
         """Rotations (m, n_nodes, increment, 1) of nodes x from the frames of clamped clips."""
@@ -312,12 +323,11 @@ class Clipped:
 
     def evenly_along(self, stations: FloatArray, at: FloatArray) -> FloatArray:
         """Change of `evenly` (m, n + 1, 2 d, q) as the clips slide by `at` (m, k, q) [m]."""
-        if not self.moved:
+        if not self.kinds:
             return NONE
         m, count, size, _ = stations.shape
         out, rows = np.zeros((m, count, size, at.shape[2])), np.arange(m)
-        moved = np.zeros((m, count, 1, at.shape[2]))
-        moved[rows[:, None], self.nodes, 0] = at[:, self.moved]
+        moved = self.at_nodes(at)
         for index in self.nodes.T:
             e, u, width = self._evened(index)
             dw = moved[rows, e + 1] - moved[rows, e]
@@ -336,25 +346,10 @@ class Clipped:
     def _evened(self, index: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
         """Element (m,) with the even place of a moved node; its share (m, 1, 1) and length [m]."""
         rows, s = np.arange(len(self.at)), self.chain.places[index]
-        e = index - (s <= self.places[rows, index])
+        e = (self.places <= s[:, None]).sum(axis=1) - 1
         width = self.places[rows, e + 1] - self.places[rows, e]
         u = (s - self.places[rows, e]) / width
         return e, u[:, None, None], width[:, None, None]
-
-
-def _within(mean: Any, a: Any, c: Any, x: Any, w: Any) -> tuple[Any, Any, Any]:
-    """Mean, linear and quadratic variation of m + a y + c (y^2 - 1/12) where y = x + w z."""
-    return mean + a * x + c * (x * x + (w * w - 1) / 12), w * (a + 2 * c * x), c * w * w
-
-
-def moved_rest(chain: Chain, inside: ca.SX, low: ca.SX, width: ca.SX) -> ca.SX:
-    """As `Clipped.rest`: symbols (3 strains, n_segments), segments (1, n_segments) [m]."""
-    x = (low + width / 2 - ca.DM(chain.places[:-1]).T) / chain.h - 0.5
-    rows = ca.vertsplit(inside)
-    own: list[ca.SX] = []
-    for mean, a, c in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
-        own += _within(mean, a, c, x, width / chain.h)
-    return ca.vertcat(*own)
 
 
 def _stepped(delta: FloatArray, step: FloatArray) -> FloatArray:

@@ -1,10 +1,9 @@
 """Clips: what holds a cable between its ends.
 
-A clip k at the arc length s_k adds lam_k . (r(s_k) - place_k) to the Lagrangian. In every segment
-r(s_k) advances by the share of the segment before s_k, as for a point force: arc lengths need not
-be nodes. For an eyelet s_k is also an unknown, and dL/ds_k = lam_k . t = 0: no force along the
-cable. The nearest node is moved to each other clip, so that shear and curvature do not jump inside
-an element; a clamped clip bends the cable by a moment, and its node carries its frame.
+A clip k at the arc length s_k adds lam_k . (r(s_k) - place_k) to the Lagrangian. The nearest node
+is moved to s_k, so that shear and curvature jump at a node; on the segments before it lam_k acts
+like a force at their end. A clamped clip bends the cable by a moment, and its node carries its
+frame. For an eyelet s_k is also an unknown, and dL/ds_k = 0: no force along the cable.
 """
 
 from collections.abc import Sequence
@@ -17,10 +16,6 @@ from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Heading, Node
 from dlo_casadi.rod.supports import SupportKind
-
-# Distance before the edge of a segment, as a share of its length, from which on a place counts as
-# beyond it. Rounding is smaller, so that just one segment has the derivatives by the place.
-BESIDE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -110,18 +105,11 @@ def nearest_nodes(chain: Chain, at: FloatArray) -> IntArray:
     return np.asarray(np.minimum(np.maximum.accumulate(near, axis=-1), chain.n - len(k)) + k)
 
 
-def held_nodes(chain: Chain, clips: Sequence[HeldClip]) -> tuple[int, ...]:
-    """Nodes that are moved to the clips, but to eyelets."""
-    at = np.array([clip.at for clip in clips if not clip.kind.slides], dtype=float)
-    return tuple(nearest_nodes(chain, at).tolist())
-
-
-def node_places(chain: Chain, clips: Sequence[HeldClip]) -> FloatArray:
-    """Arc lengths (n_nodes,) [m] of the nodes; some are moved to the clips."""
-    places = chain.places.copy()
-    held = [clip.at for clip in clips if not clip.kind.slides]
-    places[list(held_nodes(chain, clips))] = held
-    return places
+def placed_nodes(chain: Chain, near: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Nodes (m, k) nearest to `near` (m, k), and arc lengths (m, n + 1) with these `at` [m]."""
+    nodes, places = nearest_nodes(chain, near), np.tile(chain.places, (len(at), 1))
+    places[np.arange(len(at))[:, None], nodes] = at
+    return nodes, places
 
 
 def tangents(node: type[Node], x: FloatArray) -> FloatArray:

@@ -15,35 +15,28 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.framed import SegmentNumbers, in_frame
 from dlo_casadi.model.lagrangian import MODELS, lagrangian_of
 from dlo_casadi.model.stacked import Mapped, simplified
-from dlo_casadi.rod.element import LAYOUT_SIZE, Segment
+from dlo_casadi.rod.element import Segment
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.in_frame import SegmentDerivatives, SegmentInFrame
 
 
 class Functions(CableFunctions):
-    """CasADi functions of one segment, of the ends and of one station of an `unmeshed` model.
+    """CasADi functions of one segment, of the ends and of one station of an `unmeshed` model."""
 
-    Parameters
-    ----------
-    unheld : bool
-        See `Lagrangian`.
-    """
-
-    def __init__(self, model: CableModel, unheld: bool = False) -> None:
-        super().__init__(lagrangian_of(model, unheld))
+    def __init__(self, model: CableModel) -> None:
+        super().__init__(lagrangian_of(model))
         own, lam, place = self.terms, self.terms.lam, self.terms.place
         self._segment_arguments = [own.x, lam, own.p, own.rest_strains, place, own.deviation]
         self._end_arguments = [own.x, lam, own.p, own.pose, own.deviation]
-        # Variables of the first and second derivatives; the rows of eyelets' arc lengths, which are
+        # Variables of the first and second derivatives; the row of a length that was fed, which is
         # part of `place`; values by which gradients of segments are also differentiated.
         self._by, first = ca.vertcat(own.delta, lam), own.delta.numel()
-        self._sliding = [(first + row, place[LAYOUT_SIZE + k]) for k, row in model.sliding.items()]
-        self._sliding += [(first + row, place[-1]) for row in model.fed]
+        self._sliding = [(first + row, place[-1]) for row in model.fed]
         self._by_ends = ca.vertcat(own.delta, lam)
         for row, s in self._sliding:
             self._by[row] = s
         self._numbers = ca.vertcat(own.p, own.rest_strains, own.deviation)
-        self._along = ca.vertcat(own.rest_strains, place)
+        self._edges = place[:2]  # with clips: arc lengths of the segment's ends
         self._mapped: dict[str, Mapped] = {}
         self._compact: dict[str, ca.Function] = {}
 
@@ -66,7 +59,7 @@ class Functions(CableFunctions):
 
     def _is_repetitive(self, name: str) -> bool:
         """Whether half of its operations are repeated: with a law of the bend; else a fifth is."""
-        return self.terms.has_law_of_bend and name.startswith("segment")
+        return self.terms.has_law_of_bend and name.startswith(("segment", "edge"))
 
     def _here(self, name: str, arguments: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
         """A function at zero increments, with dense outputs."""
@@ -205,9 +198,32 @@ class Functions(CableFunctions):
         return self._of_segment("segment_sensitivity", self._gradient_by(self._numbers))
 
     @cached_property
-    def segment_by_place(self) -> ca.Function:
-        """As `segment` -> derivative of the gradient by rest and place (2b + k, ...)."""
-        return self._of_segment("segment_by_place", self._gradient_by(self._along))
+    def _by_edges(self) -> ca.SX:
+        """Derivatives (2,) [N] of a segment's Lagrangian by the arc lengths of its ends."""
+        terms = self.terms.segment_terms
+        value = self._about_nodes.value if self.kind.framed else terms.lagrangian
+        return ca.gradient(value, self._edges)
+
+    @cached_property
+    def edge_slope(self) -> ca.Function:
+        """As `segment` -> `_by_edges`."""
+        return self._of_segment("edge_slope", self._by_edges)
+
+    @cached_property
+    def segment_by_edges(self) -> ca.Function:
+        """As `segment` -> derivatives by the ends' arc lengths: of the gradient, once and twice.
+
+        That of the gradient is (2b + k, 2); the others are `_by_edges`, the configurational forces
+        at both ends, and (2, 2).
+        """
+        twice = ca.jacobian(self._by_edges, self._edges)
+        outputs = self._gradient_by(self._edges), self._by_edges, twice
+        return self._of_segment("segment_by_edges", *outputs)
+
+    @cached_property
+    def edge_sensitivity(self) -> ca.Function:
+        """As `segment` -> derivatives (2, ...) of `_by_edges` by p, rest and deviation."""
+        return self._of_segment("edge_sensitivity", ca.jacobian(self._by_edges, self._numbers))
 
     def _gradient_by(self, numbers: ca.SX) -> ca.SX:
         """Derivative (2b + k, a) of the gradient of a segment by other numbers (a,)."""
@@ -260,9 +276,9 @@ class Functions(CableFunctions):
         return self._of_segment("segment_curve_slopes", self._advanced, *blocks)
 
     @cached_property
-    def segment_curve_by_place(self) -> ca.Function:
-        """As `segment_curve` -> its derivative by rest and place."""
-        return self._of_segment("segment_curve_by_place", self._advanced_by(self._along))
+    def curve_by_edges(self) -> ca.Function:
+        """As `segment_curve` -> its derivatives by the arc lengths of the segment's ends."""
+        return self._of_segment("curve_by_edges", self._advanced_by(self._edges))
 
     def _advanced_by(self, numbers: ca.SX) -> ca.SX:
         """Derivative of `_advanced` by other numbers (a,)."""
@@ -337,9 +353,9 @@ class Functions(CableFunctions):
         return self._of_segment("segment_state", mean, *slopes)
 
     @cached_property
-    def segment_state_by_place(self) -> ca.Function:
-        """As `segment_state` -> derivative of the rest strains after the pose by rest and place."""
-        return self._of_segment("state_by_place", ca.jacobian(self._mean_after, self._along))
+    def state_by_edges(self) -> ca.Function:
+        """As `segment_state` -> derivatives of the rest strains after by the ends' arc lengths."""
+        return self._of_segment("state_by_edges", ca.jacobian(self._mean_after, self._edges))
 
     @property
     def _mean_after(self) -> ca.SX:
@@ -405,9 +421,9 @@ class Functions(CableFunctions):
         return self._of_ends("reading_slopes", *(ca.jacobian(self._readings, one) for one in by))
 
 
-def functions_of(model: CableModel, unheld: bool = False) -> Functions:
+def functions_of(model: CableModel) -> Functions:
     """The functions of a model, made once for all its meshes."""
-    return _functions_of(model.unmeshed, unheld)
+    return _functions_of(model.unmeshed)
 
 
 _functions_of = lru_cache(maxsize=MODELS)(Functions)

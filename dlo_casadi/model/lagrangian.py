@@ -29,10 +29,13 @@ from dlo_casadi.model.cable_model import (
     VIEWPOINT_SIZE,
     CableModel,
 )
-from dlo_casadi.model.clips import BESIDE, clip_size
+from dlo_casadi.model.clips import clip_size
 from dlo_casadi.rod.element import LAYOUT_SIZE, Section, Segment
 from dlo_casadi.rod.ends import ClipConditions, EndConditions, held_turns
 
+# Distance before the edge of a segment, as a share of its length, from which on a place counts as
+# beyond it. Rounding is smaller, so that just one segment has the derivatives by the place.
+BESIDE = 1e-9
 # Number of models whose expressions and functions are cached: a diagnosis compares about thirty.
 MODELS = 64
 
@@ -48,11 +51,6 @@ class _SegmentTerms(NamedTuple):
 class Lagrangian:
     """Symbols and expressions of an `unmeshed` model: of one segment, the ends and one pose.
 
-    Parameters
-    ----------
-    unheld : bool
-        True for a segment with no clip inside: the first clip's force pulls its end; `Unheld`.
-
     Attributes
     ----------
     p : (n_parameters,)
@@ -67,18 +65,20 @@ class Lagrangian:
         Coordinates of a segment's two nodes, or of the first and last node; their increments.
     rest_strains : (3 strains,) [1/m]
         Rest strains inside a segment, see `Chain.rest_stencils`.
-    place : (6 + n_clips,) or (7,)
-        A row of `Layout.segments`, then the arc lengths of the clips, or the length that was fed
-        through a sliding end [m]. All segments get longer alike: on its mesh the cable begins at
-        0 and ends at the declared length.
+    place : (6,), (7,) or (4,)
+        A row of `Layout.segments`, then the length that was fed through a sliding end [m]: all
+        segments get longer alike, on its mesh the cable begins at 0 and ends at the declared
+        length. With clips the arc lengths of its ends, the length of an element, and where the even
+        element starts that has its rest strains.
     inner : (n_inner,)
         Internal unknowns of an element, which are eliminated.
     """
 
-    def __init__(self, model: CableModel, unheld: bool = False) -> None:
+    def __init__(self, model: CableModel) -> None:
         self.model, self.node, self.kind = model, model.node, model.chain.kind
         n, pulls = model.n_springs, model.pulls
-        self.end_pull, self.pulls = (pulls[n], pulls[:n]) if unheld else (model.end_pull, pulls)
+        # With clips the first one's rows are those of the force beyond a segment, see `Beyond`.
+        self.end_pull, self.pulls = pulls[n] if model.clips else model.end_pull, pulls[:n]
         self.p = ca.SX.sym("p", len(model.parameters))
         self.pose = ca.SX.sym("pose", model.n_pose)
         self.deviation = ca.SX.sym("deviation", len(model.deviation_names))
@@ -86,7 +86,7 @@ class Lagrangian:
         self.x = ca.SX.sym("x", 2 * self.node.coordinates)
         self.delta = ca.SX.sym("delta", 2 * self.node.increment)
         self.rest_strains = ca.SX.sym("rest", 3 * len(self.node.strains))
-        self.place = ca.SX.sym("place", LAYOUT_SIZE + len(model.clips) + len(model.fed))
+        self.place = ca.SX.sym("place", 4 if model.clips else LAYOUT_SIZE + len(model.fed))
         self.inner = ca.SX.sym("inner", self.kind.n_inner)
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
@@ -220,13 +220,37 @@ class Lagrangian:
         """The segment's symbols."""
         return Segment(
             local=self.local if local is None else local,
-            rest=self.rest_strains,
-            place=self.place[:LAYOUT_SIZE],
+            rest=self._rest_inside,
+            place=self.row,
             stretch=self.stretch,
             ratio=ratio,
             inner=inner,
             square=square,
         )
+
+    @property
+    def row(self) -> ca.SX:
+        """A row of `Layout.segments` (6,)."""
+        if not self.model.clips:
+            return self.place[:LAYOUT_SIZE]
+        low, high, mesh, _ = ca.vertsplit(self.place)
+        return ca.vertcat(low, high - low, low, high - low, 1, mesh)
+
+    @property
+    def _rest_inside(self) -> ca.SX:
+        """Rest strains (3 strains,) [1/m] inside the segment, whose ends may be moved to clips.
+
+        m + a x + c (x^2 - 1/12) of the even element, |x| <= 1/2, is the same of y at x = x_0 + w y.
+        """
+        if not self.model.clips:
+            return self.rest_strains
+        low, high, mesh, even = ca.vertsplit(self.place)
+        x, w, inside = ((low + high) / 2 - even) / mesh - 0.5, (high - low) / mesh, []
+        for own in ca.vertsplit(self.rest_strains, 3):
+            mean, a, c = ca.vertsplit(own)
+            inside += [mean + a * x + c * (x * x + (w * w - 1) / 12)]
+            inside += [w * (a + 2 * c * x), c * w * w]
+        return ca.vertcat(*inside)
 
     def elastic_energy(self, segment: Segment) -> ca.SX:
         """Energy of bending and twist of a segment [J]."""
@@ -276,17 +300,15 @@ class Lagrangian:
 
     @cached_property
     def share_symbols(self) -> ca.SX:
-        """Shares (0 to 1) of a segment that lie before each point force, spring, and clip."""
+        """Shares (0 to 1) of a segment that lie before each point force and spring."""
         return ca.SX.sym("share", len(self.dead_forces) + len(self.pulls))
 
     @cached_property
     def shares(self) -> ca.Function:
-        """(p, place) -> the shares of a segment (n_forces + n_springs + n_clips,)."""
+        """(p, place) -> the shares of a segment (n_forces + n_springs,)."""
         start = self.place[0]
         positions = [x.position for x in self.dead_forces] + [x.position for x in self.springs]
         positions = [s / (1 + self.fed) for s in positions]  # of one cable, however long it is
-        if len(self.pulls) > self.model.n_springs:
-            positions += ca.vertsplit(self.place[LAYOUT_SIZE:])
         last = start + self.length > self.model.cable.length - BESIDE * self.length
         shares = [(s - start) / self.length for s in positions]
         inside = [ca.logic_and(u >= -BESIDE, ca.logic_or(u < 1 - BESIDE, last)) for u in shares]
@@ -295,15 +317,15 @@ class Lagrangian:
 
     @property
     def length(self) -> ca.SX:
-        """Length of a segment [m], of all the same unless nodes are moved to clips."""
-        return self.place[1 if self.model.moves_nodes else 5]
+        """Length of a segment [m], if it has one: of links that of all elements."""
+        return self.row[1 if self.kind.smooth else 5]
 
     def with_shares(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Expressions with the shares in place of their symbols."""
         return ca.substitute(expressions, [self.share_symbols], [self.shares(self.p, self.place)])
 
     def work_of_multipliers(self, segment: Segment) -> ca.SX:
-        """Work [J] along a segment of the multipliers of places: end, springs and clips."""
+        """Work [J] along a segment of the force at its end and of those on springs."""
         work = ca.SX(0)
         if self.end_pull:
             work = ca.dot(self.lam[self.end_pull], self.kind.advance(segment))
@@ -408,9 +430,9 @@ class Lagrangian:
         return self.lam[self.model.fed] * (tension + ca.dot(per_length, self.true_ends.end))
 
 
-def lagrangian_of(model: CableModel, unheld: bool = False) -> Lagrangian:
+def lagrangian_of(model: CableModel) -> Lagrangian:
     """The expressions of a model, made once for all its meshes."""
-    return _lagrangian_of(model.unmeshed, unheld)
+    return _lagrangian_of(model.unmeshed)
 
 
 _lagrangian_of = lru_cache(maxsize=MODELS)(Lagrangian)

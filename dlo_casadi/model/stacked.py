@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
 from typing import Any
@@ -32,11 +32,15 @@ class Shapes:
         Multipliers of the end conditions; places and multipliers of springs.
     deviation : (m, n_deviations)
         Unknowns that each pose has of its own, see `deviation_names`.
+    near : (m, k) [m], optional
+        For each eyelet the arc length that says which node is moved to it: the nearest one to that.
+        NaN, or none at all, where that is the eyelet's own arc length.
     """
 
     x: FloatArray
     lam: FloatArray
     deviation: FloatArray
+    near: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
     def declared(cls, x: FloatArray, lam: FloatArray, clips: int = 0) -> Shapes:
@@ -50,17 +54,27 @@ class Shapes:
         """
         lam = _by_name(self.lam, model.border_names, other.border_names)
         own = _by_name(self.deviation, model.deviation_names, other.deviation_names)
-        return Shapes(self.x, lam, own)
+        return replace(self, lam=lam, deviation=own)
 
     def subset(self, index: Any) -> Shapes:
         """Shapes of some of the poses."""
-        return Shapes(self.x[index], self.lam[index], self.deviation[index])
+        near = self.near[index] if self.near.size else self.near
+        return Shapes(self.x[index], self.lam[index], self.deviation[index], near)
+
+    def near_each(self, count: int) -> FloatArray:
+        """`near` of that number of eyelets (m, count)."""
+        if self.near.shape == (len(self.x), count):
+            return self.near
+        return np.full((len(self.x), count), np.nan)
 
     def replaced(self, index: Any, other: Shapes) -> Shapes:
         """Shapes with those of some of the poses from `other`, which has these poses alone."""
         x, lam, deviation = self.x.copy(), self.lam.copy(), self.deviation.copy()
         x[index], lam[index], deviation[index] = other.x, other.lam, other.deviation
-        return Shapes(x, lam, deviation)
+        count = max(self.near.shape[1], other.near.shape[1])
+        near = self.near_each(count).copy()
+        near[index] = other.near_each(count)
+        return Shapes(x, lam, deviation, near)
 
 
 def _by_name(rows: FloatArray, names: Sequence[str], others: Sequence[str]) -> FloatArray:
@@ -274,79 +288,57 @@ _BORDER_AXES = {
     "segment_slope": ((2,),),
     "segment_sensitivity": ((2,),),
     "segment_curve_slopes": ((), (3,), ()),
+    "segment_by_edges": ((2,), (), ()),
 }
 
 
 @dataclass(frozen=True)
-class Unheld:
-    """Segments with no clip inside; all forces beyond them act like one force at their end.
+class Beyond:
+    """Forces of all that holds the cables beyond their segments act like one at a segment's end.
 
-    Functions of a segment take several times as long with clips inside as without.
+    Functions of a segment of a cable with clips depend on that one, in the rows of the first clip.
 
     Parameters
     ----------
-    beyond : (m, n_segments, k)
-        1 if a segment lies before a clip, else 0; arbitrary for segments with the clip inside.
-    inside : (m, j)
-        Segments that contain the j clips that hold no node.
+    before : (m, n_segments, k)
+        1 where a segment is before a clip, else 0.
     rows : (1 + k, dimension)
         Border rows of the forces on the end's holder (-1 for a free end) and on the clips.
     """
 
-    beyond: FloatArray
-    inside: IntArray
+    before: FloatArray
     rows: IntArray
 
     @classmethod
-    def of(cls, model: CableModel, table: FloatArray, segments: IntArray) -> Unheld:
-        """Segments of a model with clips, from `Clipped.segments` and `Clipped.segments_at`."""
-        width = table[..., 1:2] if model.moves_nodes else model.chain.h
-        share = (table[..., -len(model.clips) :] - table[..., :1]) / width
-        sliding = list(model.sliding)
+    def of(cls, model: CableModel, before: FloatArray) -> Beyond:
+        """Forces on the clips of a model."""
         end = model.end_pull or [-1] * model.node.dimension
-        rows = [end, *model.pulls[model.n_springs :]]
-        return cls((share > 0.5).astype(float), segments[:, sliding], np.array(rows))
-
-    def evaluated(
-        self,
-        name: str,
-        mapped: Callable[[str, bool], Callable[..., list[FloatArray]]],
-        arguments: Sequence[FloatArray],
-        first: int,
-    ) -> list[FloatArray]:
-        """Outputs (m, n_segments, rows, columns) of a function of segments.
-
-        `mapped` (name, unheld) -> the function. Its second argument is the border, whose rows start
-        at `first` in outputs that have them.
-        """
-        both, lam, *others = arguments
-        found = mapped(name, True)(both, self.summed(lam), *others)
-        for out, axes in zip(found, _BORDER_AXES.get(name, ((),) * len(found)), strict=True):
-            for axis in axes:
-                self._spread(out, axis, first)
-        if self.inside.size:
-            here = np.arange(len(lam))[:, None], self.inside
-            held = mapped(name, False)(*(one[here] for one in arguments))
-            for out, one in zip(found, held, strict=True):
-                out[here] = one
-        return found
+        return cls(before, np.array([end, *model.pulls[model.n_springs :]]))
 
     def summed(self, lam: FloatArray) -> FloatArray:
         """Border (m, n_segments, n_lam) with the sum of all forces beyond as first clip's force."""
         own, (end, *clips) = lam.copy(), self.rows
         total = np.zeros(lam.shape[:2] + end.shape) if end[0] < 0 else lam[..., end]
         for k, rows in enumerate(clips):
-            total = total + self.beyond[..., [k]] * lam[..., rows]
+            total = total + self.before[..., [k]] * lam[..., rows]
         own[..., clips[0]] = total
         return own
 
+    def spread(self, name: str, outputs: Sequence[FloatArray], first: int) -> None:
+        """Expand derivatives by that sum, from row `first` of an axis, to those by each force.
+
+        `outputs` (m, n_segments, rows, columns) of the function of segments of that name.
+        """
+        for out, axes in zip(outputs, _BORDER_AXES.get(name, ((),) * len(outputs)), strict=True):
+            for axis in axes:
+                self._spread(out, axis, first)
+
     def _spread(self, out: FloatArray, axis: int, first: int) -> None:
-        """Expand derivatives by that sum, from row `first` of an axis, to those by each force."""
         rows = np.moveaxis(out, axis, 0)
         end, *clips = first + self.rows
         total = rows[clips[0]].copy()
-        shape = (*self.beyond.shape[:2], *(1,) * (out.ndim - 3))
+        shape = (*self.before.shape[:2], *(1,) * (out.ndim - 3))
         if self.rows[0, 0] >= 0:
             rows[end] = total
         for k, own in enumerate(clips):
-            rows[own] = total * self.beyond[..., k].reshape(shape)
+            rows[own] = total * self.before[..., k].reshape(shape)

@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clipped import moved_rest
 from dlo_casadi.model.clips import clip_size
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
@@ -51,8 +50,9 @@ class PoseSymbols:
 class Potential:
     """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
 
-    The parameters stack p, rest curvature of the cells, pose and deviation. `by_segment` (n_lam,
-    n_segments): what each segment adds to the conditions; for the end's place its advance [m].
+    The parameters stack p, rest curvature of the cells, pose, deviation, and with clips for each
+    node, clip by clip, 1 if it is moved there, else 0. `by_segment` (n_lam, n_segments): what each
+    segment adds to the conditions; for the end's place its advance [m].
     """
 
     coordinates: ca.SX
@@ -62,18 +62,19 @@ class Potential:
     by_segment: ca.SX
 
 
-def potential(model: CableModel, nodes: tuple[int, ...] = ()) -> Potential:
+def potential(model: CableModel) -> Potential:
     """The minimisation that IPOPT solves: min V(coordinates) s.t. conditions = 0.
 
     The coordinates are those of the nodes, places of springs and eyelets, unknowns inside segments,
     and those of compliant clamps: a clamp of the compliance c turns by sqrt(c) a and stores a^2/2.
-    `nodes`: those that are moved to the clips, see `clips.held_nodes`.
     """
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
     energy, gradient, _ = functions.at_ends(*end_arguments(model, s))
-    segments = _segment_arguments(model, s, nodes)
+    moved = ca.SX.sym("moved", len(model.clips), model.chain.n_nodes)
+    segments = _segment_arguments(model, s, moved)
     own, reached = functions.compact("segment_potential")(*segments, inner)
+    reached = _spread(model, reached, moved)
     energy = sum(ca.horzsplit(own), start=energy)
     conditions = sum(ca.horzsplit(reached), start=gradient[2 * model.node.increment :])
     multipliers = np.flatnonzero(model.are_multipliers[: model.n_lam]).tolist()
@@ -84,11 +85,11 @@ def potential(model: CableModel, nodes: tuple[int, ...] = ()) -> Potential:
         conditions[lagrangian.compliant] -= ca.sqrt(lagrangian.compliances(s.p)) * given_way
     given, zero = [energy, conditions[multipliers], reached], ca.SX.zeros(len(multipliers))
     energy, conditions, reached = ca.substitute(given, [s.lam[multipliers]], [zero])
-    for node, frame in _clip_frames(model, s, nodes).items():
+    for k, frame in _clip_frames(model, s, moved).items():
         # Nothing else depends on the coordinates of a node that a clip holds.
-        energy += ca.sumsqr(s.x[_rows(model, node)] - frame) / 2
+        energy += ca.sumsqr(_nodes(model, s) @ moved[k, :].T - frame) / 2
     coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
-    parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation)
+    parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation, ca.vec(moved))
     return Potential(coordinates, parameters, energy, conditions, reached)
 
 
@@ -159,57 +160,61 @@ def end_arguments(model: CableModel, s: PoseSymbols) -> list[Any]:
     return [both, s.lam, s.p, s.pose, s.deviation]
 
 
-def _rows(model: CableModel, node: int) -> list[int]:
-    """Rows of a node's coordinates."""
-    c = model.node.coordinates
-    return list(range(c * node, c * (node + 1)))
+def _nodes(model: CableModel, s: PoseSymbols) -> Any:
+    """Coordinates of the nodes, one column each."""
+    return ca.reshape(s.x, model.node.coordinates, model.chain.n_nodes)
 
 
-def _clip_frames(model: CableModel, s: PoseSymbols, nodes: tuple[int, ...]) -> dict[int, Any]:
-    """Frames at nodes of clamped clips, from the pose; swivels take the roll of their nodes.
+def _clip_frames(model: CableModel, s: PoseSymbols, moved: ca.SX) -> dict[int, Any]:
+    """Frames of clamped clips, from the pose; swivels take the roll of the nodes that they hold.
 
-    As in `clips.Clipped.of`.
+    As in `Clipped.of`. `moved` (k, n_nodes): see `Potential`.
     """
     size, c, count = clip_size(model.node), model.node.coordinates, len(model.clips)
-    moved = [k for k, kind in enumerate(model.clips) if not kind.slides]
     turns, frames = functions_of(model).true_clips(s.p, s.pose)[2], {}
-    for k, node in zip(moved, nodes, strict=True):
-        if not model.clips[k].direction:
+    for k, kind in enumerate(model.clips):
+        if not kind.direction:
             continue
         last = model.n_pose - size * (count - k) + size - 1
         frame = model.node.moved(s.pose[last - c : last], ca.SX(turns[:, k]))
-        if not model.clips[k].roll:
-            parts, own = ca.vertsplit(frame), ca.vertsplit(s.x[_rows(model, node)])
+        if not kind.roll:
+            parts, own = ca.vertsplit(frame), ca.vertsplit(_nodes(model, s) @ moved[k, :].T)
             roll, _, _, rest = quaternion_product(conjugate(parts), own)
             length = ca.sqrt(roll**2 + rest**2)
             turn = (roll / length, ca.SX(0), ca.SX(0), rest / length)
             frame = ca.vertcat(*quaternion_product(parts, turn))
-        frames[node] = frame
+        frames[k] = frame
     return frames
 
 
-def _segment_arguments(model: CableModel, s: PoseSymbols, nodes: tuple[int, ...] = ()) -> list[Any]:
+def _spread(model: CableModel, reached: Any, moved: ca.SX) -> Any:
+    """Conditions (n_lam, n_segments) of each force, given that of the one beyond: see `Beyond`."""
+    if not model.clips:
+        return reached
+    pulls, found = model.pulls[model.n_springs :], ca.SX(reached)
+    if model.end_pull:
+        found[model.end_pull, :] = reached[pulls[0], :]
+    for k, rows in enumerate(pulls):
+        before = ca.cumsum(moved[k, ::-1], 1)[:, ::-1][:, 1:]
+        found[rows, :] = reached[pulls[0], :] * ca.repmat(before, len(rows), 1)
+    return found
+
+
+def _segment_arguments(model: CableModel, s: PoseSymbols, moved: ca.SX | None = None) -> list[Any]:
     """One column for each segment, or a single column if all segments share it."""
-    chain = model.chain
-    x = ca.reshape(s.x, model.node.coordinates, chain.n_nodes)
+    chain, x = model.chain, _nodes(model, s)
     inside = chain.rest_inside(np.eye(chain.n_rests)).reshape((-1, chain.n_rests))
     rest = ca.reshape(ca.sparsify(ca.DM(inside)) @ s.rest, -1, chain.n_segments)
     place: Any = ca.DM(chain.layout.segments.T)
-    if model.clips:
+    if moved is not None and model.clips:
         at = ca.vertsplit(ca.SX(functions_of(model).true_clips(s.p, s.pose)[1]))
         for k, row in model.sliding.items():
             at[k] = s.lam[row]
-        places = ca.SX(ca.DM(chain.places))
-        moved = [k for k, kind in enumerate(model.clips) if not kind.slides]
-        for k, node in zip(moved, nodes, strict=False):  # none in problems of users
-            places[node] = at[k]
-        for node, frame in _clip_frames(model, s, nodes).items() if nodes else ():
-            x[:, node] = frame
-        low, width = places[:-1].T, (places[1:] - places[:-1]).T
-        if nodes:
-            place = ca.vertcat(low, width, low, width, place[4:, :])
-            rest = moved_rest(chain, rest, low, width)
-        place = ca.vertcat(place, ca.repmat(ca.vertcat(*at), 1, chain.n_segments))
+        even = (1 - ca.sum1(moved)) * ca.DM(chain.places).T
+        places = even + ca.horzcat(*at) @ moved
+        place = ca.vertcat(places[:-1], places[1:], place[5, :], place[0, :])
+        for k, frame in _clip_frames(model, s, moved).items():
+            x = x * (1 - ca.repmat(moved[k, :], x.shape[0], 1)) + frame @ moved[k, :]
     for row in model.fed:
         place = ca.vertcat(place, ca.repmat(s.lam[row], 1, chain.n_segments))
     after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)

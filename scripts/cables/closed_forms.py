@@ -13,7 +13,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibria
 from dlo_casadi.model.assembly import Assembly, Inputs
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import HeldClip, node_places
+from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.obstacles import Capsule, Plane
 
 MESHES = (20, 40, 80)
@@ -139,8 +139,9 @@ def check_bvp() -> None:
         pose = HeldPose((0.0, 0.0), end, clips=(HeldClip("pinned", place, at),))
         (eq,) = solve_equilibria(model, model.nominal, np.zeros(n), [pose])
         given = Inputs.of(model.nominal, np.zeros(n), pose.vector[None])
-        curve = NodeCurve.of(1.0, Assembly(model, eq.shapes, given).curve()[0])
-        u, nodes = np.linspace(0, 1, 201), node_places(model.chain, pose.clips)
+        here = Assembly(model, eq.shapes, given)
+        curve, u = NodeCurve.of(1.0, here.curve()[0]), np.linspace(0, 1, 201)
+        nodes = here.clipped.places[0]
         guess = []
         for s in (at * u, at + (1 - at) * u):
             phi = np.interp(s, nodes, eq.phi)

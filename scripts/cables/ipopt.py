@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dlo_casadi.equilibrium.guesses import guessed_frames
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import placed_nodes
 from dlo_casadi.model.whole_pose import Potential, potential
 
 FloatArray = NDArray[np.floating]
@@ -41,18 +42,22 @@ def _gaps(model: CableModel, problem: Potential) -> list[ca.SX]:
     return [one.symbolic(places).T - model.cable.diameter / 2 for one in model.obstacles]
 
 
+# Maximum number of runs while nodes follow eyelets, and by how many elements these slide at most in
+# the last one.
+MOST_RUNS, NARROW = 8, 0.25
+
+
 class Ipopt:
     """min V(increments of the frames) s.t. end position and clamps, exact derivatives.
 
     Increments are about the frames of a first guess, which are parameters. A clamp's frame is a
     condition as the end position is; that no node is inside of an obstacle are inequalities.
-    Stability is not checked, as by IPOPT it is not. `clamped`: nodes that clamped clips hold, see
-    `clips.held_nodes`. In a plane the frames are headings.
+    Stability is not checked, as by IPOPT it is not. In a plane the frames are headings.
     """
 
-    def __init__(self, model: CableModel, clamped: tuple[int, ...] = ()) -> None:
+    def __init__(self, model: CableModel) -> None:
         self.model, node = model, model.node
-        problem, self._count = potential(model, clamped), model.chain.n_nodes
+        problem, self._count = potential(model), model.chain.n_nodes
         count, c, b = self._count, node.coordinates, node.increment
         frames, turns = ca.SX.sym("frames", c * count), ca.SX.sym("turns", b * count)
         inner = problem.coordinates[c * count :]
@@ -97,17 +102,39 @@ class Ipopt:
 
         `places`: first guesses of the arc lengths [m] of eyelets.
         """
-        model, count, b = self.model, self._count, self.model.node.increment
-        deviation = np.zeros(len(model.deviation_names))
-        for guess in guessed_frames(model, p, rest, pose) if guesses is None else guesses:
-            given = np.concatenate([guess.ravel(), p, rest, pose.vector, deviation])
-            start = np.zeros(b * count + self._rest)
-            start[b * count : b * count + len(places)] = places
+        numbers = np.concatenate([p, rest, pose.vector, np.zeros(len(self.model.deviation_names))])
+        for guess in guessed_frames(self.model, p, rest, pose) if guesses is None else guesses:
             begin = process_time()
-            out = self._solver(x0=start, p=given, lbg=0.0, ubg=self._upper)
-            seconds = process_time() - begin
-            if not self._solver.stats()["success"]:
-                continue
-            turns = np.array(out["x"]).ravel()[: b * count].reshape(count, b)
-            frames = model.node.moved(guess, turns)
-            yield Found(float(out["f"]), frames, np.array(out["lam_g"]).ravel(), seconds)
+            x, found, slid = guess, None, np.array(places)
+            for _ in range(MOST_RUNS if len(slid) else 1):
+                before = slid
+                found, x, slid = self._solved(numbers, pose, x, before)
+                if found is None or np.allclose(slid, before, atol=NARROW * self.model.chain.h):
+                    break
+            if found is not None:
+                lam = np.array(found["lam_g"]).ravel()
+                yield Found(float(found["f"]), x, lam, process_time() - begin)
+
+    def _solved(
+        self, numbers: FloatArray, pose: HeldPose, x: FloatArray, places: FloatArray
+    ) -> tuple[dict[str, ca.DM] | None, FloatArray, FloatArray]:
+        """One run with a node at each clip: results, nodes, and arc lengths [m] of the eyelets."""
+        model, count, b = self.model, self._count, self.model.node.increment
+        at = np.array([np.nan if clip.at is None else clip.at for clip in pose.clips], dtype=float)
+        at[np.isnan(at)] = places
+        nodes, along = (part[0] for part in placed_nodes(model.chain, at[None], at[None]))
+        moved = np.ravel(np.arange(count) == nodes[:, None], order="F")
+        start, room = np.zeros(b * count + self._rest), np.full((2, b * count + self._rest), np.inf)
+        eyelets = nodes[[clip.at is None for clip in pose.clips]]
+        own = b * count + np.arange(len(places))
+        start[own] = places
+        room[0, own] = 0.8 * (along[eyelets] - along[eyelets - 1])
+        room[1, own] = 0.8 * (along[eyelets + 1] - along[eyelets])
+        given = np.concatenate([x.ravel(), numbers, moved])
+        bounds = {"lbx": start - room[0], "ubx": start + room[1], "lbg": 0.0, "ubg": self._upper}
+        out = self._solver(x0=start, p=given, **bounds)
+        if not self._solver.stats()["success"]:
+            return None, x, places
+        ends = np.array(out["x"]).ravel()
+        frames = model.node.moved(x, ends[: b * count].reshape(count, b))
+        return out, frames, ends[own]
