@@ -1,6 +1,6 @@
 """The cable in motion against closed forms and recordings of another simulator with known truth.
 
-    python scripts/check_dynamics.py [--data FOLDER] [--n 20] [--only NUMBER]
+    python scripts/check_dynamics.py [--data FOLDER] [--n 20] [--tolerance 3e-6] [--only NUMBER]
 
 With --data: every recording of every session in FOLDER, from its true first state with true
 parameters, which are read from the folder beside it that ends in `_truth`. Told are the largest
@@ -28,6 +28,7 @@ from scipy.special import jn_zeros
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
+from dlo_casadi.motion.trajectory import TOLERANCE
 
 FloatArray = NDArray[np.floating]
 # Largest distance over the length, in a recording.
@@ -42,6 +43,7 @@ class Recording(NamedTuple):
     folder: Path
     number: int
     n: int
+    tolerance: float
 
 
 class Found(NamedTuple):
@@ -152,7 +154,7 @@ def compared(case: Recording) -> tuple[float, float, float]:
         **{k: x if np.ndim(x) < 1 + (k in ("start", "end")) else x[:3] for k, x in known.items()},
     )
     before = process_time()
-    found = cable.simulate(fine, begins=begins, **known)
+    found = cable.simulate(fine, begins=begins, tolerance=case.tolerance, **known)
     seconds = process_time() - before
     s = np.linspace(0.0, length, 41)
     gaps = found.at(s)[::20] - np.stack([row(s) for row in points])
@@ -160,12 +162,12 @@ def compared(case: Recording) -> tuple[float, float, float]:
     return float(sizes[0]), float(sizes.max()), seconds / float(t[-1])
 
 
-def recordings(data: Path, n: int) -> Iterator[Recording]:
+def recordings(data: Path, n: int, tolerance: float) -> Iterator[Recording]:
     """All recordings of all sessions in a folder."""
     for folder in sorted(x.parent for x in data.glob("*/session.yaml")):
         session = yaml.safe_load((folder / "session.yaml").read_text())
         for k in range(len(session["experiment"]["motions"])):
-            yield Recording(folder, k + 1, n)
+            yield Recording(folder, k + 1, n, tolerance)
 
 
 # ---- closed forms ------------------------------------------------------------------------------
@@ -229,6 +231,7 @@ def main() -> int:
     parser = options(__doc__, only="number of the case", jobs=True)
     parser.add_argument("--data", type=Path, help="folder of sessions with motions")
     parser.add_argument("--n", type=int, default=20, help="number of elements")
+    parser.add_argument("--tolerance", type=float, default=TOLERANCE, help="of a step in time")
     chosen = parser.parse_args()
     if chosen.data is None:
         wrong = 0
@@ -236,7 +239,7 @@ def main() -> int:
             print(f"{one.name}: off by {one.error:.2e} (allowed {one.allowed:.0e}) {one.remark}")
             wrong += one.error > one.allowed
         return int(wrong > 0)
-    cases = list(recordings(chosen.data, chosen.n))
+    cases = list(recordings(chosen.data, chosen.n, chosen.tolerance))
     cases = cases if chosen.only is None else [cases[chosen.only]]
 
     def line(case: Recording, row: tuple[float, float, float], _: float) -> str:

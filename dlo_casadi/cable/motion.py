@@ -4,21 +4,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from os import PathLike
+from pathlib import Path
 from typing import Any, Self
 
+import casadi as ca
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate, EstimatedCable
 from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.moving_picture import (
+    draw_modes,
+    draw_motion,
+    frame_times,
+    moving_picture,
+)
 from dlo_casadi.effects import IN_MOTION, MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
+from dlo_casadi.io.files import write_file
 from dlo_casadi.model.cable_model import DAMPING_TIME
+from dlo_casadi.motion.equations import motion_equations, unknowns_of
 from dlo_casadi.motion.modes import damped_modes, displacements
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.state import State
@@ -38,9 +50,10 @@ class Modes:
     Parameters
     ----------
     frequencies : (M,) [Hz]
-        Natural ones |s| / (2 pi) of exp(s t); those that are seen are sqrt(1 - zeta^2) times that.
+        Natural ones w / (2 pi) of s^2 + 2 zeta w s + w^2 = 0 for exp(s t); those that are seen are
+        sqrt(1 - zeta^2) times that. Zero for what does not come back, as the roll between pins.
     damping_ratios : (M,)
-        zeta = -Re s / |s|; above 1 a mode does not swing.
+        zeta; above 1 a mode does not swing.
     shapes : (M, K, d)
         Displacements of the points of the shape; the largest is 1.
     points : (K, d) [m]
@@ -51,6 +64,12 @@ class Modes:
     damping_ratios: FloatArray
     shapes: FloatArray
     points: FloatArray
+
+    def plot(self) -> Figure:
+        """Draw the modes about the shape."""
+        both = zip(self.frequencies.tolist(), self.damping_ratios.tolist(), strict=True)
+        names = [f"{f:.3g} Hz, damping ratio {zeta:.2g}" for f, zeta in both]
+        return draw_modes(self.points, self.shapes, names, "modes")
 
     def __repr__(self) -> str:
         rows = zip(self.frequencies.tolist(), self.damping_ratios.tolist(), strict=True)
@@ -102,6 +121,33 @@ class Motion:
         """Kinetic and potential energy (T,) [J]."""
         return self.way.at(self.t, self.way.energy)
 
+    def plot(self) -> Figure:
+        """Draw instants of the motion."""
+        title, free = f"{self.cable.name}: motion", not self.cable.model.end.place
+        return draw_motion(self.points, self.t, title, tip=free)
+
+    def animate(self, path: str | PathLike[str]) -> Path:
+        """Write the motion in real time as a GIF; return its path.
+
+        Raises
+        ------
+        DloError
+            If the name does not end in .gif, or if the file cannot be written.
+        """
+        file = Path(path)
+        if file.suffix.lower() != ".gif":
+            raise DloError(f"{file}: moving pictures are GIF.\n  Try: {file.with_suffix('.gif')}")
+        times = frame_times(float(self.t[0]), float(self.t[-1]))
+        points = self.way.points(times, self.s)
+        write_file(file, moving_picture(points, times, f"{self.cable.name}: motion"))
+        return file
+
+    @property
+    def unknowns(self) -> list[dict[str, FloatArray]]:
+        """Arguments x, v, a and multipliers of `motion_equations` at the ends of all steps."""
+        both = zip(self.way.states, *self.way.forces, strict=True)
+        return [unknowns_of(self.way.cable, state, (first, last)) for state, first, last in both]
+
 
 class ShapeInMotion:
     """Of a shape what concerns motions about it."""
@@ -123,12 +169,10 @@ class ShapeInMotion:
         moving = moving_cable(self.cable).about(self.equilibrium)
         fixtures = moving.fixtures(self.pose.vector)
         state = moving.at_rest(self.equilibrium, fixtures)
-        roots, vectors = damped_modes(moving, state, fixtures, int(count))
-        sizes = np.abs(roots)
+        found = damped_modes(moving, state, fixtures, int(count))
         s = np.linspace(0.0, self.cable.length, POINTS)
-        points, moved = displacements(moving, state, vectors, s)
-        zeta = np.divide(-roots.real, sizes, out=np.zeros_like(sizes), where=sizes > 0)
-        return Modes(sizes / (2 * np.pi), zeta, moved, points)
+        points, moved = displacements(moving, state, found.vectors, s)
+        return Modes(found.rates / (2 * np.pi), found.damping_ratios, moved, points)
 
 
 class CableInMotion(EstimatedCable):
@@ -170,6 +214,31 @@ class CableInMotion(EstimatedCable):
         metadata = replace(self.metadata, params={**self.metadata.params, **new})
         p = np.array([values[name] for name in model.names])
         return replace(self, model=model, p=p, metadata=metadata)
+
+    def motion_equations(self) -> ca.Function:
+        """The equations of motion, for collocation in a problem of one's own.
+
+        (x, v, a, multipliers, fixtures) -> residual. `Motion.unknowns` gives values of the first
+        four at the end of each step.
+
+        Returns
+        -------
+        casadi.Function
+            x : (1 + 2 or 4 + 3, n_nodes), each node's heading [rad] or quaternion (x, y, z, w), and
+            its place [m].
+            v : (1 + 2 or 3 + 3, n_nodes), rates of turning about the node's own axes [rad/s], and
+            velocities [m/s]: x(t + dt) = moved(x, v dt + a dt^2 / 2) to second order.
+            a : likewise, their derivatives by time.
+            multipliers : of the segments, one after the other, the force f_e [N], and of each
+            spring its place [m] and force [N], zero on other segments; moments [N m] of the
+            directions that the ends hold; forces [N] of the cable on the fixtures of start and end.
+            fixtures : start, end [m], headings or quaternions of both; zeros where nothing is held.
+
+            residual : balance of the moments and forces at the nodes (as v), conditions of the
+            segments and their springs, directions and places at the ends, in space squares of the
+            quaternions' lengths less one.
+        """
+        return motion_equations(moving_cable(self))
 
     def simulate(
         self,

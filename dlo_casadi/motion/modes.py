@@ -92,10 +92,22 @@ def lowest(matrices: Matrices, count: int, scale: float) -> tuple[FloatArray, Fl
     return squares[:count], q[:, :count]
 
 
+@dataclass(frozen=True, eq=False)
+class DampedModes:
+    """Modes with damping: s^2 + 2 zeta w s + w^2 = 0.
+
+    `rates` w (count,) [rad/s], `damping_ratios` zeta (count,), `vectors` (N, count).
+    """
+
+    rates: FloatArray
+    damping_ratios: FloatArray
+    vectors: ComplexArray
+
+
 def damped(matrices: Matrices, square: float, mode: FloatArray) -> tuple[complex, ComplexArray]:
     """The damped mode that belongs to one without damping: s [1/s], and q (N,).
 
-    With a damping ratio near 1 or above, s is that of the mode alone: s^2 + 2 zeta w s + w^2 = 0.
+    With a damping ratio near 1 or above, s is that of the mode alone; see `DampedModes`.
     """
     damping, mass = matrices.sparse(matrices.damping), matrices.sparse(matrices.mass)
     own = float(mode @ (mass @ mode))
@@ -121,15 +133,21 @@ def damped(matrices: Matrices, square: float, mode: FloatArray) -> tuple[complex
     return s, q
 
 
-def damped_modes(
-    cable: MovingCable, state: State, fixtures: Fixtures, count: int
-) -> tuple[ComplexArray, ComplexArray]:
-    """The slowest modes about a state at rest: s (count,) [1/s], and q (N, count)."""
+def damped_modes(cable: MovingCable, state: State, fixtures: Fixtures, count: int) -> DampedModes:
+    """The slowest modes about a state at rest."""
     matrices = Matrices.of(cable, state, fixtures)
     squares, modes = lowest(matrices, count, cable.slowest**2)
-    found = [damped(matrices, float(x), q) for x, q in zip(squares, modes.T, strict=True)]
-    roots, vectors = zip(*found, strict=True)
-    return np.array(roots), np.array(vectors).T
+    rates, ratios, vectors = [], [], []
+    for square, mode in zip(squares.tolist(), modes.T, strict=True):
+        s, q = damped(matrices, square, mode)
+        # Two real roots have the product w^2 and the mean -zeta w.
+        real = s.imag == 0 and square > 0
+        rate = np.sqrt(square) if real else abs(s)
+        mean = -(s.real + square / s.real) / 2 if real and s.real else -s.real
+        rates.append(rate)
+        ratios.append(mean / rate if rate else 0.0)
+        vectors.append(q)
+    return DampedModes(np.array(rates), np.array(ratios) + 0.0, np.array(vectors).T)
 
 
 def displacements(

@@ -189,7 +189,7 @@ class MovingCable:
     # ---- evaluation ----------------------------------------------------------------------------
 
     @cached_property
-    def _numbers(self) -> list[FloatArray]:
+    def numbers(self) -> list[FloatArray]:
         """Arguments of the segments that do not change in motion."""
         chain, count = self.model.chain, self.n_segments
         rest = chain.rest_inside(self.rest[:, None])[..., 0]
@@ -204,7 +204,7 @@ class MovingCable:
             return np.concatenate([rows[:-1], rows[1:]], axis=1)
 
         moving = (state.x, state.r, state.w, state.v, state.alpha, state.a)
-        return [*map(both, moving), state.force, *self._numbers]
+        return [*map(both, moving), state.force, *self.numbers]
 
     def segments(self, name: str, state: State, *more: FloatArray) -> list[FloatArray]:
         """Evaluate a function of `MovingSegment` for all segments (n_segments, rows, columns)."""
@@ -238,10 +238,10 @@ class MovingCable:
 
     def power_of_ends(self, state: State) -> float:
         """Power [W] that friction at the ends takes."""
-        if self._rubs is None:
+        if self.rubs is None:
             return 0.0
         rates = np.concatenate([state.w[0], state.w[-1]])
-        return float(rates @ np.array(self._rubs(rates, self.p)[0]).ravel())
+        return float(rates @ np.array(self.rubs(rates, self.p)[0]).ravel())
 
     def _ends(self, state: State, fixtures: Fixtures) -> list[FloatArray]:
         """Gradient, Hessian and damping of the ends, by the unknowns of `_index`."""
@@ -250,15 +250,15 @@ class MovingCable:
         kept = [*range(2 * b), *(2 * b + row for row in (*start, *end))]
         damping = np.zeros((len(kept), len(kept)))
         gradient, hessian = gradient[kept, 0], hessian[np.ix_(kept, kept)]
-        if self._rubs is not None:
+        if self.rubs is not None:
             rates = np.concatenate([state.w[0], state.w[-1]])
-            pulled, by_rates = (np.array(x) for x in self._rubs(rates, self.p))
+            pulled, by_rates = (np.array(x) for x in self.rubs(rates, self.p))
             gradient[: 2 * b] += pulled[:, 0]
             damping[: 2 * b, : 2 * b] += by_rates
         return [gradient, hessian, damping]
 
     @cached_property
-    def _rubs(self) -> ca.Function | None:
+    def rubs(self) -> ca.Function | None:
         """(body rates of both ends, p) -> moments against them, and their derivatives."""
         effects = self.segment.terms.effects_of(Damping)
         rates = ca.SX.sym("rates", 2 * self.b)
@@ -305,7 +305,7 @@ class MovingCable:
     def handles(self, state: State) -> tuple[FloatArray, FloatArray]:
         """Handles (n_segments, 4, d) [m], derivative (n_segments, 4 d, ...) by turns and places."""
         x, r, *_ = self.arguments(state)
-        p, _, place = self._numbers[:3]
+        p, _, place = self.numbers[:3]
         z, by_place = self.segment.mapped("curve")(*(row[None] for row in (x, r, p, place)))
         return z[0].reshape((-1, 4, self.d)), by_place[0]
 
@@ -323,6 +323,12 @@ class MovingCable:
         stiffness = self.p[self.model.stiffness_indices[0]]
         bent = stiffness / (cable.mass * cable.length**3)
         return float(np.sqrt(bent + np.linalg.norm(self.model.gravity) / cable.length))
+
+    @property
+    def held_turns(self) -> list[int]:
+        """Rows of the border of all directions that the ends hold."""
+        start, end = self._condition_rows
+        return [*start, *end]
 
     @property
     def n_moments(self) -> int:

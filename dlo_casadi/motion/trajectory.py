@@ -210,6 +210,7 @@ def _halved(dt: float, now: float, t: tuple[float, float], cable: MovingCable) -
         return dt / 2
     raise MotionError(
         f"{cable.model.cable.name!r} at {now:.6g} s: no step in time has a solution, down to "
-        f"{dt:.2g} s.\n  Try: fixtures that stay within the cable's reach, and that do not jump.",
+        f"{dt:.2g} s.\n  Try: fixtures that stay within the cable's reach, and that do not jump; "
+        f"with large forces more elements (n = {cable.model.n}).",
         t=now,
     )

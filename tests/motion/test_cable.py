@@ -81,3 +81,26 @@ def test_wrong_arguments_are_named(cable, asked, message):
 def test_unknown_damping_is_named(cable):
     with pytest.raises(dlo.DloError, match="viscous_drag"):
         cable.with_damping(water=1.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_equations_hold_at_every_step(dimension):
+    torsion = {} if dimension == 2 else {"torsional_stiffness": 0.007}
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=0.009, **torsion)
+    gravity, ends = (*(0.0,) * (dimension - 1), -9.81), ("clamped", "pinned")
+    bob = {"name": "lumped_mass", "parameters": {"mass": 0.01, "position": 0.25}}
+    tied = {"stiffness": 3.0, "position": 0.4, **dict.fromkeys(("anchor_x", "anchor_y"), 0.2)}
+    tied |= {"anchor_z": 0.1} if dimension == 3 else {}
+    model = {"n": 10, "effects": [bob, {"name": "tether", "parameters": tied}]}
+    cable = dlo.known_cable(data, gravity=gravity, boundary=ends, model=model)
+    cable = cable.with_damping(0.02, air_drag=1.0, pin_friction=1e-3)
+    t = np.linspace(0.0, 0.3, 7)
+    end = np.tile((0.4, 0.1, 0.05)[:dimension], (7, 1))
+    end[:, 0] += 0.05 * np.sin(4 * t) ** 2
+    held = {"start_heading": 0.2} if dimension == 2 else {"start_orientation": (0, 0, 0, 1)}
+    motion = cable.simulate(t, end=end, **held)
+    equations, path = cable.motion_equations(), motion.way.path
+    for k in (len(motion.way.t) // 2, -1):
+        fixtures = path.at(motion.way.t[k], motion.way.cable).pose[: equations.numel_in(4)]
+        residual = equations(**motion.unknowns[k], fixtures=fixtures)["residual"]
+        assert np.abs(np.array(residual)).max() < 1e-6
