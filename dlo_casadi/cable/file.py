@@ -106,6 +106,7 @@ class _Cable(OpenSection):
     diameter: Positive
     bending_stiffness: Annotated[Positive, within(STIFFNESS)]
     torsional_stiffness: Positive | None = None
+    damping_time: NonNegative | None = None
     rest_shape: str
 
 

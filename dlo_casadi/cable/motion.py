@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
@@ -23,13 +24,14 @@ from dlo_casadi.cable.moving_picture import (
     frame_times,
     moving_picture,
 )
+from dlo_casadi.cable.saved import parameters_hash
 from dlo_casadi.effects import IN_MOTION, MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.io.files import write_file
-from dlo_casadi.model.cable_model import DAMPING_TIME
+from dlo_casadi.model.cable_model import DAMPING_TIME, CableModel
 from dlo_casadi.motion.equations import motion_equations, unknowns_of
 from dlo_casadi.motion.modes import damped_modes, displacements
 from dlo_casadi.motion.path import FixturePath
@@ -196,7 +198,7 @@ class CableInMotion(EstimatedCable):
         known = dict(zip(self.model.names, self.p.tolist(), strict=True))
         model, added = self.model, {}
         if damping_time is not None:
-            model = replace(model, cable=replace(model.cable, damping_time=0.0))
+            model = replace(model, cable=replace(model.cable, damping_time=float(damping_time)))
             added[DAMPING_TIME] = damping_time
         for name, value in effects.items():
             if name not in IN_MOTION:
@@ -211,7 +213,15 @@ class CableInMotion(EstimatedCable):
         values = known | added
         units = {q.name: q.unit for q in model.parameters}
         new = {k: Estimate(float(x), 0.0, units[k], fixed=True) for k, x in added.items()}
-        metadata = replace(self.metadata, params={**self.metadata.params, **new})
+        known_so_far = self.metadata
+        document = _with_rows(known_so_far.document, model, added)
+        params = {**known_so_far.params, **new}
+        metadata = replace(
+            known_so_far,
+            params=params,
+            document=document,
+            model_hash=document["model_hash"],
+        )
         p = np.array([values[name] for name in model.names])
         return replace(self, model=model, p=p, metadata=metadata)
 
@@ -305,6 +315,25 @@ def moving_cable(cable: EstimatedCable) -> MovingCable:
     """The cable in motion, without effects of the camera."""
     model, p = cable.model.without_kind(MeasurementEffect, cable.p)
     return MovingCable(model, p, cable.rest)
+
+
+def _with_rows(
+    document: dict[str, Any], model: CableModel, added: Mapping[str, float]
+) -> dict[str, Any]:
+    """The document of a cable with further parameters, all known."""
+    data = {**document, "parameters": dict(document["parameters"])}
+    for q in model.parameters:
+        if q.name in added:
+            lower, upper = (x if np.isfinite(x) else None for x in q.bounds(estimated=False))
+            row = {"value": float(added[q.name]), "std": 0.0, "unit": q.unit, "lower": lower}
+            data["parameters"][q.name] = {**row, "upper": upper, "fitted": False}
+    labels = {effect["label"] for effect in document["effects"]}
+    own = [effect for effect in model.effects if effect.label not in labels]
+    data["effects"] = [*document["effects"], *({"name": x.name, "label": x.label} for x in own)]
+    if DAMPING_TIME in added:
+        data["cable"] = {**document["cable"], DAMPING_TIME: float(added[DAMPING_TIME])}
+    data["model_hash"] = parameters_hash(data)
+    return data
 
 
 def _begun(

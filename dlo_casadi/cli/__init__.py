@@ -30,6 +30,8 @@ COMMANDS = {
     "predict": ("fitted", "predict the shape of a fitted cable from where its ends are held"),
     "limits": ("fitted", "check whether a fitted cable keeps its limits in a list of poses"),
     "shape-table": ("fitted", "predict the shapes of a fitted cable in very many poses"),
+    "modes": ("moving", "frequencies and damping of small motions of a fitted cable"),
+    "simulate": ("moving", "simulate a fitted cable under moving fixtures"),
     "export": ("export", "write a fitted cable for a simulator, such as MuJoCo"),
     "generate-solver": ("fitted", "write the C solver of a fitted cable for planners to embed"),
     "schema": ("new", "print the JSON schema of a configuration, for editors"),
