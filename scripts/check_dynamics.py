@@ -23,12 +23,14 @@ import yaml
 from harness import options, run
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import brentq
 from scipy.special import jn_zeros
 
 import dlo_casadi as dlo
-from dlo_casadi.cable.fitted_cable import FittedCable, Shape
-from dlo_casadi.motion.trajectory import TOLERANCE
+from dlo_casadi.cable.fitted_cable import FittedCable
+from dlo_casadi.cable.motion import Motion, moving_cable
+from dlo_casadi.motion.path import FixturePath
+from dlo_casadi.motion.trajectory import TOLERANCE, Way
 
 FloatArray = NDArray[np.floating]
 # Largest distance over the length, in a recording.
@@ -65,11 +67,11 @@ def truth_of(folder: Path) -> tuple[dict[str, Any], Any]:
     return values, np.load(beside / "truth_shapes.npz")
 
 
-def true_cable(session: dict[str, Any], truth: dict[str, Any], n: int, **more: Any) -> FittedCable:
-    """The cable with its true parameters; `more`: further effects with their parameters."""
+def true_cable(session: dict[str, Any], truth: dict[str, Any], n: int) -> FittedCable:
+    """The cable with its true parameters."""
     data, experiment = session["cable"], session["experiment"]
     hidden = dict(truth["effects"])
-    effects = [{"name": k, "parameters": x} for k, x in more.items()]
+    effects = []
     if "lump" in hidden:
         lump = {"mass": hidden["lump"][1], "position": truth["lump_position_m"]}
         effects.append({"name": "lumped_mass", "parameters": lump})
@@ -111,25 +113,19 @@ def fixtures_of(
     return known
 
 
-def pulled_aside(
-    session: dict[str, Any], truth: dict[str, Any], n: int, held: Any, points: Any
-) -> Shape:
-    """The shape from which a cable is let go: under the force at its tip that gives it."""
-    length, s = session["cable"]["length"], np.linspace(0.0, 1.0, 21)
-    places = points[0](s * length)
-
-    def shape(force: FloatArray) -> Shape:
-        pull = {"fx": force[0], "fy": force[1], "position": length}
-        return true_cable(session, truth, n, point_force=pull).solve(**held)
-
-    def gap(force: FloatArray) -> FloatArray:
-        return np.asarray(shape(force).curve.at(s * length) - places).ravel()
-
-    weight = 9.81 * session["cable"]["mass"]
-    guesses = [
-        least_squares(gap, weight * np.array(x), x_scale=weight) for x in ((0.3, 0.1), (-0.3, 0.1))
-    ]
-    return shape(min(guesses, key=lambda x: x.cost).x)
+def let_go(cable: FittedCable, held: dict[str, FloatArray], points: Any) -> Motion:
+    """The first instant of a cable that is let go in the shape of a curve, in a plane."""
+    moving = moving_cable(cable)
+    pose = cable.solve(**{key: x[0] if np.ndim(x) > 1 else x for key, x in held.items()}).pose
+    s = moving.model.chain.places
+    turned = np.unwrap(np.arctan2(*points(s, 1).T[::-1]))
+    # The clamp holds the first heading, with its full turns.
+    x = pose.frames[0] + turned[:, None] - turned[0]
+    none = np.zeros((moving.n_segments, moving.d)), np.zeros(moving.n_moments)
+    path = FixturePath(pose, {})
+    fixtures = path.at(0.0, moving)
+    state = moving.with_places(moving.still_state(x, *none), fixtures, points(s))
+    return Motion(cable, np.zeros(1), Way(moving, path, np.zeros(1), (state,)))
 
 
 def compared(case: Recording) -> tuple[float, float, float]:
@@ -145,14 +141,9 @@ def compared(case: Recording) -> tuple[float, float, float]:
     begins = None
     if motion["begins"] == "moving":
         held = fixtures_of(case.folder, motion, delay, t[:1])
-        begins = pulled_aside(session, truth, case.n, held, points)
+        begins = let_go(cable, held, points[0])
     fine = np.linspace(0.0, t[-1], 20 * len(t) - 19)
     known = fixtures_of(case.folder, motion, delay, fine)
-    cable.simulate(
-        fine[:3],
-        begins=begins,
-        **{k: x if np.ndim(x) < 1 + (k in ("start", "end")) else x[:3] for k, x in known.items()},
-    )
     before = process_time()
     found = cable.simulate(fine, begins=begins, tolerance=case.tolerance, **known)
     seconds = process_time() - before
