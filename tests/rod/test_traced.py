@@ -7,7 +7,7 @@ import pytest
 from dlo_casadi.rod import elements, in_frame, node
 from dlo_casadi.rod.elements import Helix
 from dlo_casadi.rod.node import Frame
-from dlo_casadi.rod.quaternions import rotation, traced
+from dlo_casadi.rod.quaternions import rotated, rotation, traced
 
 
 def random(*sizes):
@@ -19,8 +19,8 @@ def random(*sizes):
 @pytest.mark.parametrize(
     ("function", "sizes"),
     [
-        (node.rotated, (4, 3)),
-        (node.rotation, (3,)),
+        (rotated, (4, 3)),
+        (rotation, (3,)),
         (node._frame_moved, (4, 3)),
         (node._frame_difference, (4, 4)),
         (elements._between, (4, 4)),
