@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
     from dlo_casadi.config import Clip as Clip
+    from dlo_casadi.config import FixturePath as FixturePath
+    from dlo_casadi.config import Motion as Motion
     from dlo_casadi.config import Obstacle as Obstacle
     from dlo_casadi.config import Pose as Pose
     from dlo_casadi.effects import EFFECTS as EFFECTS
@@ -39,7 +41,7 @@ _PUBLIC = {
     "cable.fitted_cable": "FittedCable Shape",
     "cable.placing": "Placing",
     "codegen": "CompiledSolver",
-    "config": "Cable Clip Obstacle Pose",
+    "config": "Cable Clip FixturePath Motion Obstacle Pose",
     "effects": "EFFECTS",
     "errors": "ConfigError DloError EquilibriumError EstimationError MeasurementError VisionError",
 }

@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cable": {*MECHANICS, "motion", "config", "io", "codegen", "show", "export", "runtime"},
     "vision": set(),
     "sensing": {*MECHANICS, "vision"},
-    "estimation": {*MECHANICS, "sensing", "runtime"},
+    "estimation": {*MECHANICS, "motion", "sensing", "runtime"},
     "paper": {*MECHANICS, "sensing"},
     "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
 }

@@ -13,6 +13,7 @@ from dlo_casadi.config.load import (
     known_config,
     load_config,
 )
+from dlo_casadi.config.motions import FixturePath, Motion
 from dlo_casadi.config.options import (
     Centerlines,
     DeclaredCamera,

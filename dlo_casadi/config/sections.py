@@ -24,6 +24,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config.cable import Cable
 from dlo_casadi.config.document import dump_yaml, yaml_text
 from dlo_casadi.config.frozen import ConfigSection, Given, Numbers, Rows, Turned, entry, optional
+from dlo_casadi.config.motions import Motion
 from dlo_casadi.config.options import (
     Centerlines,
     DeclaredTolerances,
@@ -47,21 +48,13 @@ from dlo_casadi.config.values import (
     Points,
     Quaternion,
     checked,
+    no_file_name,
 )
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import counted, well_formed
 from dlo_casadi.rod.ends import REACTIONS, clip_force
 from dlo_casadi.rod.obstacles import Obstacle as Surface
 from dlo_casadi.rod.supports import SupportKind
-
-
-def _no_file_name(name: str) -> str:
-    """Why results cannot carry this name; empty if they can."""
-    if name in (".", "..") or set(name) & set('/\\:*?"<>|\0') or name != name.strip():
-        return (
-            f"results are named after it: a file name without ending belongs here, found {name!r}"
-        )
-    return ""
 
 
 def _both_ends(value: object) -> object:
@@ -96,7 +89,7 @@ class Pose(ConfigSection):
     """Points [[x, y], ...] along the cable [m], in space [[x, y, z], ...], instead of a file."""
     at: Given[ArcLengths | None, Numbers | None] = entry(default=None)
     """Arc lengths [m] of the points from the start, [s, ...], which makes them markers."""
-    name: Annotated[Name, checked(_no_file_name)] = entry(default="", validate_default=True)
+    name: Annotated[Name, checked(no_file_name)] = entry(default="", validate_default=True)
     """What to call the pose; as its file without folder and ending, or by its number, when
     absent."""
     start: Given[Place, Numbers] = entry(kw_only=False)
@@ -263,6 +256,17 @@ class Experiment(ConfigSection):
     """What the cable may touch, in all poses."""
     poses: tuple[Pose, ...]
     """The poses, in the order in which they were taken."""
+    motions: tuple[Motion, ...] = ()
+    """Recordings of the moving cable."""
+
+    @field_validator("motions")
+    @classmethod
+    def _called(cls, motions: tuple[Motion, ...]) -> tuple[Motion, ...]:
+        """Name motions without a file by their number."""
+        return tuple(
+            motion if motion.name else motion.changed(name=f"motion_{k:02d}")
+            for k, motion in enumerate(motions, start=1)
+        )
 
     @property
     def in_space(self) -> bool:

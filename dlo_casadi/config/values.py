@@ -74,6 +74,8 @@ GRAVITY = Range(0.0, 1.0e4, "m/s^2")
 COORDINATE = Range(-1.0e3, 1.0e3, "m")
 # Beyond it rounding exceeds 1e-10 rad, and at 1e9 rad no equilibrium is found. As in the C solver.
 HEADING = Range(-1.0e6, 1.0e6, "rad")
+# Seconds since 1970, or since any other time: after 3e9 s doubles still resolve a microsecond.
+TIME = Range(-1.0e10, 1.0e10, "s")
 # The heaviest cable (100 kg/m, 100 m) weighs 1e5 N; tension adds to it. Moments: at a metre's arm.
 FORCE, MOMENT = Range(-1.0e6, 1.0e6, "N"), Range(-1.0e6, 1.0e6, "N m")
 # A joint needs two elements; 2000 elements on a metre have half a millimetre each, less than a
@@ -133,6 +135,15 @@ def _implausible_quaternion(values: Sequence[float]) -> str:
     size = math.hypot(*values)
     text = f"a unit quaternion [qx, qy, qz, qw] belongs here, its length is {size:.4g}"
     return "" if abs(size - 1) <= _UNIT else text
+
+
+def no_file_name(name: str) -> str:
+    """Why results cannot carry this name; empty if they can."""
+    if name in (".", "..") or set(name) & set('/\\:*?"<>|\0') or name != name.strip():
+        return (
+            f"results are named after it: a file name without ending belongs here, found {name!r}"
+        )
+    return ""
 
 
 class Axes(NamedTuple):
@@ -206,7 +217,7 @@ def _listed(belongs: str, schema: Any, *counts: int) -> BeforeValidator:
     return BeforeValidator(check, json_schema_input_type=schema)
 
 
-def _table(words: str, *columns: int) -> BeforeValidator:
+def _table(words: str, *columns: int, of: Range = COORDINATE) -> BeforeValidator:
     """Numbers in rows of one of these lengths (or one plain row), as a frozen tuple."""
 
     def check(value: object) -> object:
@@ -230,8 +241,8 @@ def _table(words: str, *columns: int) -> BeforeValidator:
                 f"{show(rows[wrong[0]].tolist())} in place {wrong[0] + 1} is not finite; leave out "
                 "the points that were not measured, gaps are allowed"
             )
-        if len(far := rows[(rows < COORDINATE.least) | (rows > COORDINATE.most)]):
-            raise ValueError(COORDINATE.complaint(float(far[0])))
+        if len(far := rows[(rows < of.least) | (rows > of.most)]):
+            raise ValueError(of.complaint(float(far[0])))
         numbers = array.astype(float).tolist()
         return tuple(map(tuple, numbers)) if columns else tuple(numbers)
 
@@ -263,6 +274,11 @@ Points = Annotated[
     tuple[tuple[float, ...], ...], _table("numbers [[x, y], ...], in space [[x, y, z], ...]", 2, 3)
 ]
 ArcLengths = Annotated[tuple[float, ...], _table("arc lengths [s, ...]")]
+Times = Annotated[tuple[float, ...], _table("times [t, ...]", of=TIME)]
+Headings = Annotated[tuple[float, ...], _table("headings [phi, ...]", of=HEADING)]
+Quaternions = Annotated[
+    tuple[tuple[float, ...], ...], _table("quaternions [[qx, qy, qz, qw], ...]", 4)
+]
 Force = Annotated[Direction, within(FORCE)]
 Moment = Annotated[
     tuple[Number, ...],

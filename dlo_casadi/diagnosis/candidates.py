@@ -90,7 +90,12 @@ def setup_of(model: CableModel, **seen: Any) -> Setup:
     return Setup(model.cable, model.start, model.end, model.gravity, curved, **seen)
 
 
-def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> list[Candidate]:
+def candidates(
+    model: CableModel,
+    setup: Setup,
+    exclude: Sequence[str] = (),
+    among: Mapping[str, type[Effect]] = EFFECTS,
+) -> list[Candidate]:
     """List all effects that may be missing from a model.
 
     Parameters
@@ -99,9 +104,11 @@ def candidates(model: CableModel, setup: Setup, exclude: Sequence[str] = ()) -> 
         Includes its nuisances. An effect that it has without a prior is no candidate any more.
     exclude : sequence of str
         Effects that the user excludes.
+    among : mapping
+        Kinds of effects by their names.
     """
     found = []
-    kinds = [x for x in EFFECTS.values() if x.name not in exclude and x.applies(setup)]
+    kinds = [x for x in among.values() if x.name not in exclude and x.applies(setup)]
     for effect in (effect for kind in kinds for effect in kind.each_for(setup)):
         prefix = f"{effect.label}."
         frees = tuple(prefix + q.name for q in effect.parameters(model.cable))

@@ -8,6 +8,7 @@ from dlo_casadi.effects.cable import CableData, Parameter, Setup
 from dlo_casadi.effects.camera_frame import CameraFrame
 from dlo_casadi.effects.clamps import ClampAngle, ClampCompliance, ClampRotation
 from dlo_casadi.effects.clips import ClipAngle, ClipOffset, ClipSlip
+from dlo_casadi.effects.clock_delay import ClockDelay
 from dlo_casadi.effects.contact import ContactPlane, ObstacleOffset
 from dlo_casadi.effects.damping import AirDrag, Damping, PinFriction, TurningLoss, ViscousDrag
 from dlo_casadi.effects.effect import (
@@ -100,11 +101,14 @@ EFFECTS = Registry(
 
 # Effects that still shapes do not know.
 IN_MOTION: dict[str, type[Effect]] = {
-    kind.name: kind for kind in (AirDrag, ViscousDrag, PinFriction, TurningLoss, DynamicStiffness)
+    kind.name: kind
+    for kind in (AirDrag, ViscousDrag, PinFriction, TurningLoss, DynamicStiffness, ClockDelay)
 }
 
 # Effect that estimates the mass if it is not declared.
 UNKNOWN_MASS: type[Effect] = MassError
+# Effect by which motions may differ a little from still shapes without being a finding.
+STIFFER_IN_MOTION: type[Effect] = DynamicStiffness
 # Effect whose parameter moves a clip along the cable, for derivatives by the clip's arc length.
 ALONG_CABLE = ClipSlip
 

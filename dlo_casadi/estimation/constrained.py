@@ -221,7 +221,10 @@ class _Profile:
         """Refit with the parameter fixed, from a neighbour; None without equilibria there."""
         fit, k = self.fit, self._k
         base = 2 * fit.point.objective - fit.problem.unknowns.own_prior(fit.point.theta, k)
-        problem = replace(fit.problem, unknowns=self._fixed_at(place))
+        fixed, priors = self._fixed_at(place), fit.problem.priors
+        value = fit.problem.unknowns.pack(fixed.fixed, fit.coefficients)[k]
+        told = tuple((np.delete(row, k), x - float(row[k] * value)) for row, x in priors.told)
+        problem = replace(fit.problem, unknowns=fixed, priors=replace(priors, told=told))
         for theta in (self._along(place, near), near.point.theta):
             point = problem.balanced(replace(near.point, theta=theta))
             if point is not None:

@@ -139,14 +139,14 @@ class MovingSegment(DampedSegment):
         return ca.Function("curve", [self.x, self.r, self.p, self.place], outputs)
 
     @cached_property
-    def motion(self) -> ca.Function:
-        """(arguments, c (2,)) -> residual, K, and c_1 C + c_2 M, by turns, places and forces.
+    def _matrices(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Residual, K, C and M by turns, places and forces.
 
         K, C and M are its derivatives by positions, velocities and accelerations.
         """
-        c, parts = ca.SX.sym("c", 2), self._moving_rows
+        parts, size = self._moving_rows, self.moving
         _, residual, stiffness = map(ca.SX, self._statics)
-        damping, size = ca.SX(*stiffness.shape), self.moving
+        damping, mass = ca.SX(*stiffness.shape), ca.SX(*stiffness.shape)
         rows = sum((part.value for part in parts), start=ca.SX.zeros(size))
         residual[:size] += rows
         stiffness[:size, :size] += sum(part.by_place for part in parts)
@@ -155,9 +155,30 @@ class MovingSegment(DampedSegment):
                 own = slice(k, k + self.b)
                 stiffness[own, own] -= ca.skew(rows[own]) / 2
         for part in parts:
-            damping[:size, :size] += c[0] * part.by_rate + c[1] * part.by_acceleration
-        outputs = self._stiffened([residual, stiffness, damping])
+            damping[:size, :size] += part.by_rate
+            mass[:size, :size] += part.by_acceleration
+        return residual, stiffness, damping, mass
+
+    @cached_property
+    def motion(self) -> ca.Function:
+        """(arguments, c (2,)) -> residual, K, and c_1 C + c_2 M, see `_matrices`."""
+        c = ca.SX.sym("c", 2)
+        residual, stiffness, damping, mass = self._matrices
+        outputs = self._stiffened([residual, stiffness, c[0] * damping + c[1] * mass])
         return ca.Function("motion", [*self.arguments, c], [ca.densify(x) for x in outputs])
+
+    @cached_property
+    def linear(self) -> ca.Function:
+        """(arguments) -> K, C, M, and derivatives of the residual by p and by rest strains."""
+        residual, *matrices = self._stiffened(list(self._matrices))
+        by = [ca.jacobian(residual, x) for x in (self.p, self.rest)]
+        return ca.Function("linear", self.arguments, [ca.densify(x) for x in (*matrices, *by)])
+
+    @cached_property
+    def seen(self) -> ca.Function:
+        """(arguments) -> handles z [m], and their derivatives by turns and places, and by p."""
+        outputs = [self.handles.z, self.handles.by_place, ca.jacobian(self.handles.z, self.p)]
+        return ca.Function("seen", self.arguments, [ca.densify(x) for x in outputs])
 
     @cached_property
     def residual(self) -> ca.Function:

@@ -22,6 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.motion.state import Banded, Fixtures, State
@@ -152,7 +153,7 @@ class _Trial:
         dt: float,
     ) -> None:
         self._cable, self._scheme, self._before = cable, scheme, before
-        self._fixtures, self._dt, self._held = fixtures, dt, _held(cable)
+        self._fixtures, self._dt, self._held = fixtures, dt, cable.held
         # As if the method's accelerations stayed the same.
         self._moved = dt * before.rates + dt**2 / 2 * before.own
         self._force, self._moment = before.state.force, before.state.moment
@@ -186,7 +187,7 @@ class _Trial:
         """The residual, and its derivative by the unknowns."""
         factors = self._scheme.factors(self._dt)
         balance = self._cable.evaluated(self.state.state, self._fixtures, factors)
-        return balance.residual, balance.stepped(_turns(self._moved[:, : self._cable.b]))
+        return balance.residual, balance.stepped(turns_of(self._moved[:, : self._cable.b]))
 
     def move(self, solution: FloatArray, length: float) -> float:
         """Add a step of Newton's method; return its size [rad, lengths]."""
@@ -200,11 +201,6 @@ class _Trial:
         return size
 
 
-def _held(cable: MovingCable) -> list[tuple[int, int]]:
-    """Which fixture holds the place of which node."""
-    return [(0, 0), (1, cable.n_nodes - 1)] if cable.model.end.place else [(0, 0)]
-
-
 def _composed(x: FloatArray, turned: FloatArray) -> FloatArray:
     """The increment x followed by another one, both of the same nodes."""
     if x.shape[1] == 1:
@@ -213,7 +209,7 @@ def _composed(x: FloatArray, turned: FloatArray) -> FloatArray:
     return np.asarray(total / (1 - (x * turned).sum(axis=1, keepdims=True) / 4))
 
 
-def _turns(x: FloatArray) -> FloatArray:
+def turns_of(x: FloatArray) -> FloatArray:
     """Derivative (n_nodes, increment, increment) of `_composed` by the second increment at zero."""
     count, b = x.shape
     unit = np.broadcast_to(np.eye(b), (count, b, b))
@@ -239,12 +235,29 @@ def started(
     turned, moved = after.state.w - state.w, after.state.v - state.v
     if max(np.abs(turned).max(), np.abs(moved).max() / cable.model.cable.length) > _JUMP:
         state = replace(state, w=after.state.w, v=after.state.v)
-    after = first.step(_without_acceleration(state), later, dt)
-    if after is None:
-        return None
-    found = after.state
-    begun = replace(state, alpha=found.alpha, a=found.a, force=found.force, moment=found.moment)
-    return Moving(begun, np.hstack([found.alpha, found.a]))
+    after = first_step(cable, state, later, dt)
+    return None if after is None else begun_by(state, after)
+
+
+def first_step(cable: MovingCable, state: State, later: Fixtures, dt: float) -> Moving | None:
+    """A step with constant accelerations, which need no earlier ones."""
+    return Stepper(cable, FIRST).step(_without_acceleration(state), later, dt)
+
+
+def begun_by(state: State, after: Moving) -> Moving:
+    """A state with the accelerations and forces of its `first_step`."""
+    now = after.state
+    begun = replace(state, alpha=now.alpha, a=now.a, force=now.force, moment=now.moment)
+    return Moving(begun, np.hstack([now.alpha, now.a]))
+
+
+def turned_back(x: FloatArray, turns: FloatArray) -> FloatArray:
+    """Turns (n_nodes, increment, q) about nodes, seen from these after increments x."""
+    if x.shape[1] == 1:
+        return turns
+    quaternion = np.concatenate([x / 2, np.ones((len(x), 1))], axis=1)
+    matrices = Rotation.from_quat(quaternion).as_matrix()
+    return np.asarray(matrices.transpose(0, 2, 1) @ turns)
 
 
 def _without_acceleration(state: State) -> Moving:

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from scipy.sparse import csr_array
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.effects import Damping
@@ -110,7 +111,7 @@ class MovingCable:
         )
 
     @cached_property
-    def _places(self) -> tuple[IntArray, IntArray, IntArray, int]:
+    def places(self) -> tuple[IntArray, IntArray, IntArray, int]:
         """Unknowns of nodes (n_nodes, b + d), forces (n_segments, ...), moments; their number.
 
         Minus one for what is no unknown.
@@ -140,20 +141,20 @@ class MovingCable:
         return nodes, forces, moments, count
 
     def steps(self, solution: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Increments of turns, places, forces and moments in a solution (N,); zero where held."""
-        nodes, forces, moments, _ = self._places
-        known = np.append(solution, 0.0)
+        """Increments of turns, places, forces, moments in solutions (N, ...); zero where held."""
+        nodes, forces, moments, _ = self.places
+        known = np.concatenate([solution, np.zeros((1, *solution.shape[1:]))])
         return known[nodes[:, : self.b]], known[nodes[:, self.b :]], known[forces], known[moments]
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return self._places[3]
+        return self.places[3]
 
     @cached_property
     def _index(self) -> tuple[IntArray, IntArray]:
         """Unknowns of each segment (n_segments, L), of the ends (2 b + moments,); -1 for none."""
-        nodes, forces, moments, _ = self._places
+        nodes, forces, moments, _ = self.places
         b = self.b
         first, last = nodes[:-1], nodes[1:]
         of_segment = np.hstack([first[:, :b], last[:, :b], first[:, b:], last[:, b:], forces])
@@ -211,20 +212,20 @@ class MovingCable:
         rows = [*self.arguments(state), *more]
         return [out[0] for out in self.segment.mapped(name)(*(row[None] for row in rows))]
 
-    def _at_ends(self, state: State, fixtures: Fixtures) -> list[FloatArray]:
-        """Lagrangian of the ends, its gradient and Hessian, without forces on places."""
+    def at_ends(self, name: str, state: State, fixtures: Fixtures) -> list[FloatArray]:
+        """Evaluate a function of the ends, such as `Functions.at_ends`; no forces on places."""
         model, (start, end) = self.model, self._condition_rows
         lam = np.zeros(model.n_lam)
         lam[[*start, *end]] = state.moment
         both = np.concatenate([state.x[0], state.x[-1]])
         deviation = np.zeros(len(model.deviation_names))
         rows = (both, lam, self.p, fixtures.pose, deviation)
-        found = functions_of(model).mapped("at_ends")(*(row[None, None] for row in rows))
+        found = functions_of(model).mapped(name)(*(row[None, None] for row in rows))
         return [out[0, 0] for out in found]
 
     def energy_of_ends(self, state: State, fixtures: Fixtures) -> float:
         """Potential energy [J] of the holders, and of dead loads at the start."""
-        value = self._at_ends(state, fixtures)[0]
+        value = self.at_ends("at_ends", state, fixtures)[0]
         nowhere = np.zeros(self.d)
         # Springs have theirs with the segments, see `MovingSegment`.
         return float(value[0, 0]) - float(self._springs_at(self.p, nowhere))
@@ -243,23 +244,28 @@ class MovingCable:
         rates = np.concatenate([state.w[0], state.w[-1]])
         return float(rates @ np.array(self.rubs(rates, self.p)[0]).ravel())
 
-    def _ends(self, state: State, fixtures: Fixtures) -> list[FloatArray]:
+    def ends(self, state: State, fixtures: Fixtures) -> list[FloatArray]:
         """Gradient, Hessian and damping of the ends, by the unknowns of `_index`."""
-        b, (start, end) = self.b, self._condition_rows
-        _, gradient, hessian = self._at_ends(state, fixtures)
-        kept = [*range(2 * b), *(2 * b + row for row in (*start, *end))]
+        b, kept = self.b, self.end_rows
+        _, gradient, hessian = self.at_ends("at_ends", state, fixtures)
         damping = np.zeros((len(kept), len(kept)))
         gradient, hessian = gradient[kept, 0], hessian[np.ix_(kept, kept)]
         if self.rubs is not None:
             rates = np.concatenate([state.w[0], state.w[-1]])
-            pulled, by_rates = (np.array(x) for x in self.rubs(rates, self.p))
+            pulled, by_rates, _ = (np.array(x) for x in self.rubs(rates, self.p))
             gradient[: 2 * b] += pulled[:, 0]
             damping[: 2 * b, : 2 * b] += by_rates
         return [gradient, hessian, damping]
 
     @cached_property
+    def end_rows(self) -> list[int]:
+        """Rows of the functions of the ends: turns of both nodes, then directions held."""
+        start, end = self._condition_rows
+        return [*range(2 * self.b), *(2 * self.b + row for row in (*start, *end))]
+
+    @cached_property
     def rubs(self) -> ca.Function | None:
-        """(body rates of both ends, p) -> moments against them, and their derivatives."""
+        """(body rates of both ends, p) -> moments against them, derivatives by both."""
         effects = self.segment.terms.effects_of(Damping)
         rates = ca.SX.sym("rates", 2 * self.b)
         sides = zip((self.model.start, self.model.end), ca.vertsplit(rates, self.b), strict=True)
@@ -270,8 +276,8 @@ class MovingCable:
         if total.is_zero():
             return None
         hessian, gradient = ca.hessian(total, rates)
-        outputs = [ca.densify(gradient), ca.densify(hessian)]
-        return ca.Function("rubs", [rates, self.segment.p], outputs)
+        outputs = [gradient, hessian, ca.jacobian(gradient, self.segment.p)]
+        return ca.Function("rubs", [rates, self.segment.p], [ca.densify(x) for x in outputs])
 
     def evaluated(
         self, state: State, fixtures: Fixtures, c: tuple[float, float] = (0.0, 0.0)
@@ -279,14 +285,14 @@ class MovingCable:
         """The balance of a state, with its derivatives K and c_1 C + c_2 M."""
         factors = np.broadcast_to(np.array(c), (self.n_segments, 2))
         rows, stiff, damp = self.segments("motion", state, factors)
-        gradient, hessian, rubbing = self._ends(state, fixtures)
+        gradient, hessian, rubbing = self.ends(state, fixtures)
         residual = self.gathered(rows[..., 0], gradient)
         return Balance(self, residual, rows[..., 0], (stiff, hessian), (damp, c[0] * rubbing))
 
     def residual(self, state: State, fixtures: Fixtures) -> FloatArray:
         """Residual (N,) alone."""
         (rows,) = self.segments("residual", state)
-        return self.gathered(rows[..., 0], self._ends(state, fixtures)[0])
+        return self.gathered(rows[..., 0], self.ends(state, fixtures)[0])
 
     def gathered(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
         """Rows (N,) summed over the segments (n_segments, L) and the ends."""
@@ -294,6 +300,22 @@ class MovingCable:
         values = np.concatenate([segments.ravel(), ends])
         total = np.bincount(index % (self.size + 1), values, self.size + 1)
         return np.asarray(total[: self.size], dtype=float)
+
+    def gathered_columns(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
+        """The same (N, q) of columns (n_segments, L, q) and (L, q)."""
+        rows = np.concatenate([segments.reshape(-1, segments.shape[-1]), ends])
+        return np.asarray(self._gathering @ rows)
+
+    @cached_property
+    def _gathering(self) -> csr_array:
+        index = np.concatenate([self._index[0].ravel(), self._index[1]])
+        known = np.flatnonzero(index >= 0)
+        return csr_array((0 * known + 1.0, (index[known], known)), (self.size, len(index)))
+
+    @property
+    def held(self) -> list[tuple[int, int]]:
+        """Which fixture (0: start, 1: end) holds the place of which node."""
+        return [(0, 0), (1, self.n_nodes - 1)] if self.model.end.place else [(0, 0)]
 
     def band(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
         """Band (3 width + 1, N) summed over the segments (n_segments, L, L) and the ends."""
@@ -333,7 +355,7 @@ class MovingCable:
     @property
     def n_moments(self) -> int:
         """Number of directions that the ends hold."""
-        return len(self._places[2])
+        return len(self.places[2])
 
     # ---- states --------------------------------------------------------------------------------
 

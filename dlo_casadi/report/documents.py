@@ -32,6 +32,7 @@ from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.runtime.executors import software
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.session.fitting import Declared
+from dlo_casadi.session.in_motion import MotionStage
 from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage
 from dlo_casadi.session.questions import Suspicion
 
@@ -74,6 +75,7 @@ def stage_dict(stage: Stage, outcome: Outcome) -> dict[str, Any]:
     kept = ("value", "std", "unit", "interval_95", "interval_95_if_hidden", "identifiable")
     return {
         **fields_of(stage, "name", "explains", "rmse_fit", "rmse_held_out"),
+        **motion_dict(stage.motion),
         **{
             f"{quantity.name}_rmse_{role}": errors.of(quantity)
             for quantity in QUANTITIES
@@ -109,6 +111,18 @@ def stage_dict(stage: Stage, outcome: Outcome) -> dict[str, Any]:
             **{key: fields_of(found, *kept) for key, found in stage.parameters.items()},
             "rest_curvature": curvature,
         },
+    }
+
+
+def motion_dict(motion: MotionStage | None) -> dict[str, Any]:
+    """Errors [m] of the recorded motions in a stage; no keys without motions."""
+    if motion is None:
+        return {}
+    return {
+        "motion_rmse_fit": motion.rmse_fit,
+        "motion_rmse_held_out": motion.rmse_held_out,
+        "motion_chi2_per_dof": motion.chi2_per_dof,
+        "motions": {item.name: {"role": item.role, "rmse": item.rmse} for item in motion.shown},
     }
 
 

@@ -17,6 +17,7 @@ from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from dlo_casadi.estimation.stiffness import LEAST_POINTS, law_of, measured_moment_curve
 from dlo_casadi.report import canvas, words
+from dlo_casadi.report.figures_motion import motion_figure
 from dlo_casadi.report.figures_poses import limits_figure
 from dlo_casadi.report.scene import Mark, Scene, next_marks, pull_marks, scene_of
 from dlo_casadi.report.words import NOISE_ALONE, compared, directions
@@ -54,6 +55,7 @@ def figures_of(outcome: Outcome) -> dict[str, Figure]:
         ("next_pose", outcome.next_pose, next_pose_figure),
         ("moment", not end.place, moment_figure),
         ("limits", outcome.limits, limits_figure),
+        ("motion", last.motion, motion_figure),
     ]
     drawn = {name: draw(outcome) for name, needed, draw in wanted if needed}
     return {name: drawing for name, drawing in drawn.items() if drawing is not None}

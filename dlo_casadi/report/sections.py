@@ -18,7 +18,7 @@ from rich.text import Text
 
 from dlo_casadi.errors import counted
 from dlo_casadi.io.files import finite
-from dlo_casadi.report import documents, findings, tables, words
+from dlo_casadi.report import documents, findings, motions, tables, words
 from dlo_casadi.report.canvas import inline_svg
 from dlo_casadi.report.documents import fields_of
 from dlo_casadi.report.figures import figures_of
@@ -351,6 +351,14 @@ SECTIONS = (
         terminal=lambda outcome: [limits_table(outcome.config.cable.name, outcome.limits)],
     ),
     Section(
+        "motion",
+        lambda outcome: "In motion",
+        applies=motions.stages_of,
+        context=motions.context_of,
+        data=lambda outcome: {"motion_scores": dict(outcome.motion_scores)},
+        terminal=lambda outcome: [motions.motion_table(outcome)],
+    ),
+    Section(
         "parameters",
         lambda outcome: "Parameters",
         context=lambda outcome: {
@@ -369,7 +377,7 @@ SECTIONS = (
     ),
 )
 # On the terminal the last lines are seen first: the verdict stands near them.
-_ON_TERMINAL = ("parameters", "errors", "verdict", "limits", "warnings", "run")
+_ON_TERMINAL = ("parameters", "errors", "motion", "verdict", "limits", "warnings", "run")
 
 
 def report_dict(outcome: Outcome) -> dict[str, Any]:

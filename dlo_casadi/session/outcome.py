@@ -28,6 +28,7 @@ from dlo_casadi.rod.quantities import QUANTITIES, Quantity, quantity_of
 from dlo_casadi.runtime.work import Part
 from dlo_casadi.sensing.pixels import ViewInput
 from dlo_casadi.session.found_effects import FoundEffect
+from dlo_casadi.session.in_motion import MotionStage
 from dlo_casadi.session.pose_shape import BranchShape, EitherSide, PoseShape
 
 StageName = Literal["initial", "stiffness_only", "algorithm1", "batch", "closed"]
@@ -108,6 +109,8 @@ class Stage(Brief):
         its parameters have no intervals.
     surfaces : tuple of Obstacle
         All surfaces that the cable may touch, if the fit has them.
+    motion : MotionStage or None
+        The recorded motions by this model, if there are any.
     """
 
     name: StageName
@@ -125,6 +128,7 @@ class Stage(Brief):
     readings_held_out: ReadingErrors = ReadingErrors()
     explains: bool | None = None
     surfaces: tuple[Obstacle, ...] = ()
+    motion: MotionStage | None = None
 
     @property
     def label(self) -> str:
@@ -329,6 +333,8 @@ class Outcome:
         Of all predicted poses, where the session declares limits.
     cut_off : bool
         Whether the diagnosis has met the bound on its work before everything was tried.
+    motion_scores : dict
+        Score of each effect that only motion shows, see `search_in_motion`.
     work : Part
         What the parts of the run took, in steps and seconds.
     """
@@ -354,6 +360,7 @@ class Outcome:
     limits: tuple[LimitCheck, ...] = ()
     versions: dict[str, str] = field(default_factory=dict)
     cut_off: bool = False
+    motion_scores: Mapping[str, float] = field(default_factory=dict)
     work: Part = field(default_factory=Part)
 
     @cached_property

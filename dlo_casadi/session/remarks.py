@@ -8,6 +8,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import SkippedPose
 from dlo_casadi.equilibrium.pose import SIGNS
 from dlo_casadi.errors import worded
+from dlo_casadi.estimation.fit import EXPLAINED
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.session.outcome import SIMPLER, PoseInput, Stage
 from dlo_casadi.session.outliers import LEAST_POINTS, Outliers
@@ -164,6 +165,20 @@ def worse_than_simpler(stages: Sequence[Stage]) -> list[str]:
         for stage in stages
         if stage.name in SIMPLER and stage.rmse_fit is not None and stage.rmse_fit < least
     ]
+
+
+def motion_doubts(stage: Stage) -> tuple[str, ...]:
+    """Why the last stage does not explain the recorded motions; empty if it does."""
+    motion = stage.motion
+    if motion is None or motion.chi2_per_dof <= EXPLAINED:
+        return ()
+    said = worded(
+        "recorded motions are met to {fit:mm}, {times:.2g} times what their noise leaves: the "
+        "model lacks something in motion. Try: the times of fixtures and points, begins: moving",
+        fit=motion.rmse_fit,
+        times=float(np.sqrt(motion.chi2_per_dof)),
+    )
+    return (said,)
 
 
 def doubts_of(stages: Sequence[Stage], poses: Sequence[PoseInput], fit: Fit) -> tuple[str, ...]:

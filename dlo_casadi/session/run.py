@@ -27,17 +27,20 @@ from dlo_casadi.runtime.executors import InProcess, one_thread, software
 from dlo_casadi.runtime.parallel import begin
 from dlo_casadi.runtime.progress import Progress, Step, nobody
 from dlo_casadi.runtime.work import accounted, accounted_as, add, part
+from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.fit_remarks import fit_warnings
 from dlo_casadi.session.found_effects import found_effects
+from dlo_casadi.session.in_motion import fit_moving
 from dlo_casadi.session.measure import measured_poses, read_session
+from dlo_casadi.session.motions import read_motions
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, Stage
 from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_parameters
 
-TIMED = ("vision", "algorithm1", "batch", "diagnosis")
+TIMED = ("vision", "algorithm1", "batch", "diagnosis", "motion")
 
 
 def run_session(
@@ -65,9 +68,10 @@ def run_session(
     executor = executor or InProcess()
     begin(executor, software)  # meanwhile another process starts and imports what fits need
     config, inputs = read_session(config, step)
+    motions = read_motions(config, step)
     try:
         with one_thread(), accounted() as work:
-            outcome = _Run(config, step, warn, executor, began).outcome(inputs)
+            outcome = _Run(config, step, warn, executor, began, motions).outcome(inputs)
         add(work)
         work.tell()
         return replace(outcome, work=work)
@@ -81,7 +85,7 @@ class _Run:
     """One run: what its parts use.
 
     `began`: the time at which it began. `seconds`: wall-clock time [s] per part of a run; parts
-    that run in parallel both count in full.
+    that run in parallel both count in full. `motions`: the recordings of the session.
     """
 
     config: Config
@@ -89,6 +93,7 @@ class _Run:
     warn: Callable[[Sequence[str]], None]
     executor: Executor
     began: float
+    motions: tuple[MeasuredMotion, ...] = ()
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(TIMED, 0.0))
 
     def outcome(self, inputs: Sequence[PoseInput]) -> Outcome:
@@ -150,6 +155,8 @@ class _Run:
             fit, found = self.close_the_loop(fit, nearest, stages, measured, reported, center)
         else:
             fit, found = nearest, {}
+        if self.motions:
+            fit, found = self.moved(fit, found, stages, measured, reported)
         return judged(
             Outcome(
                 config=config,
@@ -248,6 +255,38 @@ class _Run:
         }
         return fit, found
 
+    def moved(
+        self,
+        fit: Fit,
+        found: dict[str, Any],
+        stages: list[Stage],
+        measured: Sequence[MeasuredPose],
+        reported: Sequence[str],
+    ) -> tuple[Fit, dict[str, Any]]:
+        """Fit the motions with the still poses; the last stage becomes that of both.
+
+        Another stage follows if effects are found that only motion shows.
+        """
+        began, options = time.perf_counter(), self.config.diagnosis
+        result = fit_moving(
+            fit, self.motions, options.exclude, self.step, diagnosed=options.enabled
+        )
+        self.seconds["motion"] = time.perf_counter() - began
+        effects = (*found.get("effects", ()), *result.effects)
+        names = [*reported, *_parameters_of({x.label for x in effects}, result.fit.model)]
+        last = stages[-1]
+        own = fit_stage(last.name, result.fit, measured, profile_intervals(result.fit), names)
+        first, *others = result.stages
+        if others:
+            stages[-1] = replace(last, motion=first)
+            stages.append(replace(own, name="closed", motion=others[-1], explains=last.explains))
+        else:
+            stages[-1] = replace(own, motion=first, explains=last.explains)
+        more: dict[str, Any] = {"effects": effects, "motion_scores": result.scores}
+        if result.effects and found.get("verdict") == "complete":
+            more["verdict"] = "effect_found"
+        return result.fit, {**found, **more}
+
     def meshed(self, fit: Fit, modes: int = SMOOTH_MODES) -> Fit:
         """The fit on a fine enough mesh, or as it is on the declared one."""
         return fit if self.config.model.n else fine_enough(fit, fit.model.n, modes)
@@ -262,7 +301,10 @@ class _Run:
 def judged(outcome: Outcome) -> Outcome:
     """Add the remarks on its fit to an outcome, and the verdict if no doubt forbids it."""
     fit, stages, verdict = outcome.fit, outcome.stages, outcome.verdict
-    doubts = remarks.doubts_of(stages, outcome.poses, fit)
+    doubts = (
+        *remarks.doubts_of(stages, outcome.poses, fit),
+        *remarks.motion_doubts(stages[-1]),
+    )
     declared = outcome.config.experiment.measurement.std
     # With `robust` the outliers have been sought, and are left out.
     poses = () if outcome.config.estimation.robust else outcome.poses

@@ -28,7 +28,7 @@ from dlo_casadi.estimation.prediction import (
 )
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, DAMPING_TIME, END_ROLL, CableModel
 from dlo_casadi.model.clips import clip_rows
 from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.paper.algorithm1 import Algorithm1Result
@@ -389,6 +389,11 @@ def fitted_parameters(
             known = {"interval_95": tuple(ends), "identifiable": interval.identifiable}
         parameters[key] = estimate(full, unit, size, **known)
     roll = [END_ROLL] if END_ROLL in model.names else []
+    if DAMPING_TIME in fit.problem.unknowns.names:
+        value, spread = fit.value(DAMPING_TIME), NORMAL_95 * fit.std(DAMPING_TIME)
+        around = (max(0.0, value - spread), value + spread)
+        known = {"interval_95": around, "identifiable": fit.is_determined(DAMPING_TIME)}
+        parameters[DAMPING_TIME] = estimate(DAMPING_TIME, "s", **known)
     for name in (*roll, *reported):
         unit = model.parameters[model.names.index(name)].unit
         parameters[name] = estimate(name, unit, identifiable=fit.is_determined(name))

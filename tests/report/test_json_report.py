@@ -37,6 +37,7 @@ KEYS = {
     "structure": type(None),
     "if_hidden": dict,
     "limits": list,
+    "motion_scores": dict,
 }
 
 
@@ -61,7 +62,7 @@ def test_every_key_of_the_schema_is_there(outcome):
 
     assert {key: type(value) for key, value in report.items()} == KEYS
     assert report["schema"] == "dlo-report/1"
-    timed = {"vision", "algorithm1", "batch", "diagnosis", "total", "parts"}
+    timed = {"vision", "algorithm1", "batch", "diagnosis", "motion", "total", "parts"}
     assert set(report["timing_s"]) == timed
     assert [set(part) for part in report["timing_s"]["parts"]] == [
         {"name", "calls", "steps", "seconds", "parts"} for _ in outcome.work.parts

@@ -1,0 +1,408 @@
+"""A recorded motion beside the model: residuals of its points, and their exact derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from dlo_casadi.arrays import FloatArray, IntArray
+from dlo_casadi.effects import SectionLaw
+from dlo_casadi.effects.clock_delay import CLOCK_DELAY
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.errors import EquilibriumError, EstimationError
+from dlo_casadi.estimation.unknowns import Unknowns
+from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.motion import sensitivities
+from dlo_casadi.motion.beginning import Basis, begun, columns_of, strains_of
+from dlo_casadi.motion.handles import between
+from dlo_casadi.motion.path import FixturePath
+from dlo_casadi.motion.sensitivities import Columns, Numbers, Tangent
+from dlo_casadi.motion.state import Fixtures, State
+from dlo_casadi.motion.steps import RHO, Moving, Scheme, Stepper, begun_by, first_step
+from dlo_casadi.motion.system import MovingCable
+from dlo_casadi.sensing.measured_motion import MeasuredMotion
+
+# Modes of a first state: with 8, shapes pulled aside at one place are met within 0.1 % of the pull
+# (amplitudes of a free cable's modes fall with the square of their number).
+MODES = 8
+# Standard deviation of the amplitude of the first mode, in lengths; of higher ones in proportion to
+# the inverse of their frequencies.
+AMPLITUDE = 0.3
+# Halvings of a step of time whose Newton's method fails.
+_HALVINGS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A motion as the model predicts it.
+
+    Parameters
+    ----------
+    residual : (R,) [m]
+        Predicted minus measured, of all points that were seen.
+    by_theta, by_own : (R, size), (R, n_own)
+        Their derivatives; empty if not asked for.
+    first : State
+        The state at the first instant.
+    points : (T, K, d) [m]
+        Predicted points.
+    """
+
+    residual: FloatArray
+    by_theta: FloatArray
+    by_own: FloatArray
+    first: State
+    points: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A measured motion, and the unknowns that it has of its own.
+
+    Parameters
+    ----------
+    dt : float [s]
+        Longest step of time. Derivatives are those of these steps; points are extrapolated from
+        them and from half of them, to fourth order.
+    basis : Basis, optional
+        Of the first state; None if the cable hangs still at first.
+    until : float [s]
+        Only points up to this time are compared.
+    period : float [s]
+        Of the first mode.
+    """
+
+    measured: MeasuredMotion
+    tolerances: Tolerances
+    dt: float
+    basis: Basis | None = None
+    until: float = np.inf
+    period: float = 1.0
+
+    @cached_property
+    def path(self) -> FixturePath:
+        """How the fixtures move."""
+        own = self.measured
+        rows = {
+            f"{name.partition('_')[0]}_frame" if "_" in name else name: _columns(x)
+            for name, x in own.moving.items()
+        }
+        first = {**own.resting, **{name: x[0] for name, x in own.moving.items()}}
+        return FixturePath.of(_held_by(first), own.fixtures_t, rows)
+
+    @cached_property
+    def times(self) -> FloatArray:
+        """Times (T,) [s] of the compared points."""
+        return self.measured.t[self.measured.t <= self.until]
+
+    # ---- own unknowns --------------------------------------------------------------------------
+
+    def own_std(self, model: CableModel) -> FloatArray:
+        """Standard deviations (n_own,) of its own unknowns.
+
+        These are deviations of the end's place [m], of the directions of the start and of the end
+        [rad], then the coordinates of the first state, see `beginning`.
+        """
+        parts = [np.full(len(self._turned(model)), getattr(self.tolerances, model.node.tolerance))]
+        if model.end.place:
+            parts.insert(0, np.full(model.node.dimension, self.tolerances.end))
+        if self.basis is not None:
+            w = self.basis.frequencies
+            parts += [AMPLITUDE * w[0] / w, np.full(len(w), AMPLITUDE * w[0])]
+        return np.concatenate(parts)
+
+    @staticmethod
+    def _turned(model: CableModel) -> list[int]:
+        """Rows of turns (2 increment,) of fixtures that hold the direction."""
+        b = model.node.increment
+        sides = enumerate((model.start, model.end))
+        return [
+            b * k + int(row)
+            for k, kind in sides
+            for row in np.flatnonzero(kind.rotations(model.node))
+        ]
+
+    def _ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of the end's place (d, n_own) and of fixtures' turns (2 b, n_own)."""
+        n, d, b = len(self.own_std(model)), model.node.dimension, model.node.increment
+        place, turns = np.zeros((d, n)), np.zeros((2 * b, n))
+        first = d * model.end.place
+        place[:, :first] = np.eye(d)[:, :first]
+        rows = self._turned(model)
+        turns[rows, first + np.arange(len(rows))] = 1.0
+        return place, turns
+
+    def fixtures(self, cable: MovingCable, t: float, own: FloatArray) -> Fixtures:
+        """The fixtures at a time of the points' clock, with their deviations."""
+        model, delay = cable.model, _delay(cable)
+        found = self.path.at(t + delay, cable)
+        place, turns = self._ways(model)
+        node, pose = model.node, found.pose.copy()
+        d, c, b = node.dimension, node.coordinates, node.increment
+        pose[d : 2 * d] += place @ own
+        for k in (0, 1):
+            at = slice(2 * d + c * k, 2 * d + c * (k + 1))
+            pose[at] = node.moved(pose[at], (turns @ own)[b * k : b * (k + 1)])
+        return cable.fixtures(pose, found.velocities, found.accelerations)
+
+    # ---- evaluation ----------------------------------------------------------------------------
+
+    def evaluate(
+        self,
+        unknowns: Unknowns,
+        theta: FloatArray,
+        own: FloatArray,
+        near: State | None = None,
+        *,
+        derivatives: bool = False,
+    ) -> Seen:
+        """Predicted minus measured points.
+
+        `near`: a first state near which that of these unknowns is sought.
+
+        Raises
+        ------
+        EstimationError
+            If the first state or a step of time is not found.
+        """
+        model, p, rest = unknowns.model, unknowns.p(theta), unknowns.rest(theta)
+        cable = MovingCable(model, p, rest)
+        if _depends_on_rest(model):
+            at_rest = rest_state(cable, self.fixtures(cable, 0.0, own), None)
+            cable = MovingCable(model, p, rest, strains_of(cable, at_rest))
+        numbers = _Numbers(self, cable, unknowns, theta) if derivatives else None
+        first = self._first(cable, own, near)
+        rows = self._observed(cable, own, first, numbers)
+        seen, columns = zip(*rows, strict=True)
+        # The error of a step falls with the square of its length: extrapolated to zero.
+        finer = replace(self, dt=self.dt / 2)._observed(cable, own, first, None)
+        fine = np.array([one for one, _ in finer])
+        points, size = fine + (fine - np.array(seen)) / 3, unknowns.size
+        mask = np.isfinite(self.measured.points[: len(points), :, 0])
+        if self.measured.s is None:
+            raise EstimationError("lines of a moving cable are not compared yet: markers are")
+        residual = (points - self.measured.points[: len(points)])[mask].ravel()
+        if not derivatives:
+            none = np.zeros((0, 0))
+            return Seen(residual, none, none, first, points)
+        by = np.array(columns)[mask].reshape(len(residual), -1)
+        return Seen(residual, by[:, :size], by[:, size:], first, points)
+
+    def _first(self, cable: MovingCable, own: FloatArray, near: State | None) -> State:
+        fixtures = self.fixtures(cable, 0.0, own)
+        if self.basis is None:
+            return rest_state(cable, fixtures, near)
+        if near is None:
+            near = rest_state(cable, fixtures, None)
+        count = self.basis.forces.shape[1]
+        return begun(cable, near, fixtures, self.basis, own[-2 * count :])
+
+    def _observed(
+        self, cable: MovingCable, own: FloatArray, first: State, numbers: _Numbers | None
+    ) -> Iterator[tuple[FloatArray, FloatArray | None]]:
+        """Predicted points (K, d) at each time, and their derivatives (K, d, q)."""
+        times = self.times
+        columns = self._first_columns(cable, own, first, numbers)
+        yield self._points(cable, first, columns, numbers)
+        if len(times) == 1:
+            return
+        dt = min(self.dt, float(times[1] - times[0]))
+        now, columns = self._started(cable, own, first, columns, dt, numbers)
+        before, stepper = dt, Stepper(cable, SCHEME)
+        for begin, end in pairwise(times):
+            count = int(np.ceil((end - begin) / self.dt - 1e-9))
+            dt = (end - begin) / count
+            for k in range(count):
+                now, columns = _for_step(now, columns, dt / before)
+                at = begin + (k + 1) * dt
+                now, columns, before = self._stepped(stepper, own, now, columns, at, dt, numbers)
+            yield self._points(cable, now.state, columns, numbers)
+
+    def _first_columns(
+        self, cable: MovingCable, own: FloatArray, first: State, numbers: _Numbers | None
+    ) -> Columns | None:
+        """Derivatives of the first state."""
+        if numbers is None:
+            return None
+        at_first, given = numbers.at(0.0), self.fixtures(cable, 0.0, own)
+        if self.basis is None:
+            return sensitivities.at_rest(Tangent(cable, first, given), at_first)
+        return columns_of(cable, first, given, self.basis, at_first)
+
+    def _started(
+        self,
+        cable: MovingCable,
+        own: FloatArray,
+        first: State,
+        columns: Columns | None,
+        dt: float,
+        numbers: _Numbers | None,
+    ) -> tuple[Moving, Columns | None]:
+        fixtures = self.fixtures(cable, dt, own)
+        tried = first_step(cable, first, fixtures, dt)
+        if tried is None:
+            raise EstimationError("the first step of a motion was not found")
+        now = begun_by(first, tried)
+        if numbers is None or columns is None:
+            return now, None
+        tangent = Tangent(cable, tried.state, fixtures)
+        return now, sensitivities.started(first, tried, columns, tangent, numbers.at(dt), dt)
+
+    def _stepped(
+        self,
+        stepper: Stepper,
+        own: FloatArray,
+        now: Moving,
+        columns: Columns | None,
+        at: float,
+        dt: float,
+        numbers: _Numbers | None,
+    ) -> tuple[Moving, Columns | None, float]:
+        """One step of time to `at`, halved where Newton's method fails; the last step [s]."""
+        cable = stepper.cable
+        for halving in range(_HALVINGS + 1):
+            parts, small = 2**halving, dt / 2**halving
+            ahead, along = _for_step(now, columns, 1 / parts)
+            for k in range(parts):
+                t = at - dt + (k + 1) * small
+                fixtures = self.fixtures(cable, t, own)
+                after = stepper.step(ahead, fixtures, small)
+                if after is None:
+                    break
+                if numbers is not None and along is not None:
+                    tangent = Tangent(cable, after.state, fixtures)
+                    given = numbers.at(t)
+                    along = sensitivities.stepped(
+                        ahead, after, along, tangent, given, small, SCHEME
+                    )
+                ahead = after
+            else:
+                return ahead, along, small
+        raise EstimationError(f"no step of time was found at {at:.3f} s")
+
+    def _points(
+        self, cable: MovingCable, state: State, columns: Columns | None, numbers: _Numbers | None
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Points (K, d) of the markers, and their derivatives (K, d, q)."""
+        z, by_place, by_p = cable.segments("seen", state)
+        segment, u = self._markers(cable)
+        d = cable.d
+        handles = z[segment, :, 0].reshape(-1, 4, d)
+        points = between(handles, u)
+        if columns is None or numbers is None:
+            return points, None
+        both = [columns.turn[:-1], columns.turn[1:], columns.place[:-1], columns.place[1:]]
+        moved = by_place @ np.concatenate(both, axis=1) + by_p @ numbers.p
+        moved = moved[segment].reshape(len(segment), 4, d, -1)
+        q = moved.shape[-1]
+        found = between(moved.reshape(len(segment), 4, d * q), u)
+        return points, found.reshape(len(segment), d, q)
+
+    def _markers(self, cable: MovingCable) -> tuple[IntArray, FloatArray]:
+        """Segment of each marker, and its share of it."""
+        low, width = cable.model.chain.layout.segments[:, :2].T
+        s = np.asarray(self.measured.s)
+        segment = np.clip(np.searchsorted(low, s, side="right") - 1, 0, len(low) - 1)
+        return segment, (s - low[segment]) / width[segment]
+
+
+SCHEME = Scheme.of(RHO)
+
+
+def _for_step(now: Moving, columns: Columns | None, factor: float) -> tuple[Moving, Columns | None]:
+    """A state continued with a step of another length, and its derivatives."""
+    if abs(factor - 1) < 1e-12:
+        return now, columns
+    if columns is not None:
+        known = columns.accelerations
+        columns = replace(columns, own=known + factor * (columns.own - known))
+    return now.for_step(factor), columns
+
+
+def _depends_on_rest(model: CableModel) -> bool:
+    """Whether an effect acts on changes from the shape at rest."""
+    none = SectionLaw.dynamic
+    return any(isinstance(x, SectionLaw) and type(x).dynamic is not none for x in model.effects)
+
+
+def _delay(cable: MovingCable) -> float:
+    """What the fixtures' clock shows minus what the points' clock shows [s]."""
+    names = cable.model.names
+    return float(cable.p[names.index(CLOCK_DELAY)]) if CLOCK_DELAY in names else 0.0
+
+
+def rest_state(cable: MovingCable, fixtures: Fixtures, near: State | None) -> State:
+    """The state of equilibrium between fixtures, near another one if given."""
+    model = cable.model
+    held = held_pose(model, fixtures.pose)
+    guess = None if near is None else near.x
+    try:
+        found = solve_equilibrium(model, cable.p, cable.rest, held, x_init=guess)
+    except EquilibriumError as error:
+        raise EstimationError(f"no shape at rest at the first instant: {error}") from error
+    return cable.at_rest(found, fixtures)
+
+
+def _columns(rows: FloatArray) -> FloatArray:
+    return rows[:, None] if rows.ndim == 1 else rows
+
+
+def _held_by(fields: Mapping[str, FloatArray]) -> HeldPose:
+    """A pose of numbers by the names of its fields."""
+    known: dict[str, Any] = {
+        name: float(x) if name.endswith("heading") else tuple(np.ravel(x).tolist())
+        for name, x in fields.items()
+    }
+    return HeldPose(**known)
+
+
+def held_pose(model: CableModel, pose: FloatArray) -> HeldPose:
+    """The declared pose of numbers (n_pose,)."""
+    node = model.node
+    d, c = node.dimension, node.coordinates
+    start, end, first, last = np.split(pose[: 2 * (d + c)], np.cumsum([d, d, c]))
+    held = {}
+    for side, frame in (("start", first), ("end", last)):
+        if getattr(model, side).direction:
+            held[f"{side}_{node.direction}"] = node.declared(frame)
+    end_place = tuple(end.tolist()) if model.end.place else None
+    return HeldPose(start=tuple(start.tolist()), end=end_place, **held)
+
+
+class _Numbers:
+    """Derivatives of what a motion is given, by theta and by its own unknowns."""
+
+    def __init__(
+        self, recording: Recording, cable: MovingCable, unknowns: Unknowns, theta: FloatArray
+    ) -> None:
+        model, own = cable.model, len(recording.own_std(cable.model))
+        self.recording, self.cable = recording, cable
+        self.p = np.pad(unknowns.slopes(theta), ((0, 0), (0, own)))
+        rest = model.chain.rest_inside(unknowns.rest_slopes)
+        self.rest = np.pad(rest, ((0, 0), (0, 0), (0, own)))
+        place, turns = recording._ways(model)
+        q, d = self.p.shape[1], cable.d
+        self.turns = np.pad(turns, ((0, 0), (q - own, 0)))
+        self.places = np.zeros((2, d, q))
+        self.places[1, :, q - own :] = place
+        pose = recording.path.at(_delay(cable), cable).pose
+        self.places += sensitivities.places_by_p(cable, pose) @ self.p
+        names = model.names
+        self.delay = self.p[names.index(CLOCK_DELAY)] if CLOCK_DELAY in names else None
+
+    def at(self, t: float) -> Numbers:
+        """The derivatives at a time."""
+        none = np.zeros_like(self.places)
+        if self.delay is None:
+            return Numbers(self.p, self.rest, self.turns, self.places, none, none)
+        cable, path = self.cable, self.recording.path
+        at = t + _delay(cable)
+        moved = [path.rates(at, order)[..., None] * self.delay for order in (1, 2, 3)]
+        turns = self.turns + path.turning(at)[:, None] * self.delay
+        return Numbers(self.p, self.rest, turns, self.places + moved[0], moved[1], moved[2])

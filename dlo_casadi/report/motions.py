@@ -1,0 +1,63 @@
+"""What a report says of recorded motions."""
+
+from typing import Any
+
+from rich.table import Table
+
+from dlo_casadi.errors import worded
+from dlo_casadi.report.terminal import plain_table
+from dlo_casadi.session.in_motion import MotionStage
+from dlo_casadi.session.outcome import Outcome
+from dlo_casadi.show.text import millimetres
+
+_SAID = "Fitted motions are met to {fit:mm}{held_out}; noise alone leaves {noise:mm}."
+_BEFORE = " Without {names} it was {fit:mm}."
+
+
+def stages_of(outcome: Outcome) -> list[MotionStage]:
+    """The motions by the model before, and with what was found."""
+    return [stage.motion for stage in outcome.stages if stage.motion]
+
+
+def context_of(outcome: Outcome) -> dict[str, Any]:
+    """Data of the section on the page."""
+    stages = stages_of(outcome)
+    before = stages[0] if len(stages) > 1 else None
+    rows = [
+        {
+            "name": item.name,
+            "role": item.role.replace("_", " "),
+            "rms": millimetres(item.rmse),
+            "before": millimetres(before.shown[k].rmse) if before else "",
+        }
+        for k, item in enumerate(stages[-1].shown)
+    ]
+    return {"motion_rows": rows, "motion_before": before, "motion_sentence": sentence_of(outcome)}
+
+
+def sentence_of(outcome: Outcome) -> str:
+    """How well motions are met, and how well they were before."""
+    *before, last = stages_of(outcome)
+    held = last.rmse_held_out
+    dimension = len(outcome.config.experiment.gravity)
+    said = worded(
+        _SAID,
+        fit=last.rmse_fit,
+        held_out=worded(", held-out ones to {held:mm}", held=held) if held is not None else "",
+        noise=(outcome.measurement.std or 0.0) * dimension**0.5,
+    )
+    if before:
+        names = " and ".join(map(str, outcome.effects))
+        said += worded(_BEFORE, names=names, fit=before[0].rmse_fit)
+    return said
+
+
+def motion_table(outcome: Outcome) -> Table:
+    """Motions, their roles and errors, on the terminal."""
+    found = context_of(outcome)
+    columns = ["role", *(["before"] if found["motion_before"] else []), "RMS"]
+    table = plain_table("Distance of the markers in motion, RMS", ["motion"], columns)
+    for row in found["motion_rows"]:
+        cells = [row["role"], *([row["before"]] if found["motion_before"] else []), row["rms"]]
+        table.add_row(row["name"], *cells)
+    return table

@@ -1,0 +1,153 @@
+"""The recordings of a session: fitted with the still poses, searched, predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dlo_casadi.arrays import Brief, FloatArray
+from dlo_casadi.diagnosis.in_motion import InMotion, search_in_motion
+from dlo_casadi.errors import EstimationError
+from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted
+from dlo_casadi.estimation.result import Fit
+from dlo_casadi.sensing.measured_motion import MeasuredMotion
+from dlo_casadi.session.found_effects import FoundEffect, effect_parameters
+
+
+@dataclass(frozen=True, repr=False)
+class MotionShown(Brief):
+    """One motion, measured and predicted.
+
+    Parameters
+    ----------
+    name, role : str
+    t : (T,) [s]
+    s : (K,) [m]
+        Arc lengths of the markers.
+    measured, predicted : (T, K, d) [m]
+        Markers that were not seen are NaN.
+    """
+
+    name: str
+    role: str
+    t: FloatArray
+    s: FloatArray
+    measured: FloatArray
+    predicted: FloatArray
+
+    @property
+    def distances(self) -> FloatArray:
+        """Distances (T, K) [m] of measured and predicted points; NaN where not seen."""
+        return np.asarray(np.linalg.norm(self.predicted - self.measured, axis=2))
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square distance [m]."""
+        return float(np.sqrt(np.nanmean(self.distances**2)))
+
+
+@dataclass(frozen=True)
+class MotionStage:
+    """Motions by one model.
+
+    Parameters
+    ----------
+    rmse_fit, rmse_held_out : float or None [m]
+        Over all points and times; None without motions of that role.
+    chi2_per_dof : float
+        Of the fitted motions.
+    shown : tuple of MotionShown
+    """
+
+    rmse_fit: float
+    rmse_held_out: float | None
+    chi2_per_dof: float
+    shown: tuple[MotionShown, ...]
+
+
+@dataclass(frozen=True)
+class MovingResult:
+    """What the motions of a session tell.
+
+    Parameters
+    ----------
+    fit : Fit
+        Of still poses and motions together, with the effects that were found.
+    stages : tuple of MotionStage
+        Of the model before, and with the effects if some were found.
+    effects : tuple of FoundEffect
+    scores : dict
+        Of each candidate, see `search_in_motion`.
+    """
+
+    fit: Fit
+    stages: tuple[MotionStage, ...]
+    effects: tuple[FoundEffect, ...]
+    scores: dict[str, float]
+
+
+def fit_moving(
+    fit: Fit,
+    motions: Sequence[MeasuredMotion],
+    exclude: Sequence[str],
+    step: Callable[[str, int, int], None],
+    *,
+    diagnosed: bool,
+) -> MovingResult:
+    """Fit the motions of a session with its still poses, and search for what the model lacks.
+
+    Raises
+    ------
+    EstimationError
+        If the motions cannot be fitted.
+    """
+    step("fit the motions", 0, 1)
+    before = fit_motions(fit, motions)
+    step("fit the motions", 1, 1)
+    found = (
+        search_in_motion(before, exclude, step) if diagnosed else InMotion(before, before, (), {})
+    )
+    fits = [before, found.after] if found.added else [before]
+    return MovingResult(
+        found.after.fit,
+        tuple(_stage(one, motions) for one in fits),
+        tuple(
+            FoundEffect(
+                name=item.candidate.name,
+                label=item.candidate.effect.label,
+                of=None,
+                parameters=effect_parameters(found.after.fit, item.candidate.effect),
+                p_value=None,
+                rmse_cross_validated_before=item.before,
+                rmse_cross_validated_after=item.after,
+                indistinguishable_from=item.rivals,
+            )
+            for item in found.added
+        ),
+        found.scores,
+    )
+
+
+def _stage(fit: MotionFit, motions: Sequence[MeasuredMotion]) -> MotionStage:
+    fitted = {item.recording.measured.name: item.seen.points for item in fit.motions}
+    shown = []
+    for one in motions:
+        if one.s is None:
+            continue
+        points = fitted.get(one.name)
+        if points is None:
+            try:
+                points = predicted(fit, one)
+            except EstimationError:
+                points = np.full_like(one.points, np.nan)
+        role = "held_out" if one.held_out else "fit"
+        shown.append(MotionShown(one.name, role, one.t, one.s, one.points, points))
+    both = {role: [x.distances for x in shown if x.role == role] for role in ("fit", "held_out")}
+
+    def rms(role: str) -> float | None:
+        rows = [x.ravel() for x in both[role]]
+        return float(np.sqrt(np.nanmean(np.concatenate(rows) ** 2))) if rows else None
+
+    return MotionStage(rms("fit") or 0.0, rms("held_out"), fit.chi2_per_dof, tuple(shown))

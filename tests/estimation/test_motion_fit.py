@@ -1,0 +1,104 @@
+"""Recorded motions are fitted with still shapes, and tell what these cannot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dlo_casadi.diagnosis.in_motion import search_in_motion
+from dlo_casadi.effects import AirDrag, CableData
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import solve_equilibrium
+from dlo_casadi.estimation.fit import fit_model
+from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted
+from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.motion.path import FixturePath
+from dlo_casadi.motion.system import MovingCable
+from dlo_casadi.motion.trajectory import way_of
+from dlo_casadi.rod.supports import SupportKind
+from dlo_casadi.sensing.measured_motion import MeasuredMotion
+from dlo_casadi.sensing.measured_pose import MeasuredPose
+
+TRUE = CableData(0.6, 0.06, 0.02, 0.009, straight=True, damping_time=0.03)
+DECLARED = replace(TRUE, bending_stiffness=0.011, damping_time=None)
+STD, START = 2e-4, (0.0, 0.0)
+S, T = np.linspace(0.1, 0.6, 6), np.arange(0.0, 0.61, 0.02)
+
+
+def model_of(cable: CableData, n: int, effects: tuple = ()) -> CableModel:
+    ends = SupportKind("clamped"), SupportKind("free")
+    return CableModel(cable, n, start=ends[0], end=ends[1], effects=effects, n_rest=0)
+
+
+def noise(k: int, shape: tuple[int, ...]) -> np.ndarray:
+    return STD * np.random.default_rng(k).normal(size=shape)
+
+
+def still(k: int, heading: float) -> MeasuredPose:
+    """Markers of a shape at rest."""
+    model, pose = model_of(TRUE, 24), HeldPose(start=START, start_heading=heading)
+    eq = solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+    seen = BatchEquilibrium(model, [pose], wrenches=False).seen(
+        eq.shapes, model.nominal, np.zeros(model.chain.n_rests)
+    )
+    points = seen[0].curve.at(S) + noise(k, (len(S), 2))
+    return MeasuredPose.of_points(pose, points, s=S)
+
+
+def motion(name: str, k: int, *, drag: float = 0.0, held_out: bool = False) -> MeasuredMotion:
+    """Markers of a cable whose clamp is carried aside in a third of a second."""
+    model = model_of(TRUE, 16, (AirDrag(),) if drag else ())
+    p = np.array(
+        [drag if "air" in name else x for name, x in zip(model.names, model.nominal, strict=True)]
+    )
+    cable = MovingCable(model, p, np.zeros(model.chain.n_rests))
+    t = np.arange(0.0, 0.7, 0.01)
+    share = np.clip((t - 0.05) / 0.3, 0.0, 1.0)
+    x = 0.15 * (-1) ** k * share**3 * (10 - 15 * share + 6 * share**2)
+    start = np.stack([x, 0 * x], axis=1)
+    pose = HeldPose(start=START, start_heading=-0.8)
+    path = FixturePath.of(pose, t, {"start": start})
+    eq = solve_equilibrium(model, p, cable.rest, pose)
+    way = way_of(cable, cable.at_rest(eq, path.at(0.0, cable)), path, (0.0, float(T[-1])), 1e-6)
+    points = way.points(T, S) + noise(10 + k, (len(T), len(S), 2))
+    points[3, 1] = np.nan
+    resting = {"start_heading": np.array(-0.8)}
+    return MeasuredMotion(
+        name, T, points, S, t, {"start": start}, resting, at_rest=True, held_out=held_out
+    )
+
+
+@pytest.fixture(scope="module")
+def stills() -> list[MeasuredPose]:
+    return [still(k, heading) for k, heading in enumerate((-0.2, -0.7, -1.2, 0.3))]
+
+
+def fitted(stills: list[MeasuredPose], drag: float = 0.0) -> MotionFit:
+    fit = fit_model(model_of(DECLARED, 20), stills, Tolerances(), STD)
+    return fit_motions(fit, [motion("carry", 0, drag=drag), motion("back", 1, drag=drag)])
+
+
+def test_damping_is_found_and_motions_are_predicted(stills: list[MeasuredPose]) -> None:
+    found = fitted(stills)
+    fit = found.fit
+    assert found.converged
+    assert 0.85 < found.chi2_per_dof < 1.15
+    assert abs(fit.value("damping_time") - 0.03) < 3 * fit.std("damping_time")
+    assert fit.std("damping_time") < 0.002
+    assert abs(fit.value("bending_stiffness") - 0.009) < 3 * fit.std("bending_stiffness")
+    ahead = predicted(found, motion("ahead", 2, held_out=True))
+    left = ahead - motion("ahead", 2).points
+    assert np.sqrt(np.nanmean((left**2).sum(axis=2))) < 1.2 * np.sqrt(2) * STD
+    assert not search_in_motion(found).added
+
+
+def test_drag_of_air_is_found(stills: list[MeasuredPose]) -> None:
+    before = fitted(stills, drag=3.0)
+    found = search_in_motion(before)
+    assert [item.candidate.name for item in found.added][:1] == ["air_drag"]
+    drag = found.after.fit
+    assert (
+        abs(drag.value("air_drag.coefficient") - 3.0) < 3 * drag.std("air_drag.coefficient") + 0.1
+    )
+    assert found.after.rmse < before.rmse
