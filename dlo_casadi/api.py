@@ -29,6 +29,7 @@ from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.config import (
     Cable,
     Config,
+    Motion,
     Obstacle,
     Pose,
     any_photographs,
@@ -170,6 +171,8 @@ class Session(Config):
         Of one component of a reading; estimated when absent.
     obstacles : sequence of Obstacle or mapping, optional
         Obstacles that the cable may touch, as in a configuration.
+    motions : sequence of Motion or mapping, optional
+        Recordings of the moving cable.
     camera, board, reference : mapping, optional
         For photographs, as in a configuration.
     tolerances, model, estimation, diagnosis, limits : mapping, optional
@@ -195,6 +198,7 @@ class Session(Config):
         gravity: Numbers | None = None,
         boundary: Sequence[str] | None = None,
         obstacles: Sequence[Obstacle | Mapping[str, Any]] | None = None,
+        motions: Sequence[Motion | Mapping[str, Any]] | None = None,
         std: float | None = None,
         force_std: float | None = None,
         moment_std: float | None = None,
@@ -214,7 +218,11 @@ class Session(Config):
         measurement["kind"] = "images" if pictures else "centerlines"
         experiment = {"measurement": measurement, "poses": poses}
         experiment |= _given(
-            gravity=gravity, boundary=boundary, tolerances=tolerances, obstacles=obstacles
+            gravity=gravity,
+            boundary=boundary,
+            tolerances=tolerances,
+            obstacles=obstacles,
+            motions=motions,
         )
         options = _given(model=model, estimation=estimation, diagnosis=diagnosis, limits=limits)
         given = plain({"cable": cable, "experiment": experiment, **options, **unknown})

@@ -65,7 +65,7 @@ OPTIONS = {
     },
 }
 IN_PLANE = {
-    "cable": CABLE | {"youngs_modulus": 1.0e8},
+    "cable": CABLE | {"youngs_modulus": 1.0e8, "damping_time": 0.02},
     "experiment": {
         "gravity": [0.0, -9.81],
         "boundary": {"start": "clamped", "end": "clamped"},
@@ -74,6 +74,7 @@ IN_PLANE = {
             (
                 *("length", "end", "heading", "rotation", "roll", "scale", "camera_rotation"),
                 *("camera_translation", "force_bias", "moment_bias", "clip", "slip", "obstacle"),
+                "delay",
             ),
             0.001,
         ),
@@ -103,6 +104,32 @@ IN_PLANE = {
     },
     **OPTIONS,
 }
+# Recordings: with all that rests as arrays, and with all that moves.
+IN_PLANE["experiment"]["motions"] = [
+    {
+        "t": [0.0, 0.1, 0.2],
+        "points": [[0.0, 0.0], [0.0, 0.01], [0.0, 0.02]],
+        "at": [0.1, 0.1, 0.1],
+        "name": "swing",
+        "start": [0.0, 0.0],
+        "end": [0.4, 0.0],
+        "start_heading": 0.1,
+        "end_heading": 0.2,
+        "begins": "at_rest",
+        "role": "held_out",
+    },
+    {
+        "t": [0.0, 0.1],
+        "points": [[0.0, 0.0], [0.0, 0.01]],
+        "fixtures": {
+            "t": [0.0, 0.5],
+            "start": [[0.0, 0.0], [0.1, 0.0]],
+            "end": [[0.4, 0.0], [0.5, 0.0]],
+            "start_heading": [0.1, 0.1],
+            "end_heading": [0.2, 0.2],
+        },
+    },
+]
 BOARD = {
     "dictionary": "DICT_4X4_50",
     "marker_size": 0.08,
@@ -181,6 +208,20 @@ FED = {
         ],
     },
 }
+IN_SPACE["experiment"]["motions"] = [
+    {
+        "t": [0.0, 0.1],
+        "points": [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]],
+        "start_orientation": FRAME,
+        "end_orientation": FRAME,
+        "fixtures": {
+            "t": [0.0, 0.5],
+            "start_orientation": [FRAME, FRAME],
+            "end_orientation": [FRAME, FRAME],
+        },
+    }
+]
+FED["experiment"]["motions"] = [{"file": "swing.csv"}]
 ALL = {
     "in a plane": IN_PLANE,
     "in space": IN_SPACE,
@@ -247,6 +288,8 @@ def test_arguments_make_what_a_file_makes(name, tmp_path):
     for key in pose.keys() & {"file", "files"}:
         named = [str(tmp_path / x) for x in np.atleast_1d(pose[key])]
         pose[key] = named[0] if key == "file" else named
+    for motion in tree["experiment"].get("motions", ()):
+        motion |= {key: str(tmp_path / motion[key]) for key in motion.keys() & {"file"}}
     (tmp_path / "session.yaml").write_text(dump_yaml(tree))
     from_file, session = load_config(tmp_path / "session.yaml"), from_arguments(tree)
     for section in KEYS:

@@ -32,6 +32,8 @@ class Cable(ConfigSection):
     """Bending stiffness EI [N m^2], a crude prior; or give youngs_modulus."""
     torsional_stiffness: Annotated[Positive, within(STIFFNESS)] | None = None
     """Torsional stiffness GJ [N m^2] of a cable in space, a crude prior; EI / 1.3 when absent."""
+    damping_time: Positive | None = None
+    """Damping time tau [s], M = EI (kappa - kappa_0 + tau dkappa/dt): a first guess for motions."""
     rest_shape: Literal["straight", "curved"] = "curved"
     """Shape without load: straight (no rest curvature is fitted) or curved."""
 

@@ -353,6 +353,9 @@ class DeclaredTolerances(ConfigSection):
     """Of the frame of a measurement in space against the fixtures, about each axis [rad]."""
     camera_translation: Positive = _STANDARD.camera_translation
     """Of the frame of a measurement in space against the fixtures, along each axis [m]."""
+    delay: Positive | None = _STANDARD.delay
+    """Of the fixtures' clock against that of the points of motions [s]; without it a difference is
+    an effect to be found."""
     force_bias: Positive = _STANDARD.force_bias
     """Of a constant offset of a sensor's force, each component [N]."""
     moment_bias: Positive = _STANDARD.moment_bias

@@ -21,7 +21,16 @@ import numpy as np
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.effects import IN_MOTION
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.motion_fit import MotionFit, rejoined, told_by, with_model
+from dlo_casadi.estimation.fit import EXPLAINED
+from dlo_casadi.estimation.motion_fit import (
+    STRETCHES,
+    MotionFit,
+    joined,
+    rejoined,
+    stretched,
+    told_by,
+    with_model,
+)
 from dlo_casadi.model.cable_model import CableModel
 
 # Gain of the log likelihood that an effect of one parameter must exceed: twice it, 15, is exceeded
@@ -95,7 +104,8 @@ class Score:
 
 def in_motion_only(model: CableModel, exclude: Sequence[str] = ()) -> list[Candidate]:
     """Candidates that still poses do not know."""
-    return candidates(model, setup_of(model, moves=True), exclude, IN_MOTION)
+    found = candidates(model, setup_of(model, moves=True), exclude, IN_MOTION)
+    return [item for item in found if item.effect.shown]
 
 
 def search_in_motion(
@@ -103,21 +113,39 @@ def search_in_motion(
     exclude: Sequence[str] = (),
     step: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> InMotion:
-    """Add effects until none gains more than its price."""
+    """Add effects until none gains more than its price.
+
+    `fit`: of the declared model over a first stretch, which hardly tells what is missing. The later
+    a fit looks, the farther off what is missing drives it: at the end of each of STRETCHES the
+    candidates are compared with the model as it is, all from where the stretch before has left it.
+    """
     now, added, first = fit, list[AddedInMotion](), dict[str, float]()
-    for _ in range(MOST):
-        step("search for what motion lacks", len(added), MOST)
-        listed = in_motion_only(now.fit.model, exclude)
-        scores = scored(now, listed)
-        first = first or {name: one.value for name, one in scores.items()}
-        chosen = _best(now, scores)
-        if chosen is None:
-            break
-        better, one = chosen
-        added.append(one)
-        now = better
+    before: MotionFit | None = None
+    for end in [x for x in STRETCHES if x > fit.until] or [fit.until]:
+        start = now
+        if end > now.until:
+            start = stretched(now, end)
+            now = joined(start.fit, start.motions, start.std, end)
+        while len(added) < MOST and (end == np.inf or now.chi2_per_dof > EXPLAINED):
+            step("search for what motion lacks", len(added), MOST)
+            scores = scored(start, in_motion_only(start.fit.model, exclude))
+            first = first or {name: one.value for name, one in scores.items()}
+            chosen = _best(start, now, scores)
+            if chosen is None:
+                break
+            before = before or _whole(now)
+            added.append(chosen[1])
+            now = start = chosen[0]
     step("search for what motion lacks", MOST, MOST)
-    return InMotion(fit, now, tuple(added), first)
+    return InMotion(before or now, now, tuple(added), first)
+
+
+def _whole(now: MotionFit) -> MotionFit:
+    """A fit beside the whole motions, as far as it goes."""
+    try:
+        return stretched(now, np.inf)
+    except EstimationError:
+        return now
 
 
 def scored(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Score]:
@@ -170,17 +198,16 @@ def _excess(fit: MotionFit, item: Candidate) -> float:
 
 
 def _best(
-    now: MotionFit,
-    scores: dict[str, Score],
+    start: MotionFit, now: MotionFit, scores: dict[str, Score]
 ) -> tuple[MotionFit, AddedInMotion] | None:
-    """The best candidate, fitted; None if none gains more than its price."""
+    """The best candidate, fitted from `start`; None if none gains its price over `now`."""
     order = sorted(scores.values(), key=lambda one: -one.value)
     least = max(2 * PRICE, NEAR * order[0].value) if order else np.inf
     fitted: list[tuple[float, Candidate, MotionFit]] = []
     for one in [x for x in order if x.value > least][:REFITTED]:
-        item, model = one.candidate, one.candidate.add_to(now.fit.model)
+        item, model = one.candidate, one.candidate.add_to(start.fit.model)
         try:
-            trial = rejoined(now, model, one.values)
+            trial = rejoined(start, model, one.values)
         except EstimationError:
             continue
         gain = (now.objective - trial.objective) / _excess(trial, item)

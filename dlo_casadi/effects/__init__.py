@@ -107,8 +107,12 @@ IN_MOTION: dict[str, type[Effect]] = {
 
 # Effect that estimates the mass if it is not declared.
 UNKNOWN_MASS: type[Effect] = MassError
-# Effect by which motions may differ a little from still shapes without being a finding.
-STIFFER_IN_MOTION: type[Effect] = DynamicStiffness
+# Effects within which a motion may differ without a finding, and the standard deviation of their
+# parameter: polymers and strands relax by more than a hundredth, and frequencies tell stiffness to
+# a thousandth; which turnings internal damping opposes is not known.
+TOLERATED_IN_MOTION: dict[type[Effect], float] = {DynamicStiffness: 0.01, TurningLoss: 0.5}
+# Effect of the fixtures' clock, for a declared tolerance.
+OF_CLOCKS: type[Effect] = ClockDelay
 # Effect whose parameter moves a clip along the cable, for derivatives by the clip's arc length.
 ALONG_CABLE = ClipSlip
 

@@ -150,6 +150,7 @@ class TurningLoss(Damping):
 
     name = "turning_loss"
     dimensions = (3,)
+    shown = False
     declared = (Parameter("share", scale=0.3, lower=0.0, upper=1.0),)
 
     def of_turning(self, params: Params) -> ca.SX:

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.effects import STIFFER_IN_MOTION
+from dlo_casadi.effects import OF_CLOCKS, TOLERATED_IN_MOTION, Effect, Setup
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend, refit
 from dlo_casadi.estimation.motion_start import (
@@ -36,14 +36,11 @@ from dlo_casadi.model.cable_model import BENDING_STIFFNESS, DAMPING_TIME, CableM
 from dlo_casadi.runtime.work import accounted_as, spend
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 
-# Standard deviation of the stiffness in motion over that of still shapes, as far as no effect is
-# meant: polymers and strands relax by more, and frequencies tell stiffness to a thousandth.
-DYNAMIC_STD = 0.01
 # First guess of an undeclared damping time [s].
 FIRST_DAMPING_TIME = 0.02
 # Ends of the stretches [s] that are fitted one after the other: a wrong damping or stiffness moves
 # a prediction by the more the later it is.
-STRETCHES = (0.5, 1.2, np.inf)
+STRETCHES = (0.3, 0.6, 1.2, np.inf)
 # Shares of the objective below which a step's gain ends a stretch: the last one, and those before.
 # With a thousand residuals the first is a tenth of what one standard deviation costs.
 _CONVERGED, _NEARLY = 1e-4, 2e-2
@@ -83,6 +80,11 @@ class MotionFit:
     std: float
     converged: bool
 
+    @property
+    def until(self) -> float:
+        """Time [s] up to which the motions are compared."""
+        return self.motions[0].recording.until
+
     @cached_property
     def objective(self) -> float:
         """Half the sum of squares of all, priors included."""
@@ -106,20 +108,38 @@ class MotionFit:
         return total / self.std**2 / max(count - own, 1)
 
 
-def moving_model(model: CableModel, damping_time: float | None = None) -> CableModel:
-    """The model with a damping time, and a stiffness in motion that may differ a little."""
+def moving_model(
+    model: CableModel, damping_time: float | None = None, delay: float | None = None
+) -> CableModel:
+    """The model with a damping time, and with what may differ in motion within tolerances.
+
+    `damping_time` [s]: a first guess. `delay` [s]: tolerance of the fixtures' clock.
+    """
     guess = model.cable.damping_time or damping_time or FIRST_DAMPING_TIME
     model = replace(model, cable=replace(model.cable, damping_time=guess))
-    nuisance = STIFFER_IN_MOTION()
-    if any(effect.label == nuisance.label for effect in model.effects):
+    setup = Setup(model.cable, model.start, model.end, model.gravity, moves=True)
+    tolerated = dict(TOLERATED_IN_MOTION) | ({OF_CLOCKS: delay} if delay else {})
+    for kind, std in tolerated.items():
+        model = _tolerating(model, kind.made_for(setup), std) if kind.applies(setup) else model
+    return model
+
+
+def _tolerating(model: CableModel, effect: Effect, std: float) -> CableModel:
+    """The model with an effect whose parameters have a prior, unless it has the effect."""
+    if any(other.label == effect.label for other in model.effects):
         return model
-    (name,) = (f"{nuisance.label}.{q.name}" for q in nuisance.parameters(model.cable))
-    return model.with_effect(nuisance, {name: DYNAMIC_STD})
+    names = (f"{effect.label}.{q.name}" for q in effect.parameters(model.cable))
+    return model.with_effect(effect, dict.fromkeys(names, std))
 
 
 @accounted_as("motions")
 def fit_motions(
-    fit: Fit, measured: Sequence[MeasuredMotion], std: float | None = None
+    fit: Fit,
+    measured: Sequence[MeasuredMotion],
+    std: float | None = None,
+    *,
+    damping_time: float | None = None,
+    until: float = np.inf,
 ) -> MotionFit:
     """Fit still poses and motions together, from a fit of the still poses.
 
@@ -127,23 +147,27 @@ def fit_motions(
     ----------
     std : float, optional [m]
         Noise of a marker's coordinate; by default that of the still poses.
+    damping_time : float, optional [s]
+        A first guess.
+    until : float [s]
+        Time up to which the motions are compared.
 
     Raises
     ------
     EstimationError
         If a motion has no first state near its points, or no step of time is found.
     """
-    model = moving_model(fit.model)
+    tolerances = fit.problem.priors.tolerances
+    model = moving_model(fit.model, damping_time, tolerances.delay)
     fit = refit(fit, model)
     std = std or fit.noise.std
     moving = unknowns_in_motion(fit.problem.unknowns)
-    tolerances = fit.problem.priors.tolerances
     begun = [
         begin(Recording(one, tolerances, LONGEST_STEP), fit, moving, std)
         for one in measured
         if not one.held_out
     ]
-    return joined(fit, begun, std)
+    return joined(fit, begun, std, until)
 
 
 def rejoined(now: MotionFit, model: CableModel, values: Mapping[str, float]) -> MotionFit:
@@ -155,7 +179,7 @@ def rejoined(now: MotionFit, model: CableModel, values: Mapping[str, float]) -> 
         If still poses or motions are lost there.
     """
     extended = with_model(now, model, values)
-    return joined(extended.fit, extended.motions, now.std)
+    return joined(extended.fit, extended.motions, now.std, now.until)
 
 
 def with_model(now: MotionFit, model: CableModel, values: Mapping[str, float]) -> MotionFit:
@@ -173,22 +197,30 @@ def with_model(now: MotionFit, model: CableModel, values: Mapping[str, float]) -
     if point is None:
         raise EstimationError("a still pose is lost with another effect")
     extended = MotionFit(Fit(still, point), still, now.motions, now.std, converged=False)
-    return _stretched(extended, unknowns_in_motion(still.unknowns), np.inf)
+    return _stretched(extended, unknowns_in_motion(still.unknowns), now.until)
 
 
-def joined(fit: Fit, motions: Sequence[FittedMotion], std: float) -> MotionFit:
-    """The minimum of still poses and motions, from a fit and from recordings begun there."""
+def joined(
+    fit: Fit, motions: Sequence[FittedMotion], std: float, until: float = np.inf
+) -> MotionFit:
+    """The minimum of still poses and motions, from a fit and from recordings begun there.
+
+    The motions are compared up to a time [s] that grows in STRETCHES from that of the recordings.
+    """
     still = replace(fit.problem, priors=replace(fit.problem.priors, told=()))
     unknowns = unknowns_in_motion(still.unknowns)
     now = MotionFit(fit, still, tuple(motions), std, converged=False)
     longest = max(item.recording.measured.t[-1] for item in motions)
-    done = max(item.recording.times[-1] for item in motions)
-    for end in STRETCHES:
-        if end > done and (end == np.inf or end < longest):
-            now = _descended(_stretched(now, unknowns, end), unknowns, last=end == np.inf)
-    if done >= longest:
-        now = _descended(now, unknowns, last=True)
+    later = [x for x in STRETCHES if now.until < x <= until and (x < longest or x == until)]
+    for end in later or [now.until]:
+        now = now if end == now.until else _stretched(now, unknowns, end)
+        now = _descended(now, unknowns, last=end == (later or [now.until])[-1])
     return _told_to(now, unknowns)
+
+
+def stretched(now: MotionFit, end: float) -> MotionFit:
+    """The same unknowns compared up to another time [s]; EstimationError if a motion is lost."""
+    return _stretched(now, unknowns_in_motion(now.fit.problem.unknowns), end)
 
 
 def _stretched(now: MotionFit, unknowns: Unknowns, end: float) -> MotionFit:
@@ -327,19 +359,24 @@ def _stepped(now: MotionFit, unknowns: Unknowns, damping: float) -> MotionFit | 
 
 
 def _told_to(now: MotionFit, unknowns: Unknowns) -> MotionFit:
-    """The fit with what the motions tell, weighed by how their residuals vary together in time."""
+    """The fit with what the motions tell, weighed by how their residuals vary together in time.
+
+    The minimum stays that of the whole objective: rows and values of `Priors.told` balance the
+    gradient of the still poses there.
+    """
     told = [_Told.of(item, unknowns, now.std) for item in now.motions]
     _, _, varied = told_by(now)
-    theta = now.fit.point.theta
-    rows = _rows(told, theta, 0.0, varied, _repeated(unknowns, theta))
-    priors = replace(now.still.priors, told=rows)
-    problem = replace(now.fit.problem, priors=priors)
-    fit = descend(Fit(problem, problem.evaluate(now.fit.point)))
-    step = fit.point.theta - theta
-    moved = []
-    for item, one in zip(now.motions, told, strict=True):
-        moved.append(tried(item, unknowns, fit.point.theta, item.own + one.own_step(step)) or item)
-    return replace(now, fit=fit, motions=tuple(moved))
+    theta, point = now.fit.point.theta, now.fit.point
+    loose = _rows(told, theta, 0.0, varied, _repeated(unknowns, theta))
+    rows = np.array([row for row, _ in loose])
+    still = Fit(now.still, now.still.evaluate(point)).normal.gradient
+    pulled = np.linalg.lstsq(rows.T, -still, rcond=None)[0]
+    balanced = tuple(
+        (row, float(row @ theta - pull)) for row, pull in zip(rows, pulled, strict=True)
+    )
+    problem = replace(now.fit.problem, priors=replace(now.still.priors, told=balanced))
+    fit = Fit(problem, problem.evaluate(point), converged=now.fit.converged)
+    return replace(now, fit=fit)
 
 
 def _varied(item: FittedMotion, told: _Told, std: float) -> FloatArray:

@@ -436,6 +436,7 @@ class Tolerances:
     clip: float = 2e-4
     slip: float = 5e-4
     obstacle: float = 5e-4
+    delay: float | None = None
 
     def deviation(self, model: CableModel) -> FloatArray:
         """Standard deviations of a model's `deviation_names`; infinite for unknown forces."""

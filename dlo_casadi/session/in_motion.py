@@ -11,6 +11,7 @@ from dlo_casadi.arrays import Brief, FloatArray
 from dlo_casadi.diagnosis.in_motion import InMotion, search_in_motion
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted
+from dlo_casadi.estimation.motion_start import FIRST_STRETCHES
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.session.found_effects import FoundEffect, effect_parameters
@@ -95,8 +96,11 @@ def fit_moving(
     step: Callable[[str, int, int], None],
     *,
     diagnosed: bool,
+    damping_time: float | None = None,
 ) -> MovingResult:
     """Fit the motions of a session with its still poses, and search for what the model lacks.
+
+    `damping_time` [s]: a first guess.
 
     Raises
     ------
@@ -104,12 +108,13 @@ def fit_moving(
         If the motions cannot be fitted.
     """
     step("fit the motions", 0, 1)
-    before = fit_motions(fit, motions)
+    until = FIRST_STRETCHES[-1] if diagnosed else np.inf
+    before = fit_motions(fit, motions, damping_time=damping_time, until=until)
     step("fit the motions", 1, 1)
     found = (
         search_in_motion(before, exclude, step) if diagnosed else InMotion(before, before, (), {})
     )
-    fits = [before, found.after] if found.added else [before]
+    fits = [found.before, found.after] if found.added else [found.after]
     return MovingResult(
         found.after.fit,
         tuple(_stage(one, motions) for one in fits),
@@ -142,8 +147,10 @@ def _stage(fit: MotionFit, motions: Sequence[MeasuredMotion]) -> MotionStage:
                 points = predicted(fit, one)
             except EstimationError:
                 points = np.full_like(one.points, np.nan)
+        whole = np.full_like(one.points, np.nan)
+        whole[: len(points)] = points
         role = "held_out" if one.held_out else "fit"
-        shown.append(MotionShown(one.name, role, one.t, one.s, one.points, points))
+        shown.append(MotionShown(one.name, role, one.t, one.s, one.points, whole))
     both = {role: [x.distances for x in shown if x.role == role] for role in ("fit", "held_out")}
 
     def rms(role: str) -> float | None:

@@ -269,7 +269,12 @@ class _Run:
         """
         began, options = time.perf_counter(), self.config.diagnosis
         result = fit_moving(
-            fit, self.motions, options.exclude, self.step, diagnosed=options.enabled
+            fit,
+            self.motions,
+            options.exclude,
+            self.step,
+            diagnosed=options.enabled,
+            damping_time=self.config.cable.damping_time,
         )
         self.seconds["motion"] = time.perf_counter() - began
         effects = (*found.get("effects", ()), *result.effects)
