@@ -185,8 +185,6 @@ class Recording:
         fine = np.array([one for one, _ in finer])
         points, size = fine + (fine - np.array(seen)) / 3, unknowns.size
         mask = np.isfinite(self.measured.points[: len(points), :, 0])
-        if self.measured.s is None:
-            raise EstimationError("lines of a moving cable are not compared yet: markers are")
         residual = (points - self.measured.points[: len(points)])[mask].ravel()
         if not derivatives:
             none = np.zeros((0, 0))

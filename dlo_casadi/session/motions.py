@@ -7,7 +7,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.config import Config, Motion
-from dlo_casadi.errors import MeasurementError, counted
+from dlo_casadi.errors import ConfigError, MeasurementError, counted
 from dlo_casadi.io.motions import (
     FixtureTrack,
     MotionPoints,
@@ -16,6 +16,7 @@ from dlo_casadi.io.motions import (
     read_fixtures,
     read_motion,
 )
+from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.progress import Step, nobody
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 
@@ -29,11 +30,15 @@ def read_motions(config: Config, step: Step = nobody) -> tuple[MeasuredMotion, .
 
     Raises
     ------
+    ConfigError
+        If the session has a part that motion does not know.
     MeasurementError
         If one of them cannot be a recording of the declared cable; the message names the file, the
         line and what to try.
     """
     motions, found = config.experiment.motions, []
+    if motions:
+        _check_known(config)
     for k, motion in enumerate(motions):
         step(f"read {motion.shown_by}", k, len(motions))
         try:
@@ -44,8 +49,27 @@ def read_motions(config: Config, step: Step = nobody) -> tuple[MeasuredMotion, .
     return tuple(found)
 
 
+def _check_known(config: Config) -> None:
+    """Refuse what a moving cable cannot have yet."""
+    experiment, what = config.experiment, ""
+    if experiment.clips:
+        what = "clips"
+    elif experiment.obstacles:
+        what = "obstacles"
+    elif experiment.boundary.end.slides:
+        what = "an end that slides"
+    elif not ELEMENTS[config.model.element].smooth:
+        what = f"elements of the kind {config.model.element}"
+    if what:
+        text = f"experiment.motions: a session with {what} has no motions yet"
+        raise ConfigError(f"{text}.\n  Try: a session of its own for the motions", config.path)
+
+
 def _read(config: Config, motion: Motion) -> MeasuredMotion:
     points, track = _points(config, motion), _track(config, motion)
+    if points.s is None:
+        text = "lines of a moving cable are not compared yet"
+        raise MeasurementError(f"{text}.\n  Try: markers, with their arc lengths as s_m (at)")
     origin = points.t[0]
     points, track = replace(points, t=points.t - origin), replace(track, t=track.t - origin)
     if track.values:

@@ -8,6 +8,7 @@ import pytest
 
 import dlo_casadi as dlo
 from dlo_casadi.config import load_config
+from dlo_casadi.io.motions import read_motion
 from dlo_casadi.session.motions import read_motions
 
 T = np.arange(60) / 50
@@ -71,11 +72,24 @@ def test_markers_by_instant_with_gaps(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion.resting["start_heading"], -1.5708)
 
 
-def test_lines_have_as_many_points_as_are_seen(tmp_path: Path) -> None:
-    (motion,) = read(tmp_path, points=swing()[:, [0, 2, 3]], header="t_s,x_m,y_m")
-    assert motion.s is None
-    assert np.isfinite(motion.points[2, :2]).all()
-    assert np.isnan(motion.points[2, 2]).all()
+def test_lines_are_read_and_refused(tmp_path: Path) -> None:
+    write(tmp_path, "lines.csv", "t_s,x_m,y_m", swing()[:, [0, 2, 3]])
+    found = read_motion(tmp_path / "lines.csv", 2, 0.6)
+    assert found.s is None
+    assert np.isfinite(found.points[2, :2]).all()
+    assert np.isnan(found.points[2, 2]).all()
+    with pytest.raises(dlo.MeasurementError, match="lines of a moving cable are not compared"):
+        read(tmp_path, points=swing()[:, [0, 2, 3]], header="t_s,x_m,y_m")
+
+
+def test_what_does_not_move_yet_is_refused(tmp_path: Path) -> None:
+    read(tmp_path)
+    config = load_config(tmp_path / "session.yaml")
+    table = dlo.Obstacle(kind="plane", point=[0, -0.6], normal=[0, 1])
+    with pytest.raises(dlo.ConfigError, match="a session with obstacles has no motions yet"):
+        read_motions(config.changed(experiment={"obstacles": (table,)}))
+    with pytest.raises(dlo.ConfigError, match="elements of the kind link"):
+        read_motions(config.changed(model={"element": "link"}))
 
 
 def test_fixtures_that_move_and_another_zero_of_time(tmp_path: Path) -> None:
