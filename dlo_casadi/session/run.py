@@ -14,7 +14,7 @@ from dlo_casadi.diagnosis.from_data import from_data
 from dlo_casadi.diagnosis.from_pose_to_pose import at_random, with_loose_poses
 from dlo_casadi.diagnosis.if_hidden import IfHidden
 from dlo_casadi.diagnosis.next_measurement import separating_pose
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, EstimationError
 from dlo_casadi.estimation.constrained import as_measured, profile_intervals, profiled
 from dlo_casadi.estimation.fit import SEARCH_MESH, fine_enough, mesh_error, refine_mesh
 from dlo_casadi.estimation.prediction import noise_distance
@@ -156,7 +156,12 @@ class _Run:
         else:
             fit, found = nearest, {}
         if self.motions:
-            fit, found = self.moved(fit, found, stages, measured, reported)
+            try:
+                fit, found = self.moved(fit, found, stages, measured, reported)
+            except EstimationError as error:
+                # What the still poses tell stands without them.
+                warnings.append(f"recorded motions could not be fitted: {error.message}")
+                found |= {"verdict": "unexplained"} if "verdict" in found else {}
         return judged(
             Outcome(
                 config=config,
