@@ -14,12 +14,12 @@ unknowns along the candidate. The best one is added if its gain exceeds its pric
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
-from dlo_casadi.effects import IN_MOTION
+from dlo_casadi.effects import IN_MOTION, Load
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import EXPLAINED
 from dlo_casadi.estimation.motion_fit import (
@@ -37,7 +37,7 @@ from dlo_casadi.model.cable_model import CableModel
 # by chance in 1e-4 of cases, and by one of seven candidates in less than 1e-3.
 PRICE = 7.5
 # Candidates that are fitted in each round, and the share of the best score that they need.
-REFITTED, NEAR = 2, 0.3
+REFITTED, NEAR = 3, 0.3
 # Information below which a candidate is not seen at all.
 _UNSEEN = 1e-6
 # Most effects that are added.
@@ -129,6 +129,8 @@ def search_in_motion(
         while len(added) < MOST and (end == np.inf or now.chi2_per_dof > EXPLAINED):
             step("search for what motion lacks", len(added), MOST)
             scores = scored(start, in_motion_only(start.fit.model, exclude))
+            if now.chi2_per_dof > EXPLAINED:
+                scores |= heavy(start, exclude)
             first = first or {name: one.value for name, one in scores.items()}
             chosen = _best(start, now, scores)
             if chosen is None:
@@ -155,7 +157,34 @@ def scored(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Score]:
     model = now.fit.model
     for item in listed:
         model = item.add_to(model)
-    extended = with_model(now, model, {})
+    return _scores(with_model(now, model, {}), listed)
+
+
+def heavy(now: MotionFit, exclude: Sequence[str] = ()) -> dict[str, Score]:
+    """Best score over their places of effects that have a mass; a weight swings slower.
+
+    Still shapes know them, too, but a motion may be the first to show them.
+    """
+    found: dict[str, Score] = {}
+    for item in candidates(now.fit.model, setup_of(now.fit.model), exclude):
+        effect = item.effect
+        if not isinstance(effect, Load) or type(effect).masses is Load.masses or item.nuisance:
+            continue
+        for scan in item.scans:
+            try:
+                extended = with_model(now, item.add_to(now.fit.model), scan)
+            except EstimationError:
+                continue
+            for name, one in _scores(extended, [item], item.screened).items():
+                if one.value > (found[name].value if name in found else 0.0):
+                    found[name] = replace(one, values={**scan, **one.values})
+    return found
+
+
+def _scores(
+    extended: MotionFit, listed: Sequence[Candidate], asked: Sequence[str] | None = None
+) -> dict[str, Score]:
+    """Scores of the candidates that a model has; `asked`: of their parameters, all by default."""
     unknowns, theta = extended.fit.problem.unknowns, extended.fit.point.theta
     told, slope, _ = told_by(extended)
     still = extended.fit.normal
@@ -167,7 +196,7 @@ def scored(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Score]:
     lower, upper = unknowns.bounds
     scores: dict[str, Score] = {}
     for item in listed:
-        at = [names.index(name) for name in item.frees]
+        at = [names.index(name) for name in asked or item.frees]
         arm = inverse @ hessian[np.ix_(old, at)]
         own = hessian[np.ix_(at, at)] - hessian[np.ix_(at, old)] @ arm
         slope_of = gradient[at] - arm.T @ gradient[old]
@@ -180,7 +209,7 @@ def scored(now: MotionFit, listed: Sequence[Candidate]) -> dict[str, Score]:
         full = theta.copy()
         full[at] = value
         p = dict(zip(unknowns.model.names, unknowns.p(full), strict=True))
-        values = {name: float(p[name]) for name in item.frees}
+        values = {name: float(p[name]) for name in asked or item.frees}
         scores[item.name] = Score(item, score, values)
     return scores
 
