@@ -379,6 +379,20 @@ def _told_to(now: MotionFit, unknowns: Unknowns) -> MotionFit:
     return replace(now, fit=fit)
 
 
+def repeated_fit(now: MotionFit) -> Fit:
+    """The still poses with what the motions tell of them.
+
+    Parameters of the motions may differ from those of the still poses, see REPEATED: the minimum
+    over both is that of the motions, which are many; this one is between theirs and the poses' own.
+    """
+    unknowns = unknowns_in_motion(now.fit.problem.unknowns)
+    told = [_Told.of(item, unknowns, now.std) for item in now.motions]
+    theta = now.fit.point.theta
+    rows = _rows(told, theta, 0.0, told_by(now)[2], _repeated(unknowns, theta))
+    problem = replace(now.fit.problem, priors=replace(now.still.priors, told=rows))
+    return descend(Fit(problem, problem.evaluate(now.fit.point)))
+
+
 def _varied(item: FittedMotion, told: _Told, std: float) -> FloatArray:
     """Variance (size, size) of the gradient by theta, from the residuals themselves.
 

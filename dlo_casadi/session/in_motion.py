@@ -10,7 +10,7 @@ import numpy as np
 from dlo_casadi.arrays import Brief, FloatArray
 from dlo_casadi.diagnosis.in_motion import InMotion, search_in_motion
 from dlo_casadi.errors import EstimationError
-from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted
+from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted, repeated_fit
 from dlo_casadi.estimation.motion_start import FIRST_STRETCHES
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
@@ -115,15 +115,16 @@ def fit_moving(
         search_in_motion(before, exclude, step) if diagnosed else InMotion(before, before, (), {})
     )
     fits = [found.before, found.after] if found.added else [found.after]
+    both = repeated_fit(found.after)
     return MovingResult(
-        found.after.fit,
+        both,
         tuple(_stage(one, motions) for one in fits),
         tuple(
             FoundEffect(
                 name=item.candidate.name,
                 label=item.candidate.effect.label,
                 of=None,
-                parameters=effect_parameters(found.after.fit, item.candidate.effect),
+                parameters=effect_parameters(both, item.candidate.effect),
                 p_value=None,
                 rmse_cross_validated_before=item.before,
                 rmse_cross_validated_after=item.after,
