@@ -128,7 +128,7 @@ class Recording:
             for row in np.flatnonzero(kind.rotations(model.node))
         ]
 
-    def _ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
+    def ways(self, model: CableModel) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the end's place (d, n_own) and of fixtures' turns (2 b, n_own)."""
         n, d, b = len(self.own_std(model)), model.node.dimension, model.node.increment
         place, turns = np.zeros((d, n)), np.zeros((2 * b, n))
@@ -142,7 +142,7 @@ class Recording:
         """The fixtures at a time of the points' clock, with their deviations."""
         model, delay = cable.model, _delay(cable)
         found = self.path.at(t + delay, cable)
-        place, turns = self._ways(model)
+        place, turns = self.ways(model)
         node, pose = model.node, found.pose.copy()
         d, c, b = node.dimension, node.coordinates, node.increment
         pose[d : 2 * d] += place @ own
@@ -288,11 +288,10 @@ class Recording:
         self, cable: MovingCable, state: State, columns: Columns | None, numbers: _Numbers | None
     ) -> tuple[FloatArray, FloatArray | None]:
         """Points (K, d) of the markers, and their derivatives (K, d, q)."""
-        z, by_place, by_p = cable.segments("seen", state)
+        z, by_place, by_p = cable.handles(state)
         segment, u = self._markers(cable)
         d = cable.d
-        handles = z[segment, :, 0].reshape(-1, 4, d)
-        points = between(handles, u)
+        points = between(z[segment], u)
         if columns is None or numbers is None:
             return points, None
         both = [columns.turn[:-1], columns.turn[1:], columns.place[:-1], columns.place[1:]]
@@ -384,7 +383,7 @@ class _Numbers:
         self.p = np.pad(unknowns.slopes(theta), ((0, 0), (0, own)))
         rest = model.chain.rest_inside(unknowns.rest_slopes)
         self.rest = np.pad(rest, ((0, 0), (0, 0), (0, own)))
-        place, turns = recording._ways(model)
+        place, turns = recording.ways(model)
         q, d = self.p.shape[1], cable.d
         self.turns = np.pad(turns, ((0, 0), (q - own, 0)))
         self.places = np.zeros((2, d, q))

@@ -160,7 +160,7 @@ def displacements(
     places = cable.model.chain.places
     e = np.clip(np.searchsorted(places, s, side="right") - 1, 0, len(places) - 2)
     share = (s - places[e]) / np.diff(places)[e]
-    z, by_unknowns = cable.handles(state)
+    z, by_unknowns, _ = cable.handles(state)
     points, moved = between(z[e], share), []
     for mode in modes.T:
         real, imaginary = (cable.moved_handles(by_unknowns, x) for x in (mode.real, mode.imag))

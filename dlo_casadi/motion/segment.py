@@ -134,8 +134,9 @@ class MovingSegment(DampedSegment):
 
     @cached_property
     def curve(self) -> ca.Function:
-        """(x, r, p, place) -> z (4 dimension,), derivative by both nodes' turns and places."""
-        outputs = [ca.densify(x) for x in (self.handles.z, self.handles.by_place)]
+        """(x, r, p, place) -> z (4 dimension,), derivatives by both nodes' turns, places; by p."""
+        z = self.handles
+        outputs = [ca.densify(x) for x in (z.z, z.by_place, ca.jacobian(z.z, self.p))]
         return ca.Function("curve", [self.x, self.r, self.p, self.place], outputs)
 
     @cached_property
@@ -173,12 +174,6 @@ class MovingSegment(DampedSegment):
         residual, *matrices = self._stiffened(list(self._matrices))
         by = [ca.jacobian(residual, x) for x in (self.p, self.rest)]
         return ca.Function("linear", self.arguments, [ca.densify(x) for x in (*matrices, *by)])
-
-    @cached_property
-    def seen(self) -> ca.Function:
-        """(arguments) -> handles z [m], and their derivatives by turns and places, and by p."""
-        outputs = [self.handles.z, self.handles.by_place, ca.jacobian(self.handles.z, self.p)]
-        return ca.Function("seen", self.arguments, [ca.densify(x) for x in outputs])
 
     @cached_property
     def residual(self) -> ca.Function:

@@ -324,12 +324,12 @@ class MovingCable:
         total = total + np.bincount(self._scatter[1], ends.ravel(), height * self.size + 1)
         return np.asarray(total[:-1].reshape(height, self.size), dtype=float)
 
-    def handles(self, state: State) -> tuple[FloatArray, FloatArray]:
-        """Handles (n_segments, 4, d) [m], derivative (n_segments, 4 d, ...) by turns and places."""
+    def handles(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Handles (n_segments, 4, d) [m], derivatives (n_segments, 4 d, ...) by nodes and by p."""
         x, r, *_ = self.arguments(state)
         p, _, place = self.numbers[:3]
-        z, by_place = self.segment.mapped("curve")(*(row[None] for row in (x, r, p, place)))
-        return z[0].reshape((-1, 4, self.d)), by_place[0]
+        z, *by = self.segment.mapped("curve")(*(row[None] for row in (x, r, p, place)))
+        return z[0].reshape((-1, 4, self.d)), by[0][0], by[1][0]
 
     def moved_handles(self, by_place: FloatArray, solution: FloatArray) -> FloatArray:
         """Change (n_segments, 4, d) of the handles along a solution (N,)."""
