@@ -1,4 +1,4 @@
-"""A fitted cable in motion: its modes in a shape, and its way under moving fixtures."""
+"""A fitted cable in motion: its way under moving fixtures."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate, EstimatedCable
 from dlo_casadi.cable.held import held_pose
 from dlo_casadi.cable.moving_picture import (
-    draw_modes,
     draw_motion,
     frame_times,
     moving_picture,
 )
 from dlo_casadi.cable.saved import parameters_hash
-from dlo_casadi.effects import IN_MOTION, MeasurementEffect
+from dlo_casadi.cable.shape_in_motion import POINTS, ShapeInMotion, moving_cable
+from dlo_casadi.effects import IN_MOTION
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -33,49 +33,14 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.io.files import write_file
 from dlo_casadi.model.cable_model import DAMPING_TIME, CableModel
 from dlo_casadi.motion.equations import motion_equations, unknowns_of
-from dlo_casadi.motion.modes import damped_modes, displacements
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.state import State
+from dlo_casadi.motion.step_function import step_function
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.motion.trajectory import TOLERANCE, Way, way_of
 
-# Number of points along a cable.
-POINTS = 101
 # Distance [lengths] and angle [rad] between a shape and its fixtures from which it is another one.
 _OFF, _ASKEW = 0.01, 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class Modes:
-    """Small motions of a cable about a shape, the slowest first.
-
-    Parameters
-    ----------
-    frequencies : (M,) [Hz]
-        Natural ones w / (2 pi) of s^2 + 2 zeta w s + w^2 = 0 for exp(s t); those that are seen are
-        sqrt(1 - zeta^2) times that. Zero for what does not come back, as the roll between pins.
-    damping_ratios : (M,)
-        zeta; above 1 a mode does not swing.
-    shapes : (M, K, d)
-        Displacements of the points of the shape; the largest is 1.
-    points : (K, d) [m]
-        The shape.
-    """
-
-    frequencies: FloatArray
-    damping_ratios: FloatArray
-    shapes: FloatArray
-    points: FloatArray
-
-    def plot(self) -> Figure:
-        """Draw the modes about the shape."""
-        both = zip(self.frequencies.tolist(), self.damping_ratios.tolist(), strict=True)
-        names = [f"{f:.3g} Hz, damping ratio {zeta:.2g}" for f, zeta in both]
-        return draw_modes(self.points, self.shapes, names, "modes")
-
-    def __repr__(self) -> str:
-        rows = zip(self.frequencies.tolist(), self.damping_ratios.tolist(), strict=True)
-        return "\n".join(f"{f:10.4g} Hz  damping ratio {zeta:.3g}" for f, zeta in rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,32 +116,6 @@ class Motion:
         return [unknowns_of(self.way.cable, state, (first, last)) for state, first, last in both]
 
 
-class ShapeInMotion:
-    """Of a shape what concerns motions about it."""
-
-    cable: EstimatedCable
-    pose: HeldPose
-    equilibrium: Equilibrium
-
-    def modes(self, count: int = 6) -> Modes:
-        """Small motions about the shape, with the fixtures at rest.
-
-        Raises
-        ------
-        DloError
-            If the mesh has fewer modes, or if motion does not know a part of the cable.
-        """
-        if not isinstance(count, int | np.integer) or count < 1:
-            raise DloError(f"modes: a number of modes belongs here, found {count!r}")
-        moving = moving_cable(self.cable).about(self.equilibrium)
-        fixtures = moving.fixtures(self.pose.vector)
-        state = moving.at_rest(self.equilibrium, fixtures)
-        found = damped_modes(moving, state, fixtures, int(count))
-        s = np.linspace(0.0, self.cable.length, POINTS)
-        points, moved = displacements(moving, state, found.vectors, s)
-        return Modes(found.rates / (2 * np.pi), found.damping_ratios, moved, points)
-
-
 class CableInMotion(EstimatedCable):
     """A fitted cable that moves."""
 
@@ -250,6 +189,51 @@ class CableInMotion(EstimatedCable):
         """
         return motion_equations(moving_cable(self))
 
+    def step(self, dt: float, *, about: ShapeInMotion | None = None) -> ca.Function:
+        """One step in time, for `mapaccum`, multiple shooting or a planner of one's own.
+
+        (state, fixtures) -> next, end_force, start_force, places. The method is that of `simulate`:
+        generalised alpha, of second order. Derivatives of any order are exact, by the implicit
+        function theorem. `Shape.at_rest` gives a first state and fixtures. The function is also
+        generated as C (`step.generate`).
+
+        Parameters
+        ----------
+        dt : float [s]
+        about : Shape, optional
+            The shape at rest from which changes count, if the cable is stiffer in motion.
+
+        Returns
+        -------
+        casadi.Function
+            state : (N,), of each node, one after the other, heading [rad] or quaternion
+            (x, y, z, w), place [m], rates of turning about its own axes [rad/s] and velocity [m/s],
+            their derivatives by time, and the method's own ones, which lag behind these.
+            fixtures : (K,), at the end of the step: start, end [m], headings or quaternions of
+            both, velocities of start and end [m/s], accelerations of both [m/s^2]; zeros where
+            nothing is held.
+
+            next : (N,), the state dt later. Where a step has no solution, all outputs are NaN.
+            end_force, start_force : (d,) [N], of the cable on what holds it.
+            places : (d, n_nodes) [m], of the nodes dt later.
+
+        Raises
+        ------
+        DloError
+            If dt is no time, or if motion does not know a part of the cable.
+        """
+        if not (isinstance(dt, int | float) and np.isfinite(dt) and dt > 0):
+            raise DloError(f"dt: a time [s] above zero belongs here, found {dt!r}")
+        moving = moving_cable(self)
+        if about is not None:
+            moving = moving.about(about.equilibrium)
+        elif moving.segment.stiffens:
+            raise DloError(
+                "step: the stiffness in motion acts on changes from a shape at rest.\n"
+                "  Try: cable.step(dt, about=shape)"
+            )
+        return step_function(moving, float(dt))
+
     def simulate(
         self,
         t: ArrayLike,
@@ -309,12 +293,6 @@ class CableInMotion(EstimatedCable):
         state = _begun(self, cable, pose, rest, begins)
         way = way_of(cable, state, path, (times[0], times[-1]), tolerance)
         return Motion(self, times, way)
-
-
-def moving_cable(cable: EstimatedCable) -> MovingCable:
-    """The cable in motion, without effects of the camera."""
-    model, p = cable.model.without_kind(MeasurementEffect, cable.p)
-    return MovingCable(model, p, cable.rest)
 
 
 def _with_rows(

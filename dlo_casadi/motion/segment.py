@@ -95,13 +95,18 @@ class MovingSegment(DampedSegment):
         own = [self.x, self.r, self.w, self.v, self.alpha, self.a, self.force]
         return [*own, self.p, self.rest, self.place, self.deviation, self.on, self.still]
 
+    @property
+    def stiffens(self) -> bool:
+        """Whether the stiffness acts on changes from a shape at rest."""
+        return not self._dynamic.is_constant()
+
     def _stiffened(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Expressions with the stiffness against changes from the shape at rest.
 
         M_rest + F B (k - k_rest) = F B (k - k_rest + (k_rest - k_0) / F) for the factor F.
         """
         factor = self._dynamic
-        if factor.is_constant():
+        if not self.stiffens:
             return expressions
         count, rest, p = len(self.node.strains), ca.SX(self.rest), ca.SX(self.p)
         mean, linear = self.still[:count], self.still[count:]

@@ -229,7 +229,7 @@ def started(
     """
     soon = replace(now, places=now.places + _INSTANT * now.velocities)
     first = Stepper(cable, FIRST)
-    after = first.step(_without_acceleration(state), soon, _INSTANT)
+    after = first.step(still(state), soon, _INSTANT)
     if after is None:
         return None
     turned, moved = after.state.w - state.w, after.state.v - state.v
@@ -241,7 +241,7 @@ def started(
 
 def first_step(cable: MovingCable, state: State, later: Fixtures, dt: float) -> Moving | None:
     """A step with constant accelerations, which need no earlier ones."""
-    return Stepper(cable, FIRST).step(_without_acceleration(state), later, dt)
+    return Stepper(cable, FIRST).step(still(state), later, dt)
 
 
 def begun_by(state: State, after: Moving) -> Moving:
@@ -260,6 +260,7 @@ def turned_back(x: FloatArray, turns: FloatArray) -> FloatArray:
     return np.asarray(matrices.transpose(0, 2, 1) @ turns)
 
 
-def _without_acceleration(state: State) -> Moving:
+def still(state: State) -> Moving:
+    """A state with no accelerations."""
     none = np.zeros_like(state.w), np.zeros_like(state.v)
     return Moving(replace(state, alpha=none[0], a=none[1]), np.hstack(none))

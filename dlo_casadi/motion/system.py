@@ -112,10 +112,7 @@ class MovingCable:
 
     @cached_property
     def places(self) -> tuple[IntArray, IntArray, IntArray, int]:
-        """Unknowns of nodes (n_nodes, b + d), forces (n_segments, ...), moments; their number.
-
-        Minus one for what is no unknown.
-        """
+        """Unknowns of nodes, forces, moments; their number. -1 for what is no unknown."""
         b, d, count = self.b, self.d, 0
         start, end = self._condition_rows
         nodes = np.full((self.n_nodes, b + d), -1)
@@ -152,7 +149,7 @@ class MovingCable:
         return self.places[3]
 
     @cached_property
-    def _index(self) -> tuple[IntArray, IntArray]:
+    def index(self) -> tuple[IntArray, IntArray]:
         """Unknowns of each segment (n_segments, L), of the ends (2 b + moments,); -1 for none."""
         nodes, forces, moments, _ = self.places
         b = self.b
@@ -164,7 +161,7 @@ class MovingCable:
     def width(self) -> int:
         """Half width of the band."""
         widest = 0
-        of_segment, at_ends = self._index
+        of_segment, at_ends = self.index
         start = len(self._condition_rows[0])
         b = self.b
         sides = (
@@ -180,7 +177,7 @@ class MovingCable:
     def _scatter(self) -> tuple[IntArray, IntArray]:
         """Flat places in the band of the matrices of segments and ends; the last one for none."""
         own = []
-        for index in (self._index[0], self._index[1][None]):
+        for index in (self.index[0], self.index[1][None]):
             rows, columns = index[:, :, None], index[:, None, :]
             inside = (rows >= 0) & (columns >= 0) & (np.abs(rows - columns) <= self.width)
             flat = (2 * self.width + rows - columns) * self.size + columns
@@ -232,7 +229,7 @@ class MovingCable:
 
     @cached_property
     def _springs_at(self) -> ca.Function:
-        """(p, place) -> energy [J] of all springs at that place."""
+        """(p, place) -> energy [J] of all springs there."""
         place, springs = ca.SX.sym("place", self.d), self.segment.terms.springs
         energy = sum((spring.energy(place) for spring in springs), start=ca.SX(0))
         return ca.Function("springs_at", [self.segment.p, place], [energy])
@@ -245,7 +242,7 @@ class MovingCable:
         return float(rates @ np.array(self.rubs(rates, self.p)[0]).ravel())
 
     def ends(self, state: State, fixtures: Fixtures) -> list[FloatArray]:
-        """Gradient, Hessian and damping of the ends, by the unknowns of `_index`."""
+        """Gradient, Hessian and damping of the ends, by the unknowns of `index`."""
         b, kept = self.b, self.end_rows
         _, gradient, hessian = self.at_ends("at_ends", state, fixtures)
         damping = np.zeros((len(kept), len(kept)))
@@ -296,7 +293,7 @@ class MovingCable:
 
     def gathered(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
         """Rows (N,) summed over the segments (n_segments, L) and the ends."""
-        index = np.concatenate([self._index[0].ravel(), self._index[1]])
+        index = np.concatenate([self.index[0].ravel(), self.index[1]])
         values = np.concatenate([segments.ravel(), ends])
         total = np.bincount(index % (self.size + 1), values, self.size + 1)
         return np.asarray(total[: self.size], dtype=float)
@@ -304,11 +301,12 @@ class MovingCable:
     def gathered_columns(self, segments: FloatArray, ends: FloatArray) -> FloatArray:
         """The same (N, q) of columns (n_segments, L, q) and (L, q)."""
         rows = np.concatenate([segments.reshape(-1, segments.shape[-1]), ends])
-        return np.asarray(self._gathering @ rows)
+        return np.asarray(self.gathering @ rows)
 
     @cached_property
-    def _gathering(self) -> csr_array:
-        index = np.concatenate([self._index[0].ravel(), self._index[1]])
+    def gathering(self) -> csr_array:
+        """The sum as a matrix."""
+        index = np.concatenate([self.index[0].ravel(), self.index[1]])
         known = np.flatnonzero(index >= 0)
         return csr_array((0 * known + 1.0, (index[known], known)), (self.size, len(index)))
 
