@@ -54,7 +54,11 @@ def step_function(cable: MovingCable, dt: float) -> ca.Function:
     step, d = _Step(cable, dt), cable.d
     # The rest is below all errors in time; the residual itself has no common unit.
     ended = {"abstol": 0.0, "abstolStep": _LAST, "max_iter": NEWTON_STEPS}
-    options = {"jacobian_function": step.by_unknowns, "error_on_fail": False, **ended}
+    options: dict[str, Any] = {
+        "jacobian_function": step.by_unknowns,
+        "error_on_fail": False,
+        **ended,
+    }
     solver = ca.rootfinder("solver", "fast_newton", step.balance, options)
     state, fixtures = (ca.MX.sym(name, size) for name, size in step.given.items())
     given = ca.vertcat(state, fixtures)
