@@ -28,7 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "motion": MECHANICS,
     "config": MECHANICS,
     "io": {*MECHANICS, "config"},
-    "codegen": {*MECHANICS, "config", "io"},
+    "codegen": {*MECHANICS, "motion", "config", "io"},
     "export": {*MECHANICS, "io"},
     "cable": {*MECHANICS, "motion", "config", "io", "codegen", "show", "export", "runtime"},
     "vision": set(),

@@ -288,7 +288,9 @@ class EstimatedCable(CasadiCable):
         """
         return write_parameters(self.metadata.document, self.model, path)
 
-    def compile(self, *, flags: Sequence[str] = ("-O2",), obstacles: int = 0) -> CompiledSolver:
+    def compile(
+        self, *, flags: Sequence[str] = ("-O2",), obstacles: int = 0, motion: bool = False
+    ) -> CompiledSolver:
         """The cable as C, compiled and loaded: thousands of shapes a second.
 
         Parameters
@@ -297,13 +299,17 @@ class EstimatedCable(CasadiCable):
             For the compiler.
         obstacles : int
             Maximum number of obstacles on which the cable may lie, see `CompiledSolver`.
+        motion : bool
+            Whether it also steps the cable in time, see `CompiledStepper`.
 
         Raises
         ------
         DloError
-            If there is no C compiler, or if it rejects the flags.
+            If there is no C compiler, if it rejects the flags, or if motion does not know a part of
+            the cable.
         """
-        return CompiledSolver(self.model, self.p, self.rest, flags=flags, obstacles=obstacles)
+        chosen: dict[str, Any] = {"flags": flags, "obstacles": obstacles, "motion": motion}
+        return CompiledSolver(self.model, self.p, self.rest, **chosen)
 
 
 # Rounding error allowed in arc lengths beyond the ends, relative to the length.

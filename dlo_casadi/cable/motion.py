@@ -289,7 +289,7 @@ class CableInMotion(EstimatedCable):
         path = FixturePath.of(pose, times, moving)
         cable = moving_cable(self)
         rest = solve_equilibrium(cable.model, cable.p, cable.rest, pose)
-        cable = cable.about(rest)
+        cable = cable.about(rest.x)
         state = _begun(self, cable, pose, rest, begins)
         way = way_of(cable, state, path, (times[0], times[-1]), tolerance)
         return Motion(self, times, way)

@@ -73,7 +73,7 @@ class ShapeInMotion:
         """
         if not isinstance(count, int | np.integer) or count < 1:
             raise DloError(f"modes: a number of modes belongs here, found {count!r}")
-        moving = moving_cable(self.cable).about(self.equilibrium)
+        moving = moving_cable(self.cable).about(self.equilibrium.x)
         fixtures = moving.fixtures(self.pose.vector)
         state = moving.at_rest(self.equilibrium, fixtures)
         found = damped_modes(moving, state, fixtures, int(count))

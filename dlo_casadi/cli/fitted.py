@@ -360,6 +360,7 @@ def _poses(cable: FittedCable, chosen: argparse.Namespace) -> Grid | PoseList:
         metavar="N",
         help="maximum number of obstacles; they are given with each pose",
     ),
+    option("--motion", action="store_true", help="also step the cable in time (dlo_advance)"),
     *MESH,
     json="print files and hash as JSON",
 )
@@ -372,10 +373,12 @@ def generate_solver(chosen: argparse.Namespace) -> None:
     dlo generate-solver results/cable --output solver --prefix rope --elements 40
     dlo generate-solver results/loom --output solver --clips pinned pinned
     dlo generate-solver results/cable --output solver --obstacles 3
+    dlo generate-solver results/rope --output solver --motion
     """
     cable = load(chosen.parameters).with_mesh(chosen.elements, chosen.element)
     cable = cable.with_clips(chosen.clips)
-    solver = generate(cable.model, cable.p, cable.rest, chosen.prefix, obstacles=chosen.obstacles)
+    asked = {"obstacles": chosen.obstacles, "motion": chosen.motion}
+    solver = generate(cable.model, cable.p, cable.rest, chosen.prefix, **asked)
     written = solver.write(chosen.output)
     page = Page(chosen)
     page.data({"files": [str(path) for path in written], "solver_hash": solver.hash})

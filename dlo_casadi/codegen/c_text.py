@@ -14,6 +14,12 @@ _HELPERS = {
     "square": "static double square(double a) { return a * a; }\n",
     "sign_of": "static double sign_of(double a) { return a > 0.0 ? 1.0 : (a < 0.0 ? -1.0 : a); }\n",
 }
+# Doubles as conditions, of which clang warns.
+_CONDITIONS = (
+    (re.compile(r"\((a\d+)(\|\||&&)(a\d+)\)"), r"(\1!=0\2\3!=0)"),
+    (re.compile(r"\((a\d+)\?"), r"(\1!=0?"),
+    (re.compile(r"\(!(a\d+)\)"), r"(\1==0)"),
+)
 _BODY = re.compile(r"^static int casadi_f0\(.*?\{\n(.*?)^\}", re.MULTILINE | re.DOTALL)
 _INPUT = re.compile(r"arg\[(\d+)\]\? arg\[\1\]\[(\d+)\] : 0")
 _OUTPUT = re.compile(r"if \(res\[0\]!=0\) res\[0\]\[(\d+)\]=(.*?);")
@@ -53,6 +59,8 @@ def statements(function: ca.Function, inputs: Sequence[str], targets: Sequence[s
     text = _INPUT.sub(lambda match: f"{inputs[int(match[1])]}[{match[2]}]", found[1])
     text = _OUTPUT.sub(lambda match: f"{targets[int(match[1])]} {match[2]};", text)
     text = text.replace("  return 0;\n", "")
+    for pattern, written in _CONDITIONS:
+        text = pattern.sub(written, text)
     text = re.sub(
         r"casadi_\w+", lambda match: _CALLS.get(match[0], match[0][len("casadi_") :]), text
     )

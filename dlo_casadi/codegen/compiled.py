@@ -31,9 +31,11 @@ from dlo_casadi.codegen.shapes import (
     surfaces_of,
 )
 from dlo_casadi.codegen.statuses import STATUSES, no_equilibrium
+from dlo_casadi.codegen.stepper import CompiledStepper
 from dlo_casadi.equilibrium.pose import Branch
 from dlo_casadi.errors import DloError, EquilibriumError, counted
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.rod.obstacles import Obstacle, Plane
 
 # Poses, or rows of numbers in the layout of dlo_pose in the C header.
@@ -74,11 +76,13 @@ class CompiledSolver:
         For the compiler.
     obstacles : int
         Maximum number of obstacles that the cable may touch; at least those of the model.
+    motion : bool
+        Whether the solver also steps the cable in time: `motion` is then a `CompiledStepper`.
 
     Raises
     ------
     DloError
-        If there is no C compiler.
+        If there is no C compiler, or if motion does not know a part of the cable.
 
     Examples
     --------
@@ -94,10 +98,12 @@ class CompiledSolver:
         *,
         flags: Sequence[str] = ("-O2",),
         obstacles: int = 0,
+        motion: bool = False,
     ) -> None:
         self.model = model
-        self._remade = partial(CompiledSolver, flags=flags, obstacles=obstacles), (model, p, rest)
-        self.source = generate(model, p, rest, obstacles=obstacles)
+        chosen = {"obstacles": obstacles, "motion": motion}
+        self._remade = partial(CompiledSolver, flags=flags, **chosen), (model, p, rest)
+        self.source = generate(model, p, rest, obstacles=obstacles, motion=motion)
         self.most_obstacles = self.source.obstacles.most
         self.obstacles = self.source.obstacles.declared
         folder = Path(tempfile.mkdtemp(prefix="dlo_solver_"))
@@ -109,6 +115,8 @@ class CompiledSolver:
             getattr(self._c, name).argtypes = [_TYPES[kind] for kind in kinds]
         self._records = records_of(model, self.most_obstacles)
         self.workspace = workspace_of(self._c)
+        moving = MovingCable(model, p, rest) if motion else None
+        self.motion = None if moving is None else CompiledStepper(moving, self._c)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return self._remade

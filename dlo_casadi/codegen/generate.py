@@ -10,7 +10,7 @@ import numpy as np
 
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.c_text import c_number, table_to_c
+from dlo_casadi.codegen.c_text import c_number, helpers_of, table_to_c
 from dlo_casadi.codegen.cases import (
     ITERATIONS,
     TRY_STEPS,
@@ -20,6 +20,7 @@ from dlo_casadi.codegen.cases import (
     template,
 )
 from dlo_casadi.codegen.kernels import kernel_texts, size_of_code
+from dlo_casadi.codegen.moving import MovingCase
 from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
@@ -245,6 +246,7 @@ def generate(
     *,
     inline: bool = True,
     obstacles: int = 0,
+    motion: bool = False,
 ) -> Solver:
     """Generate the C solver of a model.
 
@@ -264,6 +266,8 @@ def generate(
     obstacles : int
         Maximum number of obstacles that the cable may touch, given with each call; at least those
         of the model.
+    motion : bool
+        Whether the solver also steps the cable in time.
 
     Raises
     ------
@@ -294,13 +298,24 @@ def generate(
             f"{counted(len(bare.clips), 'clip')} on {counted(bare.n, 'element')}: a clip needs a "
             "node\n  Try: a finer mesh, --n"
         )
+    if motion and among.most:
+        raise DloError(
+            "no solver for motion among obstacles: contact in motion is not known\n"
+            "  Try: without obstacles, or a solver of its own for motion"
+        )
+    moving = MovingCase(bare, p, rest, inline).values if motion else {}
+    numbers = _values(case, prefix, digest) | moving
+    helpers = helpers_of(str(moving.get("MOTION_KERNELS", "")))
+    missing = [text for text in helpers if text not in str(numbers["KERNELS"])]
+    numbers["KERNELS"] = "\n".join([*missing, str(numbers["KERNELS"])])
     values = {
         mark: value if isinstance(value, str) else str(int(value))
-        for mark, value in _values(case, prefix, digest).items()
+        for mark, value in numbers.items()
     }
     node, guessed = f"node_{case.name}", f"guesses_{case.name}"
     first = ("common", "contact", "newton", node, "columns", "descent", "between", "landing")
     then = ("guesses", guessed, "pose", "find", "shape", "clearance", "limits", "interface")
+    timed = ("motion", "motion_slopes") if motion else ()
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),
@@ -308,10 +323,11 @@ def generate(
         f"{prefix}_solver.pc.in": template("solver.pc.in"),
         "example.c": template("example.c.in"),
         f"{prefix}_solver.c": "".join(
-            template(f"{name}.c.in") for name in (*first, *then, "casadi")
+            template(f"{name}.c.in") for name in (*first, *then, *timed, "casadi")
         ),
     }
-    found = {name: marked(text, case.words) for name, text in found.items()}
+    words = case.words | {"MOTION": marked(template("motion.h.in"), case.words) if motion else ""}
+    found = {name: marked(text, words) for name, text in found.items()}
     names = set(re.findall(r"(?<!@)\b\w+\b(?!@)", "".join(found.values())))
     for name in sorted(names):
         renamed = fill(name, {}, prefix)

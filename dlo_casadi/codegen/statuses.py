@@ -61,6 +61,12 @@ _STATUSES = (
         "a fixture is inside of an obstacle",
         advice="the obstacles' places: a fixture is inside of one.",
     ),
+    Status(
+        "no_step",
+        "no step in time was found",
+        "the ends are torn apart, or the step is too long",
+        "a shorter step, or fixtures within the cable's reach that do not jump.",
+    ),
 )
 # Words by the values of dlo_status.
 STATUSES = tuple(status.word for status in _STATUSES)

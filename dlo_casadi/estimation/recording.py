@@ -19,7 +19,7 @@ from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import CableModel, Tolerances
 from dlo_casadi.motion import sensitivities
-from dlo_casadi.motion.beginning import Basis, begun, columns_of, strains_of
+from dlo_casadi.motion.beginning import Basis, begun, columns_of
 from dlo_casadi.motion.handles import between
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.sensitivities import Columns, Numbers, Tangent
@@ -175,7 +175,7 @@ class Recording:
         cable = MovingCable(model, p, rest)
         if _depends_on_rest(model):
             at_rest = rest_state(cable, self.fixtures(cable, 0.0, own), None)
-            cable = MovingCable(model, p, rest, strains_of(cable, at_rest))
+            cable = cable.about(at_rest.x)
         numbers = _Numbers(self, cable, unknowns, theta) if derivatives else None
         first = self._first(cable, own, near)
         rows = self._observed(cable, own, first, numbers)

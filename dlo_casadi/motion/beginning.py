@@ -169,20 +169,6 @@ def _change_of_product(
     return cable.gathered_columns(total, np.zeros((len(cable.end_rows), q)))
 
 
-def strains_of(cable: MovingCable, state: State) -> FloatArray:
-    """Mean strains of the segments, and their linear variation (n_segments, 2 strains) [1/m].
-
-    See `MovingSegment.still`. The variation is that between the neighbours' means.
-    """
-    between = np.asarray(cable.model.node.difference(state.x[:-1], state.x[1:]))
-    if between.shape[1] > 1:  # from increments of the Cayley map to rotation vectors
-        size = np.linalg.norm(between, axis=1, keepdims=True)
-        between = between * np.where(size > 1e-8, 2 * np.arctan(size / 2) / (size + 1e-300), 1.0)
-    stretch = float(cable.segment.stretch(cable.p))
-    mean = between / (cable.model.chain.layout.segments[:, 1:2] * stretch)
-    return np.hstack([mean, np.gradient(mean, axis=0)])
-
-
 def near_shape(
     cable: MovingCable,
     fixtures: Fixtures,

@@ -25,6 +25,7 @@ from functools import cached_property, lru_cache
 import casadi as ca
 
 from dlo_casadi.effects import Damping
+from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.stacked import Mapped
@@ -100,7 +101,7 @@ class MovingSegment(DampedSegment):
         """Whether the stiffness acts on changes from a shape at rest."""
         return not self._dynamic.is_constant()
 
-    def _stiffened(self, expressions: list[ca.SX]) -> list[ca.SX]:
+    def stiffened(self, expressions: list[ca.SX]) -> list[ca.SX]:
         """Expressions with the stiffness against changes from the shape at rest.
 
         M_rest + F B (k - k_rest) = F B (k - k_rest + (k_rest - k_0) / F) for the factor F.
@@ -145,7 +146,7 @@ class MovingSegment(DampedSegment):
         return ca.Function("curve", [self.x, self.r, self.p, self.place], outputs)
 
     @cached_property
-    def _matrices(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    def matrices(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Residual, K, C and M by turns, places and forces.
 
         K, C and M are its derivatives by positions, velocities and accelerations.
@@ -166,26 +167,31 @@ class MovingSegment(DampedSegment):
         return residual, stiffness, damping, mass
 
     @cached_property
+    def rows(self) -> ca.SX:
+        """The residual alone, in fewer operations."""
+        rows = ca.SX(self._static_rows)
+        rows[: self.moving] += sum(part.value for part in self._moving_rows)
+        return rows
+
+    @cached_property
     def motion(self) -> ca.Function:
-        """(arguments, c (2,)) -> residual, K, and c_1 C + c_2 M, see `_matrices`."""
+        """(arguments, c (2,)) -> residual, K, and c_1 C + c_2 M, see `matrices`."""
         c = ca.SX.sym("c", 2)
-        residual, stiffness, damping, mass = self._matrices
-        outputs = self._stiffened([residual, stiffness, c[0] * damping + c[1] * mass])
+        residual, stiffness, damping, mass = self.matrices
+        outputs = self.stiffened([residual, stiffness, c[0] * damping + c[1] * mass])
         return ca.Function("motion", [*self.arguments, c], [ca.densify(x) for x in outputs])
 
     @cached_property
     def linear(self) -> ca.Function:
         """(arguments) -> K, C, M, and derivatives of the residual by p and by rest strains."""
-        residual, *matrices = self._stiffened(list(self._matrices))
+        residual, *matrices = self.stiffened(list(self.matrices))
         by = [ca.jacobian(residual, x) for x in (self.p, self.rest)]
         return ca.Function("linear", self.arguments, [ca.densify(x) for x in (*matrices, *by)])
 
     @cached_property
     def residual(self) -> ca.Function:
         """(arguments) -> residual, as of `motion`."""
-        rows = ca.SX(self._static_rows)
-        rows[: self.moving] += sum(part.value for part in self._moving_rows)
-        outputs = self._stiffened([rows])
+        outputs = self.stiffened([self.rows])
         return ca.Function("residual", self.arguments, [ca.densify(x) for x in outputs])
 
     @cached_property
@@ -197,7 +203,7 @@ class MovingSegment(DampedSegment):
         value, gradient, _ = self._statics
         rows = sum((part.value for part in parts), start=ca.SX.zeros(self.moving))
         held = rows[size:] + gradient[size : self.moving]
-        outputs = self._stiffened([value, self.kinetic_energy, power, held])
+        outputs = self.stiffened([value, self.kinetic_energy, power, held])
         return ca.Function("quantities", self.arguments, [ca.densify(x) for x in outputs])
 
     @cached_property
@@ -217,3 +223,18 @@ def moving_segment(model: CableModel) -> MovingSegment:
 
 
 _moving_segment = lru_cache(maxsize=MODELS)(MovingSegment)
+
+
+def refuse_still(model: CableModel) -> None:
+    """Raise an error where a model cannot move yet."""
+    what = ""
+    if model.surfaces:
+        what = "obstacles: contact in motion is not known"
+    elif model.end.slides:
+        what = "a sliding end: a cable in motion is not fed"
+    elif not model.chain.kind.smooth:
+        what = f"elements of the kind {model.element!r}: try 'quadratic'"
+    elif model.clips:
+        what = "clips: a cable in motion is held at its ends alone"
+    if what:
+        raise DloError(f"{model.cable.name!r} has {what}")

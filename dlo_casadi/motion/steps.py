@@ -34,9 +34,9 @@ RHO = 0.8
 # a tenth of that at most.
 NEWTON_STEPS, LAST_STEP = 12, 1e-7
 # Ratio of two steps from which a kept matrix is made anew.
-_SLOW = 0.1
+SLOW = 0.1
 # Longest step of Newton's method [rad]: farther, the Cayley map is no guide.
-_LONGEST = 1.0
+LONGEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Stepper:
             size = trial.move(found, length)
             if size < LAST_STEP:
                 return trial.state
-            if size > _SLOW * last:
+            if size > SLOW * last:
                 self._solver = None
             last = size
         self._solver = None
@@ -193,7 +193,7 @@ class _Trial:
         """Add a step of Newton's method; return its size [rad, lengths]."""
         b, (turned, shifted, pulled, twisted) = self._cable.b, self._cable.steps(solution)
         size = max(float(np.abs(turned).max()), float(np.abs(shifted).max()) / length)
-        share = min(1.0, _LONGEST / size) if size else 1.0
+        share = min(1.0, LONGEST / size) if size else 1.0
         turns = _composed(self._moved[:, :b], share * turned)
         self._moved = np.hstack([turns, self._moved[:, b:] + share * shifted])
         self._force = self._force + share * pulled

@@ -17,10 +17,9 @@ from scipy.sparse import csr_array
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.effects import Damping
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.motion.segment import MovingSegment, moving_segment
+from dlo_casadi.motion.segment import MovingSegment, moving_segment, refuse_still
 from dlo_casadi.motion.state import Banded, Fixtures, State
 from dlo_casadi.rod.ends import EndConditions
 
@@ -78,7 +77,7 @@ class MovingCable:
     def __init__(
         self, model: CableModel, p: FloatArray, rest: FloatArray, still: FloatArray | None = None
     ) -> None:
-        _refuse(model)
+        refuse_still(model)
         self.model, self.p, self.rest = model, np.asarray(p, float), np.asarray(rest, float)
         self.segment: MovingSegment = moving_segment(model)
         chain, node = model.chain, model.node
@@ -390,12 +389,19 @@ class MovingCable:
         state = self.still_state(eq.x, force, lam[[*start, *end]])
         return self.with_places(state, fixtures)
 
-    def about(self, eq: Equilibrium) -> MovingCable:
-        """The same cable; a dynamic stiffness acts on changes from an equilibrium."""
-        means = eq.curvature if not self.model.node.twists else np.append(eq.twist, eq.curvature)
-        inside = self.model.chain.rest_inside(means[:, None])[..., 0]
-        still = np.hstack([inside[:, ::3], inside[:, 1::3]])
-        return MovingCable(self.model, self.p, self.rest, still)
+    def about(self, x: FloatArray) -> MovingCable:
+        """The same cable; a dynamic stiffness acts on changes from nodes x (n_nodes, coordinates).
+
+        Variations of the strains at rest are those of parabolas through the neighbours' means.
+        """
+        turns = np.asarray(self.model.node.difference(x[:-1], x[1:]))
+        if turns.shape[1] > 1:  # from increments of the Cayley map to rotation vectors
+            size = np.linalg.norm(turns, axis=1, keepdims=True)
+            turns = turns * np.where(size > 1e-8, 2 * np.arctan(size / 2) / (size + 1e-300), 1.0)
+        stretch = float(self.segment.stretch(self.p))
+        mean = turns / (self.model.chain.layout.segments[:, 1:2] * stretch)
+        between = np.gradient(mean, axis=0, edge_order=2 if len(mean) > 2 else 1)
+        return MovingCable(self.model, self.p, self.rest, np.hstack([mean, between]))
 
     def still_state(self, x: FloatArray, force: FloatArray, moment: FloatArray) -> State:
         """Nodes at rest, all at the origin."""
@@ -431,18 +437,3 @@ class MovingCable:
             force[:, : self.d] += change[..., 0]
             state = replace(state, force=force)
         return state
-
-
-def _refuse(model: CableModel) -> None:
-    """Raise an error where a model cannot move yet."""
-    what = ""
-    if model.surfaces:
-        what = "obstacles: contact in motion is not known"
-    elif model.end.slides:
-        what = "a sliding end: a cable in motion is not fed"
-    elif not model.chain.kind.smooth:
-        what = f"elements of the kind {model.element!r}: try 'quadratic'"
-    elif model.clips:
-        what = "clips: a cable in motion is held at its ends alone"
-    if what:
-        raise DloError(f"{model.cable.name!r} has {what}")
