@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cable": {*MECHANICS, "motion", "config", "io", "codegen", "show", "export", "runtime"},
     "vision": set(),
     "sensing": {*MECHANICS, "vision"},
-    "estimation": {*MECHANICS, "motion", "sensing", "runtime"},
+    "estimation": {*MECHANICS, "motion", "codegen", "sensing", "runtime"},
     "paper": {*MECHANICS, "sensing"},
     "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
 }

@@ -40,6 +40,11 @@ def table_to_c(numbers: Sequence[float]) -> str:
     return ",\n    ".join(rows)
 
 
+def marked(text: str, values: dict[str, str]) -> str:
+    """Replace the @MARKS@ that have a value; CMake's own marks stay."""
+    return re.sub(r"@([A-Z_]+)@", lambda match: values.get(match.group(1), match.group(0)), text)
+
+
 def helpers_of(text: str) -> list[str]:
     """C text of the functions that a text calls beside libm's."""
     return [helper for name, helper in _HELPERS.items() if f"{name}(" in text]

@@ -10,7 +10,7 @@ import numpy as np
 
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.c_text import c_number, helpers_of, table_to_c
+from dlo_casadi.codegen.c_text import c_number, helpers_of, marked, table_to_c
 from dlo_casadi.codegen.cases import (
     ITERATIONS,
     TRY_STEPS,
@@ -224,11 +224,6 @@ def comment(text: str) -> str:
     """
     line = text.encode("unicode_escape").decode()
     return re.sub(r"(?<=/)(?=\*)|(?<=\*)(?=/)|(?<=\?)(?=\?)", " ", line)
-
-
-def marked(text: str, values: dict[str, str]) -> str:
-    """Replace the @MARKS@ that have a value; CMake's own marks stay."""
-    return re.sub(r"@([A-Z_]+)@", lambda match: values.get(match.group(1), match.group(0)), text)
 
 
 def fill(text: str, values: dict[str, str], prefix: str) -> str:

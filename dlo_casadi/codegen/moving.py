@@ -9,12 +9,15 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.codegen.c_text import c_number, statements, table_to_c
+from dlo_casadi.codegen.c_text import c_number, helpers_of, marked, statements, table_to_c
+from dlo_casadi.codegen.cases import template
+from dlo_casadi.codegen.statuses import STATUS_TEXTS
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.motion.segment import MovingSegment, moving_segment
-from dlo_casadi.motion.steps import LAST_STEP, LONGEST, NEWTON_STEPS, RHO, SLOW, Scheme
+from dlo_casadi.motion.steps import LAST_STEP, LONGEST, NEWTON_STEPS, SCHEME, SLOW
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.rod.ends import EndConditions
 
@@ -22,6 +25,7 @@ from dlo_casadi.rod.ends import EndConditions
 _OF_SEGMENT = ("x", "r", "w", "v", "alpha", "a", "force", "still", "row", "table")
 _OF_ENDS = ("x", "w", "moment", "pose", "table")
 _OF_PLACES = ("pose", "table")
+_OF_MATRICES = ("STIFFNESS", "DAMPING", "MASS", "END_STIFFNESS", "END_DAMPING", "END_TURNS")
 # A step of Newton's method in C leaves less than that of Python, where steps share a matrix.
 _LAST = 1e-2 * LAST_STEP
 # Derivatives of a step by fixtures and by the step before alone.
@@ -42,7 +46,8 @@ class MovingCase:
     p : (n_parameters,)
     rest : (n_rests,) [1/m]
     inline : bool
-        Whether parameters are written into the code; otherwise they are in the table.
+        Whether parameters are written into the code; otherwise they are in the table, and
+        derivatives by them and by rest strains are among the functions.
     """
 
     model: CableModel
@@ -102,8 +107,8 @@ class MovingCase:
     def _of_segment(self, *outputs: ca.SX) -> tuple[ca.Function, list[ca.SX]]:
         """A function of `_OF_SEGMENT` -> entries that are not zero, and where they are."""
         of = self.segment
-        found, numbers = self._at_numbers(of.stiffened(list(outputs)))
-        found = [found[0], *map(ca.sparsify, found[1:])]
+        found, numbers = self._at_numbers(list(outputs))
+        found = [one if one.is_dense() else ca.sparsify(one) for one in found]
         arguments = [of.x, of.r, of.w, of.v, of.alpha, of.a, of.force, of.still, *numbers]
         return _stacked(arguments, found), found
 
@@ -128,11 +133,15 @@ class MovingCase:
         _, gradient, hessian = of.at_ends.call(arguments)
         (by,) = of.end_sensitivity.call(arguments)
         turned, rubbing = ca.SX.zeros(len(kept)), ca.SX(len(kept), len(kept))
+        by_p = ca.SX(len(kept), len(self.p))
         if cable.rubs is not None:
-            turned[: 2 * b], rubbing[: 2 * b, : 2 * b], _ = cable.rubs.call([w, p])
+            found = cable.rubs.call([w, p])
+            turned[: 2 * b], rubbing[: 2 * b, : 2 * b], by_p[: 2 * b, :] = found
         by_turns = by[kept, len(self.p) + d : len(self.p) + d + 2 * b]
         rows = gradient[kept] + turned
-        parts = (hessian[kept, kept], rubbing, by_turns)
+        parts = [hessian[kept, kept], rubbing, by_turns]
+        if not self.inline:
+            parts.append(by[kept, : len(self.p)] + by_p)
         found = [ca.densify(rows), *map(ca.sparsify, parts)]
         return _stacked([x, w, moment, pose, table], found), found
 
@@ -141,10 +150,9 @@ class MovingCase:
         """(pose, table) -> true places (2 dimension,) of the fixtures, dead loads (dimension,)."""
         pose, table = self._pose, ca.SX.sym("table", len(self.table))
         p = ca.SX(ca.DM(self.p)) if self.inline else table[: len(self.p)]
-        still = ca.SX.zeros(len(self.model.deviation_names))
-        true, _ = self.segment.terms.true_ends_and_length.call([p, pose, still])
+        (places,) = self.segment.true_places.call([p, pose])
         (load,) = functions_of(self.model).dead_load.call([p])
-        return _stacked([pose, table], [ca.densify(true[: 2 * self.cable.d]), ca.densify(load)])
+        return _stacked([pose, table], [places, ca.densify(load)])
 
     @cached_property
     def _pose(self) -> ca.SX:
@@ -155,49 +163,82 @@ class MovingCase:
     @property
     def values(self) -> dict[str, int | str]:
         """Values that replace the templates' marks."""
-        cable, model, of = self.cable, self.model, self.segment
-        residual, *parts = of.matrices
-        matrices, parts = self._of_segment(ca.densify(residual), *parts)
-        rows, _ = self._of_segment(ca.densify(of.rows))
+        cable, of = self.cable, self.segment
+        residual, *matrices = of.stiffened(list(of.matrices))
+        whole, parts = self._of_segment(ca.densify(residual), *map(ca.sparsify, matrices))
+        (residual,) = of.stiffened([of.rows])
+        rows, _ = self._of_segment(ca.densify(residual))
         ends, of_ends = self._ends
-        functions = (
+        functions = [
             ("segment_rows", rows, _OF_SEGMENT),
-            ("segment_matrices", matrices, _OF_SEGMENT),
+            ("segment_matrices", whole, _OF_SEGMENT),
             ("end_matrices", ends, _OF_ENDS),
             ("true_places", self._places, _OF_PLACES),
-        )
+        ]
+        patterns = dict(zip(_OF_MATRICES, [*parts[1:], *of_ends[1:]], strict=False))
+        by_model = {"NUMBERS_OF_MODEL": 0, "MODEL_ROWS": 1, "MODEL_ENTRIES": 1}
+        if not self.inline:
+            by = ca.jacobian(residual, ca.vertcat(of.p, of.rest))
+            numbers, (by,) = self._of_segment(ca.sparsify(by))
+            functions.append(("segment_by_model", numbers, _OF_SEGMENT))
+            patterns |= {"BY_MODEL": by, "END_BY_MODEL": of_ends[-1]}
+            by_model["NUMBERS_OF_MODEL"] = len(self.p) + of.rest.numel() * cable.n_segments
+            by_model |= {"MODEL_ROWS": cable.n_segments, "MODEL_ENTRIES": max(by.nnz(), 1)}
         texts = [_text(*one) for one in functions]
         nodes, forces, moments, count = cable.places
-        scheme = Scheme.of(RHO)
-        names = ("STIFFNESS", "DAMPING", "MASS", "END_STIFFNESS", "END_DAMPING", "END_TURNS")
-        patterns = [*parts[1:], *of_ends[1:]]
-        return {
+        return by_model | {
             "MOTION_KERNELS": "\n".join(texts),
-            "PATTERNS": "\n".join(map(_pattern, names, patterns)),
-            "MOTION_TABLE": table_to_c(self.table),
-            "ROWS_AT": 0 if self.inline else len(self.p),
+            "PATTERNS": "\n".join(_pattern(*one) for one in patterns.items()),
+            "MOTION_TABLE": table_to_c(self.table if self.inline else []),
+            "PARAMETERS": 0 if self.inline else len(self.p),
             "MOTION_ROW": len(self._varying),
             "UNKNOWNS": count,
             "WIDTH": cable.width,
             "PULLS": forces.shape[1],
             "MOMENTS": len(moments),
-            "ENTRIES": matrices.nnz_out(0),
+            "ENTRIES": whole.nnz_out(0),
             "END_ENTRIES": ends.nnz_out(0),
-            "NUMBERS_OF_MODEL": 0,
-            "BY_MODEL": _BY_FIXTURES,
-            "STRAINS": len(model.node.strains),
+            "BY_MODEL": _BY_FIXTURES
+            if self.inline
+            else marked(template("motion_by_model.c.in"), {"RESTS": str(of.rest.numel())}),
+            "STRAINS": len(self.model.node.strains),
             "NODE_AT": _table(nodes),
             "FORCE_AT": _table(forces),
             "MOMENT_AT": ", ".join(map(str, moments)) or "0",
-            "SLOWEST": c_number(cable.slowest),
+            "SLOWEST": c_number(cable.slowest if self.inline else 1.0),
             "NEWTON_STEPS": NEWTON_STEPS,
             "LAST_STEP": c_number(_LAST),
             "LONGEST": c_number(LONGEST),
             "SLOW": c_number(SLOW),
             "SCHEME": ", ".join(
-                c_number(x) for x in (scheme.alpha_m, scheme.alpha_f, scheme.beta, scheme.gamma)
+                c_number(x) for x in (SCHEME.alpha_m, SCHEME.alpha_f, SCHEME.beta, SCHEME.gamma)
             ),
         }
+
+
+def alone(case: MovingCase) -> str:
+    """C text of the steps of a cable alone, with a table of numbers for each call."""
+    model, node = case.model, case.model.node
+    texts = {
+        "MOTION": template("motion.h.in"),
+        "STEPS": template("motion.c.in") + template("motion_slopes.c.in"),
+    }
+    values = case.values | STATUS_TEXTS
+    values |= {
+        "VERSION": __version__,
+        "DIMENSION": node.dimension,
+        "COORDINATES": node.coordinates,
+        "AXES": node.increment,
+        "N": case.cable.n_segments,
+        "LENGTH": c_number(model.cable.length),
+        "END_FREE": int(not model.end.place),
+        "START_CLAMPED": int(model.start.direction),
+        "END_CLAMPED": int(model.end.direction),
+        "STATES_ARE": "headings [rad], in space unit quaternions",
+        "HELPERS": "\n".join(helpers_of(str(values["MOTION_KERNELS"]))),
+    }
+    text = marked(template("motion_alone.c.in"), texts)
+    return marked(text, {mark: str(value) for mark, value in values.items()})
 
 
 def _stacked(arguments: list[ca.SX], parts: Sequence[ca.SX]) -> ca.Function:

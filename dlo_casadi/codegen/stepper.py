@@ -76,7 +76,7 @@ class CompiledStepper:
         known = {name: one[name].copy() for name in (*_OF_STATE, "force")}
         return Moving(State(**known, moment=one["moment"][:-1].copy()), one["mean"].copy())
 
-    def _numbers_of(self, fixtures: Fixtures) -> FloatArray:
+    def numbers_of(self, fixtures: Fixtures) -> FloatArray:
         """Fixtures as a dlo_fixtures."""
         node = self.cable.model.node
         pose = np.zeros(EndConditions.size(node) + node.twists)
@@ -88,15 +88,15 @@ class CompiledStepper:
 
     def rest(self, fixtures: Fixtures, shape: NDArray[Any]) -> tuple[NDArray[Any], str]:
         """The cable at rest in a dlo_shape, and one of STATUSES; so below."""
-        return self._made("dlo_rest", self._numbers_of(fixtures), shape)
+        return self._made("dlo_rest", self.numbers_of(fixtures), shape)
 
     def start(self, now: NDArray[Any], fixtures: Fixtures, dt: float) -> tuple[NDArray[Any], str]:
         """A motion with its first accelerations and forces, means over a step dt [s]."""
-        return self._made("dlo_start", self._numbers_of(fixtures), dt, now)
+        return self._made("dlo_start", self.numbers_of(fixtures), dt, now)
 
     def advance(self, now: NDArray[Any], fixtures: Fixtures, dt: float) -> tuple[NDArray[Any], str]:
         """The motion dt [s] later, where fixtures are as given."""
-        return self._made("dlo_advance", self._numbers_of(fixtures), dt, now)
+        return self._made("dlo_advance", self.numbers_of(fixtures), dt, now)
 
     def slopes(
         self,
@@ -107,15 +107,16 @@ class CompiledStepper:
         columns: NDArray[Any],
     ) -> tuple[NDArray[Any], str]:
         """Derivatives (q,) of `after` by q numbers: `columns` (q,) of `before`, `given` (q,)."""
-        out, numbers = np.zeros(len(columns), self.slope), self._numbers_of(fixtures)
+        out, numbers = np.zeros(len(columns), self.slope), self.numbers_of(fixtures)
         moved = (numbers, before, after, len(columns), given, columns, out)
-        return out, self._call("dlo_advance_slopes", *moved)
+        return out, self.call("dlo_advance_slopes", *moved)
 
     def _made(self, name: str, *arguments: Any) -> tuple[NDArray[Any], str]:
         out = np.zeros(1, self.record)
-        return out, self._call(name, *arguments, out)
+        return out, self.call(name, *arguments, out)
 
-    def _call(self, name: str, *arguments: Any) -> str:
+    def call(self, name: str, *arguments: Any) -> str:
+        """Call a function of the library with the workspace; one of STATUSES."""
         given = map(_passed, (*arguments, self._work, self._work.size))
         return STATUSES[getattr(self._c, name)(*given)]
 

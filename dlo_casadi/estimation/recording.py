@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
+from dlo_casadi.codegen.fit_steps import CompiledSteps, fastest_steps
 from dlo_casadi.effects import SectionLaw
 from dlo_casadi.effects.clock_delay import CLOCK_DELAY
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -22,9 +23,9 @@ from dlo_casadi.motion import sensitivities
 from dlo_casadi.motion.beginning import Basis, begun, columns_of
 from dlo_casadi.motion.handles import between
 from dlo_casadi.motion.path import FixturePath
-from dlo_casadi.motion.sensitivities import Columns, Numbers, Tangent
+from dlo_casadi.motion.sensitivities import Columns, Numbers, Steps, Tangent
 from dlo_casadi.motion.state import Fixtures, State
-from dlo_casadi.motion.steps import RHO, Moving, Scheme, Stepper, begun_by, first_step
+from dlo_casadi.motion.steps import Moving, begun_by, first_step
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
 
@@ -140,16 +141,7 @@ class Recording:
 
     def fixtures(self, cable: MovingCable, t: float, own: FloatArray) -> Fixtures:
         """The fixtures at a time of the points' clock, with their deviations."""
-        model, delay = cable.model, _delay(cable)
-        found = self.path.at(t + delay, cable)
-        place, turns = self.ways(model)
-        node, pose = model.node, found.pose.copy()
-        d, c, b = node.dimension, node.coordinates, node.increment
-        pose[d : 2 * d] += place @ own
-        for k in (0, 1):
-            at = slice(2 * d + c * k, 2 * d + c * (k + 1))
-            pose[at] = node.moved(pose[at], (turns @ own)[b * k : b * (k + 1)])
-        return cable.fixtures(pose, found.velocities, found.accelerations)
+        return _Held(self, cable, own).at(t)
 
     # ---- evaluation ----------------------------------------------------------------------------
 
@@ -178,19 +170,19 @@ class Recording:
             cable = cable.about(at_rest.x)
         numbers = _Numbers(self, cable, unknowns, theta) if derivatives else None
         first = self._first(cable, own, near)
-        rows = self._observed(cable, own, first, numbers)
-        seen, columns = zip(*rows, strict=True)
+        held, steps = _Held(self, cable, own), fastest_steps(cable)
+        seen, by = self._seen(self._states(steps, held, first, numbers), held, numbers)
         # The error of a step falls with the square of its length: extrapolated to zero.
-        finer = replace(self, dt=self.dt / 2)._observed(cable, own, first, None)
-        fine = np.array([one for one, _ in finer])
-        points, size = fine + (fine - np.array(seen)) / 3, unknowns.size
+        finer = replace(self, dt=self.dt / 2)
+        fine, _ = finer._seen(finer._states(steps, held, first, None), held, None)
+        points, size = fine + (fine - seen) / 3, unknowns.size
         mask = np.isfinite(self.measured.points[: len(points), :, 0])
         residual = (points - self.measured.points[: len(points)])[mask].ravel()
-        if not derivatives:
+        if by is None:
             none = np.zeros((0, 0))
             return Seen(residual, none, none, first, points)
-        by = np.array(columns)[mask].reshape(len(residual), -1)
-        return Seen(residual, by[:, :size], by[:, size:], first, points)
+        rows = by[mask].reshape(len(residual), -1)
+        return Seen(residual, rows[:, :size], rows[:, size:], first, points)
 
     def _first(self, cable: MovingCable, own: FloatArray, near: State | None) -> State:
         fixtures = self.fixtures(cable, 0.0, own)
@@ -201,48 +193,45 @@ class Recording:
         count = self.basis.forces.shape[1]
         return begun(cable, near, fixtures, self.basis, own[-2 * count :])
 
-    def _observed(
-        self, cable: MovingCable, own: FloatArray, first: State, numbers: _Numbers | None
-    ) -> Iterator[tuple[FloatArray, FloatArray | None]]:
-        """Predicted points (K, d) at each time, and their derivatives (K, d, q)."""
+    def _states(
+        self, steps: Steps | CompiledSteps, held: _Held, first: State, numbers: _Numbers | None
+    ) -> Iterator[tuple[State, Columns | None]]:
+        """The state at each time, and its derivatives."""
         times = self.times
-        columns = self._first_columns(cable, own, first, numbers)
-        yield self._points(cable, first, columns, numbers)
+        columns = self._first_columns(held, first, numbers)
+        yield first, columns
         if len(times) == 1:
             return
         dt = min(self.dt, float(times[1] - times[0]))
-        now, columns = self._started(cable, own, first, columns, dt, numbers)
-        before, stepper = dt, Stepper(cable, SCHEME)
+        now, columns = self._started(held, first, columns, dt, numbers)
+        before = dt
         for begin, end in pairwise(times):
             count = int(np.ceil((end - begin) / self.dt - 1e-9))
             dt = (end - begin) / count
             for k in range(count):
                 now, columns = _for_step(now, columns, dt / before)
                 at = begin + (k + 1) * dt
-                now, columns, before = self._stepped(stepper, own, now, columns, at, dt, numbers)
-            yield self._points(cable, now.state, columns, numbers)
+                now, columns, before = self._stepped(steps, held, now, columns, at, dt, numbers)
+            yield now.state, columns
 
-    def _first_columns(
-        self, cable: MovingCable, own: FloatArray, first: State, numbers: _Numbers | None
-    ) -> Columns | None:
+    def _first_columns(self, held: _Held, first: State, numbers: _Numbers | None) -> Columns | None:
         """Derivatives of the first state."""
         if numbers is None:
             return None
-        at_first, given = numbers.at(0.0), self.fixtures(cable, 0.0, own)
+        cable, at_first, given = held.cable, numbers.at(0.0), held.at(0.0)
         if self.basis is None:
             return sensitivities.at_rest(Tangent(cable, first, given), at_first)
         return columns_of(cable, first, given, self.basis, at_first)
 
     def _started(
         self,
-        cable: MovingCable,
-        own: FloatArray,
+        held: _Held,
         first: State,
         columns: Columns | None,
         dt: float,
         numbers: _Numbers | None,
     ) -> tuple[Moving, Columns | None]:
-        fixtures = self.fixtures(cable, dt, own)
+        cable, fixtures = held.cable, held.at(dt)
         tried = first_step(cable, first, fixtures, dt)
         if tried is None:
             raise EstimationError("the first step of a motion was not found")
@@ -254,8 +243,8 @@ class Recording:
 
     def _stepped(
         self,
-        stepper: Stepper,
-        own: FloatArray,
+        steps: Steps | CompiledSteps,
+        held: _Held,
         now: Moving,
         columns: Columns | None,
         at: float,
@@ -263,43 +252,41 @@ class Recording:
         numbers: _Numbers | None,
     ) -> tuple[Moving, Columns | None, float]:
         """One step of time to `at`, halved where Newton's method fails; the last step [s]."""
-        cable = stepper.cable
         for halving in range(_HALVINGS + 1):
             parts, small = 2**halving, dt / 2**halving
             ahead, along = _for_step(now, columns, 1 / parts)
             for k in range(parts):
                 t = at - dt + (k + 1) * small
-                fixtures = self.fixtures(cable, t, own)
-                after = stepper.step(ahead, fixtures, small)
+                fixtures = held.at(t)
+                after = steps.step(ahead, fixtures, small)
                 if after is None:
                     break
                 if numbers is not None and along is not None:
-                    tangent = Tangent(cable, after.state, fixtures)
                     given = numbers.at(t)
-                    along = sensitivities.stepped(
-                        ahead, after, along, tangent, given, small, SCHEME
-                    )
+                    along = steps.derived(ahead, after, along, fixtures, given, small)
                 ahead = after
             else:
                 return ahead, along, small
         raise EstimationError(f"no step of time was found at {at:.3f} s")
 
-    def _points(
-        self, cable: MovingCable, state: State, columns: Columns | None, numbers: _Numbers | None
+    def _seen(
+        self,
+        states: Iterator[tuple[State, Columns | None]],
+        held: _Held,
+        numbers: _Numbers | None,
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Points (K, d) of the markers, and their derivatives (K, d, q)."""
-        z, by_place, by_p = cable.handles(state)
-        segment, u = self._markers(cable)
-        d = cable.d
-        points = between(z[segment], u)
-        if columns is None or numbers is None:
-            return points, None
-        both = [columns.turn[:-1], columns.turn[1:], columns.place[:-1], columns.place[1:]]
-        moved = by_place @ np.concatenate(both, axis=1) + by_p @ numbers.p
-        moved = moved[segment].reshape(len(segment), 4, d, -1)
-        q = moved.shape[-1]
-        found = between(moved.reshape(len(segment), 4, d * q), u)
-        return points, found.reshape(len(segment), d, q)
+        """Points (T, K, d) of the markers, and their derivatives (T, K, d, q)."""
+        cable, (segment, u) = held.cable, self._markers(held.cable)
+        d, found, moved = cable.d, list[FloatArray](), list[FloatArray]()
+        for state, columns in states:
+            z, by_place, by_p = cable.handles(state)
+            found.append(between(z[segment], u))
+            if columns is not None and numbers is not None:
+                both = [columns.turn[:-1], columns.turn[1:], columns.place[:-1], columns.place[1:]]
+                by = by_place @ np.concatenate(both, axis=1) + by_p @ numbers.p
+                by = by[segment].reshape(len(segment), 4, -1)
+                moved.append(between(by, u).reshape(len(segment), d, -1))
+        return np.array(found), np.array(moved) if moved else None
 
     def _markers(self, cable: MovingCable) -> tuple[IntArray, FloatArray]:
         """Segment of each marker, and its share of it."""
@@ -307,9 +294,6 @@ class Recording:
         s = np.asarray(self.measured.s)
         segment = np.clip(np.searchsorted(low, s, side="right") - 1, 0, len(low) - 1)
         return segment, (s - low[segment]) / width[segment]
-
-
-SCHEME = Scheme.of(RHO)
 
 
 def _for_step(now: Moving, columns: Columns | None, factor: float) -> tuple[Moving, Columns | None]:
@@ -370,6 +354,32 @@ def held_pose(model: CableModel, pose: FloatArray) -> HeldPose:
             held[f"{side}_{node.direction}"] = node.declared(frame)
     end_place = tuple(end.tolist()) if model.end.place else None
     return HeldPose(start=tuple(start.tolist()), end=end_place, **held)
+
+
+class _Held:
+    """Where fixtures are, with their deviations."""
+
+    def __init__(self, recording: Recording, cable: MovingCable, own: FloatArray) -> None:
+        self.cable, self._path, self._delay = cable, recording.path, _delay(cable)
+        place, turns = recording.ways(cable.model)
+        self._place, self._turns = place @ own, turns @ own
+        self._resting: Fixtures | None = None
+
+    def at(self, t: float) -> Fixtures:
+        """The fixtures at a time of the points' clock."""
+        if self._resting is not None:
+            return self._resting
+        node, (pose, rates) = self.cable.model.node, self._path.declared(t + self._delay)
+        d, c, b = node.dimension, node.coordinates, node.increment
+        pose = pose.copy()
+        pose[d : 2 * d] += self._place
+        for k in (0, 1):
+            at = slice(2 * d + c * k, 2 * d + c * (k + 1))
+            pose[at] = node.moved(pose[at], self._turns[b * k : b * (k + 1)])
+        found = self.cable.fixtures(pose, *rates)
+        if not self._path.moving:
+            self._resting = found
+        return found
 
 
 class _Numbers:

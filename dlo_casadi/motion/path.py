@@ -67,6 +67,11 @@ class FixturePath:
 
     def at(self, t: float, cable: MovingCable) -> Fixtures:
         """The fixtures at a time [s]; before the first row and after the last they rest."""
+        pose, rates = self.declared(t)
+        return cable.fixtures(pose, *rates)
+
+    def declared(self, t: float) -> tuple[FloatArray, FloatArray]:
+        """The declared pose (n_pose,) at a time; rates of the places, once and twice (2, 2, d)."""
         node, d = self.pose.node, self.pose.node.dimension
         pose, rates = self.pose.vector, np.array([self.rates(t, 1), self.rates(t, 2)])
         frames = dict(zip(("start_frame", "end_frame"), self.pose.frames, strict=True))
@@ -80,4 +85,4 @@ class FixturePath:
                 frames[name] = node.normalised(self.moving[name](t))
             at = 2 * d + k * node.coordinates
             pose[at : at + node.coordinates] = frames[name]
-        return cable.fixtures(pose, *rates)
+        return pose, rates

@@ -31,6 +31,7 @@ from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.stacked import Mapped
 from dlo_casadi.motion.dissipation import DampedSegment
 from dlo_casadi.motion.inertia import Rows
+from dlo_casadi.rod.ends import EndConditions
 
 
 class MovingSegment(DampedSegment):
@@ -137,6 +138,14 @@ class MovingSegment(DampedSegment):
     def stretch(self) -> ca.Function:
         """(p) -> true length without load over the declared one."""
         return ca.Function("stretch", [self.p], [self.terms.stretch])
+
+    @cached_property
+    def true_places(self) -> ca.Function:
+        """(p, ends) -> true places (2 dimension,) of the fixtures at declared ends."""
+        p, ends = self.p, ca.SX.sym("ends", EndConditions.size(self.node))
+        still = ca.SX.zeros(self.deviation.numel())
+        true, _ = self.terms.true_ends_and_length.call([p, ends, still])
+        return ca.Function("true_places", [p, ends], [ca.densify(true[: 2 * self.d])])
 
     @cached_property
     def curve(self) -> ca.Function:

@@ -20,7 +20,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import MODELS, lagrangian_of
 from dlo_casadi.motion.state import Fixtures, State
-from dlo_casadi.motion.steps import FIRST, Moving, Scheme, turned_back, turns_of
+from dlo_casadi.motion.steps import FIRST, SCHEME, Moving, Scheme, Stepper, turned_back, turns_of
 from dlo_casadi.motion.system import Balance, MovingCable
 from dlo_casadi.rod.ends import EndConditions
 
@@ -178,6 +178,30 @@ def stepped(
         rates_1[node, b:] = numbers.velocities[k]
         changed_1[node, b:] = own[node, b:] = numbers.accelerations[k]
     return Columns(turn, place, rates_1, changed_1, own, force, moment)
+
+
+class Steps:
+    """Steps in time of a cable, and derivatives through them."""
+
+    def __init__(self, cable: MovingCable) -> None:
+        self._stepper = Stepper(cable, SCHEME)
+
+    def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
+        """The state dt later; None if there is no step."""
+        return self._stepper.step(before, fixtures, dt)
+
+    def derived(
+        self,
+        before: Moving,
+        after: Moving,
+        columns: Columns,
+        fixtures: Fixtures,
+        numbers: Numbers,
+        dt: float,
+    ) -> Columns:
+        """Derivatives after a step, see `stepped`."""
+        tangent = Tangent(self._stepper.cable, after.state, fixtures)
+        return stepped(before, after, columns, tangent, numbers, dt, SCHEME)
 
 
 def started(

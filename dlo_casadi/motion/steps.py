@@ -35,6 +35,8 @@ RHO = 0.8
 NEWTON_STEPS, LAST_STEP = 12, 1e-7
 # Ratio of two steps from which a kept matrix is made anew.
 SLOW = 0.1
+# Relative difference of two steps of time that share a matrix: of rounded times.
+_SAME = 1e-9
 # Longest step of Newton's method [rad]: farther, the Cayley map is no guide.
 LONGEST = 1.0
 
@@ -67,6 +69,7 @@ class Scheme:
         )
 
 
+SCHEME = Scheme.of(RHO)
 # Backward Euler: velocities and accelerations of a step need no earlier accelerations.
 FIRST = Scheme(0.0, 0.0, 1.0, 1.0)
 # Step [s] in which only a jump changes velocities, and the change [lengths/s, rad/s] that is one.
@@ -111,7 +114,7 @@ class Stepper:
     def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
         """The state dt later, where fixtures are as given; None if Newton's method fails."""
         trial = _Trial(self.cable, self.scheme, before, fixtures, dt)
-        if dt != self._dt:
+        if abs(dt - self._dt) > _SAME * dt:
             self._solver, self._dt = None, dt
         found = self._solved(trial) if self._solver is not None else None
         if found is None:

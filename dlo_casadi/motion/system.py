@@ -364,9 +364,8 @@ class MovingCable:
     ) -> Fixtures:
         """The fixtures in a declared pose (n_pose,), at rest by default."""
         size, d = EndConditions.size(self.model.node), self.d
-        deviation = np.zeros(len(self.model.deviation_names))
-        true, _ = self.segment.terms.true_ends_and_length(self.p, pose[:size], deviation)
-        places = np.array(true).ravel()[: 2 * d].reshape(2, d)
+        given = (self.p[None, None], pose[None, None, :size])
+        places = self.segment.mapped("true_places")(*given)[0].reshape(2, d)
         none = np.zeros((2, d))
         moving = (none if x is None else x for x in (velocities, accelerations))
         return Fixtures(pose, places, *moving)

@@ -1,22 +1,25 @@
 """Derivatives of a motion through its steps are those of differences."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from dlo_casadi.codegen.fit_steps import CompiledSteps, fastest_steps
 from dlo_casadi.effects import AirDrag, CableData, PinFriction, ViscousDrag
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.motion import sensitivities as derivatives
-from dlo_casadi.motion.sensitivities import Columns, Numbers, Tangent
+from dlo_casadi.motion import steps as steps_of_time
+from dlo_casadi.motion.sensitivities import Columns, Numbers, Steps, Tangent
 from dlo_casadi.motion.state import Fixtures
-from dlo_casadi.motion.steps import RHO, Moving, Scheme, Stepper, begun_by, first_step
+from dlo_casadi.motion.steps import Moving, begun_by, first_step
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.rod.supports import SupportKind
 
-DT, STEPS, SCHEME = 0.01, 6, Scheme.of(RHO)
+DT, STEPS = 0.01, 6
 PLANE = CableData(0.6, 0.06, 0.008, 0.009, damping_time=0.02)
 SPACE = replace(PLANE, torsional_stiffness=0.007)
 TURNED = (0.1, 0.2, 0.05, np.sqrt(1 - 0.0525))
@@ -44,10 +47,12 @@ def model_of(cable: CableData, start: str, end: str) -> CableModel:
 
 def moved(at: Fixtures, t: float) -> Fixtures:
     """The start shaken aside by 2 cm, from rest."""
-    w, shape = 9.0, np.zeros_like(at.places)
+    w, shape, pose = 9.0, np.zeros_like(at.places), at.pose.copy()
     shape[0, 0] = 0.02
+    pose[0] += (1 - np.cos(w * t)) * shape[0, 0]
     return replace(
         at,
+        pose=pose,
         places=at.places + (1 - np.cos(w * t)) * shape,
         velocities=w * np.sin(w * t) * shape,
         accelerations=w**2 * np.cos(w * t) * shape,
@@ -55,7 +60,13 @@ def moved(at: Fixtures, t: float) -> Fixtures:
 
 
 def run(
-    model: CableModel, held: HeldPose, p: np.ndarray, rest: np.ndarray, *, columns: bool = False
+    model: CableModel,
+    held: HeldPose,
+    p: np.ndarray,
+    rest: np.ndarray,
+    *,
+    columns: bool = False,
+    steps: type[Steps] = Steps,
 ) -> tuple[Moving, Columns | None]:
     """The state after some steps, and its derivatives by p and the rest coefficients."""
     cable = MovingCable(model, p, rest)
@@ -68,14 +79,13 @@ def run(
         along = derivatives.at_rest(Tangent(cable, state, still), numbers)
         tangent = Tangent(cable, tried.state, moved(still, DT))
         along = derivatives.started(state, tried, along, tangent, numbers, DT)
-    stepper = Stepper(cable, SCHEME)
+    stepper = steps(cable)
     for k in range(1, STEPS + 1):
         fixtures = moved(still, k * DT)
         after = stepper.step(now, fixtures, DT)
         assert after is not None
         if along is not None:
-            tangent = Tangent(cable, after.state, fixtures)
-            along = derivatives.stepped(now, after, along, tangent, numbers, DT, SCHEME)
+            along = stepper.derived(now, after, along, fixtures, numbers, DT)
         now = after
     return now, along
 
@@ -96,15 +106,38 @@ def numbers_of(cable: MovingCable) -> Numbers:
     )
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_steps_are_differentiated(name: str) -> None:
+def problem(name: str) -> tuple[CableModel, HeldPose, np.ndarray]:
+    """A model with its parameters, and where it is held."""
     cable, start, end, fields = CASES[name]
-    model, held = model_of(cable, start, end), HeldPose(**fields)
+    model = model_of(cable, start, end)
     p = np.array(model.nominal)
     for key, value in {"air_drag.coefficient": 1.0, "viscous_drag.rate": 0.02}.items():
         p[model.names.index(key)] = value
     if "pin_friction.moment" in model.names:
         p[model.names.index("pin_friction.moment")] = 1e-3
+    return model, HeldPose(**fields), p
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+@pytest.mark.parametrize("name", CASES)
+def test_compiled_steps_are_those_of_python(name: str, monkeypatch) -> None:
+    monkeypatch.setattr(steps_of_time, "LAST_STEP", 1e-10)
+    model, held, p = problem(name)
+    rest = model.rest_basis @ np.full(model.n_coefficients, 0.5)
+    (state, own), (other, compiled) = (
+        run(model, held, p, rest, columns=True, steps=steps) for steps in (Steps, fastest_steps)
+    )
+    assert isinstance(fastest_steps(MovingCable(model, p, rest)), CompiledSteps)
+    assert np.abs(state.state.r - other.state.r).max() < 1e-8
+    for field in ("turn", "place", "rates", "force"):
+        expected, found = getattr(own, field), getattr(compiled, field)
+        scale = np.abs(expected).max(axis=(0, 1))  # forces change by 1 / dt^2 with places
+        assert (np.abs(found - expected).max(axis=(0, 1)) <= 1e-5 * scale + 1e-9).all(), field
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_steps_are_differentiated(name: str) -> None:
+    model, held, p = problem(name)
     coefficients = np.full(model.n_coefficients, 0.5)
     _, found = run(model, held, p, model.rest_basis @ coefficients, columns=True)
     assert found is not None

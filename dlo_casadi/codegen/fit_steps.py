@@ -1,0 +1,161 @@
+"""Steps in time for fits of motions, compiled once for all values of a model's parameters."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import tempfile
+import weakref
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.codegen.cases import Obstacles
+from dlo_casadi.codegen.compiler import compile_library
+from dlo_casadi.codegen.generate import Solver
+from dlo_casadi.codegen.moving import MovingCase, alone
+from dlo_casadi.codegen.stepper import CompiledStepper
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.motion.sensitivities import Columns, Numbers, Steps
+from dlo_casadi.motion.state import Fixtures
+from dlo_casadi.motion.steps import Moving
+from dlo_casadi.motion.system import MovingCable
+
+# Models whose libraries stay loaded.
+_LIBRARIES = 32
+# Without much optimisation: a library is used for some ten thousand steps.
+_FLAGS = ("-O1",)
+
+
+class CompiledSteps:
+    """What `Steps` does, by compiled C."""
+
+    def __init__(self, cable: MovingCable, library: ctypes.CDLL) -> None:
+        self._c = CompiledStepper(cable, library)
+        self._table = np.array(MovingCase(cable.model, cable.p, cable.rest, inline=False).table)
+        self._numbers: tuple[Any, FloatArray] = (None, np.zeros(0))
+
+    def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
+        """The state dt later; None if there is no step."""
+        out = np.zeros(1, self._c.record)
+        given = self._c.numbers_of(fixtures)
+        status = self._c.call(
+            "dlo_advance_of", self._table, given, float(dt), self._c.recorded(before), out
+        )
+        return self._c.moving(out) if status == "ok" else None
+
+    def derived(
+        self,
+        before: Moving,
+        after: Moving,
+        columns: Columns,
+        fixtures: Fixtures,
+        numbers: Numbers,
+        dt: float,
+    ) -> Columns:
+        """Derivatives after a step."""
+        c, b = self._c, self._c.cable.b
+        count = columns.turn.shape[2]
+        slopes, given = np.zeros(count, c.slope), np.zeros(count, c.given)
+        parts = {
+            "turn": columns.turn,
+            "r": columns.place,
+            "w": columns.rates[:, :b],
+            "v": columns.rates[:, b:],
+            "alpha": columns.accelerations[:, :b],
+            "a": columns.accelerations[:, b:],
+            "mean": columns.own,
+            "force": columns.force,
+        }
+        for name, part in parts.items():
+            slopes[name] = np.moveaxis(part, -1, 0)
+        slopes["moment"][:, :-1] = columns.moment.T
+        given["turn"] = numbers.turns.T.reshape(count, 2, b)
+        for name, part in (
+            ("place", numbers.places),
+            ("velocity", numbers.velocities),
+            ("acceleration", numbers.accelerations),
+        ):
+            given[name] = np.moveaxis(part, -1, 0)
+        out = np.zeros(count, c.slope)
+        status = c.call(
+            "dlo_slopes_of",
+            self._table,
+            c.numbers_of(fixtures),
+            c.recorded(before),
+            c.recorded(after, dt),
+            count,
+            given,
+            self._of_model(numbers),
+            slopes,
+            out,
+        )
+        if status != "ok":
+            raise DloError(f"no derivatives of a step in time ({status})")
+        return _columns(out)
+
+    def _of_model(self, numbers: Numbers) -> FloatArray:
+        """Changes (q, ...) of parameters and of rest strains; the same from step to step."""
+        known, rows = self._numbers
+        if known is not numbers.p:
+            rest = np.moveaxis(numbers.rest, -1, 0).reshape(numbers.p.shape[1], -1)
+            rows = np.ascontiguousarray(np.hstack([numbers.p.T, rest]))
+            self._numbers = (numbers.p, rows)
+        return rows
+
+
+def _columns(out: NDArray[Any]) -> Columns:
+    def last(*names: str) -> FloatArray:
+        return np.moveaxis(np.concatenate([out[name] for name in names], axis=-1), 0, -1)
+
+    return Columns(
+        last("turn"),
+        last("r"),
+        last("w", "v"),
+        last("alpha", "a"),
+        last("mean"),
+        last("force"),
+        np.ascontiguousarray(out["moment"][:, :-1].T),
+    )
+
+
+def fastest_steps(cable: MovingCable) -> Steps | CompiledSteps:
+    """Compiled steps where there is a C compiler; else those of Python."""
+    key = replace(cable.model, n_rest=0, priors={})
+    library = _library(key, cable.springs_on.tobytes(), _Given(cable))
+    return Steps(cable) if library is None else CompiledSteps(cable, library)
+
+
+class _Given:
+    """A cable that is no part of a key."""
+
+    def __init__(self, cable: MovingCable) -> None:
+        self.cable = cable
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Given)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+@lru_cache(maxsize=_LIBRARIES)
+def _library(model: CableModel, springs: bytes, given: _Given) -> ctypes.CDLL | None:
+    """The library of a model, and of springs on these segments; None without a compiler."""
+    cable = given.cable
+    text = alone(MovingCase(cable.model, cable.p, cable.rest, inline=False))
+    folder = Path(tempfile.mkdtemp(prefix="dlo_steps_"))
+    source = Solver("dlo", "", {"dlo_solver.c": text}, Obstacles())
+    try:
+        library = ctypes.CDLL(str(compile_library(source, folder, _FLAGS)))
+    except (DloError, OSError):
+        shutil.rmtree(folder, ignore_errors=True)
+        return None
+    weakref.finalize(library, shutil.rmtree, folder, ignore_errors=True)
+    return library
