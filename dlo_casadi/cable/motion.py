@@ -226,7 +226,7 @@ class CableInMotion(EstimatedCable):
             raise DloError(f"dt: a time [s] above zero belongs here, found {dt!r}")
         moving = moving_cable(self)
         if about is not None:
-            moving = moving.about(about.equilibrium)
+            moving = moving.about(about.equilibrium.x)
         elif moving.segment.stiffens:
             raise DloError(
                 "step: the stiffness in motion acts on changes from a shape at rest.\n"

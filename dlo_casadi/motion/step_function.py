@@ -20,7 +20,7 @@ from scipy.sparse import csc_matrix
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.motion.state import Fixtures
-from dlo_casadi.motion.steps import NEWTON_STEPS, RHO, Moving, Scheme
+from dlo_casadi.motion.steps import NEWTON_STEPS, SCHEME, Moving
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.node import Node
@@ -92,7 +92,7 @@ class _Step:
     """Expressions of one step dt [s] of a cable."""
 
     def __init__(self, cable: MovingCable, dt: float) -> None:
-        self.cable, self.dt, self.scheme = cable, dt, Scheme.of(RHO)
+        self.cable, self.dt, self.scheme = cable, dt, SCHEME
         self.node, self.size = cable.model.node, cable.size
 
     @property

@@ -63,7 +63,7 @@ def test_the_step_is_that_of_the_simulation(dimension: int, boundary: tuple[str,
     assert np.allclose(np.array(same["end_force"]).ravel(), shape.end_force, atol=1e-8)
     rows = path(fixtures, dimension, 30)
     found = step.mapaccum(30)(state, rows)[3]
-    moving = moving_cable(cable).about(shape.equilibrium)
+    moving = moving_cable(cable).about(shape.equilibrium.x)
     stepper, now = Stepper(moving, Scheme.of(RHO)), moving.fixtures(shape.pose.vector)
     after, size = still(moving.at_rest(shape.equilibrium, now)), len(fixtures) - 4 * dimension
     for k in range(30):
