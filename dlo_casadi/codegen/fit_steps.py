@@ -34,21 +34,22 @@ _FLAGS = ("-O1",)
 
 
 class CompiledSteps:
-    """What `Steps` does, by compiled C."""
+    """What `Steps` does, by compiled C; `records` has the layouts of its structures."""
 
     def __init__(self, cable: MovingCable, library: ctypes.CDLL) -> None:
-        self._c = CompiledStepper(cable, library)
+        self.records = CompiledStepper(cable, library)
         self._table = np.array(MovingCase(cable.model, cable.p, cable.rest, inline=False).table)
         self._numbers: tuple[Any, FloatArray] = (None, np.zeros(0))
 
     def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
         """The state dt later; None if there is no step."""
-        out = np.zeros(1, self._c.record)
-        given = self._c.numbers_of(fixtures)
-        status = self._c.call(
-            "dlo_advance_of", self._table, given, float(dt), self._c.recorded(before), out
-        )
-        return self._c.moving(out) if status == "ok" else None
+        out, status = self.advance(self.records.recorded(before), fixtures, dt)
+        return self.records.moving(out) if status == "ok" else None
+
+    def advance(self, now: NDArray[Any], fixtures: Fixtures, dt: float) -> tuple[NDArray[Any], str]:
+        """The same of a dlo_motion, and one of STATUSES."""
+        out, given = np.zeros(1, self.records.record), self.records.numbers_of(fixtures)
+        return out, self.records.call("dlo_advance_of", self._table, given, float(dt), now, out)
 
     def derived(
         self,
@@ -60,7 +61,7 @@ class CompiledSteps:
         dt: float,
     ) -> Columns:
         """Derivatives after a step."""
-        c, b = self._c, self._c.cable.b
+        c, b = self.records, self.records.cable.b
         count = columns.turn.shape[2]
         slopes, given = np.zeros(count, c.slope), np.zeros(count, c.given)
         parts = {
@@ -127,9 +128,25 @@ def _columns(out: NDArray[Any]) -> Columns:
 
 def fastest_steps(cable: MovingCable) -> Steps | CompiledSteps:
     """Compiled steps where there is a C compiler; else those of Python."""
+    try:
+        return compiled_steps(cable)
+    except DloError:
+        return Steps(cable)
+
+
+def compiled_steps(cable: MovingCable, flags: tuple[str, ...] = _FLAGS) -> CompiledSteps:
+    """Compiled steps; the library is kept for cables that differ in numbers alone.
+
+    Raises
+    ------
+    DloError
+        If there is no C compiler.
+    """
     key = replace(cable.model, n_rest=0, priors={})
-    library = _library(key, cable.springs_on.tobytes(), _Given(cable))
-    return Steps(cable) if library is None else CompiledSteps(cable, library)
+    library = _library(key, cable.springs_on.tobytes(), flags, _Given(cable))
+    if isinstance(library, DloError):
+        raise library
+    return CompiledSteps(cable, library)
 
 
 class _Given:
@@ -146,16 +163,18 @@ class _Given:
 
 
 @lru_cache(maxsize=_LIBRARIES)
-def _library(model: CableModel, springs: bytes, given: _Given) -> ctypes.CDLL | None:
-    """The library of a model, and of springs on these segments; None without a compiler."""
+def _library(
+    model: CableModel, springs: bytes, flags: tuple[str, ...], given: _Given
+) -> ctypes.CDLL | DloError:
+    """The library of a model, and of springs on these segments."""
     cable = given.cable
     text = alone(MovingCase(cable.model, cable.p, cable.rest, inline=False))
     folder = Path(tempfile.mkdtemp(prefix="dlo_steps_"))
     source = Solver("dlo", "", {"dlo_solver.c": text}, Obstacles())
     try:
-        library = ctypes.CDLL(str(compile_library(source, folder, _FLAGS)))
-    except (DloError, OSError):
+        library = ctypes.CDLL(str(compile_library(source, folder, flags)))
+    except DloError as error:
         shutil.rmtree(folder, ignore_errors=True)
-        return None
+        return error
     weakref.finalize(library, shutil.rmtree, folder, ignore_errors=True)
     return library

@@ -318,9 +318,12 @@ def generate(
         f"{prefix}_solver.pc.in": template("solver.pc.in"),
         "example.c": template("example.c.in"),
         f"{prefix}_solver.c": "".join(
-            template(f"{name}.c.in") for name in (*first, *then, *timed, "casadi")
+            template(f"{name}.c.in")
+            for name in (*first, *then, *timed, "casadi", *["casadi_motion"] * motion)
         ),
     }
+    if motion:
+        found["loop.c"] = template("loop.c.in")
     words = case.words | {"MOTION": marked(template("motion.h.in"), case.words) if motion else ""}
     found = {name: marked(text, words) for name, text in found.items()}
     names = set(re.findall(r"(?<!@)\b\w+\b(?!@)", "".join(found.values())))

@@ -137,9 +137,12 @@ class MovingCase:
         if cable.rubs is not None:
             found = cable.rubs.call([w, p])
             turned[: 2 * b], rubbing[: 2 * b, : 2 * b], by_p[: 2 * b, :] = found
+        stiffness = hessian[kept, kept]
+        for k in (0, b) if node.twists else ():  # as in `MovingSegment.matrices`
+            stiffness[k : k + b, k : k + b] -= ca.skew(turned[k : k + b]) / 2
         by_turns = by[kept, len(self.p) + d : len(self.p) + d + 2 * b]
         rows = gradient[kept] + turned
-        parts = [hessian[kept, kept], rubbing, by_turns]
+        parts = [stiffness, rubbing, by_turns]
         if not self.inline:
             parts.append(by[kept, : len(self.p)] + by_p)
         found = [ca.densify(rows), *map(ca.sparsify, parts)]
@@ -205,6 +208,7 @@ class MovingCase:
             "NODE_AT": _table(nodes),
             "FORCE_AT": _table(forces),
             "MOMENT_AT": ", ".join(map(str, moments)) or "0",
+            "STIFFENS": int(of.stiffens),
             "SLOWEST": c_number(cable.slowest if self.inline else 1.0),
             "NEWTON_STEPS": NEWTON_STEPS,
             "LAST_STEP": c_number(_LAST),

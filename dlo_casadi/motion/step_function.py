@@ -237,9 +237,12 @@ class _Step:
         """Its derivative by the unknowns."""
         b, kept = self.cable.b, self.cable.end_rows
         hessian = self._at_ends("at_ends", moved)[2][kept, kept]
+        rubbing, by_rates = self._rubbing(moved)
+        for k in (0, b) if self.node.twists else ():  # as in `MovingSegment.matrices`
+            hessian[k : k + b, k : k + b] -= ca.skew(rubbing[k : k + b]) / 2
         turns = ca.vertcat(moved.turns[:, 0], moved.turns[:, -1])
         total = ca.horzcat(hessian[:, : 2 * b] @ self._by_turns(turns), hessian[:, 2 * b :])
-        total[: 2 * b, : 2 * b] += self.scheme.factors(self.dt)[0] * self._rubbing(moved)[1]
+        total[: 2 * b, : 2 * b] += self.scheme.factors(self.dt)[0] * by_rates
         return total
 
     # ---- the end of a step -------------------------------------------------------------------

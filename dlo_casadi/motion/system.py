@@ -251,6 +251,9 @@ class MovingCable:
             pulled, by_rates, _ = (np.array(x) for x in self.rubs(rates, self.p))
             gradient[: 2 * b] += pulled[:, 0]
             damping[: 2 * b, : 2 * b] += by_rates
+            for k in (0, b) if self.model.node.twists else ():  # as in `MovingSegment.matrices`
+                own = slice(k, k + b)
+                hessian[own, own] -= np.cross(np.eye(b), pulled[own, 0]) / 2
         return [gradient, hessian, damping]
 
     @cached_property

@@ -1,8 +1,10 @@
 """A cable in motion in C: steps are those of Python, statuses and derivatives are what they say."""
 
 import shutil
+import subprocess
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from solvers import QUICK, STRICT
@@ -10,6 +12,7 @@ from solvers import QUICK, STRICT
 from dlo_casadi.codegen import CompiledSolver
 from dlo_casadi.codegen.compiler import compile_library
 from dlo_casadi.codegen.generate import generate
+from dlo_casadi.codegen.statuses import STATUSES
 from dlo_casadi.effects import (
     AirDrag,
     CableData,
@@ -25,7 +28,9 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.motion import steps
+from dlo_casadi.motion.step_function import fixtures_vector, state_vector, step_function
 from dlo_casadi.motion.steps import RHO, Moving, Scheme, Stepper, begun_by, first_step
+from dlo_casadi.motion.system import MovingCable
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
 
@@ -242,3 +247,73 @@ def test_what_motion_does_not_know_is_refused():
     bare = replace(model, clips=())
     with pytest.raises(DloError, match="contact in motion is not known"):
         generate(bare, p, np.zeros(bare.chain.n_rests), motion=True, obstacles=1)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_loop_of_the_example_runs_under_sanitizers(dimension, tmp_path):
+    """A thousand steps with derivatives, whose forces are those of a swaying cable."""
+    model = model_of(dimension, "clamped", "pinned", n=5)
+    model = replace(model, effects=tuple(x for x in model.effects if x.label != "tether"))
+    generate(model, values_of(model), np.zeros(model.chain.n_rests), motion=True).write(tmp_path)
+    flags = (*QUICK, "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    command = ["cc", "-std=c99", *flags, "loop.c", "dlo_solver.c", "-lm", "-o", "loop"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True)
+    run = subprocess.run([tmp_path / "loop"], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    lines = run.stdout.splitlines()
+    assert len(lines) == 6
+    start = [float(line.split("start ")[1].split(" m")[0]) for line in lines[:5]]
+    expected = [0.06 * (1 - np.cos(6.0 * t)) / 2 for t in (0.2, 0.4, 0.6, 0.8, 1.0)]
+    assert start == pytest.approx(expected, abs=1e-4)
+
+
+def along_unit_frames(model, state):
+    """Projects changes of a state on those that keep the length of quaternions."""
+    c, nodes = model.node.coordinates, state.reshape(model.chain.n_nodes, -1)
+    projector = np.eye(state.size)
+    for k, node in enumerate(nodes if c > 1 else []):
+        q, at = node[:c], slice(k * nodes.shape[1], k * nodes.shape[1] + c)
+        projector[at, at] -= np.outer(q, q) / (q @ q)
+    return projector
+
+
+@pytest.mark.parametrize("case", [(2, "pinned", "clamped"), (3, "clamped", "pinned")])
+def test_the_step_in_casadi_is_that_of_python(case, tmp_path):
+    """Value and Jacobian; both steps end within 1e-9, Python's Jacobian is that of its own end."""
+    model = model_of(*case, n=4)
+    model = replace(model, effects=tuple(x for x in model.effects if x.label != "tether"))
+    p, rest = values_of(model), np.zeros(model.chain.n_rests)
+    source = generate(model, p, rest, "rope", motion=True)
+    library = compile_library(source, tmp_path, (*QUICK, f"-DROPE_STEP={DT}"))
+    external, cable = ca.external("rope_moved", str(library)), MovingCable(model, p, rest)
+    pose = pose_of(model)
+    eq = solve_equilibrium(model, p, rest, pose)
+    still = cable.fixtures(pose.vector)
+    state = cable.at_rest(eq, still)
+    state = state_vector(Moving(state, np.hstack([state.alpha, state.a])))
+    rng, function = np.random.default_rng(0), step_function(cable, DT)
+    for _ in range(3):
+        own = fixtures_vector(cable, still)
+        own[: 2 * cable.d] += 1e-4 * rng.normal(size=2 * cable.d)
+        found, expected = external(state, own), function(state, own)
+        assert external.name_out() == [*function.name_out(), "status"]
+        assert found[4] == 0
+        for value, other in zip(found[:4], expected, strict=False):
+            scale = max(float(np.abs(np.array(other)).max()), 1.0)
+            np.testing.assert_allclose(np.array(value), np.array(other), atol=1e-6 * scale)
+        slopes = external.jacobian()(state, own, *found)
+        known = function.jacobian()(state, own, *expected)
+        along = along_unit_frames(model, state)
+        for k in range(8):
+            slope, other = np.array(slopes[k]), np.array(known[k])
+            if k < 2:
+                other = along_unit_frames(model, np.array(found[0]).ravel()) @ other
+            if k % 2 == 0:
+                slope, other = slope @ along, other @ along
+            scale = max(float(np.abs(other).max()), 1.0)
+            np.testing.assert_allclose(slope, other, atol=1e-6 * scale)
+        state = np.array(found[0]).ravel()
+    own[cable.d] += 5.0
+    *numbers, status = external(state, own)
+    assert status == STATUSES.index("no_step")
+    assert all(np.isnan(np.array(x)).all() for x in numbers)
