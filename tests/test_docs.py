@@ -127,9 +127,10 @@ def test_yaml_is_a_configuration_or_a_part_of_one(page, tmp_path):
 def test_c_compiles_and_runs(bench, tmp_path, monkeypatch):
     folder, _ = bench
     monkeypatch.chdir(folder)
-    main(["generate-solver", "results/cable", "--output", str(tmp_path), "--quiet"])
-    program, limits = blocks(TEXTS["docs/pages/how-to/planner.md"], "c")
-    program = program.replace("    return 0;\n", f"    {{\n{limits}\n    }}\n    return 0;\n")
+    asked = ["generate-solver", "results/cable", "--motion", "--quiet"]
+    main([*asked, "--output", str(tmp_path)])
+    program, motion, limits = blocks(TEXTS["docs/pages/how-to/planner.md"], "c")
+    program = program.replace("    return 0;\n", f"{{\n{motion}}}\n{{\n{limits}}}\n    return 0;\n")
     (tmp_path / "program.c").write_text(program)
     command = [
         "cc",
@@ -144,8 +145,9 @@ def test_c_compiles_and_runs(bench, tmp_path, monkeypatch):
     subprocess.run([*command, "-o", "program", "-lm"], cwd=tmp_path, check=True)
     said = subprocess.run([tmp_path / "program"], check=True, capture_output=True, text=True)
     force = dlo.predict("results/cable", end=(0.3, -0.1)).end_force
-    told, violated = said.stdout.splitlines()  # by 16 N on the end
+    told, moving, violated = said.stdout.splitlines()  # by 16 N on the end
     assert told == f"end force {force[0]:.3f} {force[1]:.3f} N"
+    assert moving.startswith("end force in motion ")
     assert violated.startswith("a limit is violated at s = ")
 
 

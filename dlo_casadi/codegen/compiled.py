@@ -101,8 +101,8 @@ class CompiledSolver:
         motion: bool = False,
     ) -> None:
         self.model = model
-        chosen = {"obstacles": obstacles, "motion": motion}
-        self._remade = partial(CompiledSolver, flags=flags, **chosen), (model, p, rest)
+        again = partial(CompiledSolver, flags=flags, obstacles=obstacles, motion=motion)
+        self._remade = again, (model, p, rest)
         self.source = generate(model, p, rest, obstacles=obstacles, motion=motion)
         self.most_obstacles = self.source.obstacles.most
         self.obstacles = self.source.obstacles.declared

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -247,7 +248,8 @@ def alone(case: MovingCase) -> str:
 
 def _stacked(arguments: list[ca.SX], parts: Sequence[ca.SX]) -> ca.Function:
     """A function with one output: the entries of all parts that are not zero."""
-    found = ca.cse([ca.vertcat(*(ca.vertcat(*part.nonzeros()) for part in parts))])
+    entries: list[Any] = [entry for part in parts for entry in part.nonzeros()]
+    found = ca.cse([ca.vertcat(*entries)])
     return ca.Function("kernel", arguments, found)
 
 

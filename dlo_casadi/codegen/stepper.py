@@ -50,8 +50,10 @@ class CompiledStepper:
             "start_force": (d,),
             "end_force": (d,),
         }
-        still = {"still": (n, cable.still.shape[1]), "dt": ()}
-        rates = dict.fromkeys(("place", "velocity", "acceleration"), (2, d))
+        still: dict[str, tuple[int, ...]] = {"still": (n, cable.still.shape[1]), "dt": ()}
+        rates: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("place", "velocity", "acceleration"), (2, d)
+        )
         self.record = _doubles({"x": (nodes, c)} | moving | still)
         self.slope = _doubles({"turn": (nodes, b)} | moving)
         self.given = _doubles({"turn": (2, b)} | rates)

@@ -231,7 +231,7 @@ def test_what_cannot_be_is_told(swinging):
         assert not found["r"].any()
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_no_compiler_warns(dimension, tmp_path):
     model = model_of(dimension, "pinned", "pinned", n=3)
     p = values_of(model)
@@ -249,7 +249,7 @@ def test_what_motion_does_not_know_is_refused():
         generate(bare, p, np.zeros(bare.chain.n_rests), motion=True, obstacles=1)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_the_loop_of_the_example_runs_under_sanitizers(dimension, tmp_path):
     """A thousand steps with derivatives, whose forces are those of a swaying cable."""
     model = model_of(dimension, "clamped", "pinned", n=5)
