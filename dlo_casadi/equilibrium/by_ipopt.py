@@ -134,7 +134,9 @@ def _minimised(start: Assembly) -> tuple[Assembly, FloatArray, int]:
     room = np.where(np.isin(np.arange(len(x0)), clipped.clamped[0]), 0.0, np.inf)
     bounds = {"lbx": x0 - room, "ubx": x0 + room, "lbg": lower, "ubg": upper}
     for k, row in model.sliding.items():
-        back, ahead = MOST_SLID * np.diff(clipped.places[0])[clipped.beside(k)[1][0]]
+        back, ahead = (
+            MOST_SLID * np.diff(clipped.places[0])[clipped.nodes[0, k] + np.array([-1, 0])]
+        )
         at = count + int(places[:row].sum())
         bounds["lbx"][at], bounds["ubx"][at] = x0[at] - back, x0[at] + ahead
     moved = (np.arange(count) == clipped.nodes[0][:, None]).ravel(order="F")

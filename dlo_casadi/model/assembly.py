@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
-from dlo_casadi.arrays import FloatArray
-from dlo_casadi.model.clipped import NONE, Slide, by_axes, of_own_edge
+from dlo_casadi.arrays import FloatArray, IntArray
+from dlo_casadi.model.clipped import NONE, Ends, Slides, by_axes, by_rates
 from dlo_casadi.model.clips import ClipLoad, tangents
 from dlo_casadi.model.contact import Contact
 from dlo_casadi.model.evaluation import Evaluation
@@ -31,14 +30,26 @@ class Assembly(Evaluation):
     """A model's functions at the shapes of m poses, assembled."""
 
     @cached_property
-    def _slides(self) -> list[Slide]:
-        """What moves the cables along their eyelets."""
-        first = 2 * self.model.node.increment
-        return [
-            Slide.of(beside, first + row, outputs)
-            for k, row in self.model.sliding.items()
-            for beside, outputs in [self._call_beside(k, "segment_by_edges")]
-        ]
+    def _sliding(self) -> tuple[Ends, IntArray, FloatArray]:
+        """Segments, rows and rates of `Slides`."""
+        slides, b = self.model.sliding, self.model.node.increment
+        ways = np.eye(len(self.model.clips))[:, [*slides]]
+        rates = self._of_ends(np.broadcast_to(ways, (len(self.shapes.x), *ways.shape)))
+        at = np.nonzero(rates.any(axis=(2, 3)))
+        return at, 2 * b + np.array([*slides.values()], dtype=np.intp), rates[at]
+
+    @cached_property
+    def _slides(self) -> Slides | None:
+        """What moves the cables along the supports through which they slide."""
+        if not self.model.sliding:
+            return None
+        at, rows, rates = self._sliding
+        return Slides.of(at, rows, rates, self._call_some(at, "segment_by_edges"))
+
+    def _of_ends(self, rate: FloatArray) -> FloatArray:
+        """Changes (m, n_segments, 2, q) of the segments' ends with clips (m, k, q) [m]."""
+        moved = self.clipped.at_nodes(rate)
+        return np.stack([moved[:, :-1], moved[:, 1:]], axis=2)
 
     def _at_nodes(
         self, first: FloatArray, last: FloatArray, start: FloatArray, end: FloatArray
@@ -72,10 +83,8 @@ class Assembly(Evaluation):
     def balance(self) -> tuple[FloatArray, Vector, BandMatrix]:
         """Lagrangian (m,) [J], its gradient by increments and multipliers, and its Hessian."""
         value, gradient, bend = self._call_segments("segment")
-        for slide in self._slides:
-            slide.add(gradient, bend)
-        for pair in pairwise(self._slides):
-            pair[0].add_common(pair[1], bend)
+        if self._slides:
+            self._slides.add(gradient, bend)
         end_value, end_gradient, end_bend = self._call_ends("at_ends")
         total = value[:, :, 0, 0].sum(axis=1) + end_value[:, 0, 0]
         matrix = self._held(self._band(bend, end_bend))
@@ -103,10 +112,7 @@ class Assembly(Evaluation):
     def _slope(self) -> tuple[FloatArray, Vector]:
         """Gradients of the segments, and their sum with those of the ends, without contacts."""
         (gradient,) = self._call_segments("segment_slope")
-        for k, row in self.model.sliding.items():
-            beside, (slope,) = self._call_beside(k, "edge_slope")
-            row = 2 * self.model.node.increment + row
-            gradient[(*beside, row, 0)] += of_own_edge(slope[..., 0])
+        self._add_sliding(gradient, "edge_slope")
         _, end_gradient, _ = self._call_ends("at_ends")
         return gradient, self._added(gradient, end_gradient)
 
@@ -155,12 +161,20 @@ class Assembly(Evaluation):
     def balance_slopes(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the gradient by p, rest and deviation, of each segment and of the ends."""
         (segments,) = self._call_segments("segment_sensitivity")
-        for k, row in self.model.sliding.items():
-            beside, (slope,) = self._call_beside(k, "edge_sensitivity")
-            row = 2 * self.model.node.increment + row
-            segments[(*beside, row)] += of_own_edge(np.moveaxis(slope, 2, 3))
+        self._add_sliding(segments, "edge_sensitivity")
         (ends,) = self._call_ends("end_sensitivity")
         return segments, ends
+
+    def _add_sliding(self, gradient: FloatArray, name: str) -> None:
+        """Add, to gradients (m, n_segments, rows, q), those by what slides.
+
+        `name`: of the derivatives by the ends of a segment.
+        """
+        if not self.model.sliding:
+            return
+        at, rows, rates = self._sliding
+        (own,) = self._call_some(at, name)
+        gradient[at[0][:, None], at[1][:, None], rows] += by_rates(rates, own)
 
     def balance_along(self, along: Tangents, slopes: Sequence[FloatArray] | None = None) -> Vector:
         """Change of the gradient at fixed nodes and multipliers along directions.
@@ -177,10 +191,10 @@ class Assembly(Evaluation):
             _, gradient, bend = self._call_segments("segment")
             changed += bend[..., : 2 * self.model.node.increment] @ self._both(turned)
             still = by_axes(self._added(gradient, np.zeros_like(at_ends[..., :1])).x, turned)
-        for slide in self._slides:
+        if self._slides:
             shape = len(rate), self.model.chain.n_nodes, self.model.node.increment, rate.shape[2]
-            nodes = np.broadcast_to(turned, shape), self.clipped.at_nodes(rate)
-            slide.add_along(changed, *map(self._both, nodes))
+            nodes = self._both(np.broadcast_to(turned, shape))
+            self._slides.add_along(changed, nodes, self._of_ends(rate))
         total = self._added(changed, at_ends)
         if still is not None:
             total = replace(total, x=total.x + still)
@@ -205,13 +219,13 @@ class Assembly(Evaluation):
 
         `name`: of derivatives by the ends of a segment; `rate` (m, k, q) [m] of the clips.
         """
-        total = NONE
-        for k in np.flatnonzero(rate.any(axis=(0, 2))).tolist():
-            beside, (blocks, *_) = self._call_beside(k, name)
-            if total is NONE:
-                shape = len(rate), self.model.chain.n_segments, blocks.shape[2], rate.shape[2]
-                total = np.zeros(shape)
-            total[beside] += of_own_edge(blocks)[..., None] * rate[:, k, None, None]
+        if not rate.any():
+            return NONE
+        ends = self._of_ends(rate)
+        at = np.nonzero(ends.any(axis=(2, 3)))
+        blocks, *_ = self._call_some(at, name)
+        total = np.zeros((*ends.shape[:2], blocks.shape[1], rate.shape[2]))
+        total[at] = blocks @ ends[at]
         return total
 
     def _slips(self, p: FloatArray, lam: FloatArray | None = None) -> FloatArray:

@@ -8,6 +8,7 @@ segments by these numbers are the same as by any other.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -19,8 +20,8 @@ from dlo_casadi.rod.node import Node
 from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 from dlo_casadi.rod.supports import SupportKind
 
-# Indices of poses (m, 1) and of the two segments beside a clip (m, 2).
-Beside = tuple[IntArray, IntArray]
+# Indices (N,) of poses and of segments.
+Ends = tuple[IntArray, IntArray]
 # No change of segments or nodes, which broadcasts.
 NONE = np.zeros((1, 1, 1, 1))
 
@@ -50,64 +51,64 @@ class ClampNode:
 
 
 @dataclass(frozen=True)
-class Slide:
-    """What moves m cables along an eyelet: derivatives of the two segments beside it.
+class Slides:
+    """What moves m cables along the supports through which they slide.
 
-    They are by its arc length, the end of the first and the start of the second segment.
+    These are derivatives of the N segments whose ends then move along the cable.
 
     Parameters
     ----------
-    beside : (m, 1), (m, 2) int
-        See `Clipped.beside`.
-    row : int
-        Of the arc length in derivatives of segments.
-    slope : (m, 2) [N]
-        Of the Lagrangian: their sum is the configurational force.
-    mixed : (m, 2, rows)
+    at : (N,), (N,) int
+        Indices of their poses and segments.
+    rows : (u,) int
+        Of the arc lengths at these supports in derivatives of segments.
+    rates : (N, 2, u)
+        Of the arc lengths of both ends of a segment with those.
+    slope : (N, u) [N]
+        Of the Lagrangian by those: summed over the segments the configurational force.
+    mixed : (N, rows, u)
         Of the gradient of the segments.
-    twice : (m, 2, 2)
-        Of `slope` by the start and the end of each segment.
+    twice : (N, 2, 2)
+        Of the Lagrangian by both ends of a segment.
     """
 
-    beside: Beside
-    row: int
+    at: Ends
+    rows: IntArray
+    rates: FloatArray
     slope: FloatArray
     mixed: FloatArray
     twice: FloatArray
 
     @classmethod
-    def of(cls, beside: Beside, row: int, outputs: Sequence[FloatArray]) -> "Slide":
-        """From the outputs of `Functions.segment_by_edges`."""
-        mixed, slope, twice = outputs
-        return cls(beside, row, *map(of_own_edge, (slope[..., 0], mixed, twice)))
+    def of(cls, at: Ends, rows: IntArray, rates: FloatArray, edges: Sequence[FloatArray]) -> Self:
+        """From the outputs (N, ...) of `Functions.segment_by_edges`."""
+        mixed, slope, twice = edges
+        return cls(at, rows, rates, by_rates(rates, slope)[..., 0], mixed @ rates, twice)
 
     def add(self, gradient: FloatArray, bend: FloatArray) -> None:
-        """Add its row to gradients and Hessians of the segments (m, n_segments, rows, ...)."""
-        gradient[(*self.beside, self.row, 0)] += self.slope
-        bend[(*self.beside, slice(None), self.row)] += self.mixed
-        bend[(*self.beside, self.row)] += self.mixed
-        bend[(*self.beside, self.row, self.row)] += of_own_edge(self.twice)
-
-    def add_common(self, other: "Slide", bend: FloatArray) -> None:
-        """Add what it has in common with the next eyelet, where one segment is between them."""
-        (_, own), (_, next_own) = self.beside, other.beside
-        poses = np.flatnonzero(own[:, 1] == next_own[:, 0])
-        for a, b in ((self.row, other.row), (other.row, self.row)):
-            bend[poses, own[poses, 1], a, b] += self.twice[poses, 1, 1]
+        """Add their rows to gradients and Hessians of the segments (m, n_segments, rows, ...)."""
+        (poses, segments), rows = self.at, self.rows
+        each = poses[:, None], segments[:, None]
+        gradient[(*each, rows, 0)] += self.slope
+        bend[(*each, slice(None), rows)] += self.mixed.transpose(0, 2, 1)
+        bend[(*each, rows)] += self.mixed.transpose(0, 2, 1)
+        both = by_rates(self.rates, self.twice @ self.rates)
+        bend[poses[:, None, None], segments[:, None, None], rows[:, None], rows] += both
 
     def add_along(self, change: FloatArray, turned: FloatArray, rate: FloatArray) -> None:
         """Add to the change of gradients (m, n_segments, rows, q) what moves both nodes.
 
         Rotations (m, n_segments, 2b, q) and arc lengths (m, n_segments, 2, q) of these.
         """
-        by_turns = self.mixed[:, :, None, : turned.shape[2]] @ turned[self.beside]
-        moved = by_turns + self.twice[:, :, None] @ rate[self.beside]
-        change[(*self.beside, self.row)] += moved[:, :, 0]
+        own = self.mixed[:, : turned.shape[2]].transpose(0, 2, 1) @ turned[self.at]
+        own = own + by_rates(self.rates, self.twice @ rate[self.at])
+        poses, segments = self.at
+        change[poses[:, None], segments[:, None], self.rows] += own
 
 
-def of_own_edge(outputs: FloatArray) -> FloatArray:
-    """Of derivatives (m, 2, ..., 2) by both ends of two segments those by where they meet."""
-    return np.stack([outputs[:, 0, ..., 1], outputs[:, 1, ..., 0]], axis=1)
+def by_rates(rates: FloatArray, by_ends: FloatArray) -> FloatArray:
+    """Derivatives (N, u, ...) by what moves segments' ends, from those by the ends (N, 2, ...)."""
+    return rates.transpose(0, 2, 1) @ by_ends
 
 
 @dataclass(frozen=True)
@@ -185,14 +186,10 @@ class Clipped:
         """1 where a segment is before a clip (m, n_segments, k), else 0."""
         return (np.arange(self.chain.n_segments)[:, None] < self.nodes[:, None]).astype(float)
 
-    def beside(self, k: int) -> Beside:
-        """Indices, as of arrays (m, n_segments), of the segments that end and begin at clip k."""
-        return np.arange(len(self.at))[:, None], self.nodes[:, k, None] + np.array([-1, 0])
-
     def at_nodes(self, rate: FloatArray) -> FloatArray:
-        """Changes (m, n_nodes, 1, q) of the nodes' arc lengths with those of clips (m, k, q)."""
-        found = np.zeros((*self.places.shape, 1, rate.shape[2]))
-        found[np.arange(len(rate))[:, None], self.nodes, 0] = rate
+        """Changes (m, n_nodes, q) of the nodes' arc lengths with those of clips (m, k, q)."""
+        found = np.zeros((*self.places.shape, rate.shape[2]))
+        found[np.arange(len(rate))[:, None], self.nodes] = rate
         return found
 
     @property
@@ -330,8 +327,8 @@ class Clipped:
         moved = self.at_nodes(at)
         for index in self.nodes.T:
             e, u, width = self._evened(index)
-            dw = moved[rows, e + 1] - moved[rows, e]
-            du = -(moved[rows, e] + u * dw) / width
+            dw = (moved[rows, e + 1] - moved[rows, e])[:, None]
+            du = -(moved[rows, e][:, None] + u * dw) / width
             (r0, t0), (r1, t1) = (np.split(stations[rows, e + j], 2, axis=1) for j in (0, 1))
             chord, v = (r1 - r0) / width, 1 - u
             place = u * v * (v * t0 - u * t1) * dw

@@ -10,7 +10,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clipped import Beside, Clipped
+from dlo_casadi.model.clipped import Clipped, Ends
 from dlo_casadi.model.clips import clip_size
 from dlo_casadi.model.contact import DEPTH, Touching, outwards
 from dlo_casadi.model.functions import functions_of
@@ -93,13 +93,12 @@ class Evaluation:
             self._beyond.spread(name, found, 2 * self.model.node.increment)
         return found
 
-    def _call_beside(self, k: int, name: str) -> tuple[Beside, list[FloatArray]]:
-        """Evaluate a function for both segments beside a clip: indices, outputs (m, 2, ...)."""
-        beside = self.clipped.beside(k)
-        found = self._mapped(name)(*(part[beside] for part in self._arguments))
-        own = Beyond(self._beyond.before[beside], self._beyond.rows)
+    def _call_some(self, at: Ends, name: str) -> list[FloatArray]:
+        """Evaluate a function for some segments: outputs (N, rows, columns)."""
+        found = self._mapped(name)(*(part[at][:, None] for part in self._arguments))
+        own = Beyond(self._beyond.before[at][:, None], self._beyond.rows)
         own.spread(name, found, 2 * self.model.node.increment)
-        return beside, found
+        return [out[:, 0] for out in found]
 
     @cached_property
     def _beyond(self) -> Beyond:
