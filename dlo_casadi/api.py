@@ -10,6 +10,7 @@ result.cable.solve(end=(0.3, -0.1)).points
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import fields
@@ -38,6 +39,7 @@ from dlo_casadi.config import (
     load_config,
 )
 from dlo_casadi.config.frozen import Numbers, Rows, plain
+from dlo_casadi.config.oddities import odd_gravity
 from dlo_casadi.config.problems import Arguments
 from dlo_casadi.errors import DloError, library
 from dlo_casadi.report.documents import cable_of_known, fitted_cable
@@ -164,7 +166,7 @@ class Session(Config):
     gravity : (d,) [m/s^2]
         Two numbers put the cable in a plane, three in space.
     boundary : (str, str)
-        How start and end are held: pinned, clamped, swivel; the end also slide or free.
+        How start and end are held: pinned, clamped, swivel, slide; the end also free.
     std : float [m], optional
         Standard deviation of one coordinate of a point; estimated when absent.
     force_std, moment_std : float [N], [N m], optional
@@ -357,6 +359,11 @@ def known_cable(
     ConfigError
         If the arguments cannot be used; the message lists every problem with the argument's name.
 
+    Warns
+    -----
+    UserWarning
+        If gravity is neither that on Earth nor none: it may be in other units.
+
     Examples
     --------
     >>> rope = dlo.Cable(length=0.8, mass=0.05, diameter=0.005, bending_stiffness=0.01)
@@ -367,6 +374,8 @@ def known_cable(
     given |= _given(rest_curvature=rest_curvature) | {"cable": cable} | unknown
     names = tuple(signature(known_cable).parameters)[:-1]
     config, coefficients = known_config(given, names)
+    for text in odd_gravity(config.experiment.gravity):
+        warnings.warn(text, stacklevel=2)
     return cable_of_known(declared_model(config, known=True), coefficients, config.limits)
 
 

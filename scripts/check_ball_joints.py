@@ -1,7 +1,7 @@
 """Clean sessions of cables in space whose rest shape and twist are hard to tell, from another rod.
 
     python scripts/check_ball_joints.py [--count 40] [--first 0] [--seed 0] [--jobs N]
-        [--wires | --swivels] [--keep FOLDER] [--output FILE]
+        [--wires | --swivels | --slides] [--keep FOLDER] [--output FILE]
 
 Each session is a cable between two ball joints, curved at rest about both axes by 0.2 to 1.5 over
 its length: seven fitted poses and two held out, markers and lines in turn, 0.3 mm of white noise,
@@ -9,6 +9,10 @@ ends within 0.1 mm of where they are declared. Nothing holds its roll about its 
 the same shapes have equilibria that are saddles of the energy.
 
 With --swivels one end or both hold the direction, too: the other one is a clamp.
+
+With --slides a straight cable is fed through one of its ends, from pose to pose another length of
+it; the other end is a clamp. In every third session the tension beyond the end is known, in the
+others free lengths are estimated.
 
 With --wires a session is a light wire twisted by 1 to 2 turns between two clamps that are known to
 0.05 rad: three or four fitted poses, 11 to 16 points each with 3 mm of noise, 4 mm declared.
@@ -49,6 +53,8 @@ G = 9.81  # m/s^2
 SIDES = ("start", "end")
 STD, END_STD, FRAME_STD = 3e-4, 1e-4, 2e-3  # m, m, rad
 SWIVELS = (("clamped", "swivel"), ("swivel", "clamped"), ("swivel", "swivel"))
+# Share of the free length by which it is changed for the derivative of the energy.
+LONGER = 2e-3
 WIRE_STD, WIRE_DECLARED, CLAMP_STD = 3e-3, 4e-3, 0.03  # m, m, rad
 # Segments of the rod: nodes of 60 lie within 0.02 mm of those of 240 (0.6 m, bent by 1.5 / m).
 SEGMENTS = {False: 60, True: 80}
@@ -162,6 +168,60 @@ def curved(
     return bending
 
 
+def fed(index: int, generator: np.random.Generator, folder: Path) -> float:
+    """Write a session of a straight cable that is fed through one of its ends; its EI."""
+    length, mass = generator.uniform(0.4, 0.8), generator.uniform(0.03, 0.06)
+    bending = mass * G * length**2 * np.exp(generator.uniform(*np.log([0.04, 0.3])))
+    torsion, known = bending * generator.uniform(0.55, 0.85), index % 3 == 0
+    held = ("slide", "clamped") if index % 3 == 2 else ("clamped", "slide")
+    rolls = held[0] == "slide", held[1] == "slide"
+    start, poses = generator.uniform(-0.2, 0.3, 3).round(3), []
+    while len(poses) < 9:
+        free = length * generator.uniform(0.75, 1.25)
+        way = generator.standard_normal(3) * [1.0, 1.0, 0.7]
+        chord = generator.uniform(0.6, 0.93) * free * way / np.linalg.norm(way)
+        end = (start + chord).round(5)
+        along, _ = Rotation.align_vectors([chord], [[1.0, 0.0, 0.0]])
+        turns = generator.uniform(-0.7, 0.7, (2, 3)) * [3.0, 1.0, 1.0]
+        frames = [along * Rotation.from_rotvec(turn) for turn in turns]
+        off = FRAME_STD * generator.standard_normal((2, 3))
+        both = (f * Rotation.from_rotvec(e) for f, e in zip(frames, off, strict=True))
+        ends = Ends(
+            start,
+            end + END_STD * generator.standard_normal(3),
+            frames=tuple(one.as_quat() for one in both),
+        )
+        weight, still = np.array([0, 0, -mass * G]) / length, np.zeros((2, SEGMENTS[False]))
+        rods = [
+            SegmentRod(own, own * weight, bending, torsion, still, clamped=True, rolls=rolls)
+            for own in (free, *((1 + LONGER) * free, (1 - LONGER) * free) * known)
+        ]
+        nodes = rods[0].shape(ends, STARTS, GAP)
+        if nodes is None:
+            continue
+        pose: dict[str, Any] = {}
+        if known:
+            # Of the energies E(l): T = -dE/dl - the work of the weight that enters; least there.
+            here, longer, shorter = (rod.energy(ends, STARTS) for rod in rods)
+            tension = (shorter - longer) / (2 * LONGER * free) - weight @ chord
+            if not (np.isfinite(tension) and shorter + longer - 2 * here > 0):
+                continue
+            pose["end_tension"] = float(tension)
+        s = np.linspace(0.03, 0.97, 60) * free
+        points = rods[0].points(nodes, s) + STD * generator.standard_normal((len(s), 3))
+        name = f"p{len(poses)}.csv"
+        write_points(folder / name, points, None)
+        pose |= {"file": name, "start": start.tolist(), "end": end.tolist()}
+        pose |= {
+            f"{k}_orientation": f.as_quat().tolist() for k, f in zip(SIDES, frames, strict=True)
+        }
+        poses.append(pose | {"role": "held_out" if len(poses) in (3, 7) else "fit"})
+    declared = bending * float(np.exp(generator.uniform(-0.7, 0.7)))
+    cable = {"length": length, "mass": mass, "diameter": 0.004, "bending_stiffness": declared}
+    write(folder, cable | {"rest_shape": "straight"}, held, STD, poses)
+    return bending
+
+
 def twisted_wire(index: int, generator: np.random.Generator, folder: Path) -> float:
     """Write a session of a twisted wire between two clamps, known to 0.05 rad; its EI."""
     length, mass = generator.uniform(0.35, 0.5), generator.uniform(0.006, 0.012)
@@ -223,7 +283,12 @@ def write(
     (folder / "session.yaml").write_text(dump_yaml(document), encoding="utf-8")
 
 
-DRAWS = {"balls": between_ball_joints, "swivels": between_swivels, "wire": twisted_wire}
+DRAWS = {
+    "balls": between_ball_joints,
+    "swivels": between_swivels,
+    "slides": fed,
+    "wire": twisted_wire,
+}
 
 
 def fitted(index: int, seed: int, kind: str, keep: Path) -> Row:
@@ -255,6 +320,7 @@ def main() -> int:
     parser = options(__doc__, count=count, first=True, seed=0, jobs=True, output=True)
     parser.add_argument("--wires", dest="kind", action="store_const", const="wire")
     parser.add_argument("--swivels", dest="kind", action="store_const", const="swivels")
+    parser.add_argument("--slides", dest="kind", action="store_const", const="slides")
     parser.set_defaults(kind="balls")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="sessions stay there")
     chosen = parser.parse_args()

@@ -12,7 +12,8 @@ from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 
 # Waves of the rest curvature along the cable.
 WAVES = 4

@@ -109,6 +109,11 @@ class SegmentRod:
         steps = Rotation.from_quat(found[0][1]).apply(X) * self.length / self._n
         return ends.start + np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
+    def energy(self, ends: Ends, starts: int) -> float:
+        """Least energy [J] of the equilibria found from several starts; infinite without any."""
+        found = [one for k in range(starts) if (one := self._from(ends, k / starts)) is not None]
+        return min((energy for energy, _ in found), default=np.inf) * self._scale
+
     def _from(self, ends: Ends, side: float) -> tuple[float, FloatArray] | None:
         """Energy over its scale and quaternions, from an arc bulging to a side [turns]."""
         chord, u = ends.end - ends.start, (np.arange(self._n) + 0.5) / self._n

@@ -40,11 +40,11 @@ from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.model.lagrangian import lagrangian_of
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.chain import Chain
-from dlo_casadi.rod.node import Frame, Heading
+from dlo_casadi.rod.node import Frame
 from dlo_casadi.rod.obstacles import Plane
 from dlo_casadi.rod.supports import SupportKind
 
-CLAMPED, EYELET = SupportKind.CLAMPED, SupportKind.EYELET
+EYELET = SupportKind.EYELET
 
 LENGTH, EI = 1.0, 0.02  # m, N m^2
 CABLE = CableData(LENGTH, mass=0.2, diameter=0.01, bending_stiffness=EI)
@@ -58,6 +58,15 @@ def solved(clips, to=(0.8, 0.1), n=40, cable=CABLE, **held):
     start = (0.0,) * len(model.gravity)
     pose = HeldPose(start, to, clips=tuple(clips), **directions)
     return model, pose, solve_equilibrium(model, model.nominal, np.zeros(model.chain.n_rests), pose)
+
+
+def clipped_at(at, n=10, frames=None, x=None):
+    """Saddles at arc lengths `at` [m] of a cable of n elements."""
+    model = CableModel(CABLE, n, n_rest=0, clips=("clamped",) * len(at))
+    frames = np.zeros((1, len(at), 1)) if frames is None else frames
+    x = np.zeros((1, n + 1, 1)) if x is None else x
+    held = np.array([[0.0, *at, LENGTH]])
+    return Clipped.of(model, frames, held, held, np.zeros((len(at), 1, 1)), x)
 
 
 def test_a_beam_on_three_supports():
@@ -151,8 +160,7 @@ def test_a_rod_clamped_in_three_places_is_two_rods():
     # The curvature at both ends and on both sides of the clip is that at the ends of the two rods.
     clipped = Clipped.none(Chain(0.5, 10), 1)
     bends = [curvatures_along(one.curvature[None, None], clipped)[0, -2:] for one in (first, last)]
-    held, at = np.array([clip.vector(Heading)])[None], np.array([[0.5]])
-    between = Clipped.of(Chain(LENGTH, 20), (CLAMPED,), held, at, np.zeros((1, 1)), whole.x[None])
+    between = clipped_at((0.5,), 20, np.array([[clip.frame]]), whole.x[None])
     found = curvatures_along(whole.curvature[None, None], between)[0, -4:]
     np.testing.assert_allclose(found, np.concatenate(bends), rtol=1e-6)
     assert len(set(np.round(found, 3))) == 4
@@ -292,7 +300,7 @@ def test_two_eyelets_with_one_element_between_them_act_on_each_other():
 def test_nodes_follow_an_eyelet_and_do_not_turn_back():
     """Beyond two thirds of an element another node is moved; the cable stays where it is."""
     model, pose, eq = solved([HeldClip("eyelet", (0.42, 0.12))], (0.7, 0.25), 40)
-    given, row = Inputs.of(model.nominal, np.zeros(40), pose.vector[None]), model.sliding[0]
+    given, row = Inputs.of(model.nominal, np.zeros(40), pose.vector[None]), model.sliding[1]
     here = Assembly(model, eq.shapes, given)
     node, h = int(here.clipped.nodes[0, 0]), model.chain.h
 
@@ -415,10 +423,8 @@ def test_a_clearance_beside_a_saddle_between_even_places():
 def test_places_and_directions_at_even_arc_lengths_are_exact_for_cubics():
     """From those at nodes that saddles have moved either way, and not at all."""
     chain, rng = Chain(LENGTH, 10), np.random.default_rng(0)
-    held, at = np.zeros((1, 3, 4)), np.array([[0.17, 0.5, 0.74]])
-    held[..., -1] = at
-    clipped = Clipped.of(chain, (CLAMPED,) * 3, held, at, np.zeros((3, 1)), np.zeros((1, 11, 1)))
-    assert clipped.places[0, [2, 5, 7]].tolist() == at[0].tolist()
+    clipped = clipped_at((0.17, 0.5, 0.74))
+    assert clipped.places[0, [2, 5, 7]].tolist() == [0.17, 0.5, 0.74]
     curve = [np.polynomial.Polynomial(cubic) for cubic in rng.normal(size=(2, 4))]
 
     def rows(s):
@@ -431,10 +437,7 @@ def test_places_and_directions_at_even_arc_lengths_are_exact_for_cubics():
 def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():
     """kappa_0 = a + b s + c s^2: mean, slope and bend times the width, of the moved cells."""
     model, (a, b, c) = CableModel(CABLE, 10, n_rest=0, clips=("pinned",) * 2), (1.0, -4.0, 9.0)
-    held, at = np.zeros((1, 2, 4)), np.array([[0.17, 0.74]])
-    held[..., -1] = at
-    none = np.zeros((2, 1)), np.zeros((1, 11, 1))
-    clipped = Clipped.of(model.chain, model.clips, held, at, *none)
+    clipped = clipped_at((0.17, 0.74))
 
     def inside(cells):
         middle, width = cells.mean(axis=1), np.diff(cells, axis=1)[:, 0]
@@ -454,8 +457,7 @@ def test_rest_curvature_between_moved_nodes_is_exact_for_parabolas():
     [((0.3, 0.6), True), ((0.6, 0.3), False), ((0.0, 0.5), False), ((0.5, 1.0), False)],
 )
 def test_clips_are_in_order_within_the_cable(at, ordered):
-    none = np.zeros((1, 2, 4)), np.array([at]), np.zeros((2, 1)), np.zeros((1, 11, 1))
-    assert Clipped.of(Chain(LENGTH, 10), (EYELET,) * 2, *none).in_order.tolist() == [ordered]
+    assert clipped_at(at).in_order.tolist() == [ordered]
 
 
 def test_a_pose_with_other_clips_than_the_model():

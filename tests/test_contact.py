@@ -21,8 +21,9 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.start import begin
 from dlo_casadi.model.assembly import Assembly, Inputs
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import forces_on_other_mesh
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.obstacles import Capsule, Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel

@@ -560,3 +560,8 @@ def test_a_heading_of_which_rounding_leaves_nothing_is_refused():
         dlo.DloError, match=r"start_heading: 1\.1e\+06 rad: .*1e\+06 rad is possible"
     ):
         cable.solve(start_heading=1.1e6)
+
+
+def test_gravity_in_units_of_g_is_questioned():
+    with pytest.warns(UserWarning, match=r"in units of g\? Try: \[0.0, -9.81\]"):
+        dlo.known_cable(ROPE, **PINNED | {"gravity": (0, -1.0)})

@@ -22,8 +22,9 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.model.whole_pose import potential
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
@@ -73,11 +74,12 @@ def test_deviations_have_the_tolerances_of_what_deviates():
     """Nothing is known of unknown forces."""
     known, none = Tolerances(end=1e-3, heading=2e-2, rotation=3e-3, clip=4e-3), np.inf
     clipped = CableModel(CABLE, clips=("pinned", "eyelet"))
-    expected = [1e-3] * 2 + [2e-2] * 2 + [none] * 2 + [4e-3] * 4
+    expected = [1e-3] * 2 + [2e-2] * 2 + [none] * 2 + [0.02 * clipped.cable.length] + [4e-3] * 4
     assert known.deviation(clipped).tolist() == expected
     assert len(clipped.deviation_names) == len(expected)
     loom = CableModel(replace(CABLE, torsional_stiffness=0.01), gravity=(0.0, 0.0, -9.81))
-    assert known.deviation(loom).tolist() == [1e-3] * 3 + [3e-3] * 6 + [none] * 3
+    free = 0.02 * loom.cable.length
+    assert known.deviation(loom).tolist() == [1e-3] * 3 + [3e-3] * 6 + [none] * 3 + [free]
 
 
 @ALL

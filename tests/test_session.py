@@ -194,7 +194,7 @@ FED = {
     "cable": CABLE | {"bending_stiffness": 0.01, "rest_shape": "straight"},
     "experiment": {
         "gravity": [0.0, -9.81],
-        "boundary": {"start": "clamped", "end": "slide"},
+        "boundary": {"start": "slide", "end": "slide"},
         "measurement": {"kind": "centerlines"},
         "poses": [
             {
@@ -203,6 +203,7 @@ FED = {
                 "end": [0.4, 0.0],
                 "start_heading": 0.0,
                 "end_heading": 0.1,
+                "start_tension": 0.7,
                 "end_tension": 0.8,
             }
         ],
@@ -221,12 +222,18 @@ IN_SPACE["experiment"]["motions"] = [
         },
     }
 ]
+UNKNOWN = copy.deepcopy(FED)
+UNKNOWN["experiment"]["boundary"] = {"start": "clamped", "end": "slide"}
+for _key in ("start_tension", "end_tension"):
+    del UNKNOWN["experiment"]["poses"][0][_key]
+UNKNOWN["experiment"]["poses"][0]["free_length"] = 0.5
 FED["experiment"]["motions"] = [{"file": "swing.csv"}]
 ALL = {
     "in a plane": IN_PLANE,
     "in space": IN_SPACE,
     "by a reference": BY_REFERENCE,
     "fed": FED,
+    "fed without a tension": UNKNOWN,
 }
 
 

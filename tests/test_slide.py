@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from perturbed import assert_derivatives
@@ -11,13 +12,17 @@ import dlo_casadi as dlo
 from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, LengthError, MassError, PointForce
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.by_ipopt import by_ipopt
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import SolvedCable
+from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
 from dlo_casadi.export.rod import Rod
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.rod.obstacles import Plane
 
 LOOM = CableData(1.0, 0.2, 0.01, bending_stiffness=0.02, torsional_stiffness=0.015, straight=True)
 FLAT = replace(LOOM, torsional_stiffness=None)
@@ -135,9 +140,12 @@ def test_derivatives_by_parameters(space):
     assert_derivatives(model, pose, p, np.zeros(model.chain.n_rests), columns)
 
 
-@pytest.mark.parametrize("space", [False, True])
-def test_a_session_whose_free_lengths_differ(space):
-    """Lines of 0.3 mm noise; lengths between the ends differ by a third from pose to pose."""
+@pytest.mark.parametrize(("space", "known"), [(False, True), (False, False), (True, True)])
+def test_a_session_whose_free_lengths_differ(space, known):
+    """Lines of 0.3 mm noise; lengths between the ends differ by a third from pose to pose.
+
+    Tensions are `known`, or free lengths are estimated.
+    """
     model, pose, _ = case(space, 0.0, 40)
     rng, d, poses, rest = np.random.default_rng(0), 2 + space, [], np.zeros(model.chain.n_rests)
     fed = []
@@ -150,7 +158,8 @@ def test_a_session_whose_free_lengths_differ(space):
         points = held.curve.at(np.linspace(0.02, 0.98, 50)) + 3e-4 * rng.standard_normal((50, d))
         kept = {name: x for name, x in own.directions.items() if name != "turns"}
         role = "held_out" if len(poses) == 2 else "fit"
-        one = dlo.Pose(own.start, own.end, points=points, role=role, end_tension=tension, **kept)
+        kept |= {"end_tension": tension} if known else {}
+        one = dlo.Pose(own.start, own.end, points=points, role=role, **kept)
         poses.append(one)
     assert np.ptp(fed) > 0.05
     cable = dlo.Cable(
@@ -164,23 +173,233 @@ def test_a_session_whose_free_lengths_differ(space):
     low, high = result.params["bending_stiffness"].interval_95
     assert low < 0.02 < high
     assert result.stages[-1].rmse_held_out < 1e-3
-    shape = result.cable.solve(poses[0])
+    held = poses[0].held
+    fixed = {"start": held.start, **held.directions}
+    beyond = {"end_tension": held.end_tension} if known else {"free_length": 1.0 + fed[0]}
+    shape = result.cable.solve(held.end, **fixed, **beyond)
+    for k, one in enumerate(result.stages[-1].shapes.values()):
+        assert one.fed == pytest.approx(fed[k], abs=2e-3)
     assert shape.free_length == pytest.approx(1.0 + fed[0], abs=2e-3)
     assert shape.s[-1] == shape.free_length
     steps = np.linalg.norm(np.diff(shape.points, axis=0), axis=1)
     assert steps.sum() == pytest.approx(shape.free_length, rel=1e-3)
 
 
-def test_what_a_sliding_end_has_not_yet():
-    model, pose, _ = case(False, 0.8)
-    with pytest.raises(EquilibriumError, match="end_tension None"):
-        solved(model, replace(pose, end_tension=None))
-    with pytest.raises(DloError, match="no clips, obstacles or links"):
-        replace(model, clips=("pinned",))
+def reversed_case(model, pose, rest):
+    """The same cable from its other end, in space turned by half a turn about its axes z."""
+
+    def turn(direction):
+        if not isinstance(direction, tuple):
+            return None if direction is None else direction + np.pi
+        half = Rotation.from_rotvec([0.0, 0.0, np.pi])
+        return tuple((Rotation.from_quat(direction) * half).as_quat())
+
+    key = "orientation" if model.in_space else "heading"
+    directions = {
+        f"start_{key}": turn(getattr(pose, f"end_{key}")),
+        f"end_{key}": turn(getattr(pose, f"start_{key}")),
+    }
+    clips = tuple(
+        replace(clip, at=clip.at and LOOM.length - clip.at, **{key: turn(getattr(clip, key))})
+        for clip in pose.clips[::-1]
+    )
+    back = HeldPose(pose.end, pose.start, start_tension=pose.end_tension, clips=clips, **directions)
+    signs = (1.0, 1.0, -1.0) if model.in_space else (-1.0,)
+    parts = np.split(rest, len(signs))
+    other = np.concatenate([sign * part[::-1] for sign, part in zip(signs, parts, strict=True)])
+    return replace(model, start="slide", end="clamped", clips=model.clips[::-1]), back, other
+
+
+def held_between(space, kinds, obstacles=(), n=20):
+    """The case with clips of these kinds, a rest curvature and obstacles."""
+    model, pose, _ = case(space, 0.8, n)
+    places, at = [(0.25, -0.02, 0.05), (0.45, 0.05, 0.05)], (0.3, 0.5)
+    direction = {"orientation": (0.0, 0.0, 0.0, 1.0)} if space else {"heading": 0.05}
+    clips = tuple(
+        HeldClip(
+            kind,
+            place[: 2 + space],
+            None if kind == "eyelet" else s,
+            **(direction if kind == "clamped" else {}),
+        )
+        for kind, place, s in zip(kinds, places, at, strict=False)
+    )
+    model = replace(model, clips=kinds, obstacles=obstacles)
+    middles = model.chain.cells.mean(axis=1)
+    bent = 2.0 * np.sin(3 * middles)
+    rest = np.concatenate([0 * bent, bent, bent / 2]) if space else bent
+    return model, replace(pose, clips=clips), rest
+
+
+@pytest.mark.parametrize("space", [False, True])
+@pytest.mark.parametrize("kinds", [(), ("pinned",), ("clamped", "eyelet")])
+def test_a_start_that_slides_is_an_end_that_slides_of_the_reversed_cable(space, kinds):
+    held = held_between(space, kinds)
+    back = reversed_case(*held)
+    one, other = (
+        solve_equilibrium(model, model.nominal, rest, pose) for model, pose, rest in (held, back)
+    )
+    assert one.stable
+    assert other.energy == pytest.approx(one.energy, abs=1e-12)
+    assert other.fed == pytest.approx(one.fed, abs=1e-10)
+    np.testing.assert_allclose(other.points[::-1], one.points, atol=1e-9)
+    np.testing.assert_allclose(other.start_force, one.end_force, atol=1e-9)
+    np.testing.assert_allclose(other.end_force, one.start_force, atol=1e-9)
+    for load, own in zip(other.clips[::-1], one.clips, strict=True):
+        assert LOOM.length - load.at == pytest.approx(own.at, abs=1e-9)
+        np.testing.assert_allclose(load.force, own.force, atol=1e-8)
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_clips_and_a_rest_curvature_keep_their_places_on_a_cable_that_is_fed(space):
+    """The same shape as of a cable so long, of the same rest curvature, that cannot slide."""
+    errors = []
+    for n in (20, 40):
+        model, pose, rest = held_between(space, ("pinned",), n=n)
+        eq = solve_equilibrium(model, model.nominal, rest, pose)
+        free = LOOM.length + eq.fed
+        cable = replace(model.cable, length=free, mass=LOOM.mass * free / LOOM.length)
+        held = replace(model, cable=cable, end="swivel")
+        bent = 2.0 * np.sin(3 * held.chain.cells.mean(axis=1))
+        own = np.concatenate([0 * bent, bent, bent / 2]) if space else bent
+        same = solve_equilibrium(held, model.nominal, own, replace(pose, end_tension=None))
+        errors.append(np.abs(eq.points[[0, -1]] - same.points[[0, -1]]).max())
+        errors.append(np.abs(eq.end_force - same.end_force).max())
+        errors.append(np.abs(eq.clips[0].force - same.clips[0].force).max())
+    assert max(errors[::3]) < 1e-8
+    assert max(errors[4:]) < 2e-3
+    assert max(errors[4:]) < max(errors[1:3]) / 2.5
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_a_fed_cable_lies_on_a_table(space):
+    """All that touches is outside, and the table and both fixtures carry the weight."""
+    up = (0.0, 0.0, 1.0) if space else (0.0, 1.0)
+    table = Plane(tuple(-0.05 * np.array(up)), up, "table")
+    model, pose, _ = case(space, 0.45, 40)
+    model, pose = replace(model, obstacles=(table,)), replace(pose, end=(*pose.end[:-1], 0.0))
+    turn = {"end_orientation": turned(0.0, -0.2, 0.3)} if space else {"end_heading": 0.3}
+    flat = {"start_orientation": turned(0.0, 0.4, 0.0)} if space else {"start_heading": -0.4}
+    pose = replace(pose, **turn, **flat)
+    eq = solved(model, pose)
+    assert eq.stable
+    assert eq.contacts
+    assert eq.points[:, -1].min() > -0.05 + LOOM.diameter / 2 - 1e-6
+    weight = 9.81 * LOOM.mass * (LOOM.length + eq.fed) / LOOM.length
+    carried = sum(contact.force for contact in eq.contacts) + eq.start_force + eq.end_force
+    assert carried[-1] == pytest.approx(-weight, rel=1e-6)
+
+
+@pytest.mark.parametrize("space", [False, True])
+@pytest.mark.parametrize("kinds", [("pinned",), ("clamped", "eyelet")])
+def test_derivatives_between_clips(space, kinds):
+    model, pose, rest = held_between(space, kinds, n=12)
+    model = replace(model, effects=(MassError(), LengthError()))
+    p = model.nominal.copy()
+    p[model.names.index("length_error.length_difference")] = 0.01
+    columns = [model.names.index(name) for name in ("bending_stiffness", "mass_error.factor")]
+    assert_derivatives(model, pose, p, rest, columns)
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_a_free_length_that_is_given_needs_that_tension(space):
+    """The shape is the same; its derivative by the length is that of other lengths."""
+    model, pose, _ = case(space, 0.8)
+    eq = solved(model, pose)
+    told = replace(pose, end_tension=None, free_length=LOOM.length + eq.fed)
+    by_length = replace(model, fed_by_length=True)
+    same = solved(by_length, told)
+    assert same.fed == pytest.approx(eq.fed, abs=1e-14)
+    np.testing.assert_allclose(same.points, eq.points, atol=1e-12)
+    np.testing.assert_allclose(same.end_force, eq.end_force, atol=1e-10)
+    equilibria, rest = BatchEquilibrium(by_length, [told]), np.zeros(model.chain.n_rests)
+    p, own = model.nominal, by_length.deviations.index("free_length")
+
+    def fed(step):
+        there, ok = equilibria.solve(moved(step), p, rest, tolerance=1e-13)
+        assert ok.all()
+        (seen,) = equilibria.seen(there, p, rest)
+        return np.concatenate([seen.curve.numbers.ravel(), seen.readings])
+
+    def moved(step):
+        deviation = same.shapes.deviation.copy()
+        deviation[0, by_length.deviation_names.index("free_length")] = 0.003 + step
+        return replace(same.shapes, deviation=deviation)
+
+    shapes, _ = equilibria.solve(moved(0.0), p, rest, tolerance=1e-13)
+    along = equilibria.directions(shapes, p, rest, np.zeros((len(p), 0)), np.zeros((len(rest), 0)))
+    ((_, change),) = equilibria.observe(shapes, p, rest, along)
+    found = np.concatenate([change.curve[..., own].ravel(), change.readings[:, own]])
+    h = 1e-5
+    expected = (fed(-2 * h) - 8 * fed(-h) + 8 * fed(h) - fed(2 * h)) / (12 * h)
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("side", ["start", "end"])
+@pytest.mark.parametrize("space", [False, True])
+def test_the_shape_as_a_function_of_pose_and_tension(space, side):
+    """The same equilibrium; first and second derivatives are those of other poses."""
+    model, pose, _ = case(space, 0.8, 10)
     rest = np.zeros(model.chain.n_rests)
+    if side == "start":
+        model, pose, rest = reversed_case(model, pose, rest)
+    eq = solve_equilibrium(model, model.nominal, rest, pose)
+    function = CasadiCable(model, model.nominal, rest).function()
+    at = pose.numbers
+    points, end_force, _, energy, *_ = function(at)
+    np.testing.assert_allclose(np.array(points).T, eq.points, atol=1e-12)
+    np.testing.assert_allclose(np.array(end_force).ravel(), eq.end_force, atol=1e-10)
+    assert float(energy) == pytest.approx(eq.energy, abs=1e-12)
+    x = ca.MX.sym("x", len(at))
+    points, _, _, energy, *_ = function(x)
+    found = ca.vertcat(ca.vec(points), energy)
+    first = ca.Function("first", [x], [found, ca.jacobian(found, x)])
+    second, slope = ca.hessian(energy, x)
+    second = ca.Function("second", [x], [slope, second])
+    for k in (2 + space, len(at) - 1):  # the end's place x, and the tension
+        step = 1e-4 * np.eye(len(at))[k]
+        for exact in (first, second):
+            far, near = (
+                np.array(exact(at + h * step)[0]) - np.array(exact(at - h * step)[0])
+                for h in (2, 1)
+            )
+            expected = (8 * near - far).ravel() / 12e-4
+            derivative = np.array(exact(at)[1])[:, k]
+            np.testing.assert_allclose(derivative, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_a_fed_cable_in_a_problem_of_ones_own():
+    """The tension with which the middle is at a height: found again by solving."""
+    model, pose, _ = case(False, 0.8, 10)
+    rest, opti = np.zeros(model.chain.n_rests), ca.Opti()
+    tension = opti.variable()
+    opti.set_initial(tension, 1.2)
+    numbers = ca.vertcat(ca.DM(pose.numbers[:-1]), tension)
+    (shape,) = CasadiCable(model, model.nominal, rest).transcribe(opti, [numbers])
+    eq = solved(model, pose)
+    opti.subject_to(shape.points[1, 5] == eq.points[5, 1])
+    opti.solver("ipopt", {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"})
+    assert float(opti.solve().value(tension)) == pytest.approx(0.8, abs=1e-7)
+
+
+def test_what_a_sliding_end_has_not():
+    model, pose, _ = case(False, 0.8)
+    with pytest.raises(EquilibriumError, match="end_tension is missing"):
+        solved(model, replace(pose, end_tension=None))
+    with pytest.raises(EquilibriumError, match="free_length is missing"):
+        solved(replace(model, fed_by_length=True), replace(pose, end_tension=None))
+    with pytest.raises(DloError, match="through both ends"):
+        replace(model, start="slide", fed_by_length=True)
+    with pytest.raises(DloError, match="runs out or falls"):
+        replace(model, start="slide", end="free")
+    with pytest.raises(DloError, match="smooth element"):
+        replace(model, element="link")
+    rest = np.zeros(model.chain.n_rests)
+    with pytest.raises(DloError, match="no rest curvature that slides"):
+        CasadiCable(model, model.nominal, rest + 1.0).function()
     with pytest.raises(DloError, match="slides through its end yet"):
         generate(model, model.nominal, rest, "wire")
-    with pytest.raises(DloError, match="cannot be exported yet"):
+    with pytest.raises(DloError, match="cannot be exported"):
         Rod.of(SolvedCable.of(model, model.nominal, rest, pose))
 
 
@@ -200,10 +419,12 @@ experiment:
     ("old", "new", "said"),
     [
         ("end: slide", "end: clamped", "a clamped end has no end_tension"),
-        (", end_tension: 0.8", "", "a slide end has an end_tension"),
+        (", end_tension: 0.8", ", start_tension: 0.8", "a clamped start has no start_tension"),
+        ("end_tension: 0.8", "end_tension: 0.8, free_length: 0.7", "without a tension there"),
+        ("end_tension: 0.8", "end_tension: 0.8, start_tension: 1", "clamped start has no start_t"),
+        ("start: clamped, end: slide", "start: slide, end: free", "runs out of it"),
         ("end_heading: 0.9, ", "", "a slide end needs an end_heading"),
         ("end_tension: 0.8", "at: [0.1, 0.4, 0.7]", "slides through its end has no at"),
-        (", rest_shape: straight", "", "rest_shape: straight"),
         ("end: slide", "end: slipping", "slide"),
     ],
 )

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import CableCurve
-from dlo_casadi.cable.held import all_asked, among, held_pose, reaction_texts, side_texts
+from dlo_casadi.cable.held import FED, all_asked, among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.motion import POINTS, CableInMotion, ShapeInMotion
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
@@ -71,6 +71,8 @@ class FittedCable(CableInMotion):
         obstacles: Sequence[Obstacle | Mapping[str, Any]] = (),
         over: bool | Mapping[str, bool] | None = None,
         end_tension: float | None = None,
+        start_tension: float | None = None,
+        free_length: float | None = None,
     ) -> "Shape":
         """Predict the shape of the cable in a pose.
 
@@ -99,8 +101,8 @@ class FittedCable(CableInMotion):
             Obstacles that the cable may touch, see `Obstacle`; none by default.
         over : bool or mapping of str to bool, optional
             Whether the cable passes over or under the bars among the obstacles, see `Pose`.
-        end_tension : float [N], optional
-            Of the cable beyond a sliding end.
+        end_tension, start_tension, free_length : float [N], [N], [m], optional
+            Of the cable beyond a sliding end or start; or its length between the ends.
 
         Raises
         ------
@@ -110,11 +112,13 @@ class FittedCable(CableInMotion):
             If the ends are not held as the cable's boundary requires, or are not finite numbers.
         """
         asked: dict[str, Any] = {"start": start, "end": end, "turns": turns, "branch": branch}
-        asked |= {"start_heading": start_heading, "end_heading": end_heading}
+        asked |= {"start_heading": start_heading, "end_heading": end_heading, "clips": clips}
+        asked["over"] = over
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        asked |= {"clips": clips, "over": over, "end_tension": end_tension}
+        asked |= zip(FED, (start_tension, end_tension, free_length), strict=True)
         pose = held_pose(self.model, self.metadata.fixtures, all_asked(asked))
         held = self.with_clips([clip.kind for clip in pose.clips])
+        held = replace(held, model=replace(held.model, fed_by_length=free_length is not None))
         if obstacles or over is not None:
             held = replace(held, **among(held.model, held.p, obstacles, over))
         return held._solved(pose)
@@ -124,7 +128,6 @@ class FittedCable(CableInMotion):
             found = SolvedCable.of(self.model, self.p, self.rest, pose)
         except EquilibriumError as error:
             happened, _, advice = error.message.partition("\n  Try: ")
-            # A call has no configuration whose keys could be changed.
             turn = max(abs(x or 0.0) for x in (pose.start_heading, pose.end_heading))
             if "cable.length" in advice:
                 advice = "an end in metres, nearer to the start."
@@ -133,10 +136,8 @@ class FittedCable(CableInMotion):
             advice = advice.replace("(model.n)", f"(`with_mesh({2 * self.model.n})`)")
             raise EquilibriumError(f"{happened}\n  Try: {advice}", p_des=error.p_des) from None
         eq = found.equilibrium
-        if (beyond := eq.other_side) is None:
-            return self.shape_in(pose, eq)
-        near = Repeats(found, self.metadata.uncertainty).tipping(beyond)
-        if not near.either:
+        beyond, repeats = eq.other_side, Repeats(found, self.metadata.uncertainty)
+        if beyond is None or not (near := repeats.tipping(beyond)).either:
             return self.shape_in(pose, eq)
         own, others = sides_of(self.model, pose, eq, beyond)
         other_side = self.shape_in(others, beyond)
@@ -269,7 +270,7 @@ class Shape(ShapeInMotion):
 
     @property
     def free_length(self) -> float:
-        """Length [m] between the ends: the cable's, beside what was fed through a sliding end."""
+        """Length [m] between the ends: the cable's, beside what was fed through ends that slide."""
         return self.cable.length + self.equilibrium.fed
 
     @property
@@ -285,7 +286,8 @@ class Shape(ShapeInMotion):
     @cached_property
     def frames(self) -> FloatArray:
         """Material frames (101, d, d) at `s`, see `CableCurve.frames`."""
-        return self.curve.frames(self.s, self.held.places, self.equilibrium.x)
+        places = self.held.places - self.held.places[0]
+        return self.curve.frames(self.s, places * (self.s[-1] / places[-1]), self.equilibrium.x)
 
     @property
     def start_force(self) -> FloatArray:

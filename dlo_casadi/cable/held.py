@@ -24,9 +24,11 @@ from dlo_casadi.model.functions import functions_of
 from dlo_casadi.show.text import millimetres, vector
 
 # Arguments of `FittedCable.solve` that say how the ends are held.
+# Those that tell how long the cable between its ends is where it slides through one.
+FED = ("start_tension", "end_tension", "free_length")
 HELD = (
     *("end", "start", "start_heading", "end_heading", "start_orientation", "end_orientation"),
-    *("turns", "branch", "end_tension"),
+    *("turns", "branch", *FED),
 )
 # Smallest distance [m] between a fixture and the cable that a table reports.
 _SHOWN = 5e-6
@@ -181,9 +183,9 @@ def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, 
     for key, at in (("start", pose.start), ("end", pose.end)):
         if at is not None and len(at) != model.node.dimension:
             raise DloError(f"{key}: {own.place} belongs here ({gravity}), found {at}")
-    if model.end.slides != (pose.end_tension is not None):
-        has = "give" if model.end.slides else "there is no"
-        raise DloError(f"the end of {name} is {model.end}: {has} end_tension [N]")
+    by_length = pose.free_length is not None
+    if fed := pose.wrongly_fed((model.start, model.end), by_length=by_length):
+        raise DloError(fed.replace("the cable", name))
     if pose.turns and not (model.node.twists and model.start.roll and model.end.roll):
         raise DloError(f"{name} has no turns: it is not in space and clamped at both ends")
     return replace(pose, name=model.cable.name or "cable")

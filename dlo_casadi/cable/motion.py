@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate, EstimatedCable
-from dlo_casadi.cable.held import held_pose
+from dlo_casadi.cable.held import FED, held_pose
 from dlo_casadi.cable.moving_picture import (
     draw_motion,
     frame_times,
@@ -281,7 +281,7 @@ class CableInMotion(EstimatedCable):
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         rows = {key: _rows(key, x, len(times)) for key, x in asked.items() if x is not None}
         first = {key: (x[0] if x.ndim > 1 else x) for key, x in rows.items()}
-        given = dict.fromkeys((*asked, "turns", "branch", "clips", "end_tension"))
+        given = dict.fromkeys((*asked, "turns", "branch", "clips", *FED))
         numbers = {k: float(x[0]) if k.endswith("heading") else x for k, x in first.items()}
         pose = held_pose(self.model, self.metadata.fixtures, {**given, "turns": 0.0, **numbers})
         direction = node.direction

@@ -24,7 +24,7 @@ from scipy.optimize import linprog, minimize
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import EstimatedCable
-from dlo_casadi.cable.held import HELD, held_pose
+from dlo_casadi.cable.held import FED, HELD, held_pose
 from dlo_casadi.cable.limits import Asked, LimitUse, Resolved, asked_limits, bounds_of
 from dlo_casadi.config import Clip, Limits
 from dlo_casadi.effects import ALONG_CABLE
@@ -136,7 +136,8 @@ def placed(
             f"within: two corners of a region belong here, found {within!r}.\n  Try: {_TRY}"
         )
     known = cable.metadata
-    default: dict[str, Any] = {"turns": 0.0, "branch": None, "clips": [], "end_tension": None}
+    default: dict[str, Any] = {"turns": 0.0, "branch": None, "clips": []}
+    default |= dict.fromkeys(FED)
     held = tuple(
         replace(held_pose(cable.model, known.fixtures, default | dict(pose)), name=f"pose_{k}")
         for k, pose in enumerate(poses, start=1)

@@ -83,6 +83,8 @@ POSE = (
     ),
     option("--turns", type=float, metavar="N", help="extra turns of twist in space"),
     option("--end-tension", type=float, metavar="N", help="tension beyond a sliding end [N]"),
+    option("--start-tension", type=float, metavar="N", help="tension beyond a sliding start [N]"),
+    option("--free-length", type=float, metavar="M", help="length between ends that slide [m]"),
     BRANCH,
 )
 

@@ -112,8 +112,9 @@ def case_of(
     model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, obstacles: Obstacles
 ) -> "Case":
     """Contents of the templates for this cable."""
-    if model.end.slides:
-        raise DloError("no solver can be generated for a cable that slides through its end yet")
+    if model.slides:
+        side = "start" if model.start.slides else "end"
+        raise DloError(f"no solver can be generated for a cable that slides through its {side} yet")
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
     return kind(model, p, rest, inline, obstacles)
 
@@ -169,8 +170,8 @@ class Case:
     def eyelet_rows(self) -> list[int]:
         """Row of each holder's arc length in the border; 0 for holders that do not slide."""
         first, rows = self.model.node.dimension * (1 + self.holds), [0] * self.holds
-        for k, clip in enumerate(self.model.sliding):
-            rows[clip] = first + k
+        for k, support in enumerate(self.model.sliding):
+            rows[support - 1] = first + k
         return rows
 
     @property

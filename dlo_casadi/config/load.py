@@ -34,7 +34,6 @@ from dlo_casadi.config.supports import (
     clip_problems,
     clips_differ,
     obstacle_problems,
-    too_much_for_a_slide,
     too_short,
     undetermined,
     unused_directions,
@@ -90,7 +89,6 @@ def checked_config(source: Source) -> Config:
     config = source.checked(Config)
     if problems := [
         *_contradictions(config.experiment, config.cable.length),
-        *too_much_for_a_slide(config.experiment, config.cable.rest_shape),
         *_weightless(config),
         *wrong_effects(config),
         *impossible_noise(config.experiment, config.cable.length),
@@ -330,11 +328,16 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
                 yield f"a free end has no {key}. Try: boundary.end: one of {others}", None
     if pose.turns and not (space and held.start.roll and held.end.roll):
         yield "turns are of a cable in space that is clamped at both ends", "turns"
-    if held.end.slides != (pose.end_tension is not None):
-        yield f"a {held.end} end has {'an' if held.end.slides else 'no'} end_tension [N]", None
-    if held.end.slides and (pose.clips or pose.at is not None):
-        known = "clips" if pose.clips else "at: arc lengths of points"
-        yield f"a cable that slides through its end has no {known}", None
+    for key, how in (("start", held.start), ("end", held.end)):
+        needed = how.slides and not experiment.fed_by_length
+        if needed != (getattr(pose, f"{key}_tension") is not None):
+            article = ("an" if key == "end" else "a") if how.slides else "no"
+            all_of = ", in all poses or in none" if how.slides else ""
+            yield f"a {how} {key} has {article} {key}_tension [N]{all_of}", None
+        if how.slides and pose.at is not None:
+            yield f"a cable that slides through its {key} has no at: arc lengths of points", None
+    if pose.free_length is not None and not experiment.fed_by_length:
+        yield "free_length is of a cable that slides through an end, without a tension there", None
     if pose.branch in ("ccw", "cw") and space:
         yield f"branch: {pose.branch} is of a cable in a plane", "branch"
 

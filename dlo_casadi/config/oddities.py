@@ -1,7 +1,7 @@
 """Values of a configuration that are possible, but hardly meant: warnings."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,15 +45,7 @@ def oddities(config: Config) -> Iterator[str]:
             f"the cable is {cable.length:g} m long, but its ends are never more than "
             f"{max(spans):g} m apart: all in metres?"
         )
-    size = math.hypot(*experiment.gravity)
-    if size and abs(size / EARTH - 1.0) > _OTHER_GRAVITY:
-        meant = "in m/s^2?"
-        if abs(size - 1.0) < _OTHER_GRAVITY:
-            meant = f"in units of g? Try: {[round(EARTH * x, 6) + 0.0 for x in experiment.gravity]}"
-        yield (
-            f"gravity is {size:g} m/s^2, on Earth {EARTH}; a stiffness is found in proportion to "
-            f"it: {meant}"
-        )
+    yield from odd_gravity(experiment.gravity)
     if std is not None and std > 0.02 * cable.length:
         yield f"std {std:g} m is large for a cable of {cable.length:g} m: in metres?"
     if n is not None and n < _COARSE[ELEMENTS[element].order]:
@@ -85,6 +77,19 @@ def oddities(config: Config) -> Iterator[str]:
     for key in unused_directions(experiment.boundary.start, experiment.boundary.end):
         if given := [p.name for p in experiment.poses if getattr(p, key) is not None]:
             yield f"{key} is not used, the {key.partition('_')[0]} is pinned: {', '.join(given)}"
+
+
+def odd_gravity(gravity: Sequence[float]) -> Iterator[str]:
+    """Whether gravity [m/s^2] is hardly meant: neither that on Earth nor none."""
+    size = math.hypot(*gravity)
+    if size and abs(size / EARTH - 1.0) > _OTHER_GRAVITY:
+        meant = "in m/s^2?"
+        if abs(size - 1.0) < _OTHER_GRAVITY:
+            meant = f"in units of g? Try: {[round(EARTH * x, 6) + 0.0 for x in gravity]}"
+        yield (
+            f"gravity is {size:g} m/s^2, on Earth {EARTH}; a stiffness is found in proportion to "
+            f"it: {meant}"
+        )
 
 
 def _moments_of_free_turns(experiment: Experiment) -> Iterator[str]:

@@ -28,7 +28,7 @@ from dlo_casadi.config.values import (
     within,
 )
 from dlo_casadi.errors import counted
-from dlo_casadi.model.cable_model import Tolerances
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.supports import SupportKind
 from dlo_casadi.thresholds import SIGNIFICANCE
 

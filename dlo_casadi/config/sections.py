@@ -46,6 +46,7 @@ from dlo_casadi.config.values import (
     Number,
     Place,
     Points,
+    Positive,
     Quaternion,
     checked,
     no_file_name,
@@ -126,6 +127,11 @@ class Pose(ConfigSection):
     """What holds the cable between its ends, in the order along it."""
     end_tension: Number | None = None
     """Tension [N] of the cable beyond a sliding end, which pulls it out; 0 where it lies slack."""
+    start_tension: Number | None = None
+    """Tension [N] of the cable beyond a sliding start, as end_tension."""
+    free_length: Positive | None = None
+    """Length [m] between the ends of a cable that slides through one, where no tension is known: a
+    first value, which is estimated; of the measured line when absent."""
     over: StrictBool | dict[str, StrictBool] | None = None
     """Whether the cable passes over (true) or under (false) the bars among the obstacles, or some
     of them, {bar: true}: whether it crosses the half-plane that stands on a bar's axis, or the one
@@ -171,8 +177,9 @@ class Pose(ConfigSection):
 
         (6,) in a plane: start x, y, end x, y [m], start heading, end heading [rad]. (15,) in space:
         start, end [m], their quaternions (x, y, z, w), turns. What is not given is 0, or (0, 0, 0,
-        1). Then for each clip its arc length and place [m] and, if one of them is clamped, its
-        heading or quaternion: see dlo_pose in the C header.
+        1). Then the tension [N] beyond each end that slides. Then for each clip its arc length and
+        place [m] and, if one of them is clamped, its heading or quaternion: see dlo_pose in the C
+        header.
         """
         return self.held.numbers
 
@@ -272,6 +279,12 @@ class Experiment(ConfigSection):
     def in_space(self) -> bool:
         """Whether the cable may leave the plane."""
         return len(self.gravity) == 3
+
+    @property
+    def fed_by_length(self) -> bool:
+        """Whether ends slide and no pose tells the tension beyond them."""
+        slides = self.boundary.start.slides or self.boundary.end.slides
+        return slides and all(pose.held.tensions == (None, None) for pose in self.poses)
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 from dlo_casadi.config.frozen import ConfigSection, Given, Numbers, Turned, entry
 from dlo_casadi.config.problems import ConfigProblem, did_you_mean
@@ -25,7 +25,7 @@ from dlo_casadi.rod.quantities import FORCE
 from dlo_casadi.rod.supports import CLIPS, ENDS, STARTS, SupportKind
 
 # What type checkers accept as the kind of a start, an end, a clip.
-_Start: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel"]
+_Start: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "slide"]
 _End: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "slide", "free"]
 _Clip: TypeAlias = SupportKind | Literal["pinned", "clamped", "swivel", "eyelet"]
 
@@ -35,10 +35,12 @@ class Boundary(ConfigSection):
 
     start: Given[Annotated[SupportKind, one_of(STARTS)], _Start] = entry()
     """Start of the cable: pinned (free to turn), clamped (its direction is held, in space its roll,
-    too) or swivel (its direction is held, it may roll about its axis)."""
+    too), swivel (its direction is held, it may roll about its axis) or slide: it is fed through a
+    guide that holds its direction; `start_tension` of the pose determines its free length, which
+    is estimated where no pose has one."""
     end: Given[Annotated[SupportKind, one_of(ENDS)], _End] = entry()
-    """End of the cable: pinned, clamped, swivel, free, or slide: it is fed through a guide that
-    holds its direction; `end_tension` of the pose determines its free length."""
+    """End of the cable: pinned, clamped, swivel, free, or slide as the start, with `end_tension` of
+    the pose."""
 
     @property
     def directed(self) -> bool:
@@ -48,6 +50,12 @@ class Boundary(ConfigSection):
 
 def undetermined(start: SupportKind, end: SupportKind, in_space: bool) -> Iterator[ConfigProblem]:
     """Why ends held in this way leave the cable's position undetermined."""
+    if start.slides and not end.place:
+        text = (
+            "through a start that slides a cable with a free end runs out of it, or falls through "
+            "it. Try: the end that is held as the start, or end: pinned, swivel or clamped"
+        )
+        yield ConfigProblem(("experiment", "boundary"), text)
     if in_space and not (start.direction or end.place):
         text = (
             "on a ball joint and with a free end a cable in space can turn freely about the "
@@ -55,19 +63,6 @@ def undetermined(start: SupportKind, end: SupportKind, in_space: bool) -> Iterat
             "start_orientation; or two numbers of gravity, in the plane in which it hangs"
         )
         yield ConfigProblem(("experiment", "boundary"), text)
-
-
-def too_much_for_a_slide(experiment: Any, rest_shape: str) -> Iterator[ConfigProblem]:
-    """What a session of a cable that slides through its end may not have yet."""
-    if not experiment.boundary.end.slides:
-        return
-    text = "a cable that slides through its end"
-    if rest_shape != "straight":
-        yield ConfigProblem(
-            ("cable",), f"{text} is straight at rest yet. Try: rest_shape: straight"
-        )
-    if experiment.obstacles:
-        yield ConfigProblem(("experiment", "obstacles"), f"{text} has no obstacles yet")
 
 
 def unused_directions(start: SupportKind, end: SupportKind) -> list[str]:

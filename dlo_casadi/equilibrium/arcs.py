@@ -53,15 +53,17 @@ class Span:
 def arc_frames(
     model: CableModel,
     pose: HeldPose,
+    places: FloatArray,
     spans: Sequence[Span],
     clamps: Sequence[tuple[float, FloatArray | None]],
     row: GuessRow,
 ) -> FloatArray | None:
-    """Frames (n_nodes, 4); `clamps`: arc lengths and frames of all holders that fix the roll.
+    """Frames (n_nodes, 4) at arc lengths `places` (n_nodes,) [m] from one end to the other.
+
+    `clamps`: arc lengths and frames of all holders that fix the roll.
 
     None where the row rolls the cable the other way round and its roll is not nearly half a turn.
     """
-    places, length = model.chain.places, model.chain.length
     axes = np.zeros((len(places), 3))
     arcs = [_Arc.of(model, span, side) for span, side in zip(spans, row.sides, strict=True)]
     for k, (before, after) in enumerate(pairwise(arcs)):
@@ -75,10 +77,10 @@ def arc_frames(
         u = np.clip((places[inside] - span.start) / span.length, 0.0, 1.0)
         axes[inside] = arc.bent(u)
     edges: list[tuple[float, FloatArray | None]] = list(clamps)
-    if not edges or edges[0][0] > 0:
-        edges.insert(0, (0.0, None))
-    if edges[-1][0] < length:
-        edges.append((length, None))
+    if not edges or edges[0][0] > places[0]:
+        edges.insert(0, (float(places[0]), None))
+    if edges[-1][0] < places[-1]:
+        edges.append((float(places[-1]), None))
     x, roll = frames_along(places, axes, edges, pose.turns, other_way=row.rolled)
     left_out = row.rolled and (pose.turns or not 0.0 < abs(roll) < np.pi + HALF_TURN)
     return None if left_out else x

@@ -27,7 +27,7 @@ from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.contact import outwards
-from dlo_casadi.model.whole_pose import potential
+from dlo_casadi.model.whole_pose import Laid, potential
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.runtime.executors import interrupts_held
 
@@ -100,6 +100,8 @@ def by_ipopt(
         As in `solve.solve_equilibrium`.
     phi : (n_nodes,) [rad]
     """
+    if model.slides and rest.any():
+        return None  # segments change the cells whose rest strains they have
     border, still = border_of(model, pose, phi[:, None]), np.zeros((1, len(model.deviation_names)))
     given = Inputs.of(p, rest, pose.vector[None])
     now, iterations = Assembly(model, Shapes(phi[None, :, None], border[None], still), given), 0
@@ -134,13 +136,13 @@ def _minimised(start: Assembly) -> tuple[Assembly, FloatArray, int]:
     room = np.where(np.isin(np.arange(len(x0)), clipped.clamped[0]), 0.0, np.inf)
     bounds = {"lbx": x0 - room, "ubx": x0 + room, "lbg": lower, "ubg": upper}
     for k, row in model.sliding.items():
-        back, ahead = (
-            MOST_SLID * np.diff(clipped.places[0])[clipped.nodes[0, k] + np.array([-1, 0])]
-        )
-        at = count + int(places[:row].sum())
+        if not 0 < k <= len(model.clips):
+            continue
+        node, at = clipped.nodes[0, k - 1], count + int(places[:row].sum())
+        back, ahead = MOST_SLID * np.diff(clipped.places[0, node - 1 : node + 2])
         bounds["lbx"][at], bounds["ubx"][at] = x0[at] - back, x0[at] + ahead
-    moved = (np.arange(count) == clipped.nodes[0][:, None]).ravel(order="F")
-    numbers = (given.p[0], given.rest[0], given.poses[0], start.shapes.deviation[0], moved)
+    laid = Laid.numbers(model, clipped)
+    numbers = (given.p[0], given.rest[0], given.poses[0], start.shapes.deviation[0], laid)
     out, stats = run_ipopt(solver, x0=x0, p=np.concatenate(numbers), **bounds)
     multipliers, coordinates = (np.array(out[name]).ravel() for name in ("lam_g", "x"))
     border = np.zeros(model.n_border)

@@ -12,6 +12,7 @@ from dlo_casadi.model.assembly import Assembly, Shapes
 from dlo_casadi.model.clipped import Clipped
 from dlo_casadi.model.clips import ClipLoad
 from dlo_casadi.model.contact import Contact
+from dlo_casadi.model.functions import functions_of
 from dlo_casadi.rod.ends import reaction_rows
 
 # Largest angle between neighbouring headings (Eq. 8; joints only) [rad].
@@ -70,7 +71,7 @@ class Equilibrium:
     contacts : tuple of Contact
         Where the cable touches obstacles, from its start to its end.
     fed : float [m]
-        Length of the cable that was fed through a sliding end: free minus declared length.
+        Length of the cable that was fed through ends that slide: free minus declared length.
     near : (number of eyelets,) [m]
         See `Shapes`.
     """
@@ -182,6 +183,16 @@ def continued(clipped: Clipped) -> tuple[IntArray, FloatArray]:
     return index, inside + beyond
 
 
+def _fed(found: Assembly) -> FloatArray:
+    """True length (m,) [m] without load that was fed through ends that slide."""
+    clipped, m = found.clipped, len(found.shapes.x)
+    if not found.model.slides or not m:
+        return np.zeros(m)
+    stretch = functions_of(found.model).stretch.map(m)(found.given.p.T)
+    fed = clipped.held[:, -1] - clipped.held[:, 0] - found.model.chain.length
+    return np.asarray(np.array(stretch)[0] * fed)
+
+
 def equilibria_of(found: Assembly, *, stable: BoolArray, iterations: IntArray) -> list[Equilibrium]:
     """Equilibria of m shapes, whose joints bend freely; `stable` and `iterations` (m,)."""
     shapes, chain, node = found.shapes, found.model.chain, found.model.node
@@ -195,6 +206,7 @@ def equilibria_of(found: Assembly, *, stable: BoolArray, iterations: IntArray) -
     curvatures = chain.curvatures(strains)
     sizes = curvatures_along(curvatures, found.clipped).max(axis=1)
     on_clips, contacts = found.clip_loads(), found.contacts()
+    fed = _fed(found)
     out = []
     for j in range(len(shapes.x)):
         moments = [on_fixtures[j, rows[f"{side}_moment"]] for side in ("start", "end")]
@@ -217,7 +229,7 @@ def equilibria_of(found: Assembly, *, stable: BoolArray, iterations: IntArray) -
                 iterations=int(iterations[j]),
                 clips=on_clips[j],
                 contacts=contacts[j],
-                fed=float(shapes.lam[j, found.model.fed].sum()),
+                fed=float(fed[j]),
                 near=found.clipped.near[j, [*found.model.sliding]],
             )
         )

@@ -52,7 +52,7 @@ def true_ends(
 ) -> tuple[tuple[FloatArray, FloatArray], Clamps, float]:
     """Positions [m] of the ends; frames of clamps, None for a pin or a free end; length [m].
 
-    The length of a cable that slides through its end is a first guess: SLACK beyond the chord.
+    The length of a cable that slides through an end is a first guess: SLACK beyond the chord.
     """
     ends, own = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)
     d, c = model.node.dimension, model.node.coordinates
@@ -62,19 +62,9 @@ def true_ends(
         last if model.end.direction else None,
     )
     length = float(own)
-    if model.end.slides:
+    if model.slides:
         length = max((1 + SLACK) * float(np.linalg.norm(end - start)), SLACK * length)
     return (start, end), clamps, length
-
-
-def border_guess(model: CableModel, p: FloatArray, pose: HeldPose) -> FloatArray:
-    """First guess of the border (n_border,): of a sliding end the length of `true_ends`."""
-    border = np.zeros(model.n_border)
-    if model.fed:
-        *_, length = true_ends(model, p, pose)
-        own = lagrangian_of(model).true_ends_and_length(p, pose.ends, 0)[1]
-        border[model.fed] = length - float(own)
-    return border
 
 
 # ---- in a plane ----------------------------------------------------------------------------------

@@ -30,31 +30,35 @@ from dlo_casadi.equilibrium.pose import Branch, HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spans import out_of_reach
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import VIEWPOINT_SIZE, CableModel
 from dlo_casadi.model.pose_system import pose_rows
 from dlo_casadi.model.whole_pose import PoseSymbols, tangent
 from dlo_casadi.rod.ends import EndConditions
 
 # Number of equilibria that a search caches: an optimiser asks for value, gradient, Hessian.
 KEPT = 1024
+SIDES = ("start", "end")
 
 
 def pose_size(model: CableModel) -> int:
-    """Size of dlo_pose in the C header: both ends, in space `turns`, then the clips."""
+    """Size of dlo_pose in the C header: both ends, in space `turns`, tensions, then the clips."""
     frame = model.node.coordinates * model.clamped_between
     clips = (1 + model.node.dimension + frame) * len(model.clips)
-    return EndConditions.size(model.node) + model.node.twists + clips
+    return EndConditions.size(model.node) + model.node.twists + sum(model.loose) + clips
 
 
 def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None) -> HeldPose:
     """The pose with its numbers laid out as in dlo_pose; what is not held is left out."""
     d, c = model.node.dimension, model.node.coordinates
-    start, end, first, last, turns = np.split(numbers, np.cumsum([d, d, c, c]))
+    sizes = np.cumsum([d, d, c, c, int(model.node.twists)])
+    start, end, first, last, turns, beyond = np.split(numbers, sizes)
     held: dict[str, Any] = {}
     for side, frame in (("start", first), ("end", last)):
         if getattr(model, side).direction:
             held[f"{side}_{model.node.direction}"] = model.node.declared(frame)
     both = model.start.roll and model.end.roll
+    pulled = [side for side, slides in zip(SIDES, model.loose, strict=True) if slides]
+    held |= {f"{side}_tension": float(x) for side, x in zip(pulled, beyond, strict=False)}
     return HeldPose(
         start=tuple(start.tolist()),
         end=tuple(end.tolist()) if model.end.place else None,
@@ -69,8 +73,9 @@ def symbols_of(
 ) -> PoseSymbols:
     """Arguments of the expressions of a pose; `pose` as in dlo_pose, quaternions of any length."""
     d, c = model.node.dimension, model.node.coordinates
-    start, end, first, last, _ = ca.vertsplit(
-        pose, np.cumsum([0, d, d, c, c, pose.numel() - 2 * (d + c)]).tolist()
+    others = pose.numel() - 2 * (d + c) - int(model.node.twists)
+    start, end, first, last, _, beyond = ca.vertsplit(
+        pose, np.cumsum([0, d, d, c, c, int(model.node.twists), others]).tolist()
     )
     frames = []
     for held, frame in ((model.start, first), (model.end, last)):
@@ -78,8 +83,7 @@ def symbols_of(
             frame = ca.MX(ca.DM(model.node.identity))
         frames.append(model.node.normalised(frame))
     end = end if model.end.place else ca.MX.zeros(d)
-    camera = ca.MX.zeros(model.n_pose - EndConditions.size(model.node))
-    full = ca.vertcat(start, end, *frames, camera)
+    full = ca.vertcat(start, end, *frames, ca.MX.zeros(VIEWPOINT_SIZE), beyond)
     still = ca.DM.zeros(len(model.deviation_names))
     return PoseSymbols(ca.vec(x), multipliers, p, rest, full, still)
 
@@ -87,7 +91,12 @@ def symbols_of(
 def search_sizes(model: CableModel) -> list[tuple[int, int]]:
     """Sizes of the outputs of a search: x, multipliers, status, 1 or NaN."""
     x = (model.node.coordinates, model.chain.n_nodes)
-    return [x, (model.n_multipliers, 1), (1, 1), (1, 1)]
+    return [x, (len(_searched(model)), 1), (1, 1), (1, 1)]
+
+
+def _searched(model: CableModel) -> list[int]:
+    """Border rows that a search finds: multipliers, then arc lengths at ends that slide."""
+    return [*np.flatnonzero(model.are_multipliers).tolist(), *model.sliding.values()]
 
 
 class _SearchCallback(ca.Callback):
@@ -119,7 +128,7 @@ class _SearchCallback(ca.Callback):
     def _find(self, *given: bytes) -> list[ca.DM]:
         found = self._solved(*map(np.frombuffer, given))
         if isinstance(found, Equilibrium):
-            multipliers = found.multipliers[self.model.are_multipliers]
+            multipliers = found.multipliers[_searched(self.model)]
             return [ca.DM(found.x.T), ca.DM(multipliers), ca.DM(0), ca.DM(1)]
         none = [ca.DM.nan(*size) for size in self._sizes]
         return [*none[:2], ca.DM(found), none[3]]
@@ -175,14 +184,14 @@ class Numbers:
 
 
 def border_of(model: CableModel, numbers: Numbers) -> ca.Function:
-    """(x, multipliers (n_multipliers,), pose, ...) -> (n_border,): places of springs put in.
+    """(x, what a search finds of the border, pose, ...) -> (n_border,): places of springs put in.
 
     A spring's place y has the condition r(s) - y = 0: with y = 0 this is y. Without derivatives.
     """
     x = ca.MX.sym("x", model.node.coordinates, model.chain.n_nodes)
-    found, pose = ca.MX.sym("multipliers", model.n_multipliers), ca.MX.sym("pose", pose_size(model))
-    border = ca.MX.zeros(model.n_border)
-    border[np.flatnonzero(model.are_multipliers).tolist()] = found
+    known, pose = _searched(model), ca.MX.sym("pose", pose_size(model))
+    found, border = ca.MX.sym("multipliers", len(known)), ca.MX.zeros(model.n_border)
+    border[known] = found
     if model.n_springs:
         rows = pose_rows(model, symbols_of(model, x, border, pose, **numbers.inside)).conditions
         pulls = [row for rows_of_one in model.pulls[: model.n_springs] for row in rows_of_one]

@@ -115,10 +115,11 @@ def _depths(found: Assembly) -> tuple[list[str], FloatArray]:
 def _along(found: Assembly) -> FloatArray:
     """Places (m, K, d) [m] along cables, four per element, interpolated from their nodes."""
     model, points, x = found.model, found.nodes(), found.shapes.x
-    if model.clips:  # nodes are moved to these, `points` are even
-        even, moved = model.chain.places, found.clipped.places
-        x = np.array([model.node.interpolated(even, *each) for each in zip(moved, x, strict=True)])
-    slopes = model.chain.h * tangents(model.node, x)
+    if model.moves_nodes:  # `points` are even
+        each = zip(found.clipped.even, found.clipped.places, x, strict=True)
+        x = np.array([model.node.interpolated(*own) for own in each])
+    size = np.diff(found.clipped.held[:, [0, -1]]) / model.n
+    slopes = size[..., None] * tangents(model.node, x)
     u = np.arange(4)[:, None] / 4
     start, end = points[..., :-1, None, :], points[..., 1:, None, :]
     out, into = slopes[..., :-1, None, :], slopes[..., 1:, None, :]

@@ -28,8 +28,6 @@ from dlo_casadi.model.contact import DEPTH, gap_per_force
 from dlo_casadi.rod.band import NEUTRAL, BandFactor, BandMatrix, Vector
 from dlo_casadi.rod.obstacles import bars_of
 
-# Largest share of the length that a cable may lose through its end.
-SHORTEST = 0.95
 # Turn [rad] that counts as much as a slip of the whole length through an eyelet.
 _TURN = 10.0
 # Longest step of a node [rad].
@@ -86,7 +84,7 @@ class Minima(NamedTuple):
 
 def turn_per_slip(model: CableModel) -> FloatArray:
     """Turn [rad/m] equivalent to a slip through an eyelet or an end; zero for others (k,)."""
-    slide = np.isin(np.arange(model.n_border), [*model.sliding.values(), *model.fed])
+    slide = np.isin(np.arange(model.n_border), [*model.sliding.values()])
     return slide * (_TURN / model.chain.length)
 
 
@@ -293,7 +291,6 @@ def stepped(here: Assembly, step: Vector, size: FloatArray) -> Assembly:
     share = np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))
     x = model.node.moved(shapes.x, share[:, None, None] * step.x[..., 0])
     lam = shapes.lam + share[:, None] * step.y[..., 0]
-    lam[:, model.fed] = lam[:, model.fed].clip(-SHORTEST * model.chain.length)
     moved = replace(shapes, x=x, lam=lam)
     return replace(here, shapes=slid(here, moved) if model.sliding else moved)
 

@@ -13,6 +13,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.node import Frame, Heading, Node
 from dlo_casadi.rod.quaternions import quaternion_product
+from dlo_casadi.rod.supports import SupportKind
 
 Branch = Literal["ccw", "cw"]
 # In a session, a pose may also continue the pose before it, see `solve.continued`.
@@ -49,8 +50,10 @@ class HeldPose:
         What holds the cable between its ends, in the order along it.
     over : bool or mapping of str to bool, optional
         Whether the cable passes over or under bars, see `Capsule.passed`: for all, or by name.
-    end_tension : float [N], optional
-        Of the cable beyond a sliding end, which pulls it out.
+    start_tension, end_tension : float [N], optional
+        Of the cable beyond a sliding start or end, which pulls it out.
+    free_length : float [m], optional
+        Length between the ends of a cable that slides through one; instead of the tension there.
     """
 
     start: tuple[float, ...]
@@ -66,6 +69,8 @@ class HeldPose:
     clips: tuple[HeldClip, ...] = ()
     over: bool | Mapping[str, bool] | None = field(default=None, hash=False)
     end_tension: float | None = None
+    start_tension: float | None = None
+    free_length: float | None = None
 
     @property
     def node(self) -> type[Node]:
@@ -147,26 +152,46 @@ class HeldPose:
         """The numbers of dlo_pose in the C header, in their order; 0 or identity where not held.
 
         Start, end [m]; in a plane the headings of both [rad], in space their quaternions and the
-        turns; then of each clip its arc length and place [m] and, if one holds a direction, frames.
+        turns; tensions beyond ends that slide [N]; then of each clip its arc length and place [m]
+        and, if one holds a direction, frames.
         """
         turns = [self.turns] if self.node.twists else []
         held, clips = any(clip.kind.direction for clip in self.clips), []
         for clip in self.clips:
             frame = self.node.identity if clip.frame is None else clip.frame
             clips += [clip.at or 0.0, *clip.place, *(frame if held else ())]
-        return np.array([*self.ends, *turns, *clips], dtype=float)
+        beyond = [x for x in self.tensions if x is not None]
+        return np.array([*self.ends, *turns, *beyond, *clips], dtype=float)
 
     @property
     def vector(self) -> FloatArray:
-        """The model's argument `pose`: ends, camera (`effects.Viewpoint`), tension, clips.
+        """The model's argument `pose`: ends, camera (`effects.Viewpoint`), tensions, clips.
 
-        The camera's centre (x, y, z) enters as (x, y, 1) / z: zeros if it is not known.
+        The camera's centre (x, y, z) enters as (x, y, 1) / z: zeros if it is not known. Instead of
+        tensions it may have the free length.
         """
         x, y, z = self.camera_center or (0.0, 0.0, np.inf)
         clips = (clip.vector(self.node) for clip in self.clips)
         camera = np.array([x, y, 1.0]) / z
-        beyond = [] if self.end_tension is None else [self.end_tension]
+        beyond = [x for x in (*self.tensions, self.free_length) if x is not None]
         return np.concatenate([self.ends, camera, beyond, *clips])
+
+    def wrongly_fed(self, held: Sequence[SupportKind], *, by_length: bool) -> str:
+        """What is missing or too much for ends `held` (start, end) so; empty if nothing is."""
+        for side, kind, tension in zip(("start", "end"), held, self.tensions, strict=True):
+            if (kind.slides and not by_length) != (tension is not None):
+                is_it = f"is {tension:g} N" if tension is not None else "is missing"
+                return f"the {side} of the cable is {kind}, {side}_tension {is_it}"
+        slides = any(kind.slides for kind in held)
+        if (slides and by_length) != (self.free_length is not None):
+            is_it = f"is {self.free_length:g} m" if self.free_length is not None else "is missing"
+            return f"the ends of the cable are {held[0]} and {held[1]}, free_length {is_it}"
+        return ""
+
+    @property
+    def tensions(self) -> tuple[float | None, float | None]:
+        """Tensions [N] of the cable beyond both ends."""
+        return self.start_tension, self.end_tension
 
 
 def pose_numbers(pose: object) -> Any:

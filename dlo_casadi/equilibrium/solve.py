@@ -14,6 +14,7 @@ from dlo_casadi.equilibrium.equilibrium import (
     NEARBY,
     Equilibrium,
     equilibria_of,
+    stacked,
 )
 from dlo_casadi.equilibrium.minima import KEEPING_SIDE, Minima, descend_to_contact
 from dlo_casadi.equilibrium.pose import SIGNS, HeldPose
@@ -34,7 +35,7 @@ from dlo_casadi.equilibrium.spans import (
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clips import placed_nodes
+from dlo_casadi.model.clipped import Clipped
 from dlo_casadi.rod.node import Frame
 
 # Largest move of an end in one step [lengths, rad], so that a shape can be followed up to a fold.
@@ -185,8 +186,9 @@ def _chosen(
     named = None if start is not None or pose.branch == "previous" else pose.branch
     where = "its end free" if pose.end is None else f"its end at {pose.end} m"
     if start is None and found and pose.turns:
-        at = np.array([[load.at for load in eq.clips] for eq in found])
-        twists = _twists(model, at, np.array([eq.twist for eq in found]))
+        given = Inputs.of(model.nominal, np.zeros(model.chain.n_rests), pose.vector[None])
+        twisted = Assembly(model, stacked(found), given.subset(np.zeros(len(found), dtype=int)))
+        twists = _twists(twisted.clipped, np.array([eq.twist for eq in found]))
         kept = [eq for eq, held in zip(found, _holds(pose, twists), strict=True) if held]
         if not kept:
             left = min(zip(twists, found, strict=True), key=lambda pair: pair[1].energy)[0]
@@ -343,7 +345,7 @@ class _PoseSearch:
         x, kept = found.shapes.x, []
         for j, pose in enumerate(poses):
             rows = np.flatnonzero((of == j) & minima.converged)
-            rows = rows[_holds(pose, _twists(coarse, found.clipped.at[rows], twist[rows]))]
+            rows = rows[_holds(pose, _twists(found.clipped, twist)[rows])]
             rows = rows[on_named_sides(coarse, pose, points[rows])]
             rows = rows[np.argsort(minima.energy[rows], kind="stable")]
             mine = [int(rows[k]) for k in _distinct(model, x[rows])[:FEW]]
@@ -373,13 +375,12 @@ def coarse_rest(model: CableModel, coarse: CableModel, rest: FloatArray) -> Floa
     return np.concatenate([shares @ part for part in np.split(rest, len(model.node.strains))])
 
 
-def _twists(model: CableModel, at: FloatArray, twist: FloatArray) -> FloatArray:
+def _twists(clipped: Clipped, twist: FloatArray) -> FloatArray:
     """Turns (m,) that the end clamp gives cables, from the `twist` (m, n_cells) [1/m] of cells."""
-    # They stop at a clip, of arc lengths `at` (m, k) [m], that holds the roll.
-    nodes, places = placed_nodes(model.chain, at, at)
-    rolled = nodes[:, [kind.roll for kind in model.clips]]
+    # They stop at a clip that holds the roll.
+    rolled = clipped.nodes[:, [kind.roll for kind in clipped.kinds]]
     beyond = np.arange(twist.shape[1]) >= rolled.max(axis=1, keepdims=True, initial=0)
-    return np.asarray((twist * np.diff(places) * beyond).sum(axis=1) / (2 * np.pi))
+    return np.asarray((twist * np.diff(clipped.places) * beyond).sum(axis=1) / (2 * np.pi))
 
 
 def _holds(pose: HeldPose, twists: FloatArray) -> BoolArray:

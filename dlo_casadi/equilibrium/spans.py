@@ -13,11 +13,10 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.equilibrium.arcs import Span, arc_frames
-from dlo_casadi.equilibrium.guess_table import SLACKS, GuessRow, guess_table
+from dlo_casadi.equilibrium.guess_table import SLACK, SLACKS, GuessRow, guess_table
 from dlo_casadi.equilibrium.guesses import (
     arc_headings,
     arc_into_clamps,
-    border_guess,
     downwards,
     fallen,
     guessed_frames,
@@ -43,7 +42,7 @@ _ALONG = 21
 class _Holder:
     """Something that holds the cable: an end, a clip, or a bar that it passes.
 
-    `at` is None for an eyelet or a bar, `place` is None for a free end.
+    `at` is None for an eyelet, an end that slides, or a bar, `place` is None for a free end.
     """
 
     at: float | None
@@ -60,14 +59,16 @@ class _Holder:
 def holders(model: CableModel, p: FloatArray, pose: HeldPose) -> list[_Holder]:
     """All holders of the cable, from start to end; arc lengths relative to the declared length."""
     (start, end), clamps, _ = true_ends(model, p, pose)
-    found = [_Holder(0.0, start, clamps[0], not model.start.roll)]
+    first = None if model.start.slides else 0.0
+    found = [_Holder(first, start, clamps[0], not model.start.roll)]
     places, at, turns = (np.array(x) for x in functions_of(model).true_clips(p, pose.vector))
     for k, clip in enumerate(pose.clips):
         s = None if clip.kind.slides else float(at[k, 0])
         frame = None if clip.frame is None else model.node.moved(clip.frame, turns[:, k])
         found.append(_Holder(s, places[:, k], frame, not clip.kind.roll))
     place = end if model.end.place else None
-    found.append(_Holder(model.cable.length, place, clamps[1], not model.end.roll))
+    last = None if model.end.slides else model.cable.length
+    found.append(_Holder(last, place, clamps[1], not model.end.roll))
     return found
 
 
@@ -124,8 +125,17 @@ def fixed_stretches(held: Sequence[_Holder]) -> list[tuple[int, int, float]]:
 
 
 def _arc_lengths(held: Sequence[_Holder], share: float) -> list[float]:
-    """Arc lengths [m] of all holders; eyelets share the slack evenly, or as in SLACKS."""
+    """Arc lengths [m] of all holders; eyelets share the slack evenly, or as in SLACKS.
+
+    Beyond the holders of known arc lengths, up to ends that slide, spans are longer than their
+    chords by SLACK.
+    """
     at, apart = [one.at or 0.0 for one in held], chords(held)
+    known = [k for k, one in enumerate(held) if one.at is not None] or [0]
+    for k in range(known[0], 0, -1):
+        at[k - 1] = at[k] - (1 + SLACK) * apart[k - 1]
+    for k in range(known[-1], len(held) - 1):
+        at[k + 1] = at[k] + (1 + SLACK) * apart[k]
     for low, high, length in fixed_stretches(held):
         own = np.array(apart[low:high])
         slack = max(length - own.sum(), 0.0)
@@ -159,7 +169,8 @@ def first_guesses(
             model, pose, past, guess_table(len(past) - 1, model.in_space, True)
         )
     if pose.clips:
-        rows = guess_table(len(held) - 1, model.in_space, bool(model.sliding))
+        slides = any(kind.slides for kind in model.clips)
+        rows = guess_table(len(held) - 1, model.in_space, slides)
         yield from _span_guesses(model, pose, held, rows)
     elif model.node is Frame:
         yield from ((x, none) for x in guessed_frames(model, p, rest, pose))
@@ -172,37 +183,57 @@ def _span_guesses(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Arcs span by span, for each row of a table; taut spans have one side alone."""
     rolls = [k for k, one in enumerate(held) if one.frame is not None and not one.rolls]
-    clips = [k for k, one in enumerate(held) if not one.passed][1:]
+    own = [k for k, one in enumerate(held) if not one.passed]
     tried = set()
     for row in rows:
         at = _arc_lengths(held, SLACKS[row.slack])
         spans, border = spans_of(held, at), np.zeros(model.n_border)
         for k, place in model.sliding.items():
-            border[place] = at[clips[k]]
+            border[place] = at[own[k]]
         sides = tuple(0 if x.taut else side for side, x in zip(row.sides, spans, strict=True))
         if (known := row._replace(sides=sides)) in tried:
             continue
         tried.add(known)
+        places = at[0] + (at[-1] - at[0]) * (model.chain.places / model.chain.length)
         if model.node is Frame:
             edges = [(at[k], held[k].frame) for k in rolls]
-            x = arc_frames(model, pose, spans, edges, known)
+            x = arc_frames(model, pose, places, spans, edges, known)
         else:
-            x = _joined_headings(model, spans, sides)
+            x = _joined_headings(model, places, spans, sides)
         if x is not None:
             yield x, border
+
+
+def border_guess(model: CableModel, p: FloatArray, pose: HeldPose) -> FloatArray:
+    """First guess of the border (n_border,): where ends slide, for the length of `true_ends`."""
+    border = np.zeros(model.n_border)
+    if model.slides:
+        *_, length = true_ends(model, p, pose)
+        places = fed_places(model, length / float(functions_of(model).stretch(p)))
+        border[[*places]] = [*places.values()]
+    return border
+
+
+def fed_places(model: CableModel, length: float) -> dict[int, float]:
+    """Border row of each end that slides -> arc length [m], for a length between the ends [m]."""
+    start, end = (model.sliding.get(k) for k in (0, len(model.clips) + 1))
+    more = (length - model.cable.length) / max(sum(model.loose), 1)
+    found = {} if start is None else {start: -more}
+    return found if end is None else found | {end: model.cable.length + more}
 
 
 def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
     """First guess of the border (n_border,) for nodes x: each eyelet is nearest to its place."""
     border, places = border_guess(model, model.nominal, pose), model.chain.places
-    if not model.sliding:
+    eyelets = {k: row for k, row in model.sliding.items() if 0 < k <= len(model.clips)}
+    if not eyelets:
         return border
     ahead = tangents(model.node, x)
     steps = (ahead[1:] + ahead[:-1]) / 2 * np.diff(places)[:, None]
     points = np.vstack([np.zeros(steps.shape[1]), steps.cumsum(axis=0)]) + np.array(pose.start)
     low = 0.0
-    for k, row in model.sliding.items():
-        gaps = np.linalg.norm(points - np.array(pose.clips[k].place), axis=1)
+    for k, row in eyelets.items():
+        gaps = np.linalg.norm(points - np.array(pose.clips[k - 1].place), axis=1)
         gaps[places <= low] = np.inf
         border[row] = low = float(np.clip(places[gaps.argmin()], places[1], places[-2]))
     return border
@@ -212,9 +243,9 @@ def border_of(model: CableModel, pose: HeldPose, x: FloatArray) -> FloatArray:
 
 
 def _joined_headings(
-    model: CableModel, spans: Sequence[Span], sides: tuple[int, ...]
+    model: CableModel, places: FloatArray, spans: Sequence[Span], sides: tuple[int, ...]
 ) -> FloatArray:
-    """Headings (n_nodes, 1) [rad]."""
+    """Headings (n_nodes, 1) [rad] at arc lengths `places` (n_nodes,) [m]."""
     gravity = np.array(model.gravity)
     parts = [
         _headings(model, span, (1 - 2 * side) * _sagging(span, gravity))
@@ -222,7 +253,7 @@ def _joined_headings(
     ]
     _joined(parts, [any(frame is not None for frame in span.frames) for span in spans])
     at, phi = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return np.interp(model.chain.places, at, phi)[:, None]
+    return np.interp(places, at, phi)[:, None]
 
 
 def _sagging(span: Span, gravity: FloatArray) -> int:
@@ -273,17 +304,14 @@ def no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
 
 def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
     """Why a pose is out of reach: its end is missing or too far, or a number is meaningless."""
-    if model.end.slides != (pose.end_tension is not None):
-        what = (
-            f"no equilibrium: the end of the cable is {model.end}, end_tension {pose.end_tension}"
-        )
-        return no_equilibrium(pose, what, "end_tension [N] of a sliding end, and of no other.")
+    if fed := pose.wrongly_fed((model.start, model.end), by_length=model.fed_by_length):
+        return no_equilibrium(pose, f"no equilibrium: {fed}", "one of them where an end slides.")
     if pose.end is None and model.end.place:
         what = f"no equilibrium: the end of the cable is {model.end}, and the pose has none"
         return no_equilibrium(pose, what, "Pose(start, end).")
     if wrong := _meaningless(pose) or _wrong_clips(model, p, pose) or _inside(model, p, pose):
         return no_equilibrium(pose, *wrong)
-    if pose.end is None or model.extensible or model.end.slides:
+    if pose.end is None or model.extensible or model.slides:
         return None
     (start, end), _, length = true_ends(model, p, pose)
     distance = float(np.linalg.norm(end - start))
@@ -301,7 +329,8 @@ def _meaningless(pose: HeldPose) -> tuple[str, str] | None:
     """Which number of a pose is not finite, or which quaternion zero, and what to try."""
     camera = pose.vector[len(pose.ends) :][:3]
     known = {"start": pose.start, "end": pose.end, **pose.directions, "camera": camera}
-    known["end_tension"] = pose.end_tension
+    known |= {"start_tension": pose.start_tension, "end_tension": pose.end_tension}
+    known["free_length"] = pose.free_length
     for clip in pose.clips:
         own = {"place": clip.place, "at": clip.at, "direction": clip.frame}
         known |= {f"{what} of {clip.name}": x for what, x in own.items()}
@@ -353,9 +382,9 @@ def _wrong_clips(model: CableModel, p: FloatArray, pose: HeldPose) -> tuple[str,
         if not free and apart[k] < ONE_PLACE * model.cable.length:
             what = f"no equilibrium: {names[k]} and {names[k + 1]} are at the same place, where any"
             return f"{what} length of cable may lie in a loop", "one of them, or places apart."
-    *_, true_length = true_ends(model, p, pose)
+    stretch = float(functions_of(model).stretch(p))
     for low, high, declared in fixed_stretches(held):
-        length = declared * true_length / model.cable.length
+        length = declared * stretch
         if sum(apart[low:high]) >= length:
             way = " by way of the eyelets" if high > low + 1 else ""
             what = (

@@ -120,7 +120,7 @@ class CasadiCable:
             pose : as `Pose.vector`, and dlo_pose in the C header. In a plane (6,): start x, y, end
             x, y [m], start heading, end heading [rad]. In space (15,): start, end [m], their
             quaternions (x, y, z, w) of any length but zero, turns. What the boundary does not hold
-            is ignored.
+            is ignored. Then the tension [N] beyond each end that slides.
 
             points : (d, n + 1) or (d, points) [m], from start to end.
             end_force, start_force : (d,) [N] of the cable on whatever holds its end, its start.
@@ -338,7 +338,10 @@ class CasadiCable:
         """The cable's numbers, and symbols of the pose and of the parameters asked for."""
         model = self.model
         wrong = ["clips"] * bool(model.clips) + ["obstacles"] * bool(model.surfaces)
-        if wrong := wrong + ["sliding end"] * model.end.slides:
+        wrong += ["free length"] * (model.slides and model.fed_by_length)
+        bent = model.n_rest > 0 or bool(np.any(self.rest))
+        wrong += ["rest curvature that slides"] * (model.slides and bent)
+        if wrong:
             said = " and ".join(wrong)
             raise DloError(f"a function of the pose has no {said} yet.\n  Try: solve(...).")
         numbers = numbers_of(model, self.p, self.rest, parameters)

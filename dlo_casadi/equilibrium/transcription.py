@@ -90,7 +90,7 @@ def transcribed(
         for each in equations:
             if each.numel():
                 opti.subject_to(ca.vec(each) == 0)
-        if model.end.place and not pose.is_constant():
+        if model.end.place and not (model.slides or pose.is_constant()):
             chord = pose[model.node.dimension : 2 * model.node.dimension] - start
             opti.subject_to(ca.sumsqr(chord) <= (reach * model.cable.length) ** 2)
         own = outputs_of(model, symbols, rows, nodes, points)

@@ -26,8 +26,9 @@ from dlo_casadi.estimation.variances import (
     first_reading_noise,
     refine,
 )
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise

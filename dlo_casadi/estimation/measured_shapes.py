@@ -11,7 +11,7 @@ from dlo_casadi.effects import BoundaryEffect, Kinematics, MeasurementEffect
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange, denoised_length
 from dlo_casadi.equilibrium.measured_line import line_nodes
-from dlo_casadi.equilibrium.spans import first_guesses
+from dlo_casadi.equilibrium.spans import fed_places, first_guesses
 from dlo_casadi.estimation.problem import Problem
 from dlo_casadi.model.assembly import Shapes, Tangents
 from dlo_casadi.model.cable_model import END_ROLL, STIFFNESSES, CableModel
@@ -79,15 +79,16 @@ def measured_shapes(
 def with_fed_lengths(
     shapes: Shapes, model: CableModel, measured: Iterable[tuple[int, MeasuredPose]]
 ) -> Shapes:
-    """Shapes whose sliding ends were fed as much as measured lines are longer than the cable.
+    """Shapes fed through ends that slide as much as measured lines are longer than the cable.
 
     `measured`: index and measurement of some poses.
     """
     lam = shapes.lam.copy()
-    for j, item in measured if model.fed else ():
+    for j, item in measured if model.slides else ():
         if item.has_line:
             length = denoised_length(item.pose.joined(item.points))[-1]
-            lam[j, model.fed] = length - model.cable.length
+            for row, place in fed_places(model, float(length)).items():
+                lam[j, row] = place
     return replace(shapes, lam=lam)
 
 

@@ -29,8 +29,9 @@ from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.unknowns import Linearization, Point, Unknowns, Values
 from dlo_casadi.linear_mixed import LinearMixed, Normal
 from dlo_casadi.model.assembly import Shapes, Tangents
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel

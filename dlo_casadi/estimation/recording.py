@@ -18,7 +18,8 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.motion import sensitivities
 from dlo_casadi.motion.beginning import Basis, begun, columns_of
 from dlo_casadi.motion.handles import between

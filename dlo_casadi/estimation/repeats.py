@@ -183,7 +183,7 @@ def _alike(pose: HeldPose, other: HeldPose, model: CableModel) -> bool:
 
     def told(one: HeldPose) -> tuple[Any, ...]:
         clips = [(clip.kind, clip.at is None) for clip in one.clips]
-        return one.turns, one.branch, one.over, one.end_tension, clips
+        return one.turns, one.branch, one.over, one.tensions, one.free_length, clips
 
     if told(pose) != told(other):
         return False

@@ -368,7 +368,7 @@ def scatter_of(fit: Fit) -> FloatArray:
     # The coordinates of an end share one scatter, the turns of both clamps another, and all clips
     # a third.
     d, b = node.dimension, node.increment
-    for group in (range(d), range(d, d + 2 * b), range(2 * (d + b), len(scatter))):
+    for group in (range(d), range(d, d + 2 * b), range(2 * (d + b) + 1, len(scatter))):
         # Where they differ at random beyond the tolerance, nothing tells the tolerance's part.
         random = problem.random_std > 0
         members = [k for k, column in enumerate(columns) if column in group and not random[k]]

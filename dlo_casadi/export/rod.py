@@ -136,10 +136,11 @@ class Rod:
     def of(cls, held: SolvedCable, segments: int | None = None) -> Self:
         """Cut a cable into segments, by default as many as keep each joint's turn below `TURN`."""
         model, p, pose, curve = held.model, held.p, held.pose, held.curve
-        if model.end.slides:
+        if model.slides:
+            side = "start" if model.start.slides else "end"
             raise DloError(
-                "a cable that slides through its end cannot be exported yet.\n"
-                "  Try: end: swivel, with the free length as cable.length"
+                f"a cable that slides through its {side} cannot be exported.\n"
+                f"  Try: {side}: swivel, with the free length as cable.length"
             )
         terms, length = lagrangian_of(model), model.cable.length
         true, true_length = _numbers(terms, p, pose, terms.true_ends.vector, length * terms.stretch)

@@ -14,11 +14,12 @@ from functools import cached_property
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.model.clipped import NONE, Ends, Slides, by_axes, by_rates
+from dlo_casadi.model.clipped import NONE, by_axes
 from dlo_casadi.model.clips import ClipLoad, tangents
 from dlo_casadi.model.contact import Contact
 from dlo_casadi.model.evaluation import Evaluation
 from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.slides import Ends, Slides, by_rates
 from dlo_casadi.model.stacked import Inputs, Shapes, Tangents, repeated
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.ends import reaction_rows
@@ -33,9 +34,9 @@ class Assembly(Evaluation):
     def _sliding(self) -> tuple[Ends, IntArray, FloatArray]:
         """Segments, rows and rates of `Slides`."""
         slides, b = self.model.sliding, self.model.node.increment
-        ways = np.eye(len(self.model.clips))[:, [*slides]]
+        ways = np.eye(len(self.model.clips) + 2)[:, [*slides]]
         rates = self._of_ends(np.broadcast_to(ways, (len(self.shapes.x), *ways.shape)))
-        at = np.nonzero(rates.any(axis=(2, 3)))
+        at = _somewhere(rates)
         return at, 2 * b + np.array([*slides.values()], dtype=np.intp), rates[at]
 
     @cached_property
@@ -47,7 +48,7 @@ class Assembly(Evaluation):
         return Slides.of(at, rows, rates, self._call_some(at, "segment_by_edges"))
 
     def _of_ends(self, rate: FloatArray) -> FloatArray:
-        """Changes (m, n_segments, 2, q) of the segments' ends with clips (m, k, q) [m]."""
+        """Changes (m, n_segments, 2, q) of segments' ends with supports (m, k + 2, q) [m]."""
         moved = self.clipped.at_nodes(rate)
         return np.stack([moved[:, :-1], moved[:, 1:]], axis=2)
 
@@ -182,7 +183,7 @@ class Assembly(Evaluation):
         `slopes`: the `balance_slopes` if they are known.
         """
         segments, ends = slopes or self.balance_slopes()
-        rate = self._slips(along.p)
+        rate = self._slips(along.p, along.deviation)
         changed = self._by_numbers(segments, along) + self._by_slips("segment_by_edges", rate)
         at_ends = ends @ np.concatenate([along.p, along.deviation], axis=1)
         turned = self._by_turns(along.p)
@@ -207,7 +208,7 @@ class Assembly(Evaluation):
         self, blocks: FloatArray, along: Tangents, total: FloatArray | float = 0.0
     ) -> FloatArray:
         """Add the change along p, rest and deviation to a total, given segments' derivatives."""
-        rest = self.model.chain.rest_inside(along.rest)
+        rest = self.clipped.rest_inside(along.rest)
         n_p, n_r = along.p.shape[1], along.p.shape[1] + rest.shape[2]
         total = total + blocks[..., :n_p] @ along.p[:, None]
         total += blocks[..., n_p:n_r] @ rest
@@ -222,18 +223,27 @@ class Assembly(Evaluation):
         if not rate.any():
             return NONE
         ends = self._of_ends(rate)
-        at = np.nonzero(ends.any(axis=(2, 3)))
+        at = _somewhere(ends)
         blocks, *_ = self._call_some(at, name)
         total = np.zeros((*ends.shape[:2], blocks.shape[1], rate.shape[2]))
         total[at] = blocks @ ends[at]
         return total
 
-    def _slips(self, p: FloatArray, lam: FloatArray | None = None) -> FloatArray:
-        """Change (m, k, q) [m] of the arc lengths of clips along directions of p, and of lam."""
-        rate = np.asarray(functions_of(self.model).clip_slopes[0] @ p)
+    def _slips(
+        self, p: FloatArray, deviation: FloatArray | None = None, lam: FloatArray | None = None
+    ) -> FloatArray:
+        """Change (m, k + 2, q) [m] of the supports' arc lengths along directions of these."""
+        slips = functions_of(self.model).clip_slopes[0] @ p
+        rate = np.pad(slips, [(0, 0), (1, 1), (0, 0)])
+        if deviation is not None and self.model.slides and self.model.fed_by_length:
+            end, sign = self._fed_end
+            rate[:, end] += sign * deviation[:, self._free_length]
         if lam is not None:
             rate[:, [*self.model.sliding]] += lam[:, [*self.model.sliding.values()]]
         return rate
+
+    def _slips_of(self, along: Tangents) -> FloatArray:
+        return self._slips(along.p, along.deviation, along.lam)
 
     def _by_turns(self, p: FloatArray) -> FloatArray:
         """Rotations (m, n_nodes, increment, q) of the nodes that clips hold, likewise."""
@@ -255,7 +265,7 @@ class Assembly(Evaluation):
         (advance,) = self._call_segments("segment_curve")
         node, clipped = self.model.node, self.clipped
         places, rates = self._stations(advance[..., 0], self.given.poses[:, : node.dimension])
-        if not clipped.kinds:
+        if not clipped.moved:
             return places
         moved = np.concatenate([places, rates[..., :1] * tangents(node, self.shapes.x)], axis=2)
         return clipped.evenly(moved[..., None])[:, :, : node.dimension, 0]
@@ -284,7 +294,7 @@ class Assembly(Evaluation):
         lam = self.touching.lam_along(along.lam) if self.touching else along.lam[:, None]
         x = clipped.free(along.x) + self._by_turns(along.p)
         steps: FloatArray = by_nodes @ self._both(x) + by_lam @ lam
-        steps, rate = self._by_numbers(by_others, along, steps), self._slips(along.p, along.lam)
+        steps, rate = self._by_numbers(by_others, along, steps), self._slips_of(along)
         steps += self._by_slips("curve_by_edges", rate)
         start = np.zeros((len(steps), model.node.dimension, steps.shape[3]))
         places, rates = self._stations(steps, start)
@@ -306,7 +316,9 @@ class Assembly(Evaluation):
 
     def contacts(self) -> list[tuple[Contact, ...]]:
         """Where the cables touch obstacles, for each of m poses."""
-        return self.touching.contacts() if self.touching else [()] * len(self.shapes.x)
+        if not self.touching:
+            return [()] * len(self.shapes.x)
+        return self.touching.contacts(self.clipped.places)
 
     def readings_along(self, along: Tangents) -> FloatArray:
         """Change (m, n_reactions, q) of `readings` along directions."""
@@ -340,7 +352,7 @@ class Assembly(Evaluation):
         """
         after, *by = (self._stacked(part) for part in self._call_segments("segment_state"))
         m, n_p = self.given.p.shape
-        if self.model.clips:
+        if self.model.moves_nodes:
             every = np.broadcast_to(np.eye(n_p), (m, n_p, n_p))
             slipped = self._by_slips("state_by_edges", self._slips(every))
             by[2] = by[2] + (self._stacked(slipped) if slipped.any() else 0.0)
@@ -359,6 +371,12 @@ class Assembly(Evaluation):
         own = np.tile(np.stack(chain.by_strain(along.rest), axis=2), (*strains, 1))
         moved = (by_x[:, :, None] @ both + by_rest[:, :, None] @ own)[:, :, 0]
         if self.model.sliding:
-            slid = self._by_slips("state_by_edges", self._slips(0 * along.p, along.lam))
+            slid = self._by_slips("state_by_edges", self._slips(0 * along.p, None, along.lam))
             moved += self._stacked(slid) if slid.any() else 0.0
         return np.asarray(moved + by_p @ along.p + by_deviation @ along.deviation)
+
+
+def _somewhere(rates: FloatArray) -> Ends:
+    """Indices of the segments whose ends move in some way, of rates (m, n_segments, 2, q)."""
+    poses, segments = np.nonzero(rates.any(axis=(2, 3)))
+    return poses, segments

@@ -70,6 +70,11 @@ class CableFunctions:
         return ca.Function("bent_stiffness", [p], [stiffness, ca.gradient(stiffness, p)])
 
     @cached_property
+    def stretch(self) -> ca.Function:
+        """(p) -> true length without load over the declared one."""
+        return ca.Function("stretch", [self.terms.p], [self.terms.stretch])
+
+    @cached_property
     def dead_load(self) -> ca.Function:
         """(p) -> sum of the dead loads (dimension,) [N], excluding forces of single poses."""
         still = ca.SX.zeros(len(self.model.deviation_names))

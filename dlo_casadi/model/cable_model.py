@@ -39,6 +39,8 @@ STIFFNESSES = (BENDING_STIFFNESS, TORSIONAL_STIFFNESS)
 COARSE_MESH, COARSE_SPAN = 10, 6
 # Parameter name: true minus declared roll of the end clamp [rad], equivalent to a rest twist.
 END_ROLL = "end_roll"
+# Deviation of a pose: of the free length of a cable that slides through an end [m].
+FREE_LENGTH = "free_length"
 # Size of the camera part of `HeldPose.vector`.
 VIEWPOINT_SIZE = 3
 
@@ -74,6 +76,9 @@ class CableModel:
         Kinds of the clips between the ends, in the order along the cable.
     obstacles : tuple of Obstacle
         What the cable may touch in any pose, without friction.
+    fed_by_length : bool
+        Whether poses tell the length between the ends of a cable that slides through one, not the
+        tension beyond it.
     random : tuple of Effect
         Effects whose parameters each pose has of its own: they are among `deviation_names`.
     """
@@ -90,6 +95,7 @@ class CableModel:
     clips: tuple[SupportKind, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     random: tuple[Effect, ...] = ()
+    fed_by_length: bool = False
 
     def __post_init__(self) -> None:
         for name in ("start", "end"):
@@ -101,11 +107,16 @@ class CableModel:
                 f"{'has no' if len(self.gravity) == 3 else 'has a'} torsional stiffness: in space "
                 "give both, in a plane neither"
             )
-        if (self.clips or self.surfaces) and not self.chain.kind.smooth:
-            what = "clips" if self.clips else "obstacles"
-            raise DloError(f"{what} need a smooth element, found {self.element!r}; try 'quadratic'")
-        if self.end.slides and (self.clips or self.surfaces or not self.chain.kind.smooth):
-            raise DloError("a cable that slides through its end has no clips, obstacles or links")
+        named = {"clips": self.clips, "obstacles": self.surfaces, "ends that slide": self.slides}
+        what = [name for name, there in named.items() if there]
+        if what and not self.chain.kind.smooth:
+            text = f"{what[0]} need a smooth element, found {self.element!r}; try 'quadratic'"
+            raise DloError(text)
+        if self.start.slides and not self.end.place:
+            text = "through a start that slides a cable with a free end runs out or falls"
+            raise DloError(f"{text}\n  Try: end: pinned, swivel or clamped")
+        if all(self.loose) and self.fed_by_length:
+            raise DloError("of a cable that slides through both ends poses tell the tensions")
         every = (*self.effects, *self.random)
         for effect in every:
             if [other.label for other in every].count(effect.label) > 1:
@@ -143,7 +154,7 @@ class CableModel:
     @property
     def n_pose(self) -> int:
         """Size of `HeldPose.vector`."""
-        return EndConditions.size(self.node) + VIEWPOINT_SIZE + len(self.fed) + self.clip_numbers
+        return EndConditions.size(self.node) + VIEWPOINT_SIZE + sum(self.loose) + self.clip_numbers
 
     @property
     def clip_numbers(self) -> int:
@@ -324,9 +335,9 @@ class CableModel:
 
         A multiplier belongs to a condition on a distance [m] or an angle [rad]. A spring's place y
         [m] is an unknown, held on the cable by a multiplier [N]; the Hessian then couples only
-        neighbouring nodes, see `SpringAt`. An eyelet's arc length [m] is an unknown, too, and the
-        length fed through a sliding end [m]. The multiplier of a contact is the size of its force
-        [N]; contacts differ from mesh to mesh.
+        neighbouring nodes, see `SpringAt`. The arc length [m] at an eyelet, or at an end that
+        slides, is an unknown, too. The multiplier of a contact is the size of its force [N];
+        contacts differ from mesh to mesh.
         """
         places, pulls = ([f"{x}_{axis}" for axis in self.node.axes] for x in ("place", "pull"))
         kinds: dict[str, Literal["distance", "angle", "place"]] = {}
@@ -339,8 +350,9 @@ class CableModel:
             kinds |= {f"clip_{k}.{name}": "distance" for name in pulls}
             if kind.slides:
                 kinds[f"clip_{k}.place_s"] = "place"
-        if self.end.slides:
-            kinds["end.fed"] = "place"
+        for side, slides in zip(("start", "end"), self.loose, strict=True):
+            if slides and not self.fed_by_length:
+                kinds[f"{side}.place_s"] = "place"
         if self.surfaces and not self.end.place:
             kinds |= {f"free_end_{axis}": "distance" for axis in self.node.axes}
         for k in range(self.n_contacts):
@@ -362,14 +374,29 @@ class CableModel:
 
     @cached_property
     def sliding(self) -> dict[int, int]:
-        """Index of each eyelet among the clips -> border row of its arc length."""
-        eyelets = [k for k, kind in enumerate(self.clips) if kind.slides]
-        return {k: self.border_names.index(f"clip_{k}.place_s") for k in eyelets}
+        """Index of each support through which the cable slides -> border row of its arc length.
 
-    @cached_property
-    def fed(self) -> list[int]:
-        """Border row of the length fed through a sliding end [m], if it slides."""
-        return [self.border_names.index("end.fed")] if self.end.slides else []
+        Supports are counted along the cable: 0 is the start, 1 the first clip, the last the end.
+        """
+        names = ["start", *(f"clip_{k}" for k in range(len(self.clips))), "end"]
+        rows = {k: f"{name}.place_s" for k, name in enumerate(names)}
+        known = self.border_names
+        return {k: known.index(name) for k, name in rows.items() if name in known}
+
+    @property
+    def loose(self) -> tuple[bool, bool]:
+        """Whether the cable slides through its start, and through its end."""
+        return self.start.slides, self.end.slides
+
+    @property
+    def slides(self) -> bool:
+        """Whether the cable slides through an end."""
+        return any(self.loose)
+
+    @property
+    def moves_nodes(self) -> bool:
+        """Whether nodes stand at arc lengths of their own: at clips and ends that slide."""
+        return bool(self.clips) or self.slides
 
     @property
     def clamped_between(self) -> bool:
@@ -415,32 +442,6 @@ class CableModel:
     def deviations(self) -> tuple[str, ...]:
         """Deviations of a pose that matter for these boundaries."""
         own = [name for effect in self.effects for name in effect.per_pose(self.cable)]
+        own += [FREE_LENGTH] * (self.slides and self.fed_by_length)
         others = self.deviation_names[len(deviation_names(self.node)) :]
         return (*self._held("end"), *own, *others)
-
-
-@dataclass(frozen=True)
-class Tolerances:
-    """Standard deviations of the declared values."""
-
-    length: float = 5e-4
-    end: float = 2e-4
-    heading: float = 1e-2
-    scale: float = 3e-4
-    rotation: float = 5e-3
-    roll: float = 1.0
-    camera_rotation: float = 2e-3
-    camera_translation: float = 1e-3
-    force_bias: float = 0.02
-    moment_bias: float = 2e-3
-    clip: float = 2e-4
-    slip: float = 5e-4
-    obstacle: float = 5e-4
-    delay: float | None = None
-
-    def deviation(self, model: CableModel) -> FloatArray:
-        """Standard deviations of a model's `deviation_names`; infinite for unknown forces."""
-        node = model.node
-        sizes = (self.end, getattr(self, node.tolerance), np.inf, self.clip)
-        d = node.dimension
-        return np.repeat(sizes, (d, 2 * node.increment, d, d * len(model.clips)))

@@ -6,24 +6,39 @@ If a clamped clip turns, its node turns with it. These changes are exact: deriva
 segments by these numbers are the same as by any other.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, cross
-from dlo_casadi.model.clips import ClipLoad, placed_nodes
+from dlo_casadi.model.clips import ClipLoad, moved_with, placed_nodes
+from dlo_casadi.model.slides import Ends
 from dlo_casadi.rod.band import BandMatrix, Vector
 from dlo_casadi.rod.chain import Chain
 from dlo_casadi.rod.node import Node
 from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 from dlo_casadi.rod.supports import SupportKind
 
-# Indices (N,) of poses and of segments.
-Ends = tuple[IntArray, IntArray]
 # No change of segments or nodes, which broadcasts.
 NONE = np.zeros((1, 1, 1, 1))
+
+
+class Supported(Protocol):
+    """What is asked of a `CableModel` here."""
+
+    @property
+    def chain(self) -> Chain:
+        """Its mesh."""
+
+    @property
+    def clips(self) -> tuple[SupportKind, ...]:
+        """Kinds of its clips."""
+
+    @property
+    def loose(self) -> tuple[bool, bool]:
+        """Whether the cable slides through its start, and through its end."""
 
 
 @dataclass(frozen=True)
@@ -51,75 +66,18 @@ class ClampNode:
 
 
 @dataclass(frozen=True)
-class Slides:
-    """What moves m cables along the supports through which they slide.
-
-    These are derivatives of the N segments whose ends then move along the cable.
-
-    Parameters
-    ----------
-    at : (N,), (N,) int
-        Indices of their poses and segments.
-    rows : (u,) int
-        Of the arc lengths at these supports in derivatives of segments.
-    rates : (N, 2, u)
-        Of the arc lengths of both ends of a segment with those.
-    slope : (N, u) [N]
-        Of the Lagrangian by those: summed over the segments the configurational force.
-    mixed : (N, rows, u)
-        Of the gradient of the segments.
-    twice : (N, 2, 2)
-        Of the Lagrangian by both ends of a segment.
-    """
-
-    at: Ends
-    rows: IntArray
-    rates: FloatArray
-    slope: FloatArray
-    mixed: FloatArray
-    twice: FloatArray
-
-    @classmethod
-    def of(cls, at: Ends, rows: IntArray, rates: FloatArray, edges: Sequence[FloatArray]) -> Self:
-        """From the outputs (N, ...) of `Functions.segment_by_edges`."""
-        mixed, slope, twice = edges
-        return cls(at, rows, rates, by_rates(rates, slope)[..., 0], mixed @ rates, twice)
-
-    def add(self, gradient: FloatArray, bend: FloatArray) -> None:
-        """Add their rows to gradients and Hessians of the segments (m, n_segments, rows, ...)."""
-        (poses, segments), rows = self.at, self.rows
-        each = poses[:, None], segments[:, None]
-        gradient[(*each, rows, 0)] += self.slope
-        bend[(*each, slice(None), rows)] += self.mixed.transpose(0, 2, 1)
-        bend[(*each, rows)] += self.mixed.transpose(0, 2, 1)
-        both = by_rates(self.rates, self.twice @ self.rates)
-        bend[poses[:, None, None], segments[:, None, None], rows[:, None], rows] += both
-
-    def add_along(self, change: FloatArray, turned: FloatArray, rate: FloatArray) -> None:
-        """Add to the change of gradients (m, n_segments, rows, q) what moves both nodes.
-
-        Rotations (m, n_segments, 2b, q) and arc lengths (m, n_segments, 2, q) of these.
-        """
-        own = self.mixed[:, : turned.shape[2]].transpose(0, 2, 1) @ turned[self.at]
-        own = own + by_rates(self.rates, self.twice @ rate[self.at])
-        poses, segments = self.at
-        change[poses[:, None], segments[:, None], self.rows] += own
-
-
-def by_rates(rates: FloatArray, by_ends: FloatArray) -> FloatArray:
-    """Derivatives (N, u, ...) by what moves segments' ends, from those by the ends (N, 2, ...)."""
-    return rates.transpose(0, 2, 1) @ by_ends
-
-
-@dataclass(frozen=True)
 class Clipped:
     """Where the clips of m poses are on their cables.
 
     Parameters
     ----------
     kinds : (k,) SupportKind
-    at, near : (m, k) [m]
-        Arc lengths of the clips, and those to which their nodes are the nearest ones.
+        Of the clips.
+    loose : (bool, bool)
+        Whether the cable slides through its start, and through its end.
+    held, near : (m, k + 2) [m]
+        Arc lengths of the start, the clips and the end, and those that determine their nodes, see
+        `placed_nodes`.
     nodes : (m, k) int
         Nodes that are moved to the clips.
     places : (m, n + 1) [m]
@@ -128,7 +86,8 @@ class Clipped:
 
     chain: Chain
     kinds: tuple[SupportKind, ...]
-    at: FloatArray
+    loose: tuple[bool, bool]
+    held: FloatArray
     near: FloatArray
     nodes: IntArray
     clamps: tuple[ClampNode, ...]
@@ -137,49 +96,92 @@ class Clipped:
     @classmethod
     def of(
         cls,
-        chain: Chain,
-        kinds: tuple[SupportKind, ...],
-        declared: FloatArray,
-        at: FloatArray,
+        model: "Supported",
+        frames: FloatArray,
+        near: FloatArray,
+        held: FloatArray,
         turn: FloatArray,
         x: FloatArray,
     ) -> "Clipped":
-        """Clips at the arc lengths `at` (m, k) [m] of shapes x (m, n_nodes, coordinates).
+        """Supports at the arc lengths `held` of shapes x (m, n_nodes, coordinates).
 
-        The arc lengths in `declared` (m, k, clip_size) determine the nearest nodes, which then stay
-        the same while an unknown slip changes, or an eyelet's arc length. `turn` (k, m, increment)
-        [rad]: of frames from the declared ones.
+        Those in `near` determine the nodes, which then stay the same while an unknown slip changes,
+        or an arc length at which the cable slides. `frames` (m, k, coordinates): of clips, as
+        declared; `turn` (k, m, increment) [rad]: from these.
         """
+        chain, loose = model.chain, model.loose
         node, rows, clamps = chain.kind.node, np.arange(len(x)), []
-        nodes, places = placed_nodes(chain, declared[..., -1], at)
-        for k, (kind, index) in enumerate(zip(kinds, nodes.T, strict=True)):
+        nodes, places = placed_nodes(chain, near, held, loose)
+        for k, (kind, index) in enumerate(zip(model.clips, nodes.T, strict=True)):
             if not kind.direction:
                 continue
-            frame = node.moved(declared[:, k, node.dimension : -1], turn[k])
-            aligned, held = frame, kind.rotations(node)
-            if not held.all():
+            frame = node.moved(frames[:, k], turn[k])
+            aligned, blocked = frame, kind.rotations(node)
+            if not blocked.all():
                 frame = rolled_with(frame, x[rows, index])
-            clamps.append(ClampNode(index, frame, held, aligned, turn[k]))
-        return cls(chain, kinds, at, declared[..., -1], nodes, tuple(clamps), places)
+            clamps.append(ClampNode(index, frame, blocked, aligned, turn[k]))
+        return cls(chain, model.clips, loose, held, near, nodes, tuple(clamps), places)
 
     @classmethod
     def none(cls, chain: Chain, count: int) -> "Clipped":
-        """Cables of `count` poses without clips."""
-        none, places = np.zeros((count, 0)), np.tile(chain.places, (count, 1))
-        return cls(chain, (), none, none, none.astype(np.intp), (), places)
+        """Cables of `count` poses without clips, between ends that do not slide."""
+        ends = np.tile([0.0, chain.length], (count, 1))
+        nodes, places = np.zeros((count, 0), dtype=np.intp), np.tile(chain.places, (count, 1))
+        return cls(chain, (), (False, False), ends, ends, nodes, (), places)
+
+    @property
+    def at(self) -> FloatArray:
+        """Arc lengths (m, k) [m] of the clips."""
+        return self.held[:, 1:-1]
+
+    @property
+    def moved(self) -> bool:
+        """Whether nodes stand at arc lengths of their own."""
+        return bool(self.kinds) or any(self.loose)
 
     @property
     def in_order(self) -> BoolArray:
-        """Whether the clips (m,) are in order along the cable, and the eyelets within it."""
-        low, high = np.zeros(len(self.at)), np.full(len(self.at), self.chain.length)
-        return np.asarray(np.all(np.diff(np.column_stack([low, self.at, high])) > 0, axis=1))
+        """Whether the supports (m,) are in order along the cable."""
+        return np.asarray(np.all(np.diff(self.held) > 0, axis=1))
 
     @property
     def cells(self) -> FloatArray:
         """Bending cells (m, n_cells, 2) [m], between the nodes."""
-        if self.kinds:
+        if self.moved:
             return np.stack([self.places[:, :-1], self.places[:, 1:]], axis=2)
-        return np.broadcast_to(self.chain.cells, (len(self.at), *self.chain.cells.shape))
+        return np.broadcast_to(self.chain.cells, (len(self.held), *self.chain.cells.shape))
+
+    @cached_property
+    def _resting(self) -> IntArray | None:
+        """Even cells (m, n_segments), whose rest strains segments have, if ends slide.
+
+        -1 and n before and after the declared length of the cable.
+        """
+        if not any(self.loose):
+            return None
+        _, there = placed_nodes(self.chain, self.near, self.near, self.loose)
+        middle = (there[:, 1:] + there[:, :-1]) / (2 * self.chain.h)
+        return np.floor(middle).clip(-1, self.chain.n).astype(np.intp)
+
+    def rest_inside(self, means: FloatArray) -> FloatArray:
+        """Rest strains inside (m, n_segments, 3 strains, q) even cells, see `Chain.rest_inside`.
+
+        Where ends slide, those of the cell that a segment is in; before and after the declared
+        length the rest strains stay as at its ends.
+        """
+        inside = self.chain.rest_inside(means)
+        if self._resting is None:
+            return inside
+        each = inside.reshape((*inside.shape[:2], inside.shape[2] // 3, 3, inside.shape[3]))
+        beyond = []
+        for k, side in ((0, -1), (-1, 1)):
+            mean, a, c = np.moveaxis(each[:, k], 2, 0)
+            still = np.zeros_like(each[:, :1])
+            still[:, 0, :, 0] = mean + side * a / 2 + c / 6
+            beyond.append(still)
+        every = np.concatenate([beyond[0], each, beyond[1]], axis=1)
+        own = every[np.arange(len(every))[:, None], self._resting + 1]
+        return own.reshape((*self._resting.shape, *inside.shape[2:]))
 
     @property
     def before(self) -> FloatArray:
@@ -187,10 +189,9 @@ class Clipped:
         return (np.arange(self.chain.n_segments)[:, None] < self.nodes[:, None]).astype(float)
 
     def at_nodes(self, rate: FloatArray) -> FloatArray:
-        """Changes (m, n_nodes, q) of the nodes' arc lengths with those of clips (m, k, q)."""
-        found = np.zeros((*self.places.shape, rate.shape[2]))
-        found[np.arange(len(rate))[:, None], self.nodes] = rate
-        return found
+        """Changes (m, n_nodes, q) of arc lengths of nodes with those of supports (m, k + 2, q)."""
+        still = np.zeros((*self.places.shape, rate.shape[2]))
+        return moved_with(self.nodes, still, rate, self.loose)
 
     @property
     def clamped(self) -> IntArray:
@@ -240,11 +241,12 @@ class Clipped:
     def segments(self) -> FloatArray:
         """Arguments `place` of the segments (m, n_segments, ...), see `Lagrangian`."""
         even = self.chain.layout.segments
-        if not self.kinds:
-            return np.broadcast_to(even, (len(self.at), *even.shape))
-        table = np.empty((len(self.at), len(even), 4))
+        if not self.moved:
+            return np.broadcast_to(even, (len(self.held), *even.shape))
+        table = np.empty((len(self.held), len(even), 4))
         table[..., 0], table[..., 1] = self.places[:, :-1], self.places[:, 1:]
-        table[..., 2], table[..., 3] = even[:, 5], even[:, 0]
+        resting = even[:, 0] if self._resting is None else self._resting * self.chain.h
+        table[..., 2], table[..., 3] = even[:, 5], resting
         return table
 
     def gaps(self, x: FloatArray) -> FloatArray:
@@ -306,47 +308,105 @@ class Clipped:
             for each in zip(self.at, forces, moments, strict=True)
         ]
 
+    @property
+    def even(self) -> FloatArray:
+        """Even arc lengths (m, n + 1) [m] from the start to the end."""
+        if not any(self.loose):
+            return np.tile(self.chain.places, (len(self.held), 1))
+        share = self.chain.places / self.chain.length
+        return self.held[:, :1] + self._scale * self.chain.length * share
+
+    @property
+    def _scale(self) -> FloatArray:
+        """Arc length between the ends over the declared length (m, 1)."""
+        return (self.held[:, -1:] - self.held[:, :1]) / self.chain.length
+
     def evenly(self, stations: FloatArray) -> FloatArray:
-        """Places and dr/ds (m, n + 1, 2 d, q) at even arc lengths, given those at moved nodes."""
-        out, rows = stations.copy(), np.arange(len(stations))
-        for index in self.nodes.T:
-            e, u, width = self._evened(index)
-            (r0, t0), (r1, t1) = (np.split(stations[rows, e + j], 2, axis=1) for j in (0, 1))
-            chord, v = r1 - r0, 1 - u
+        """Places and dr/ds (m, n + 1, 2 d, q) at even arc lengths, given those at the nodes.
+
+        Where ends slide, s is the share of the cable between them times its declared length.
+        """
+        out = stations.copy()
+        if self.kinds:
+            own = self._evened
+            (r0, t0), (r1, t1) = own.beside(stations)
+            chord, u, v, width = r1 - r0, own.u, 1 - own.u, own.width
             place = r0 + u**2 * (3 - 2 * u) * chord + width * u * v * (v * t0 - u * t1)
             slope = 6 * u * v * chord / width + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1
-            out[rows, index] = np.concatenate([place, slope], axis=1)
+            out[own.at] = np.concatenate([place, slope], axis=2)
+        if any(self.loose):
+            out[:, :, out.shape[2] // 2 :] *= self._scale[..., None, None]
         return out
 
-    def evenly_along(self, stations: FloatArray, at: FloatArray) -> FloatArray:
-        """Change of `evenly` (m, n + 1, 2 d, q) as the clips slide by `at` (m, k, q) [m]."""
-        if not self.kinds:
+    def evenly_along(self, stations: FloatArray, rate: FloatArray) -> FloatArray:
+        """Change of `evenly` (m, n + 1, 2 d, q) as supports slide by `rate` (m, k + 2, q) [m]."""
+        if not self.moved:
             return NONE
-        m, count, size, _ = stations.shape
-        out, rows = np.zeros((m, count, size, at.shape[2])), np.arange(m)
-        moved = self.at_nodes(at)
-        for index in self.nodes.T:
-            e, u, width = self._evened(index)
-            dw = (moved[rows, e + 1] - moved[rows, e])[:, None]
-            du = -(moved[rows, e][:, None] + u * dw) / width
-            (r0, t0), (r1, t1) = (np.split(stations[rows, e + j], 2, axis=1) for j in (0, 1))
-            chord, v = (r1 - r0) / width, 1 - u
+        (m, count, size, _), out = stations.shape, NONE
+        if self.kinds:
+            own, moved = self._evened, self.at_nodes(rate)
+            out = np.zeros((m, count, size, rate.shape[2]))
+            low, high = moved[own.rows, own.element], moved[own.rows, own.element + 1]
+            share = (self.chain.places[own.nodes] / self.chain.length)[..., None]
+            goes = rate[:, :1] + share * (rate[:, -1:] - rate[:, :1])
+            dw, u, v, width = (high - low)[:, :, None], own.u, 1 - own.u, own.width
+            du = ((goes - low)[:, :, None] - u * dw) / width
+            (r0, t0), (r1, t1) = own.beside(stations)
+            chord = (r1 - r0) / width
             place = u * v * (v * t0 - u * t1) * dw
             place = place + (6 * u * v * chord + v * (1 - 3 * u) * t0 + u * (3 * u - 2) * t1) * (
                 width * du
             )
             bend = 6 * (1 - 2 * u) * chord + (6 * u - 4) * t0 + (6 * u - 2) * t1
             slope = bend * du - 6 * u * v * chord * dw / width
-            out[rows, index] = np.concatenate([place, slope], axis=1)
+            out[own.at] = np.concatenate([place, slope], axis=2)
+        if any(self.loose):
+            d, scale = size // 2, self._scale[..., None, None]
+            longer = ((rate[:, -1:] - rate[:, :1]) / self.chain.length)[:, :, None]
+            slopes = self.evenly(stations)[:, :, d:] / scale * longer
+            own_slopes = out[:, :, d:] * scale if self.kinds else 0.0
+            places = out[:, :, :d] if self.kinds else np.zeros_like(slopes)
+            out = np.concatenate([places, slopes + own_slopes], axis=2)
         return out
 
-    def _evened(self, index: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Element (m,) with the even place of a moved node; its share (m, 1, 1) and length [m]."""
-        rows, s = np.arange(len(self.at)), self.chain.places[index]
-        e = (self.places <= s[:, None]).sum(axis=1) - 1
-        width = self.places[rows, e + 1] - self.places[rows, e]
-        u = (s - self.places[rows, e]) / width
-        return e, u[:, None, None], width[:, None, None]
+    @property
+    def _evened(self) -> "_Evened":
+        """Nodes that do not stand at even places: those of clips, or all if ends slide, too."""
+        m, n = len(self.held), self.chain.n
+        nodes = np.tile(np.arange(1, n), (m, 1)) if any(self.loose) else self.nodes
+        rows = np.arange(m)[:, None]
+        s = self.even[rows, nodes]
+        element = (self.places[:, None] <= s[..., None]).sum(axis=2) - 1
+        width = self.places[rows, element + 1] - self.places[rows, element]
+        u = (s - self.places[rows, element]) / width
+        return _Evened(nodes, element, u[..., None, None], width[..., None, None])
+
+
+class _Evened(NamedTuple):
+    """Nodes (m, N) of even places: the elements (m, N) in which these are, shares and lengths.
+
+    `u`, `width` (m, N, 1, 1): the share of an element that is before the place, its length [m].
+    """
+
+    nodes: IntArray
+    element: IntArray
+    u: FloatArray
+    width: FloatArray
+
+    @property
+    def rows(self) -> IntArray:
+        """Indices of the poses (m, 1)."""
+        return np.arange(len(self.nodes))[:, None]
+
+    @property
+    def at(self) -> Ends:
+        """Indices of these nodes."""
+        return self.rows, self.nodes
+
+    def beside(self, stations: FloatArray) -> list[list[FloatArray]]:
+        """Places and dr/ds (m, N, d, q) at both ends of the elements."""
+        both = (stations[self.rows, self.element + j] for j in (0, 1))
+        return [np.split(one, 2, axis=2) for one in both]
 
 
 def _stepped(delta: FloatArray, step: FloatArray) -> FloatArray:

@@ -105,11 +105,42 @@ def nearest_nodes(chain: Chain, at: FloatArray) -> IntArray:
     return np.asarray(np.minimum(np.maximum.accumulate(near, axis=-1), chain.n - len(k)) + k)
 
 
-def placed_nodes(chain: Chain, near: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Nodes (m, k) nearest to `near` (m, k), and arc lengths (m, n + 1) with these `at` [m]."""
-    nodes, places = nearest_nodes(chain, near), np.tile(chain.places, (len(at), 1))
-    places[np.arange(len(at))[:, None], nodes] = at
-    return nodes, places
+def placed_nodes(
+    chain: Chain, near: FloatArray, at: FloatArray, loose: tuple[bool, bool] = (False, False)
+) -> tuple[IntArray, FloatArray]:
+    """Nodes (m, k) of the clips, and arc lengths (m, n + 1) [m] of all nodes.
+
+    `near`, `at` (m, k + 2) [m]: of the start, the clips and the end. The nodes nearest to `near`
+    are moved to the clips at `at`. Where the cable slides through an end, see `CableModel.loose`,
+    nodes are spread evenly from there to the next clip.
+    """
+    even, inner = np.tile(chain.places, (len(at), 1)), near[:, 1:-1]
+    if any(loose):
+        low, size = near[:, :1], near[:, -1:] - near[:, :1]
+        even, inner = low + size * (even / chain.length), (inner - low) * (chain.length / size)
+    nodes = nearest_nodes(chain, inner)
+    return nodes, moved_with(nodes, even, at, loose)
+
+
+def moved_with(
+    nodes: IntArray, others: FloatArray, at: FloatArray, loose: tuple[bool, bool]
+) -> FloatArray:
+    """Values (m, n + 1, ...) of nodes: of supports `at` (m, k + 2, ...), and of `others`.
+
+    From an end that slides to the next support they are interpolated.
+    """
+    found, k, count = others.copy(), nodes.shape[1], others.shape[1]
+    found[np.arange(len(at))[:, None], nodes] = at[:, 1:-1]
+    shape = (*others.shape[:2], *[1] * (others.ndim - 2))
+    for end, beside in ((0, 1), (-1, -2)):
+        if not loose[end]:
+            continue
+        first, last = (0, count - 1) if end == 0 else (count - 1, 0)
+        reached = nodes[:, [end]] if k else np.full((len(at), 1), last)
+        share = ((np.arange(count) - reached) / (first - reached)).reshape(shape)
+        own = at[:, [beside]] + share * (at[:, [end]] - at[:, [beside]])
+        found = np.where(share > 0, own, found)
+    return found
 
 
 def tangents(node: type[Node], x: FloatArray) -> FloatArray:

@@ -237,11 +237,14 @@ class Touching:
         own = (self.felt * (gaps + self.felt * self.softness / 2)).sum(axis=1)
         return total - work - own, Vector(force.x, y)
 
-    def contacts(self) -> list[tuple[Contact, ...]]:
-        """Stretches of neighbouring nodes that touch, for each of m poses."""
-        h, count = self.model.chain.h, _count(self.model)
+    def contacts(self, places: FloatArray) -> list[tuple[Contact, ...]]:
+        """Stretches of neighbouring nodes that touch, for each of m poses.
+
+        `places` (m, n + 1) [m]: arc lengths of the nodes.
+        """
+        count = _count(self.model)
         near, found = self.gap < CLOSE * self.model.cable.length, []
-        for sizes, pulls, close in zip(self.felt, self.pulls, near, strict=True):
+        for sizes, pulls, close, at in zip(self.felt, self.pulls, near, places, strict=True):
             own = []
             for k, obstacle in enumerate(self.model.surfaces):
                 some = slice(k * count, (k + 1) * count)
@@ -253,8 +256,9 @@ class Touching:
                         continue
                     low, high = low + pressed[0], low + pressed[-1] + 1
                     force = sizes[some][low:high]
-                    start = (low + 1) * h + _inwards(force, h)
-                    end = max(start, high * h - _inwards(force[::-1], h))
+                    own_places = at[low + 1 : high + 1]
+                    start = own_places[0] + _inwards(force, own_places)
+                    end = max(start, own_places[-1] - _inwards(force[::-1], -own_places[::-1]))
                     total = pulls[some][low:high].sum(axis=0)
                     own.append(Contact(obstacle.name, float(start), float(end), total))
             found.append(tuple(sorted(own, key=lambda one: one.start)))
@@ -337,21 +341,23 @@ class Touching:
         return Vector(change.x, y)
 
 
-def _inwards(force: FloatArray, h: float) -> float:
-    """Distance [m] from the first node with these forces [N] inwards to where the contact begins.
+def _inwards(force: FloatArray, places: FloatArray) -> float:
+    """Distance [m] from the first of nodes with forces [N] inwards to where the contact begins.
 
     A point force Q acts at the distance x outside the fourth node, and the even force q of the
-    following nodes inwards of it. Both together have the same sum F and moment about the fourth
-    node as the first four forces: F = Q + q (x + h/2), M = Q x + q (x^2/2 - h^2/8).
+    following nodes inwards of it, of the fourth one over half an element h/2. Both together have
+    the same sum F and moment about the fourth node as the first four forces: F = Q + q (x + h/2),
+    M = Q x + q (x^2/2 - h^2/8). `places` [m]: arc lengths inwards.
     """
     if len(force) < 8:
         return 0.0
-    total, arm = force[:4].sum(), h * (force[:4] @ [3, 2, 1, 0])
-    q = force[4:-3].mean() / h
-    a, b, c = -q / 2, total - q * h / 2, -q * h * h / 8 - arm
+    s, half = places - places[0], (places[4] - places[3]) / 2
+    total, arm = force[:4].sum(), force[:4] @ (s[3] - s[:4])
+    q = force[4:-3].sum() / ((places[-3] + places[-4]) / 2 - (places[4] + places[3]) / 2)
+    a, b, c = -q / 2, total - q * half, -q * half * half / 2 - arm
     root = b * b - 4 * a * c
-    x = -2 * c / (b + np.sqrt(root)) if root > 0 and b > 0 else 3 * h
-    return float(np.clip(3 * h - x, -h, 2 * h))
+    x = -2 * c / (b + np.sqrt(root)) if root > 0 and b > 0 else s[3]
+    return float(np.clip(s[3] - x, -s[1], s[2]))
 
 
 def outwards(model: CableModel) -> FloatArray:

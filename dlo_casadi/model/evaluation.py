@@ -9,12 +9,14 @@ from typing import Any, Self
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.clipped import Clipped, Ends
+from dlo_casadi.model.cable_model import FREE_LENGTH, VIEWPOINT_SIZE, CableModel
+from dlo_casadi.model.clipped import Clipped
 from dlo_casadi.model.clips import clip_size
 from dlo_casadi.model.contact import DEPTH, Touching, outwards
 from dlo_casadi.model.functions import functions_of
+from dlo_casadi.model.slides import Ends
 from dlo_casadi.model.stacked import Beyond, Inputs, Mapped, Shapes, repeated
+from dlo_casadi.rod.ends import EndConditions
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +53,35 @@ class Evaluation:
     def clipped(self) -> Clipped:
         """Where the clips are on the cable."""
         model, given, x = self.model, self.given, self.shapes.x
-        if not model.clips:
+        if not model.moves_nodes:
             return Clipped.none(model.chain, len(x))
+        size, d = clip_size(model.node), model.node.dimension
         declared = given.poses[:, given.poses.shape[1] - model.clip_numbers :]
-        declared = declared.reshape((len(declared), len(model.clips), clip_size(model.node)))
+        declared = declared.reshape((len(x), len(model.clips), size))
         slips, turns = functions_of(model).clip_slopes
-        at = declared[..., -1] + given.p @ slips.T
+        near = np.pad(declared[..., -1], [(0, 0), (1, 1)])
+        near[:, -1] = model.cable.length
+        held = near + np.pad(given.p @ slips.T, [(0, 0), (1, 1)])
+        if model.slides and model.fed_by_length:
+            free = given.poses[:, EndConditions.size(model.node) + VIEWPOINT_SIZE]
+            end, sign = self._fed_end
+            near[:, end] += sign * (free - model.cable.length)
+            held[:, end] = near[:, end] + sign * self.shapes.deviation[:, self._free_length]
         if model.sliding:
-            eyelets, rows = [*model.sliding], [*model.sliding.values()]
-            at[:, eyelets] = self.shapes.lam[:, rows]
-            near, declared = self.shapes.near_each(len(rows)), declared.copy()
-            declared[:, eyelets, -1] = np.where(np.isnan(near), at[:, eyelets], near)
-        return Clipped.of(model.chain, model.clips, declared, at, given.p @ turns, x)
+            slides, rows = [*model.sliding], [*model.sliding.values()]
+            held[:, slides], own = self.shapes.lam[:, rows], self.shapes.near_each(len(rows))
+            near[:, slides] = np.where(np.isnan(own), held[:, slides], own)
+        return Clipped.of(model, declared[..., d:-1], near, held, given.p @ turns, x)
+
+    @property
+    def _free_length(self) -> int:
+        """Index of the deviation of the free length."""
+        return self.model.deviation_names.index(FREE_LENGTH)
+
+    @property
+    def _fed_end(self) -> tuple[int, float]:
+        """Index of the end that slides among the supports, and change of its arc length."""
+        return (-1, 1.0) if self.model.end.slides else (0, -1.0)
 
     @cached_property
     def touching(self) -> Touching | None:
@@ -96,8 +115,9 @@ class Evaluation:
     def _call_some(self, at: Ends, name: str) -> list[FloatArray]:
         """Evaluate a function for some segments: outputs (N, rows, columns)."""
         found = self._mapped(name)(*(part[at][:, None] for part in self._arguments))
-        own = Beyond(self._beyond.before[at][:, None], self._beyond.rows)
-        own.spread(name, found, 2 * self.model.node.increment)
+        if self.model.clips:
+            own = Beyond(self._beyond.before[at][:, None], self._beyond.rows)
+            own.spread(name, found, 2 * self.model.node.increment)
         return [out[:, 0] for out in found]
 
     @cached_property
@@ -117,15 +137,13 @@ class Evaluation:
         shapes, clipped, count = self.shapes, self.clipped, self.model.chain.n_segments
         p, deviation = (repeated(one, count) for one in (self.given.p, shapes.deviation))
         both, table = clipped.carried(self._both(shapes.x)), clipped.segments()
-        if self.model.fed:
-            table = np.concatenate([table, lam[..., self.model.fed]], axis=2)
         own = self._beyond.summed(lam) if self.model.clips else lam
         return [both, own, p, self._rest_inside, table, deviation]
 
     @property
     def _rest_inside(self) -> FloatArray:
         """Rest strains inside (m, n_segments, 3 strains) of even segments."""
-        return self.model.chain.rest_inside(self.given.rest[..., None])[..., 0]
+        return self.clipped.rest_inside(self.given.rest[..., None])[..., 0]
 
     def _both(self, nodes: FloatArray) -> FloatArray:
         """Rows (m, n_segments, 2 k, ...) of both nodes of segments, from (m, n_nodes, k, ...)."""

@@ -28,15 +28,11 @@ class Functions(CableFunctions):
         own, lam, place = self.terms, self.terms.lam, self.terms.place
         self._segment_arguments = [own.x, lam, own.p, own.rest_strains, place, own.deviation]
         self._end_arguments = [own.x, lam, own.p, own.pose, own.deviation]
-        # Variables of the first and second derivatives; the row of a length that was fed, which is
-        # part of `place`; values by which gradients of segments are also differentiated.
-        self._by, first = ca.vertcat(own.delta, lam), own.delta.numel()
-        self._sliding = [(first + row, place[-1]) for row in model.fed]
-        self._by_ends = ca.vertcat(own.delta, lam)
-        for row, s in self._sliding:
-            self._by[row] = s
+        # Variables of the first and second derivatives; values by which gradients of segments are
+        # also differentiated.
+        self._by = ca.vertcat(own.delta, lam)
         self._numbers = ca.vertcat(own.p, own.rest_strains, own.deviation)
-        self._edges = place[:2]  # with clips: arc lengths of the segment's ends
+        self._edges = place[:2]  # where nodes are moved: arc lengths of the segment's ends
         self._mapped: dict[str, Mapped] = {}
         self._compact: dict[str, ca.Function] = {}
 
@@ -80,10 +76,7 @@ class Functions(CableFunctions):
     def _gradient(self) -> ca.SX:
         """Gradient (2b + k,) of the Lagrangian of a segment."""
         if self.kind.framed:
-            gradient = self._of_forces @ self._about_nodes.gradient
-            for row, s in self._sliding:
-                gradient[row] = ca.gradient(self._about_nodes.value, s)
-            return gradient
+            return self._of_forces @ self._about_nodes.gradient
         return ca.gradient(self.terms.segment_terms.lagrangian, self._by)
 
     @cached_property
@@ -92,9 +85,6 @@ class Functions(CableFunctions):
         if self.kind.framed:
             found, spread = self._about_nodes, self._of_forces
             value, hessian = found.value, spread @ found.hessian @ spread.T
-            for row, s in self._sliding:
-                hessian[:, row] = ca.jacobian(self._gradient, s)
-                hessian[row, :] = hessian[:, row].T
         else:
             value = self.terms.segment_terms.lagrangian
             hessian, _ = ca.hessian(value, self._by)
@@ -167,7 +157,7 @@ class Functions(CableFunctions):
     @cached_property
     def at_ends(self) -> ca.Function:
         """(x, lam, p, pose, deviation) of the first and last node -> as `segment`."""
-        hessian, gradient = ca.hessian(self._of_both, self._by_ends)
+        hessian, gradient = ca.hessian(self._of_both, self._by)
         return self._of_ends("at_ends", self._of_both, gradient, hessian)
 
     @property
@@ -178,7 +168,7 @@ class Functions(CableFunctions):
     @cached_property
     def end_slope(self) -> ca.Function:
         """As `at_ends` -> its gradient alone."""
-        return self._of_ends("end_slope", ca.gradient(self._of_both, self._by_ends))
+        return self._of_ends("end_slope", ca.gradient(self._of_both, self._by))
 
     @cached_property
     def end_shape(self) -> ca.Function:
@@ -231,15 +221,12 @@ class Functions(CableFunctions):
             return ca.jacobian(self._gradient, numbers)
         first, last, by_lam = self._framed.by_numbers(numbers)
         turns = self._framed.node_turns
-        mixed = self._of_forces @ ca.vertcat(turns[0] @ first, turns[1] @ last, by_lam)
-        for row, _ in self._sliding:
-            mixed[row, :] = ca.jacobian(self._gradient[row], numbers)
-        return mixed
+        return self._of_forces @ ca.vertcat(turns[0] @ first, turns[1] @ last, by_lam)
 
     @cached_property
     def end_sensitivity(self) -> ca.Function:
         """As `at_ends` -> derivative of the gradient by p and deviation (2b + k, ...)."""
-        gradient = ca.gradient(self._of_both, self._by_ends)
+        gradient = ca.gradient(self._of_both, self._by)
         numbers = ca.vertcat(self.terms.p, self.terms.deviation)
         return self._of_ends("end_sensitivity", ca.jacobian(gradient, numbers))
 
@@ -267,8 +254,6 @@ class Functions(CableFunctions):
         if self.kind.framed:
             # The advance is the derivative of the Lagrangian by the force on the end's holder.
             by_nodes = (self._of_forces @ self._about_nodes.hessian)[:, 6:9].T
-            for row, s in self._sliding:
-                by_nodes[:, row] = ca.jacobian(self._about_nodes.by_lam[:3], s)
             moving = ca.vertcat(by_nodes, ca.jacobian(self._rates, self._by))
         else:
             moving = ca.jacobian(self._advanced, self._by)
@@ -417,7 +402,7 @@ class Functions(CableFunctions):
     @cached_property
     def reading_slopes(self) -> ca.Function:
         """As `readings` -> derivatives by increments and multipliers, by p, and by deviation."""
-        by = (self._by_ends, self.terms.p, self.terms.deviation)
+        by = (self._by, self.terms.p, self.terms.deviation)
         return self._of_ends("reading_slopes", *(ca.jacobian(self._readings, one) for one in by))
 
 

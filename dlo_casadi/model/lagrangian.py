@@ -25,6 +25,7 @@ from dlo_casadi.effects import (
 from dlo_casadi.model.cable_model import (
     BENDING_STIFFNESS,
     END_ROLL,
+    FREE_LENGTH,
     TORSIONAL_STIFFNESS,
     VIEWPOINT_SIZE,
     CableModel,
@@ -65,11 +66,10 @@ class Lagrangian:
         Coordinates of a segment's two nodes, or of the first and last node; their increments.
     rest_strains : (3 strains,) [1/m]
         Rest strains inside a segment, see `Chain.rest_stencils`.
-    place : (6,), (7,) or (4,)
-        A row of `Layout.segments`, then the length that was fed through a sliding end [m]: all
-        segments get longer alike, on its mesh the cable begins at 0 and ends at the declared
-        length. With clips the arc lengths of its ends, the length of an element, and where the even
-        element starts that has its rest strains.
+    place : (6,) or (4,)
+        A row of `Layout.segments`. Where nodes are moved, to clips or with an end that slides: the
+        arc lengths of its ends, the length of an element, and where the even element starts that
+        has its rest strains.
     inner : (n_inner,)
         Internal unknowns of an element, which are eliminated.
     """
@@ -86,7 +86,7 @@ class Lagrangian:
         self.x = ca.SX.sym("x", 2 * self.node.coordinates)
         self.delta = ca.SX.sym("delta", 2 * self.node.increment)
         self.rest_strains = ca.SX.sym("rest", 3 * len(self.node.strains))
-        self.place = ca.SX.sym("place", 4 if model.clips else LAYOUT_SIZE + len(model.fed))
+        self.place = ca.SX.sym("place", 4 if model.moves_nodes else LAYOUT_SIZE)
         self.inner = ca.SX.sym("inner", self.kind.n_inner)
 
     def effects_of(self, base: type[Any]) -> list[tuple[Any, dict[str, ca.SX]]]:
@@ -131,7 +131,8 @@ class Lagrangian:
     def true_ends(self) -> EndConditions:
         """True ends: as declared, plus the pose's deviation and the boundary effects."""
         d, b = self.node.dimension, self.node.increment
-        fixed, clips = 2 * (d + b), 2 * (d + b) + d * len(self.model.clips)
+        fixed = 2 * (d + b) + 1
+        clips = fixed + d * len(self.model.clips)
         edges = [0, d, d + b, d + 2 * b, fixed, clips, self.deviation.numel()]
         place, first, last, _, moved, _ = ca.vertsplit(self.deviation, edges)
         declared, held = EndConditions.of(self.declared_ends, self.node), []
@@ -153,22 +154,13 @@ class Lagrangian:
 
         The ends as `EndConditions.vector`, declared and true.
         """
-        length = self.model.cable.length * self._stretch_of_effects
+        length = self.model.cable.length * self.stretch
         arguments = [self.p, self.declared_ends, self.deviation]
         return ca.Function("true_ends_and_length", arguments, [self.true_ends.vector, length])
 
     @cached_property
-    def fed(self) -> ca.SX:
-        """Length that was fed through a sliding end over the declared one."""
-        return self.place[-1] / self.model.cable.length if self.model.fed else ca.SX(0)
-
-    @cached_property
     def stretch(self) -> ca.SX:
         """True length without load over the declared one."""
-        return self._stretch_of_effects + self.fed
-
-    @cached_property
-    def _stretch_of_effects(self) -> ca.SX:
         cable, effects = self.model.cable, self.effects_of(Kinematics)
         return prod((effect.stretch(cable, local) for effect, local in effects), start=ca.SX(1))
 
@@ -187,11 +179,7 @@ class Lagrangian:
         return gravity
 
     def resultant(self, s: ca.SX | float) -> ca.SX:
-        """Force [N] of all distributed loads on the part of the cable beyond s."""
-        return self._declared_resultant(s) * (1 + self.fed)
-
-    def _declared_resultant(self, s: ca.SX | float) -> ca.SX:
-        """The same of a cable of the declared length."""
+        """Force [N] of all distributed loads on the cable from s to its declared length."""
         weight = self.model.cable.mass / self.model.cable.length * self.felt_gravity
         total = weight * (self.model.cable.length - s)
         for effect, local in self.effects_of(Load):
@@ -211,8 +199,21 @@ class Lagrangian:
 
     @cached_property
     def total_load(self) -> ca.SX:
-        """Sum of all dead loads [N]."""
-        return sum((force.force for force in self.dead_forces), start=self.resultant(0.0))
+        """Sum of all dead loads [N] on the cable from its start to its declared length."""
+        start = self.resultant(self.along_ends[0])
+        return sum((force.force for force in self.dead_forces), start=start)
+
+    @cached_property
+    def along_ends(self) -> tuple[ca.SX | float, ca.SX | float]:
+        """Arc lengths [m] at both ends."""
+        own, (starts, ends) = dict(self.model.sliding), self.model.loose
+        length = self.model.cable.length
+        if self.model.fed_by_length:
+            deviation = self.deviation[self.model.deviation_names.index(FREE_LENGTH)]
+            more = self.pose[EndConditions.size(self.node) + VIEWPOINT_SIZE] + deviation
+            return (length - more if starts else 0.0), (more if ends else length)
+        low, high = own.get(0), own.get(len(self.model.clips) + 1)
+        return 0.0 if low is None else self.lam[low], length if high is None else self.lam[high]
 
     def segment(
         self, ratio: ca.SX, inner: ca.SX, square: ca.SX, local: ca.SX | None = None
@@ -231,8 +232,8 @@ class Lagrangian:
     @property
     def row(self) -> ca.SX:
         """A row of `Layout.segments` (6,)."""
-        if not self.model.clips:
-            return self.place[:LAYOUT_SIZE]
+        if not self.model.moves_nodes:
+            return self.place
         low, high, mesh, _ = ca.vertsplit(self.place)
         return ca.vertcat(low, high - low, low, high - low, 1, mesh)
 
@@ -242,7 +243,7 @@ class Lagrangian:
 
         m + a x + c (x^2 - 1/12) of the even element, |x| <= 1/2, is the same of y at x = x_0 + w y.
         """
-        if not self.model.clips:
+        if not self.model.moves_nodes:
             return self.rest_strains
         low, high, mesh, even = ca.vertsplit(self.place)
         x, w, inside = ((low + high) / 2 - even) / mesh - 0.5, (high - low) / mesh, []
@@ -308,7 +309,6 @@ class Lagrangian:
         """(p, place) -> the shares of a segment (n_forces + n_springs,)."""
         start = self.place[0]
         positions = [x.position for x in self.dead_forces] + [x.position for x in self.springs]
-        positions = [s / (1 + self.fed) for s in positions]  # of one cable, however long it is
         last = start + self.length > self.model.cable.length - BESIDE * self.length
         shares = [(s - start) / self.length for s in positions]
         inside = [ca.logic_and(u >= -BESIDE, ca.logic_or(u < 1 - BESIDE, last)) for u in shares]
@@ -408,26 +408,28 @@ class Lagrangian:
         places += [clip.place for clip in true.clips]
         for place, rows in zip(places, self.model.pulls, strict=True):
             total += ca.dot(self.lam[rows], true.start - place)
-        return total - ca.dot(self._at_ends(self.total_load), true.start)
-
-    def _at_ends(self, expression: ca.SX) -> ca.SX:
-        """An expression of a segment with the length that was fed from the border."""
-        if not self.model.fed:
-            return expression
-        return ca.substitute(expression, self.place[-1], self.lam[self.model.fed])
+        total -= ca.dot(self.total_load, true.start)
+        if self.model.end.slides:
+            total += ca.dot(self.resultant(self.along_ends[1]), true.end)
+        return total
 
     @cached_property
     def feeding(self) -> ca.SX:
-        """Energy [J] of what a sliding end takes from beyond it: against the tension, its weight.
+        """Energy [J] of what ends that slide take from beyond them: against tensions, its weight.
 
-        With it the condition of the length that was fed is T = N + M k / 2 for the tension N in the
-        cable there; the weight that enters comes from the same place.
+        With it the condition of the arc length there is T = N + M k / 2 for the tension N in the
+        cable before the end; the weight that enters comes from the same place.
         """
-        if not self.model.fed:
-            return ca.SX(0)
-        per_length = self._declared_resultant(0.0) / self.model.cable.length
-        tension = self.pose[EndConditions.size(self.node) + VIEWPOINT_SIZE]
-        return self.lam[self.model.fed] * (tension + ca.dot(per_length, self.true_ends.end))
+        true, total, k = self.true_ends, ca.SX(0), EndConditions.size(self.node) + VIEWPOINT_SIZE
+        low, high = self.along_ends
+        fed = ((true.start, -ca.SX(low)), (true.end, high - self.model.cable.length))
+        weights = (self.resultant(low) - self.resultant(0.0), -self.resultant(high))
+        for slides, (place, more), weight in zip(self.model.loose, fed, weights, strict=True):
+            if slides and not self.model.fed_by_length:
+                tension, k = self.pose[k], k + 1
+                stretched = self.stretch + self.axial_compliance * tension / 2
+                total += more * tension * stretched + ca.dot(weight, place)
+        return total
 
 
 def lagrangian_of(model: CableModel) -> Lagrangian:

@@ -18,7 +18,7 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import Functions, functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.summed import Element, Elements, summed
-from dlo_casadi.model.whole_pose import PoseSymbols
+from dlo_casadi.model.whole_pose import Laid, PoseSymbols
 from dlo_casadi.rod.ends import EndConditions
 
 # Arguments that may vary, in the order in which they are stacked; the others are constant.
@@ -62,6 +62,9 @@ def pose_rows(model: CableModel, s: PoseSymbols) -> PoseRows:
         d = model.node.dimension
         curve = ca.reshape(call("curve"), d + 1, -1)[:, advancing]
         steps, ratios = curve[:d, :], curve[d:, :]
+    if model.slides:
+        places = Laid.of(model).places(model, s)
+        ratios = ratios * ((places[-1] - places[0]) / model.chain.length)
     strains = ca.reshape(call("strains"), -1, model.chain.n_segments)[:, layout.bends.tolist()]
     conditions = own + ca.sum2(each)
     energy = call("energy")
@@ -154,7 +157,11 @@ class _Parts:
             "p": self._shared("p", len(own)),
             "rest": ca.sparsify(ca.DM(inside)),
         }
-        known = self.known | {"place": chain.layout.segments.T}
+        places = chain.layout.segments.T
+        if self.model.slides:
+            u = chain.places / chain.length
+            places = np.array([u[:-1], u[1:], places[5], places[0]])
+        known = self.known | {"place": places}
         if "rest" in known:
             known["rest"] = (inside @ known["rest"]).reshape((len(own), -1)).T
         element = _element(functions_of(self.model), name, tuple(self.sizes), rows)
@@ -209,6 +216,27 @@ def _every(size: int) -> ca.DM:
     return ca.DM.eye(size)
 
 
+def _between_ends(functions: Functions, name: str) -> ca.Function:
+    """A function of a segment of which `place` has the shares of the cable that its ends are at.
+
+    Ends that slide have their arc lengths in the border; see `Slides` for the gradient by these.
+    """
+    model, base = functions.model, functions.compact(name)
+    given = [ca.SX.sym("x", *base.size_in(i)) for i in range(base.n_in())]
+    _, lam, *_, row, _ = given
+    ends = {0: ca.SX(0.0), 1: ca.SX(model.cable.length)}
+    ends |= {k: lam[own] for k, own in model.sliding.items()}
+    places = [ends[0] + u * (ends[1] - ends[0]) for u in (row[0], row[1])]
+    arguments = [*given[:4], ca.vertcat(*places, row[2:]), given[5]]
+    outputs: list[ca.SX] = base.call(arguments)
+    if name == "segment_slope":
+        (edges,) = functions.compact("edge_slope").call(arguments)
+        for k, own in model.sliding.items():
+            u = row[:2] if k else 1 - row[:2]
+            outputs[0][2 * model.node.increment + own] += ca.dot(u, edges)
+    return ca.Function(name, given, outputs)
+
+
 @lru_cache(maxsize=4 * MODELS)
 def _element(
     functions: Functions, name: str, varying: tuple[str, ...], rows: int | None
@@ -219,6 +247,8 @@ def _element(
     """
     of_segment = name.startswith("segment")
     function = functions.compact(name) if of_segment else getattr(functions, name)
+    if of_segment and functions.model.slides:
+        function = _between_ends(functions, name)
     names = ("x", "lam", "p", *(("rest", "place") if of_segment else ("pose",)))
     own = tuple(key for key in names if key in varying)
     fixed = tuple(key for key in names if key not in varying)

@@ -4,16 +4,20 @@ Symbols are SX for this package's own IPOPT problems and MX in functions for use
 expression of MX calls the functions of segments, so that graphs and their derivatives stay small.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.model.cable_model import FREE_LENGTH, VIEWPOINT_SIZE, CableModel
+from dlo_casadi.model.clipped import Clipped
 from dlo_casadi.model.clips import clip_size
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 
 
@@ -50,9 +54,9 @@ class PoseSymbols:
 class Potential:
     """A minimisation over one pose: symbols (coordinates, parameters), energy [J], conditions.
 
-    The parameters stack p, rest curvature of the cells, pose, deviation, and with clips for each
-    node, clip by clip, 1 if it is moved there, else 0. `by_segment` (n_lam, n_segments): what each
-    segment adds to the conditions; for the end's place its advance [m].
+    The parameters stack p, rest curvature of the cells, pose, deviation, and `Laid`. `by_segment`
+    (n_lam, n_segments): what each segment adds to the conditions; for the end's place its advance
+    [m].
     """
 
     coordinates: ca.SX
@@ -60,6 +64,70 @@ class Potential:
     energy: ca.SX
     conditions: ca.SX
     by_segment: ca.SX
+
+
+@dataclass(frozen=True)
+class Laid:
+    """Where the nodes are on the cable.
+
+    Parameters
+    ----------
+    moved : (k, n_nodes)
+        1 where a node is moved to a clip, else 0.
+    shares, others : (k + 2, n_nodes), (1, n_nodes)
+        Arc lengths of the nodes are `others` [m] plus the shares of those of the supports.
+    parameters : sequence
+        Those of these that are symbols.
+    """
+
+    moved: Any
+    shares: Any
+    others: Any
+    parameters: Sequence[ca.SX] = ()
+
+    @classmethod
+    def of(cls, model: CableModel) -> "Laid":
+        """Symbols; numbers without clips."""
+        count, k = model.chain.n_nodes, len(model.clips)
+        moved = ca.SX.sym("moved", k, count)
+        if model.slides and k:
+            known = (moved, ca.SX.sym("shares", k + 2, count), ca.SX.sym("others", 1, count))
+            return cls(*known, known)
+        if model.slides:
+            u = ca.DM(model.chain.places / model.chain.length).T
+            return cls(moved, ca.vertcat(1 - u, u), ca.DM.zeros(1, count))
+        still = ca.SX(1, count)
+        others = (1 - ca.sum1(moved)) * ca.DM(model.chain.places).T
+        return cls(moved, ca.vertcat(still, moved, still), others, (moved,))
+
+    @staticmethod
+    def numbers(model: CableModel, clipped: Clipped) -> FloatArray:
+        """The `parameters` of one pose as numbers."""
+        k, count = len(model.clips), model.chain.n_nodes
+        found = [(np.arange(count) == clipped.nodes[0][:, None]).ravel(order="F").astype(float)]
+        if model.slides and k:
+            shares = clipped.at_nodes(np.eye(k + 2)[None])[0]
+            found += [shares.ravel(order="C"), clipped.places[0] - shares @ clipped.held[0]]
+        return np.concatenate(found)
+
+    @staticmethod
+    def ends(model: CableModel, s: "PoseSymbols") -> tuple[Any, Any]:
+        """Arc lengths [m] of both ends, where no unknown of the border is one."""
+        length = model.cable.length
+        if not (model.slides and model.fed_by_length):
+            return 0.0, length
+        free = s.pose[EndConditions.size(model.node) + VIEWPOINT_SIZE]
+        free = free + s.deviation[model.deviation_names.index(FREE_LENGTH)]
+        return (0.0, free) if model.end.slides else (length - free, length)
+
+    def places(self, model: CableModel, s: "PoseSymbols") -> Any:
+        """Arc lengths (1, n_nodes) [m]."""
+        at = ca.vertsplit(functions_of(model).true_clips(s.p, s.pose)[1])
+        low, high = self.ends(model, s)
+        held = [low, *at, high]
+        for k, row in model.sliding.items():
+            held[k] = s.lam[row]
+        return self.others + ca.horzcat(*held) @ self.shares
 
 
 def potential(model: CableModel) -> Potential:
@@ -71,8 +139,9 @@ def potential(model: CableModel) -> Potential:
     s, functions, lagrangian = PoseSymbols.of(model), functions_of(model), lagrangian_of(model)
     inner = ca.SX.sym("inner", model.n_inner, model.chain.n_segments)
     energy, gradient, _ = functions.at_ends(*end_arguments(model, s))
-    moved = ca.SX.sym("moved", len(model.clips), model.chain.n_nodes)
-    segments = _segment_arguments(model, s, moved)
+    laid = Laid.of(model)
+    moved = laid.moved
+    segments = _segment_arguments(model, s, laid)
     own, reached = functions.compact("segment_potential")(*segments, inner)
     reached = _spread(model, reached, moved)
     energy = sum(ca.horzsplit(own), start=energy)
@@ -89,7 +158,7 @@ def potential(model: CableModel) -> Potential:
         # Nothing else depends on the coordinates of a node that a clip holds.
         energy += ca.sumsqr(_nodes(model, s) @ moved[k, :].T - frame) / 2
     coordinates = ca.vertcat(s.x, *(s.lam[i] for i in places), ca.vec(inner), given_way)
-    parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation, ca.vec(moved))
+    parameters = ca.vertcat(s.p, s.rest, s.pose, s.deviation, *map(ca.vec, laid.parameters))
     return Potential(coordinates, parameters, energy, conditions, reached)
 
 
@@ -97,7 +166,12 @@ def balance(model: CableModel, s: PoseSymbols) -> Any:
     """Gradient of the Lagrangian by increments and multipliers: force balance, then conditions."""
     b, functions = model.node.increment, functions_of(model)
     ends = functions.end_slope(*end_arguments(model, s))
-    gradient = functions.compact("segment_slope")(*_segment_arguments(model, s))
+    arguments = _segment_arguments(model, s)
+    gradient = functions.compact("segment_slope")(*arguments)
+    if model.sliding:
+        own, (before, after) = functions.compact("edge_slope")(*arguments), _slides(model)
+        for k, row in enumerate(model.sliding.values()):
+            gradient[2 * b + row, :] = own[0, :] * before[k, :] + own[1, :] * after[k, :]
     none = ca.DM.zeros(b)
     rows = ca.horzcat(none, gradient[b : 2 * b, :]) + ca.horzcat(gradient[:b, :], none)
     rows = rows[:, : model.chain.n_nodes]
@@ -109,7 +183,10 @@ def balance(model: CableModel, s: PoseSymbols) -> Any:
 def tangent(model: CableModel, s: PoseSymbols) -> Any:
     """Hessian of the Lagrangian by increments and multipliers: the derivative of `balance`."""
     b, count, functions = model.node.increment, model.chain.n_nodes, functions_of(model)
-    *_, segments = functions.compact("segment")(*_segment_arguments(model, s))
+    arguments = _segment_arguments(model, s)
+    *_, segments = functions.compact("segment")(*arguments)
+    if model.sliding:
+        segments = _with_slides(model, segments, functions.compact("segment_by_edges")(*arguments))
     *_, ends = functions.at_ends(*end_arguments(model, s))
     # Unknowns of each block: those of two nodes, and the border. A segment after the last node is
     # possible; its entries for a next node are left out.
@@ -135,6 +212,9 @@ def curve(model: CableModel, s: PoseSymbols) -> ca.SX:
     steps = advance[:, layout.advancing.tolist()]
     points = ca.cumsum(ca.horzcat(s.pose[:d], steps[:d, :]), 1)
     rates = steps[d:, :]
+    if model.slides:
+        places = Laid.of(model).places(model, s)
+        rates = rates * ((places[-1] - places[0]) / model.chain.length)
     rates = ca.horzcat(rates[:, 0], (rates[:, :-1] + rates[:, 1:]) / 2, rates[:, -1])
     first, last = layout.stations.T.tolist()
     x = ca.reshape(s.x, model.node.coordinates, model.chain.n_nodes)
@@ -200,23 +280,46 @@ def _spread(model: CableModel, reached: Any, moved: ca.SX) -> Any:
     return found
 
 
-def _segment_arguments(model: CableModel, s: PoseSymbols, moved: ca.SX | None = None) -> list[Any]:
+def _slides(model: CableModel) -> tuple[ca.DM, ca.DM]:
+    """Changes (u, n_segments) of both ends of segments with what slides, without clips."""
+    rates = ca.DM(Laid.of(model).shares)[[*model.sliding], :]
+    return rates[:, :-1], rates[:, 1:]
+
+
+def _with_slides(model: CableModel, segments: Any, edges: Sequence[Any]) -> Any:
+    """Hessians of segments side by side, with the rows of what slides: see `Slides`."""
+    size, first = segments.shape[0], 2 * model.node.increment
+    rows = [first + row for row in model.sliding.values()]
+    chosen = ca.DM(np.eye(size)[:, rows])
+    mixed, _, twice = edges
+    each = zip(
+        ca.horzsplit(segments, size),
+        ca.horzsplit(mixed, 2),
+        ca.horzsplit(twice, 2),
+        *(ca.horzsplit(x) for x in _slides(model)),
+        strict=True,
+    )
+    found = []
+    for own, by_ends, both, before, after in each:
+        rate = ca.horzcat(before, after).T @ chosen.T
+        column = by_ends @ rate
+        found.append(own + column + column.T + rate.T @ both @ rate)
+    return ca.horzcat(*found)
+
+
+def _segment_arguments(model: CableModel, s: PoseSymbols, laid: Laid | None = None) -> list[Any]:
     """One column for each segment, or a single column if all segments share it."""
     chain, x = model.chain, _nodes(model, s)
     inside = chain.rest_inside(np.eye(chain.n_rests)).reshape((-1, chain.n_rests))
     rest = ca.reshape(ca.sparsify(ca.DM(inside)) @ s.rest, -1, chain.n_segments)
     place: Any = ca.DM(chain.layout.segments.T)
-    if moved is not None and model.clips:
-        at = ca.vertsplit(ca.SX(functions_of(model).true_clips(s.p, s.pose)[1]))
-        for k, row in model.sliding.items():
-            at[k] = s.lam[row]
-        even = (1 - ca.sum1(moved)) * ca.DM(chain.places).T
-        places = even + ca.horzcat(*at) @ moved
-        place = ca.vertcat(places[:-1], places[1:], place[5, :], place[0, :])
+    if laid is None and model.moves_nodes and not model.clips:
+        laid = Laid.of(model)
+    if laid is not None and model.moves_nodes:
+        places, moved = laid.places(model, s), laid.moved
+        place = ca.vertcat(places[:, :-1], places[:, 1:], place[5, :], place[0, :])
         for k, frame in _clip_frames(model, s, moved).items():
             x = x * (1 - ca.repmat(moved[k, :], x.shape[0], 1)) + frame @ moved[k, :]
-    for row in model.fed:
-        place = ca.vertcat(place, ca.repmat(s.lam[row], 1, chain.n_segments))
     after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)
     both = ca.vertcat(x[:, : chain.n_segments], x[:, after.tolist()])
     return [both, s.lam, s.p, rest, place, s.deviation]

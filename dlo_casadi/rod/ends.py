@@ -36,10 +36,11 @@ def deviation_names(node: type[Node], clips: int = 0) -> tuple[str, ...]:
     """Names of the unknowns that each pose of any model has of its own, in this order.
 
     These are deviations of the ends from declared values [m, rad], a force of unknown cause [N],
-    and deviations of the clips [m].
+    that of the free length of a cable that slides through an end [m], and those of the clips [m].
     """
     axes, turns = node.axes, node.turns
     parts = [("end", axes), ("start", turns), ("end", turns), ("unknown_force", axes)]
+    parts += [("free", ("length",))]
     parts += [(f"clip_{k}", axes) for k in range(clips)]
     return tuple(f"{what}_{name}" for what, names in parts for name in names)
 

@@ -79,6 +79,6 @@ HOLDS = {
     SupportKind.CLAMPED: _POINT | Holds.DIRECTION | Holds.ROLL,
 }
 # Kinds that a start, an end, and a clip between the ends may have.
-STARTS = (SupportKind.PINNED, SupportKind.CLAMPED, SupportKind.SWIVEL)
-ENDS = (*STARTS, SupportKind.SLIDE, SupportKind.FREE)
+STARTS = (SupportKind.PINNED, SupportKind.CLAMPED, SupportKind.SWIVEL, SupportKind.SLIDE)
+ENDS = (*STARTS, SupportKind.FREE)
 CLIPS = (SupportKind.PINNED, SupportKind.CLAMPED, SupportKind.SWIVEL, SupportKind.EYELET)

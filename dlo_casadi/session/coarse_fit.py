@@ -8,7 +8,8 @@ import numpy as np
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS, Tolerances
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import declared_model
 from dlo_casadi.session.read_session import ReadSession, spread

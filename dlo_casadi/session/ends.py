@@ -207,8 +207,8 @@ def shorter(session: ReadSession) -> tuple[Suspicion, ...]:
     hides it only in a loop. Gaps to the held ends count as straight.
     """
     length, lines = session.config.cable.length, []
-    held = session.config.experiment.boundary.end
-    if not held.place or held.slides:
+    held = session.config.experiment.boundary
+    if not held.end.place or held.start.slides or held.end.slides:
         return ()
     read = [item for item in session.read if item.s is None and len(item.points) > 2]
     for item in read:

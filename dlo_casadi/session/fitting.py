@@ -35,7 +35,8 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.stiffness import StiffnessFit, fit_stiffness
 from dlo_casadi.estimation.unknowns import Point
 from dlo_casadi.estimation.variances import first_reading_noise, refine
-from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel, Tolerances
+from dlo_casadi.model.cable_model import BENDING_STIFFNESS, END_ROLL, CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.paper.algorithm1 import Algorithm1Result, applies, run_algorithm1
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.outcome import SIMPLER, Stage
@@ -134,6 +135,7 @@ def declared_model(
         n_rest=REST_COEFFICIENTS if coefficients is None else coefficients,
         clips=experiment.clips,
         obstacles=experiment.surfaces,
+        fed_by_length=experiment.fed_by_length,
     )
     if END_ROLL in model.names and not known:
         model = replace(model, priors={END_ROLL: experiment.tolerances.roll})

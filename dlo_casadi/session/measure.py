@@ -10,6 +10,7 @@ import numpy as np
 
 from dlo_casadi import vision
 from dlo_casadi.config import Config, DeclaredCamera, Images, Pose
+from dlo_casadi.equilibrium.curve import denoised_length
 from dlo_casadi.errors import MeasurementError, counted
 from dlo_casadi.io.points import MeasuredPoints, read_points
 from dlo_casadi.runtime.progress import Step, nobody
@@ -86,14 +87,19 @@ def measured_poses(config: Config, inputs: Sequence[PoseInput]) -> tuple[Measure
     views = [view for item in inputs for view in item.views]
     std = pixel_std(views) if views else 0.0
     return tuple(
-        _measured(pose, item, std)
+        _measured(pose, item, std, config)
         for pose, item in zip(config.experiment.poses, inputs, strict=True)
     )
 
 
-def _measured(pose: Pose, item: PoseInput, std: float) -> MeasuredPose:
+def _measured(pose: Pose, item: PoseInput, std: float, config: Config) -> MeasuredPose:
     """Convert a pose with its sensors; pixels of weight one have standard deviation `std` [m]."""
     held = replace(pose.held, camera_center=item.camera_center)
+    if config.experiment.fed_by_length and held.free_length is None:
+        length = config.cable.length
+        if len(item.points) > 1:
+            length = float(denoised_length(held.joined(item.points))[-1])
+        held = replace(held, free_length=length)
     held_out = pose.role == "held_out"
     if item.views:
         found = [pixels_of(view, std, len(item.points) > 0) for view in item.views]

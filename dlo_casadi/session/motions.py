@@ -56,7 +56,7 @@ def _check_known(config: Config) -> None:
         what = "clips"
     elif experiment.obstacles:
         what = "obstacles"
-    elif experiment.boundary.end.slides:
+    elif experiment.boundary.start.slides or experiment.boundary.end.slides:
         what = "an end that slides"
     elif not ELEMENTS[config.model.element].smooth:
         what = f"elements of the kind {config.model.element}"

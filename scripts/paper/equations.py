@@ -17,7 +17,8 @@ from dlo_casadi.estimation.constrained import (
 )
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.paper.algorithm1 import gravity_slopes, run_algorithm1
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.session.stages import rest_curvature_of

@@ -15,7 +15,8 @@ from dlo_casadi.estimation.constrained import profile_interval
 from dlo_casadi.estimation.fit import fit_model, refine_mesh
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.result import Fit
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.paper.algorithm1 import run_algorithm1
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.sensing.measured_pose import MeasuredPose

@@ -27,7 +27,8 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns, Values
 from dlo_casadi.estimation.variances import settle
 from dlo_casadi.model.assembly import Shapes
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.runtime.parallel import generator_of, map_as_completed

@@ -29,7 +29,8 @@ from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.start import begin
 from dlo_casadi.estimation.unknowns import Unknowns
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel

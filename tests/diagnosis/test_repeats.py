@@ -13,7 +13,8 @@ from dlo_casadi.effects import CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 MODEL = CableModel(CableData(0.8, 0.03, 0.006, 0.02), 12, start="clamped", end="clamped", n_rest=5)

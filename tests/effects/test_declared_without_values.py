@@ -10,8 +10,9 @@ from dlo_casadi.effects import EFFECTS, CableData, Setup, StateEffect
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.ends import REACTIONS
 from dlo_casadi.rod.obstacles import Plane
 from dlo_casadi.sensing.measured_pose import MeasuredPose

@@ -13,7 +13,8 @@ from dlo_casadi.estimation.constrained import _predicted_next
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.fitting import Minimum, confirmed
 

@@ -12,7 +12,8 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.motion_fit import MotionFit, fit_motions, predicted
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.motion.path import FixturePath
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.motion.trajectory import way_of

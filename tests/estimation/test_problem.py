@@ -36,7 +36,8 @@ from dlo_casadi.estimation.unknowns import Point, Unknowns, Values
 from dlo_casadi.estimation.variances import scatter_of
 from dlo_casadi.linear_mixed import Normal, eliminated
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.ends import deviation_names
 from dlo_casadi.rod.node import Heading
 from dlo_casadi.sensing.measured_pose import MeasuredPose

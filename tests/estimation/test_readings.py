@@ -17,8 +17,9 @@ from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.estimation.variances import first_reading_noise, reading_noise_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Tangents
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.ends import REACTIONS, reaction_rows
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel, ReadingNoise

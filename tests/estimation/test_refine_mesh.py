@@ -8,7 +8,8 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation import fit as fitting
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.prediction import predict_poses
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 MODEL = CableModel(CableData(0.5, 0.1, 0.006, 0.02), 10, n_rest=0)

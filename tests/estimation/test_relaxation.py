@@ -18,7 +18,8 @@ from dlo_casadi.estimation.problem import Priors, Problem
 from dlo_casadi.estimation.relaxation import SOFTNESS, Relaxation
 from dlo_casadi.estimation.start import begin, relaxed, with_springs_in_place
 from dlo_casadi.estimation.unknowns import Unknowns, Values
-from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
+from dlo_casadi.model.cable_model import END_ROLL, CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 

@@ -14,7 +14,8 @@ from dlo_casadi.estimation.problem import FIRST_ROUGHNESS
 from dlo_casadi.estimation.result import ROUGHNESSES
 from dlo_casadi.estimation.unknowns import REST_TURNS_STD
 from dlo_casadi.estimation.variances import settle
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.stages import rest_curvature_of
 

@@ -23,7 +23,8 @@ from dlo_casadi.estimation.start import (
     retry_outlying_poses,
 )
 from dlo_casadi.estimation.unknowns import Unknowns, Values
-from dlo_casadi.model.cable_model import END_ROLL, CableModel, Tolerances
+from dlo_casadi.model.cable_model import END_ROLL, CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 

@@ -8,7 +8,8 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import Repeats, Uncertainty, spread_across
 from dlo_casadi.estimation.fit import fit_model
 from dlo_casadi.estimation.prediction import predict_poses, uncertainty_of
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.report.documents import finite
 from dlo_casadi.report.tables import describe
 from dlo_casadi.sensing.measured_pose import MeasuredPose

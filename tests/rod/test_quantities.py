@@ -6,7 +6,7 @@ import pytest
 
 from dlo_casadi.config.frozen import keys_of
 from dlo_casadi.config.options import Measurement
-from dlo_casadi.model.cable_model import Tolerances
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.rod.ends import REACTIONS, reaction_rows
 from dlo_casadi.rod.node import Frame, Heading
 from dlo_casadi.rod.quantities import FORCE, MOMENT, QUANTITIES, quantity_of

@@ -17,8 +17,9 @@ from dlo_casadi.estimation.prediction import (
     measured_branches,
     predict_poses,
 )
-from dlo_casadi.model.cable_model import CableModel, Tolerances
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session import stages as stages_module
 from dlo_casadi.session.fitting import nearest_to_poses, not_worse
