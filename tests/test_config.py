@@ -226,7 +226,7 @@ def test_a_configuration_cannot_be_changed(tmp_path):
             "start: pinned",
             "start: free",
             9,
-            "'pinned', 'clamped' or 'swivel', .*only the end can be free",
+            "'pinned', 'clamped', 'swivel' or 'slide', .*only the end can be free",
         ),
         (
             "end: pinned",

@@ -432,6 +432,8 @@ def test_sessions_that_cannot_be(tmp_path, old, new, said):
     path = tmp_path / "session.yaml"
     path.write_text(SESSION)
     assert load_config(path).experiment.boundary.end.slides
+    path.write_text(SESSION.replace("end: [0.6, 0.2]", "end: [1.6, 0.2]"))
+    assert not load_config(path).skipped  # farther away than the cable is long
     path.write_text(SESSION.replace(old, new))
     with pytest.raises(ConfigError, match=said):
         load_config(path)

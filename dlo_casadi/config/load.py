@@ -4,7 +4,7 @@ import difflib
 import math
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.config.cable import Cable
 from dlo_casadi.config.document import BACKSLASH, Document
 from dlo_casadi.config.effects import without_values, wrong_effects, wrong_limits
 from dlo_casadi.config.frozen import plain
 from dlo_casadi.config.noise import impossible_noise
 from dlo_casadi.config.oddities import oddities
-from dlo_casadi.config.options import DeclaredTolerances
 from dlo_casadi.config.problems import (
     Arguments,
     ConfigProblem,
@@ -103,7 +101,7 @@ def checked_config(source: Source) -> Config:
         raise source.error(problems)
 
     poses = config.experiment.poses
-    unreachable = _unreachable(poses, config.cable, config.experiment.tolerances)
+    unreachable = _unreachable(config)
     unused = unused_directions(config.experiment.boundary.start, config.experiment.boundary.end)
     reachable = tuple(pose.without(unused) for pose in poses if pose.name not in unreachable)
     absent = {pose.name: [_absent(path) for path in pose.paths] for pose in reachable if pose.paths}
@@ -342,27 +340,28 @@ def _end_problems(experiment: Experiment, pose: Pose) -> Iterator[tuple[str, str
         yield f"branch: {pose.branch} is of a cable in a plane", "branch"
 
 
-def _unreachable(
-    poses: Iterable[Pose], cable: Cable, tolerances: DeclaredTolerances
-) -> dict[str, str]:
+def _unreachable(config: Config) -> dict[str, str]:
     """Find poses whose fixtures are farther apart than their cable is long, plus three tolerances.
 
     Between clips, these include how well the places of clips are known, and their arc lengths.
     """
+    cable, experiment = config.cable, config.experiment
+    tolerances, held = experiment.tolerances, experiment.boundary
+    slides = held.start.slides or held.end.slides
     slack = 3.0 * math.hypot(tolerances.length, tolerances.end)
     at_clips = math.hypot(slack, 3.0 * tolerances.clip, 3.0 * tolerances.slip)
     reasons: dict[str, str] = {}
-    for pose in poses:
+    for pose in experiment.poses:
         end = pose.end or pose.start
         distance = math.dist(pose.start, end)
-        if distance > cable.length + slack:
+        if distance > cable.length + slack and not slides:
             meant = ", ".join(f"{x / 1e3:g}" for x in end)
             hint = f" Did you mean ({meant})?" if 10 * cable.length < distance else ""
             reasons[pose.name] = (
                 f"end ({', '.join(f'{x:g}' for x in end)}) m is {distance:.4g} m from the start; "
                 f"the cable is {cable.length:.4g} m long. Are end and cable.length in metres?{hint}"
             )
-        elif wrong := too_short(pose.held, cable.length, at_clips):
+        elif wrong := too_short(pose.held, held, cable.length, at_clips):
             reasons[pose.name] = wrong
     return reasons
 

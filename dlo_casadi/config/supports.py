@@ -144,21 +144,24 @@ def clip_problems(clips: Sequence[Clip], length: float, axes: int) -> Iterator[t
         last = clip.at if clip.at is not None else last
 
 
-def too_short(pose: HeldPose, length: float, slack: float) -> str:
+def too_short(pose: HeldPose, held: Boundary, length: float, slack: float) -> str:
     """Why a pose is impossible: a span exceeds its cable by more than a slack [m]; empty if not."""
     names = ["the start", *(clip.name for clip in pose.clips)]
     places = [pose.start, *(clip.place for clip in pose.clips)]
     # A free end is at the last clip at best.
     names.append(names[-1] if pose.end is None else "the end")
     places.append(places[-1] if pose.end is None else pose.end)
-    at = [0.0, *(clip.at for clip in pose.clips), length]
+    first, last = (
+        None if kind.slides else s for kind, s in ((held.start, 0.0), (held.end, length))
+    )
+    at = [first, *(clip.at for clip in pose.clips), last]
     low, straight = 0, 0.0
     for k in range(1, len(places)):
         straight += math.dist(places[k - 1], places[k])
         s, start = at[k], at[low]
-        if s is None or start is None:
+        if s is None:
             continue
-        if straight > s - start + slack:
+        if start is not None and straight > s - start + slack:
             return (
                 f"{names[low]} and {names[k]} are {straight:.4g} m apart"
                 f"{' by way of the eyelets' if k > low + 1 else ''}, with {s - start:.4g} m of "

@@ -33,7 +33,7 @@ from dlo_casadi.estimation.repeats import enough_poses, repeat_std
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
-from dlo_casadi.model.cable_model import END_ROLL, CableModel
+from dlo_casadi.model.cable_model import END_ROLL, FREE_LENGTH, CableModel
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 # Further values of `turns` that may choose the equilibrium in which a pose was measured.
@@ -379,6 +379,7 @@ def uncertainty_of(fit: Fit) -> Uncertainty:
     names, covariance = fit.named_covariance
     own = fit.model.deviations  # random ones of the problem's poses follow these
     scatter = dict(zip(own, map(float, fit.problem.fixture_std[: len(own)]), strict=True))
+    scatter.pop(FREE_LENGTH, None)  # a pose that is asked for tells it
     history, apart = fit.problem.history, 0.0
     if not enough_poses(history, fit.model):
         apart = repeat_std(history, fit.model, fit.noise.of_points.beside_repeats)

@@ -15,7 +15,7 @@ from dlo_casadi.effects.mass_error import MASS_FACTOR
 from dlo_casadi.estimation.problem import FIRST_ROUGHNESS, Priors, Problem
 from dlo_casadi.estimation.unknowns import REST_TURNS_STD, Linearization, Point, Unknowns
 from dlo_casadi.linear_mixed import NO_INFORMATION, LinearMixed, Normal
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import FREE_LENGTH, CableModel
 from dlo_casadi.sensing.noise import NoiseModel
 from dlo_casadi.thresholds import LEAST_NOISE_DEGREES
 
@@ -281,7 +281,8 @@ class Fit(Brief):
     @property
     def _by_fixtures(self) -> list[FloatArray]:
         """Variance (R_j,) of each residual caused by the deviations of a pose's ends."""
-        size, std = self.problem.unknowns.size, self.problem.fixture_std
+        size, names = self.problem.unknowns.size, self.problem.equilibria.model.deviations
+        std = self.problem.fixture_std * [name != FREE_LENGTH for name in names]
         return [
             ((directions[:, size:] * std) ** 2).sum(axis=1)
             for directions in self.linearization.raw_directions
