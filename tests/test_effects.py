@@ -420,7 +420,7 @@ def test_an_unknown_pull_is_another_force_in_every_pose(element):
     """The mean over the poses and the pose's own deviation, together a point force."""
     model = CableModel(CABLE, n=5, element=element, effects=(UnknownPull(),))
     a = posed(model, np.array([0.05, 0.3, 0.1, 0.48]))
-    a.shapes.deviation[0, 4:] = [0.1, -0.8]
+    a.shapes.deviation[0, 4:6] = [0.1, -0.8]
     found = a.energy()[0]
     direct, _ = energies((PointForce(),), [0.4, -0.7, 0.48], element=element)
     assert found == pytest.approx(direct, abs=1e-12)

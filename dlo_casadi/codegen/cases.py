@@ -209,11 +209,11 @@ class Case:
 
     @property
     def compliances(self) -> list[float]:
-        """Rotation of the start and end clamp per moment on it [rad/(N m)]."""
+        """Rotation of the start and end clamp, or swivel, per moment on it [rad/(N m)]."""
         turns = np.array(self.lagrangian.compliances(self.p)).ravel()
         found = zip(self.lagrangian.compliant, turns, strict=True)
         named = {self.model.condition_names[k]: float(c) for k, c in found}
-        turn = self.model.node.turns[0]
+        turn = self.model.node.turns[-1]  # a swivel has no first one, about the cable's axis
         return [named.get(f"{side}_{turn}", 0.0) for side in ("start", "end")]
 
     @property

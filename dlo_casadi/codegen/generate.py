@@ -179,18 +179,21 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
 def _rolls(case: Case) -> dict[str, int | str]:
     """Where the cable may roll in clamps of its ends, and whether all of it may: it is held then.
 
-    That is by the first clamp there is, or else, SPINS, by a spring about the first node's tangent.
+    That is by the first rigid clamp there is, or else, SPINS, by a spring about the first node's
+    tangent.
     """
     ends, twists = (case.model.start, case.model.end), case.model.node.twists
     swivels = [kind.direction and not kind.roll and twists for kind in ends]
     spins = case.model.may_spin and not case.rest.any()
-    rolls = [own and not (spins and k == swivels.index(True)) for k, own in enumerate(swivels)]
-    if any(own and case.compliances[k] > 0 for k, own in enumerate(swivels)):
-        raise DloError("no solver can be generated for a swivel that gives way\n  Try: without it")
+    gives = [own and c > 0 for own, c in zip(swivels, case.compliances, strict=True)]
+    rigid = [own and not soft for own, soft in zip(swivels, gives, strict=True)]
+    rolls = [own and not (spins and k == rigid.index(True)) for k, own in enumerate(rigid)]
     return {
-        "SPINS": spins and not any(swivels),
+        "SPINS": spins and not any(rigid),
         "ROLLS_START": rolls[0],
         "ROLLS_END": rolls[1],
+        "GIVES_AND_ROLLS_START": gives[0],
+        "GIVES_AND_ROLLS_END": gives[1],
         "SWIVEL_START": swivels[0],
         "SWIVEL_END": swivels[1],
         "TURNS": all(kind.roll for kind in ends),

@@ -46,11 +46,12 @@ def cable(where, **options):
         ("plane", "cw", {}),
         ("space", None, {"start": "clamped", "end": "clamped", "effects": (ClampRotation(),)}),
         ("space", None, {"start": "clamped", "end": "swivel", "effects": (ClampRotation(),)}),
+        ("space", None, {"start": "swivel", "end": "clamped", "effects": (ClampCompliance(),)}),
         ("space", None, {"start": "swivel", "end": "swivel"}),
     ],
     ids=[
         *("plane, clamps that give way", "plane, a branch", "space"),
-        *("space, a swivel at the end", "space, swivels"),
+        *("space, a swivel at the end", "space, a swivel that gives way", "space, swivels"),
     ],
 )
 def test_external_is_the_function_and_its_jacobian(tmp_path, where, branch, options):

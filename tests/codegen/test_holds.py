@@ -401,16 +401,24 @@ MOVED = {"clip_offset.dx": 0.01, "clip_slip.ds": 0.02}
 
 
 @pytest.mark.parametrize(
-    ("clips", "effects", "more"),
+    ("ends", "clips", "effects", "more"),
     [
-        pytest.param((), (), {}, marks=pytest.mark.long),
-        (CLIPS[:1], (Tether(), ClipOffset(), ClipSlip()), TETHER | MOVED),
+        pytest.param(("clamped", "clamped"), (), (), {}, marks=pytest.mark.long),
+        (
+            ("clamped", "clamped"),
+            CLIPS[:1],
+            (Tether(), ClipOffset(), ClipSlip()),
+            TETHER | MOVED,
+        ),
+        (("clamped", "swivel"), (), (), {}),
+        (("swivel", "swivel"), (), (), {}),
     ],
-    ids=["alone", "with a tether beside a clip that has moved"],
+    ids=["alone", "with a tether beside a clip that has moved", "and a swivel", "two swivels"],
 )
-def test_clamps_in_space_that_give_way(clips, effects, more):
+def test_clamps_in_space_that_give_way(ends, clips, effects, more):
     """Their moments are minus the energy's derivative by turns of the clamps."""
-    model = loom(len(clips), (ClampCompliance(), *effects))
+    held = {"start": ends[0], "end": ends[1]}
+    model = replace(loom(len(clips), (ClampCompliance(), *effects)), **held)
     values = {"clamp_compliance.start": 8.0, "clamp_compliance.end": 0.5} | more
     solver, p, rest = compiled(model, values)
     pose = replace(POSE, clips=clips)
