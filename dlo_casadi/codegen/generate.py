@@ -313,7 +313,7 @@ def generate(
     node, guessed = f"node_{case.name}", f"guesses_{case.name}"
     first = ("common", "contact", "newton", node, "columns", "descent", "between", "landing")
     then = ("guesses", guessed, "pose", "find", "shape", "clearance", "limits", "interface")
-    timed = ("motion", "motion_slopes") if motion else ()
+    timed = ("motion", "motion_slopes", "motion_modes") if motion else ()
     found = {
         f"{prefix}_solver.h": template("solver.h.in"),
         f"{prefix}_solver.hpp": template("solver.hpp.in"),

@@ -100,6 +100,14 @@ class CompiledStepper:
         """The motion dt [s] later, where fixtures are as given."""
         return self._made("dlo_advance", self.numbers_of(fixtures), dt, now)
 
+    def modes(self, fixtures: Fixtures, rest: NDArray[Any], count: int) -> tuple[FloatArray, str]:
+        """Natural frequencies [Hz] and damping ratios (2, count) about a dlo_motion at rest."""
+        out, size = np.zeros((2, count)), self._c.dlo_modes_workspace_size
+        size.restype = ctypes.c_size_t
+        work = np.empty(int(size()))
+        given = (self.numbers_of(fixtures), rest, np.int32(count), out[0], out[1], work, work.size)
+        return out, STATUSES[self._c.dlo_modes(*map(_passed, given))]
+
     def slopes(
         self,
         before: NDArray[Any],
@@ -127,6 +135,8 @@ def _passed(argument: Any) -> Any:
     """An argument for C."""
     if isinstance(argument, float):
         return ctypes.c_double(argument)
+    if isinstance(argument, np.int32):
+        return ctypes.c_int(int(argument))
     if isinstance(argument, np.ndarray):
         return ctypes.c_void_p(argument.ctypes.data)
     return ctypes.c_size_t(argument)

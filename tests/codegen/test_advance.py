@@ -28,6 +28,7 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.motion import steps
+from dlo_casadi.motion.modes import damped_modes
 from dlo_casadi.motion.step_function import fixtures_vector, state_vector, step_function
 from dlo_casadi.motion.steps import RHO, Moving, Scheme, Stepper, begun_by, first_step
 from dlo_casadi.motion.system import MovingCable
@@ -206,6 +207,23 @@ def test_derivatives_of_steps_are_those_of_differences(swinging):
             expected = (moved[2 * q][name] - moved[2 * q + 1][name])[0] / (2 * sizes[q])
             scale = max(np.abs(expected).max(), 1e-3)
             assert np.abs(columns[name][q] - expected).max() < 1e-5 * scale, (name, q)
+
+
+def test_modes_are_those_of_python(swinging):
+    """Of the cable at rest in C: frequencies to 1e-8, damping ratios to 1e-7."""
+    fixtures, c = swinging.at(0.0), swinging.c
+    (frequencies, ratios), status = c.modes(fixtures, swinging.motion, 4)
+    assert status == "ok"
+    cable = swinging.cable
+    expected = damped_modes(cable, c.moving(swinging.motion).state, fixtures, 4)
+    known = expected.rates / (2 * np.pi)
+    swings = known > 1e-3 * known.max()  # not the roll of a cable that is free to roll
+    assert np.array_equal(frequencies > 1e-3 * known.max(), swings)
+    np.testing.assert_allclose(frequencies[swings], known[swings], rtol=1e-8)
+    np.testing.assert_allclose(
+        ratios[swings], expected.damping_ratios[swings], rtol=1e-6, atol=1e-7
+    )
+    assert c.modes(fixtures, swinging.motion, 7)[1] == "bad_argument"
 
 
 def test_what_cannot_be_is_told(swinging):
