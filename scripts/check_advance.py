@@ -58,13 +58,14 @@ class Case(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What became of it."""
+    """What became of it; `apart`: of the ends where it ended too early, in lengths."""
 
     status: str
     until: float
     off: float
     finite: bool
     halved: int
+    apart: float = 0.0
 
 
 def model_of(where: str, ends: tuple[str, str], n: int = N) -> CableModel:
@@ -160,7 +161,9 @@ def moved(steps: CompiledSteps, path: Path, first: Moving, dt: float, seconds: f
             if status == "ok":
                 break
         if status != "ok":
-            return Row(status, t, off, finite, halved)
+            ends = np.diff(path.at(t + dt).places, axis=0)
+            apart = float(np.linalg.norm(ends)) / cable.model.cable.length
+            return Row(status, t, off, finite, halved, apart)
         halved += parts > 1
         now, t = ahead, t + dt
         numbers = np.concatenate([now[name].ravel() for name in steps.records.record.names or ()])

@@ -7,7 +7,6 @@ import shutil
 import tempfile
 import weakref
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,8 @@ from dlo_casadi.motion.state import Fixtures
 from dlo_casadi.motion.steps import Moving
 from dlo_casadi.motion.system import MovingCable
 
-# Models whose libraries stay loaded.
-_LIBRARIES = 32
+# Libraries that are kept.
+_MOST = 32
 # Without much optimisation: a library is used for some ten thousand steps.
 _FLAGS = ("-O1",)
 
@@ -142,32 +141,24 @@ def compiled_steps(cable: MovingCable, flags: tuple[str, ...] = _FLAGS) -> Compi
     DloError
         If there is no C compiler.
     """
-    key = replace(cable.model, n_rest=0, priors={})
-    library = _library(key, cable.springs_on.tobytes(), flags, _Given(cable))
+    model = replace(cable.model, n_rest=0, priors={})
+    key = (model, cable.springs_on.tobytes(), flags)
+    if key not in _libraries:
+        if len(_libraries) == _MOST:
+            del _libraries[next(iter(_libraries))]
+        _libraries[key] = _library(cable, flags)
+    library = _libraries[key]
     if isinstance(library, DloError):
         raise library
     return CompiledSteps(cable, library)
 
 
-class _Given:
-    """A cable that is no part of a key."""
-
-    def __init__(self, cable: MovingCable) -> None:
-        self.cable = cable
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Given)
-
-    def __hash__(self) -> int:
-        return 0
+# By model without what makes no difference, and by the segments that springs are on.
+_libraries: dict[tuple[CableModel, bytes, tuple[str, ...]], ctypes.CDLL | DloError] = {}
 
 
-@lru_cache(maxsize=_LIBRARIES)
-def _library(
-    model: CableModel, springs: bytes, flags: tuple[str, ...], given: _Given
-) -> ctypes.CDLL | DloError:
-    """The library of a model, and of springs on these segments."""
-    cable = given.cable
+def _library(cable: MovingCable, flags: tuple[str, ...]) -> ctypes.CDLL | DloError:
+    """A compiled library, or why there is none."""
     text = alone(MovingCase(cable.model, cable.p, cable.rest, inline=False))
     folder = Path(tempfile.mkdtemp(prefix="dlo_steps_"))
     source = Solver("dlo", "", {"dlo_solver.c": text}, Obstacles())

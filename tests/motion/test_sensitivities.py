@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dlo_casadi.codegen import fit_steps
 from dlo_casadi.codegen.fit_steps import CompiledSteps, fastest_steps
 from dlo_casadi.effects import AirDrag, CableData, PinFriction, ViscousDrag
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -133,6 +134,13 @@ def test_compiled_steps_are_those_of_python(name: str, monkeypatch) -> None:
         expected, found = getattr(own, field), getattr(compiled, field)
         scale = np.abs(expected).max(axis=(0, 1))  # forces change by 1 / dt^2 with places
         assert (np.abs(found - expected).max(axis=(0, 1)) <= 1e-5 * scale + 1e-9).all(), field
+
+
+def test_without_a_compiler_python_steps(monkeypatch) -> None:
+    monkeypatch.setattr(fit_steps, "_libraries", {})
+    monkeypatch.setenv("CC", "no-such-compiler")
+    model, _, p = problem("plane, free")
+    assert isinstance(fastest_steps(MovingCable(model, p, np.zeros(6))), Steps)
 
 
 @pytest.mark.parametrize("name", CASES)
