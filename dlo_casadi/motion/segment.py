@@ -240,7 +240,7 @@ def refuse_still(model: CableModel) -> None:
     if model.surfaces:
         what = "obstacles: contact in motion is not known"
     elif model.slides:
-        what = "a sliding end: a cable in motion is not fed"
+        what = "an end that slides: a cable in motion is not fed"
     elif not model.chain.kind.smooth:
         what = f"elements of the kind {model.element!r}: try 'quadratic'"
     elif model.clips:
