@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from dlo_casadi.cable.file import load as load
     from dlo_casadi.cable.fitted_cable import FittedCable as FittedCable
     from dlo_casadi.cable.fitted_cable import Shape as Shape
+    from dlo_casadi.cable.move import Move as Move
     from dlo_casadi.cable.placing import Placing as Placing
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
@@ -39,6 +40,7 @@ _PUBLIC = {
     "cable.estimate": "Covariance Estimate",
     "cable.file": "load",
     "cable.fitted_cable": "FittedCable Shape",
+    "cable.move": "Move",
     "cable.placing": "Placing",
     "codegen": "CompiledSolver",
     "config": "Cable Clip FixturePath Motion Obstacle Pose",

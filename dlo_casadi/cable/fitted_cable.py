@@ -12,12 +12,13 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.carried import CarriedCable
 from dlo_casadi.cable.estimate import CableCurve
 from dlo_casadi.cable.held import FED, all_asked, among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
-from dlo_casadi.cable.motion import POINTS, CableInMotion, ShapeInMotion
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.cable.placing import Aim, Placing, placed
+from dlo_casadi.cable.shape_in_motion import POINTS, ShapeInMotion
 from dlo_casadi.config import Clip, Obstacle, Pose
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -39,7 +40,7 @@ from dlo_casadi.show.text import bend_radius, html_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FittedCable(CableInMotion):
+class FittedCable(CarriedCable):
     """A fitted cable: its model with the fitted values and their uncertainty.
 
     Made by `Result.cable`, by `dlo_casadi.load` from a folder of results, or without a fit by

@@ -1,6 +1,6 @@
 """Pictures of a moving cable: instants in one drawing, and moving ones as GIF."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
@@ -34,6 +34,26 @@ def draw_motion(points: FloatArray, t: FloatArray, title: str, *, tip: bool) -> 
         axes.set_title(f"{len(picked)} instants, light to dark: {t[0]:.3g} to {t[-1]:.3g} s")
         drawing.legend(loc="outside lower center", ncols=2)
         drawing.suptitle(title, fontsize=12)
+    return drawing
+
+
+def draw_move(
+    points: FloatArray, t: FloatArray, duration: float, swings: Mapping[str, float]
+) -> Figure:
+    """Draw a motion (T, K, d) [m] until it arrives, and swings [mm] by name as bars."""
+    with style.styled((10.0, 5.0)) as drawing:
+        axes = _axes(drawing, points, (1, 2, 1))
+        picked = np.linspace(0, np.searchsorted(t, duration), _INSTANTS).round().astype(int)
+        for share, k in zip(np.linspace(0.15, 1.0, len(picked)), picked, strict=True):
+            axes.plot(*points[k].T, color=1 - share * (1 - np.array(to_rgb(style.BLUE))), lw=2.0)
+        axes.set_title(f"{len(picked)} instants, light to dark, in {duration:.3g} s")
+        bars = drawing.add_subplot(1, 2, 2)
+        bars.barh(list(swings), list(swings.values()), color=style.BLUE)
+        bars.set(xscale="log", xlabel="swing after arrival [mm]")
+        bars.invert_yaxis()
+        for k, value in enumerate(swings.values()):
+            bars.annotate(f" {value:.3g}", (value, k), va="center")
+        bars.margins(x=0.15)
     return drawing
 
 

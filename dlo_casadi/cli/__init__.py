@@ -32,6 +32,7 @@ COMMANDS = {
     "shape-table": ("fitted", "predict the shapes of a fitted cable in very many poses"),
     "modes": ("moving", "frequencies and damping of small motions of a fitted cable"),
     "simulate": ("moving", "simulate a fitted cable under moving fixtures"),
+    "move": ("moving", "plan a motion after which a fitted cable is at rest"),
     "export": ("export", "write a fitted cable for a simulator, such as MuJoCo"),
     "generate-solver": ("fitted", "write the C solver of a fitted cable for planners to embed"),
     "schema": ("new", "print the JSON schema of a configuration, for editors"),

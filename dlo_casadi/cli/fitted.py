@@ -118,7 +118,7 @@ def predict(chosen: argparse.Namespace) -> None:
     from dlo_casadi.show.style import save_figure
 
     asked = {name: getattr(chosen, name) for name in HELD}
-    asked |= {name: _listed(chosen, name) for name in ("clips", "obstacles")}
+    asked |= {name: listed(chosen, name) for name in ("clips", "obstacles")}
     shape = load(chosen.parameters).solve(**asked, over=_sides(chosen.over))
     if chosen.figure is not None:
         save_figure(chosen.figure, shape.plot())
@@ -168,7 +168,7 @@ def _found_offsets(cable: FittedCable) -> str:
     return " and ".join(found)
 
 
-def _listed(chosen: argparse.Namespace, name: str) -> list[Any]:
+def listed(chosen: argparse.Namespace, name: str) -> list[Any]:
     """Clips or obstacles from the command's file; empty without a file."""
     path, kind = getattr(chosen, name), {"clips": CLIPS[0], "obstacles": "plane"}[name]
     found = [] if path is None else read_yaml(path)
@@ -196,10 +196,10 @@ def _sides(words: list[str] | None) -> bool | dict[str, bool] | None:
 
 def _checked(shape: Shape, chosen: argparse.Namespace) -> tuple[LimitCheck, ...]:
     """Check a shape against the limits of the command, or those of the session."""
-    return shape.check(_named("limits", chosen) or None, tolerances=_named("tolerances", chosen))
+    return shape.check(named("limits", chosen) or None, tolerances=named("tolerances", chosen))
 
 
-def _named(key: str, chosen: argparse.Namespace) -> dict[str, float]:
+def named(key: str, chosen: argparse.Namespace) -> dict[str, float]:
     """Numbers by name, from NAME=VALUE."""
     found = {}
     for word in getattr(chosen, key) or ():
@@ -228,7 +228,7 @@ def limits(chosen: argparse.Namespace) -> None:
     """
     from dlo_casadi.report.terminal import limits_table
 
-    cable, obstacles = load(chosen.parameters), _listed(chosen, "obstacles")
+    cable, obstacles = load(chosen.parameters), listed(chosen, "obstacles")
     checks: list[LimitCheck] = []
     lost: dict[str, str] = {}
     poses = listed_poses(cable.model, chosen.poses)

@@ -1,4 +1,4 @@
-"""`dlo modes`, `dlo simulate`: a fitted cable in motion."""
+"""`dlo modes`, `dlo simulate`, `dlo move`: a fitted cable in motion."""
 
 import argparse
 from pathlib import Path
@@ -10,7 +10,7 @@ from dlo_casadi.cable.file import load
 from dlo_casadi.cable.held import HELD
 from dlo_casadi.cable.moving_table import read_fixtures
 from dlo_casadi.cli.common import PARAMETERS, Page, command, figure, option
-from dlo_casadi.cli.fitted import POSE
+from dlo_casadi.cli.fitted import OBSTACLES, POSE, listed, named
 
 DAMPING = option(
     "--damping",
@@ -20,6 +20,29 @@ DAMPING = option(
     help="what only motion shows, if the fit does not know it: damping_time [s], air_drag, "
     "viscous_drag [N s/m^2], pin_friction [N m], dynamic_stiffness",
 )
+
+
+_WHERE = (
+    "start=0,0 end=0.3,0.1 start_heading=-1.2 ..., in space start_orientation=QX,QY,QZ,QW; "
+    "numbers [m, rad] with commas"
+)
+
+
+def _held(words: list[str]) -> dict[str, Any]:
+    """Keywords of `solve` from NAME=NUMBERS."""
+    from dlo_casadi.errors import DloError
+
+    found: dict[str, Any] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        try:
+            values = [float(x) for x in text.split(",")]
+        except ValueError:
+            values = []
+        if name not in HELD or not values:
+            raise DloError(f"{word}: NAME=NUMBERS belongs here.\n  Try: {_WHERE}")
+        found[name] = values[0] if len(values) == 1 else tuple(values)
+    return found
 
 
 def _cable(chosen: argparse.Namespace) -> Any:
@@ -121,3 +144,55 @@ def simulate(chosen: argparse.Namespace) -> None:
         page.say(f"  largest force on its {side}: {size:.4g} N")
     for line in written:
         page.say(line)
+
+
+@command(
+    PARAMETERS,
+    option("--from", nargs="+", required=True, dest="before", metavar="NAME=X", help=_WHERE),
+    option("--to", nargs="+", required=True, dest="after", metavar="NAME=X", help="likewise"),
+    option("--duration", type=float, metavar="T", help="[s]; by default the shortest"),
+    option(
+        "--limits",
+        nargs="+",
+        metavar="NAME=VALUE",
+        help="speed [m/s], acceleration [m/s^2], jerk [m/s^3], turn_speed [rad/s], "
+        "turn_acceleration [rad/s^2], force [N], moment [N m], bend_radius [m], clearance [m]",
+    ),
+    OBSTACLES,
+    option("--robust", action="store_true", help="least swing under the fit's covariance"),
+    DAMPING,
+    option("--output", type=Path, metavar="FILE", help="table for the robot: .csv or .json"),
+    option("--rate", type=float, default=250.0, metavar="HZ", help="rows a second (250)"),
+    option("--animate", type=Path, metavar="FILE", help="a moving picture (.gif)"),
+    figure("draw it beside the swing of other motions"),
+    codes="2 is also a motion that limits do not allow",
+)
+def move(chosen: argparse.Namespace) -> None:
+    """Plan a motion of the fixtures after which a fitted cable is at rest.
+
+    dlo move results/rope --from start=0,0 --to start=0.3,0 --duration 1.2 --output way.csv
+    dlo move results/rope --from start=0,0 --to start=0.3,0 --limits speed=0.5 force=2
+    """
+    from dlo_casadi.errors import DloError
+    from dlo_casadi.show.style import save_figure
+
+    if not 1.0 <= chosen.rate <= 1e4:
+        raise DloError(f"--rate {chosen.rate:g}: 1 to 10000 rows a second")
+    found = _cable(chosen).move(
+        _held(chosen.before),
+        _held(chosen.after),
+        duration=chosen.duration,
+        limits=named("limits", chosen),
+        obstacles=listed(chosen, "obstacles"),
+        robust=chosen.robust,
+    )
+    page = Page(chosen)
+    page.data(found.as_dict())
+    page.say(found)
+    if chosen.output is not None:
+        page.say(f"Table: {found.save(chosen.output, rate=chosen.rate)}")
+    if chosen.animate is not None:
+        page.say(f"Moving picture: {found.animate(chosen.animate)}")
+    if chosen.figure is not None:
+        save_figure(chosen.figure, found.plot())
+        page.say(f"Figure: {chosen.figure}")

@@ -49,3 +49,16 @@ def test_unknown_columns_are_named(folder, capsys):
     (folder / "wrong.csv").write_text("t_s,start_z_m\n0,1\n1,1\n")
     assert main(["simulate", str(folder), str(folder / "wrong.csv")]) == 2
     assert "start_z_m" in capsys.readouterr().err
+
+
+def test_a_motion_without_a_swing_is_planned(folder, capsys):
+    way, start = folder / "way.csv", "start_heading=-1.2"
+    words = ["move", str(folder), "--from", "start=0,0", start, "--to", "start=0.2,0", start]
+    assert main([*words, "--duration", "1.1", "--output", str(way), "--json"]) == 0
+    swings = json.loads(capsys.readouterr().out)["swings"]
+    assert swings["planned"] < 0.01 * swings["minimum jerk"]
+    assert way.read_text().startswith("t_s,start_x_m,start_y_m\n0,0,0\n")
+    assert main([*words, "--duration", "1.1", "--limits", "speed=0.1"]) == 2
+    assert "too short for speed" in capsys.readouterr().err
+    assert main([*words[:3], "begin=0,0", *words[4:]]) == 2
+    assert "begin=0,0: NAME=NUMBERS" in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""Motions of the fixtures after which a cable is at rest."""

@@ -1,0 +1,124 @@
+"""Motions after which a cable is at rest."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dlo_casadi as dlo
+from dlo_casadi.cable.carried import Planner
+from dlo_casadi.cable.move import Move
+from dlo_casadi.cable.moving_table import read_fixtures
+from dlo_casadi.planning.course import Course
+from dlo_casadi.planning.predicted import predicted
+from dlo_casadi.rod.obstacles import Capsule
+
+PERIOD = 1.08  # s, of the slowest mode
+
+
+def rope(dimension: int = 2) -> dlo.FittedCable:
+    """Hanging from a gripper."""
+    twist = {"torsional_stiffness": 0.007} if dimension == 3 else {}
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=0.009, **twist)
+    gravity = (0.0, 0.0, -9.81)[-dimension:]
+    known = dlo.known_cable(data, gravity=gravity, boundary=("clamped", "free"), model={"n": 8})
+    return known.with_damping(0.02, air_drag=1.1)
+
+
+def held(x: float, turn: float = 0.0) -> dict[str, object]:
+    return {"start": (x, 0.0), "start_heading": -1.2 + turn}
+
+
+@cache
+def carried() -> Move:
+    return rope().move(held(0.0), held(0.3, 0.3), duration=PERIOD)
+
+
+def test_the_cable_is_at_rest_on_arrival() -> None:
+    """By another simulation of the saved table, beside least jerk and zero vibration."""
+    move, cable = carried(), rope()
+    assert move.swing < 0.01 * move.swings["minimum jerk"]
+    assert move.swing < 0.5 * move.swings["zero vibration"]
+    table = move.table()
+    t = table.pop("t")
+    rest = {name: np.append(x, x[-1:], axis=0) for name, x in table.items()}
+    after = np.append(t, t[-1] + 0.5)
+    motion = cable.simulate(after, **rest)
+    assert np.linalg.norm(motion.points[-1] - move.rest, axis=1).max() < 2e-3
+    speeds = np.diff(table["start"], axis=0) * 250
+    assert np.allclose(speeds[[0, -1]], 0.0, atol=1e-3)
+
+
+def test_derivatives_of_a_motion_are_exact() -> None:
+    """Swing, forces, moments, curvatures and places in space against differences."""
+    cable = rope(3)
+    down = {"start_orientation": (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))}
+    tilted = {"start_orientation": (0.1, np.sqrt(0.5), 0.0, np.sqrt(0.49))}
+    shapes = cable.solve(start=(0, 0, 0), **down), cable.solve(start=(0.2, 0.1, 0), **tilted)
+    case = Planner(cable, *shapes, {}, (), False).nominal
+    course = Course.between(shapes[0].pose, shapes[1].pose, 0.5)
+    way = 1e-2 * np.random.default_rng(1).standard_normal(course.size)
+    h, first = 1e-3, course.least_jerk
+    before, now, after = (
+        predicted(case, course, first + x * way, 0.05, 0.2, derivatives=True) for x in (-h, 0.0, h)
+    )
+    for name in ("swing", "force", "moment", "curvature", "places"):
+        change = (getattr(after, name).value - getattr(before, name).value) / (2 * h)
+        found = getattr(now, name).by @ way
+        assert np.abs(found - change).max() < 1e-4 * np.abs(change).max(), name
+
+
+def test_effort_of_least_jerk_is_one() -> None:
+    """Against the closed form of the jerk of rest to rest, 720 D^2 / T^5: it ends less smoothly."""
+    shapes = [rope().solve(**held(x)) for x in (0.0, 0.3)]
+    course = Course.between(shapes[0].pose, shapes[1].pose, 2.0)
+    hessian, linear, constant = course.effort
+    theta = course.least_jerk
+    assert np.isclose(theta @ hessian @ theta / 2 + linear @ theta + constant, 1.0)
+    t = np.linspace(0, 2.0, 4001)
+    jerk = course.values(theta, t, 3)[:, 0]
+    least = 720 * 0.3**2 / 2.0**5
+    assert least < np.trapezoid(jerk**2, t) < 1.3 * least
+
+
+def test_limits_are_kept_along_the_way() -> None:
+    bar = dlo.Obstacle(kind="sphere", center=(0.16, -0.69), radius=0.12)
+    near = Capsule((0.16, -0.69), (0.16, -0.69), 0.12).near
+    asked = {"speed": 0.45, "force": 0.62, "clearance": 0.01}
+    move = rope().move(held(0.0), held(0.3), duration=1.4, limits=asked, obstacles=[bar])
+    assert max(move.used.values()) < 1.001
+    assert move.active
+    points = move.motion.points
+    assert near(points).distance.min() - 0.004 > 0.01 - 1e-4
+    assert np.linalg.norm(move.motion.start_force, axis=1).max() < 0.62 * 1.001
+
+
+def test_what_cannot_be_kept_is_told_with_numbers() -> None:
+    with pytest.raises(dlo.DloError, match=r"1\.08 s is too short for speed = 0\.2: .* 1\.5 s"):
+        rope().move(held(0.0), held(0.3), duration=PERIOD, limits={"speed": 0.2})
+    with pytest.raises(dlo.DloError, match="both poses are the same"):
+        rope().move(held(0.0), held(0.0), duration=1.0)
+    with pytest.raises(dlo.DloError, match="is no limit of a motion"):
+        rope().move(held(0.0), held(0.3), duration=1.0, limits={"sped": 1.0})
+    with pytest.raises(dlo.DloError, match="no obstacles"):
+        rope().move(held(0.0), held(0.3), duration=1.0, limits={"clearance": 0.01})
+    with pytest.raises(dlo.DloError, match="duration: a time"):
+        rope().move(held(0.0), held(0.3), duration=-1.0)
+
+
+def test_tables_are_read_back(tmp_path: Path) -> None:
+    move, cable = carried(), rope()
+    t, rows = read_fixtures(cable.model.node, move.save(tmp_path / "way.csv"))
+    table = move.table()
+    assert np.allclose(t, table["t"])
+    assert np.allclose(rows["start"], table["start"])
+    assert np.allclose(rows["start_heading"], table["start_heading"])
+    data = json.loads(move.save(tmp_path / "way.json").read_text())
+    assert np.allclose(data["table"]["start"], table["start"])
+    assert move.plot().axes
+    with pytest.raises(dlo.DloError, match=r"\.csv"):
+        move.save(tmp_path / "way.txt")
