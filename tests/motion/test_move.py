@@ -85,6 +85,7 @@ def test_effort_of_least_jerk_is_one() -> None:
     assert least < np.trapezoid(jerk**2, t) < 1.3 * least
 
 
+@pytest.mark.long
 def test_limits_are_kept_along_the_way() -> None:
     bar = dlo.Obstacle(kind="sphere", center=(0.16, -0.69), radius=0.12)
     near = Capsule((0.16, -0.69), (0.16, -0.69), 0.12).near
