@@ -52,8 +52,7 @@ class FittedCable(CarriedCable):
     p : (n_parameters,)
         In the order of `model.names` (SI).
     rest : (n_rests,) [1/m]
-        Rest curvature before the next pose; in space the rest strains: the twist of all cells,
-        then k_y, then k_z.
+        Rest curvature before the next pose; in space twist of all cells, then k_y, then k_z.
     metadata : Metadata
     """
 
