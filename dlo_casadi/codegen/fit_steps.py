@@ -38,7 +38,9 @@ class CompiledSteps:
     def __init__(self, cable: MovingCable, library: ctypes.CDLL) -> None:
         self.records = CompiledStepper(cable, library)
         self._table = np.array(MovingCase(cable.model, cable.p, cable.rest, inline=False).table)
-        self._numbers: tuple[Any, FloatArray] = (None, np.zeros(0))
+        # The last derivatives and changes, and what they are in C.
+        self._slopes: tuple[Columns | None, NDArray[Any]] = (None, np.zeros(0))
+        self._numbers: tuple[Numbers | None, Any, Any] = (None, None, None)
 
     def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
         """The state dt later; None if there is no step."""
@@ -60,54 +62,57 @@ class CompiledSteps:
         dt: float,
     ) -> Columns:
         """Derivatives after a step."""
-        c, b = self.records, self.records.cable.b
-        count = columns.turn.shape[2]
-        slopes, given = np.zeros(count, c.slope), np.zeros(count, c.given)
-        parts = {
-            "turn": columns.turn,
-            "r": columns.place,
-            "w": columns.rates[:, :b],
-            "v": columns.rates[:, b:],
-            "alpha": columns.accelerations[:, :b],
-            "a": columns.accelerations[:, b:],
-            "mean": columns.own,
-            "force": columns.force,
-        }
-        for name, part in parts.items():
-            slopes[name] = np.moveaxis(part, -1, 0)
-        slopes["moment"][:, :-1] = columns.moment.T
-        given["turn"] = numbers.turns.T.reshape(count, 2, b)
-        for name, part in (
-            ("place", numbers.places),
-            ("velocity", numbers.velocities),
-            ("acceleration", numbers.accelerations),
-        ):
-            given[name] = np.moveaxis(part, -1, 0)
-        out = np.zeros(count, c.slope)
-        status = c.call(
-            "dlo_slopes_of",
-            self._table,
-            c.numbers_of(fixtures),
-            c.recorded(before),
-            c.recorded(after, dt),
-            count,
-            given,
-            self._of_model(numbers),
-            slopes,
-            out,
-        )
+        c = self.records
+        slopes = self._slopes[1] if self._slopes[0] is columns else _slopes_of(c, columns)
+        if self._numbers[0] is not numbers:
+            self._numbers = (numbers, _given(c, numbers), _of_model(numbers))
+        _, given, of_model = self._numbers
+        out = np.zeros(len(slopes), c.slope)
+        states = (c.numbers_of(fixtures), c.recorded(before), c.recorded(after, dt))
+        moved = (len(slopes), given, of_model, slopes, out)
+        status = c.call("dlo_slopes_of", self._table, *states, *moved)
         if status != "ok":
             raise DloError(f"no derivatives of a step in time ({status})")
-        return _columns(out)
+        found = _columns(out)
+        self._slopes = (found, out)
+        return found
 
-    def _of_model(self, numbers: Numbers) -> FloatArray:
-        """Changes (q, ...) of parameters and of rest strains; the same from step to step."""
-        known, rows = self._numbers
-        if known is not numbers.p:
-            rest = np.moveaxis(numbers.rest, -1, 0).reshape(numbers.p.shape[1], -1)
-            rows = np.ascontiguousarray(np.hstack([numbers.p.T, rest]))
-            self._numbers = (numbers.p, rows)
-        return rows
+
+def _slopes_of(c: CompiledStepper, columns: Columns) -> NDArray[Any]:
+    """Derivatives as dlo_motion_slope."""
+    b = c.cable.b
+    slopes = np.zeros(columns.turn.shape[2], c.slope)
+    parts = {
+        "turn": columns.turn,
+        "r": columns.place,
+        "w": columns.rates[:, :b],
+        "v": columns.rates[:, b:],
+        "alpha": columns.accelerations[:, :b],
+        "a": columns.accelerations[:, b:],
+        "mean": columns.own,
+        "force": columns.force,
+    }
+    for name, part in parts.items():
+        slopes[name] = np.moveaxis(part, -1, 0)
+    slopes["moment"][:, :-1] = columns.moment.T
+    return slopes
+
+
+def _given(c: CompiledStepper, numbers: Numbers) -> NDArray[Any]:
+    """Changes of fixtures as dlo_fixtures_slope."""
+    count = numbers.p.shape[1]
+    given = np.zeros(count, c.given)
+    given["turn"] = numbers.turns.T.reshape(count, 2, c.cable.b)
+    parts = (numbers.places, numbers.velocities, numbers.accelerations)
+    for name, part in zip(("place", "velocity", "acceleration"), parts, strict=True):
+        given[name] = np.moveaxis(part, -1, 0)
+    return given
+
+
+def _of_model(numbers: Numbers) -> FloatArray:
+    """Changes (q, ...) of parameters, then of the rest strains of each segment."""
+    rest = np.moveaxis(numbers.rest, -1, 0).reshape(numbers.p.shape[1], -1)
+    return np.ascontiguousarray(np.hstack([numbers.p.T, rest]))
 
 
 def _columns(out: NDArray[Any]) -> Columns:

@@ -278,16 +278,21 @@ class Recording:
     ) -> tuple[FloatArray, FloatArray | None]:
         """Points (T, K, d) of the markers, and their derivatives (T, K, d, q)."""
         cable, (segment, u) = held.cable, self._markers(held.cable)
-        d, found, moved = cable.d, list[FloatArray](), list[FloatArray]()
-        for state, columns in states:
-            z, by_place, by_p = cable.handles(state)
-            found.append(between(z[segment], u))
-            if columns is not None and numbers is not None:
-                both = [columns.turn[:-1], columns.turn[1:], columns.place[:-1], columns.place[1:]]
-                by = by_place @ np.concatenate(both, axis=1) + by_p @ numbers.p
-                by = by[segment].reshape(len(segment), 4, -1)
-                moved.append(between(by, u).reshape(len(segment), d, -1))
-        return np.array(found), np.array(moved) if moved else None
+        known, columns = zip(*states, strict=True)
+        p, _, place = (np.broadcast_to(x, (len(known), *x.shape)) for x in cable.numbers[:3])
+        x, r = (_both(np.stack([getattr(one, key) for one in known])) for key in ("x", "r"))
+        z, by_place, by_p = cable.segment.mapped("curve")(x, r, p, place)
+        d, u_of = cable.d, len(segment)
+        points = between(z.reshape((*z.shape[:2], 4, d))[:, segment], u)
+        if numbers is None:
+            return points, None
+        moved = [
+            between(
+                (by[segment] @ both[segment] + by_own[segment] @ numbers.p).reshape(u_of, 4, -1), u
+            )
+            for by, by_own, both in zip(by_place, by_p, map(_of_both, columns), strict=True)
+        ]
+        return points, np.array(moved).reshape(len(known), u_of, d, -1)
 
     def _markers(self, cable: MovingCable) -> tuple[IntArray, FloatArray]:
         """Segment of each marker, and its share of it."""
@@ -357,6 +362,18 @@ def held_pose(model: CableModel, pose: FloatArray) -> HeldPose:
     return HeldPose(start=tuple(start.tolist()), end=end_place, **held)
 
 
+def _both(rows: FloatArray) -> FloatArray:
+    """Rows (T, n_nodes, ...) of both nodes of each segment, side by side."""
+    return np.concatenate([rows[:, :-1], rows[:, 1:]], axis=2)
+
+
+def _of_both(columns: Columns | None) -> FloatArray:
+    """Turns of both nodes of each segment, then places (n_segments, 2 (b + d), q)."""
+    assert columns is not None
+    parts = (columns.turn[:-1], columns.turn[1:], columns.place[:-1], columns.place[1:])
+    return np.concatenate(parts, axis=1)
+
+
 class _Held:
     """Where fixtures are, with their deviations."""
 
@@ -403,12 +420,13 @@ class _Numbers:
         self.places += sensitivities.places_by_p(cable, pose) @ self.p
         names = model.names
         self.delay = self.p[names.index(CLOCK_DELAY)] if CLOCK_DELAY in names else None
+        none = np.zeros_like(self.places)
+        self._still = Numbers(self.p, self.rest, self.turns, self.places, none, none)
 
     def at(self, t: float) -> Numbers:
         """The derivatives at a time."""
-        none = np.zeros_like(self.places)
         if self.delay is None:
-            return Numbers(self.p, self.rest, self.turns, self.places, none, none)
+            return self._still
         cable, path = self.cable, self.recording.path
         at = t + _delay(cable)
         moved = [path.rates(at, order)[..., None] * self.delay for order in (1, 2, 3)]
