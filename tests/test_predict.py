@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -26,12 +27,13 @@ BENCH = Path(__file__).parent / "data" / "bench"
 ROOT = Path(__file__).parents[1]
 
 
-def results(path, folder, n=20):
+def results(path, folder, n=20, damping_time=None):
     """A folder of results of a quick fit that holds parameters.yaml alone."""
     config = load_config(path)
     measured = measured_poses(config, read_inputs(config))
     declared = declared_model(config)
     model = declared.model.with_mesh(n)
+    model = replace(model, cable=replace(model.cable, damping_time=damping_time))
     fit = fit_model(model, measured[:4], declared.tolerances, 3e-4)
     document = fit_dict(fit)
     document["fixtures"] = shared_fixtures(config)
@@ -45,6 +47,14 @@ def results(path, folder, n=20):
 def pinned(tmp_path_factory):
     path = BENCH / "short_clean/session.yaml"
     return results(path, tmp_path_factory.mktemp("pinned") / "results" / "cable")
+
+
+def test_a_cable_that_was_fitted_with_motions_is_read_back_and_moves(tmp_path):
+    file = results(BENCH / "overhang/session.yaml", tmp_path / "rope", n=8, damping_time=0.02)
+    cable = load(file.parent)
+    assert cable.params["damping_time"].value > 0
+    pose = {"start": (0.0, 0.0), "start_heading": 0.0}
+    assert cable.simulate([0.0, 0.1], **pose).points.shape == (2, 101, 2)
 
 
 @pytest.fixture(scope="module")

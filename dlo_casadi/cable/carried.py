@@ -153,13 +153,17 @@ class Planner:
 
     def _case(self, cable: MovingCable, weight: float) -> Case:
         """A cable with the places where it rests before and after."""
-        rests = []
+        found = []
         for shape in (self.before, self.after):
             known = np.linspace(0.0, self.cable.length, len(shape.equilibrium.x))
             x = cable.model.node.interpolated(cable.model.chain.places, known, shape.equilibrium.x)
-            found = solve_equilibrium(cable.model, cable.p, cable.rest, shape.pose, x_init=x)
-            rests.append(cable.at_rest(found, cable.fixtures(shape.pose.vector)))
-        return Case(cable, rests[0], rests[1].r, weight)
+            found.append(solve_equilibrium(cable.model, cable.p, cable.rest, shape.pose, x_init=x))
+        cable = cable.about(found[0])
+        first, last = (
+            cable.at_rest(eq, cable.fixtures(shape.pose.vector))
+            for eq, shape in zip(found, (self.before, self.after), strict=True)
+        )
+        return Case(cable, first, last.r, weight)
 
     @cached_property
     def directions(self) -> list[tuple[FloatArray, FloatArray]]:

@@ -26,7 +26,7 @@ from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.prediction import uncertainty_of
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.files import finite
-from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
+from dlo_casadi.model.cable_model import DAMPING_TIME, STIFFNESSES, CableModel
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.runtime.executors import software
@@ -256,11 +256,12 @@ def _cable_dict(
     """The model of a cable, its values and their uncertainty."""
     names, covariance = uncertainty.names, uncertainty.covariance
     stds = Covariance(names, covariance).std
+    damped = [DAMPING_TIME] if model.cable.damping_time is not None else []
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "cable": {
             **fields_of(model.cable, "name", "length", "mass", "diameter"),
-            **fields_of(model.cable, *STIFFNESSES[: 1 + model.in_space]),
+            **fields_of(model.cable, *STIFFNESSES[: 1 + model.in_space], *damped),
             "rest_shape": "straight" if model.cable.straight else "curved",
         },
         "boundary": {"start": str(model.start), "end": str(model.end)},
