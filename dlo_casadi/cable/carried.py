@@ -158,7 +158,7 @@ class Planner:
             known = np.linspace(0.0, self.cable.length, len(shape.equilibrium.x))
             x = cable.model.node.interpolated(cable.model.chain.places, known, shape.equilibrium.x)
             found.append(solve_equilibrium(cable.model, cable.p, cable.rest, shape.pose, x_init=x))
-        cable = cable.about(found[0])
+        cable = cable.about(found[0].x)
         first, last = (
             cable.at_rest(eq, cable.fixtures(shape.pose.vector))
             for eq, shape in zip(found, (self.before, self.after), strict=True)

@@ -15,7 +15,7 @@ from dlo_casadi.export.common import Relaxed, relax
 from dlo_casadi.export.rod import Fixture, Rod
 from dlo_casadi.rod.node import Frame, Heading
 
-# Time step [s]; ratio of a joint's damping to its stiffness [s], not measured.
+# Time step [s]; ratio of a joint's damping to its stiffness [s] where it is not known.
 STEP, DAMPING = 0.002, 0.03
 # Moduli [Pa] in bending and twist of MuJoCo 3's own cable example (model/plugin/elasticity).
 DEFAULT = (4e6, 1e7)
@@ -57,6 +57,11 @@ contype="0" conaffinity="1" rgba="0.1 0.4 0.6 1"/>
 """
 
 
+def _damping_time(rod: Rod) -> float:
+    """Ratio [s] of a joint's damping to its stiffness."""
+    return DAMPING if rod.damping_time is None else rod.damping_time
+
+
 def _row(values: FloatArray) -> str:
     return " ".join(f"{value:.9g}" for value in np.ravel(values))
 
@@ -93,7 +98,7 @@ def _bodies(rod: Rod) -> list[str]:
             inside = place - frame.apply([rod.h / 2, 0.0, 0.0])
             lines.append(f'<body name="cable_0" pos="{_row(inside)}" quat="{_turned(frame)}">')
             if rod.start.rolls:
-                damping = DAMPING * float(rod.torsion[0]) / rod.h
+                damping = _damping_time(rod) * float(rod.torsion[0]) / rod.h
                 lines[-1] += f'<joint name="start_roll" axis="1 0 0" damping="{damping:.9g}"/>'
         elif k == 0:
             lines.append(f'<body name="cable_0" pos="{_row(place)}">{_pin(rod)}')
@@ -132,7 +137,7 @@ def principal(rod: Rod) -> tuple[FloatArray, Rotation]:
 
 def _pin(rod: Rod) -> str:
     """A pin at the start, damped like a joint so that nothing spins forever."""
-    damping = DAMPING * float(np.linalg.eigvalsh(rod.bending[0])[0]) / rod.h
+    damping = _damping_time(rod) * float(np.linalg.eigvalsh(rod.bending[0])[0]) / rod.h
     return f'<joint name="start_pin" {_PINS[rod.node.about][0]} damping="{damping:.9g}"/>'
 
 
@@ -148,7 +153,7 @@ def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: Float
         if name in rod.node.about:
             text += (
                 f'<joint name="{name}_{k}" axis="{_row(about[name])}" stiffness="{value:.9g}" '
-                f'springref="{angle:.9g}" damping="{DAMPING * value:.9g}" '
+                f'springref="{angle:.9g}" damping="{_damping_time(rod) * value:.9g}" '
                 f'armature="{STEP**2 * value:.9g}"/>'
             )
     return text

@@ -28,7 +28,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.export.common import printable
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import DAMPING_TIME, CableModel
 from dlo_casadi.model.clipped import rolled_with
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
 from dlo_casadi.rod.element import Cell
@@ -112,6 +112,8 @@ class Rod:
     start, end : Fixture
     features : dict
         Features beyond a straight uniform round cable: feature -> labels of the effects.
+    damping_time : float, optional [s]
+        Ratio of a joint's damping to its stiffness; None if it is not known.
     """
 
     name: str
@@ -131,6 +133,7 @@ class Rod:
     start: Fixture
     end: Fixture
     features: dict[Feature, tuple[str, ...]]
+    damping_time: float | None = None
 
     @classmethod
     def of(cls, held: SolvedCable, segments: int | None = None) -> Self:
@@ -181,6 +184,7 @@ class Rod:
             start=fixtures[0],
             end=fixtures[1],
             features=features,
+            damping_time=dict(zip(model.names, p.tolist(), strict=True)).get(DAMPING_TIME),
         )
 
     def with_stiffness(self, bending: float, torsion: float) -> Self:

@@ -87,8 +87,9 @@ TARGETS = {
             "of MuJoCo 3 would take the initial shape for that; it is gone in MuJoCo 4)",
             "geom mass [kg]; geom size [m]: half the diameter; option gravity [m/s^2]",
             "body start, body end: the clamps (mocap), move them; key pose: the shape in this pose",
-            "joint damping, armature, and the softness of the end's constraint are not measured:",
-            "they are chosen for a step of 2 ms, and change motion, not rest (the end by < 0.1 %)",
+            "joint damping [N m s/rad]: damping_time times stiffness, 0.03 s where it is unknown;",
+            "armature and the softness of the end's constraint are chosen for a step of 2 ms: they",
+            "change motion, not rest (the end by < 0.1 %)",
         ),
     ),
     "pyelastica": Target(
