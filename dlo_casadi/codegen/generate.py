@@ -303,6 +303,7 @@ def generate(
         )
     moving = MovingCase(bare, p, rest, inline).values if motion else {}
     numbers = _values(case, prefix, digest) | moving
+    numbers["CODE"] = int(numbers["CODE"]) + int(moving.get("MOTION_CODE", 0))
     helpers = helpers_of(str(moving.get("MOTION_KERNELS", "")))
     missing = [text for text in helpers if text not in str(numbers["KERNELS"])]
     numbers["KERNELS"] = "\n".join([*missing, str(numbers["KERNELS"])])

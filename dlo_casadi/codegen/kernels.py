@@ -22,6 +22,8 @@ from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.in_frame import SegmentDerivatives
 from dlo_casadi.rod.supports import SupportKind
 
+# Bytes of machine code per operation of a function.
+PER_OPERATION = 11.5
 # Largest difference at which two numbers count as equal: rounding of the mesh.
 _ROUNDING = 1e-14
 
@@ -113,7 +115,7 @@ class Kernels:
     @property
     def code_size(self) -> int:
         """Approximate size of their machine code in bytes."""
-        return round(11.5 * sum(kernel.function.n_nodes() for kernel in self.all))
+        return round(PER_OPERATION * sum(kernel.function.n_nodes() for kernel in self.all))
 
 
 def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:

@@ -14,6 +14,7 @@ from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.codegen.c_text import c_number, helpers_of, marked, statements, table_to_c
 from dlo_casadi.codegen.cases import template
+from dlo_casadi.codegen.kernels import PER_OPERATION
 from dlo_casadi.codegen.statuses import STATUS_TEXTS
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.functions import functions_of
@@ -26,6 +27,8 @@ from dlo_casadi.rod.ends import EndConditions
 _OF_SEGMENT = ("x", "r", "w", "v", "alpha", "a", "force", "still", "row", "table")
 _OF_ENDS = ("x", "w", "moment", "pose", "table")
 _OF_PLACES = ("pose", "table")
+# Bytes of the code of steps, derivatives and modes beside these functions.
+_OWN = 25_000
 _OF_MATRICES = ("STIFFNESS", "DAMPING", "MASS", "END_STIFFNESS", "END_DAMPING", "END_TURNS")
 # A step of Newton's method in C leaves less than that of Python, where steps share a matrix.
 _LAST = 1e-2 * LAST_STEP
@@ -193,6 +196,7 @@ class MovingCase:
         return by_model | {
             "MOTION_KERNELS": "\n".join(texts),
             "PATTERNS": "\n".join(_pattern(*one) for one in patterns.items()),
+            "MOTION_CODE": round(PER_OPERATION * sum(f.n_nodes() for _, f, _ in functions)) + _OWN,
             "MOTION_TABLE": table_to_c(self.table if self.inline else []),
             "PARAMETERS": 0 if self.inline else len(self.p),
             "MOTION_ROW": len(self._varying),
