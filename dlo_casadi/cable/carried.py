@@ -13,7 +13,9 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.held import among
 from dlo_casadi.cable.motion import CableInMotion, Motion
-from dlo_casadi.cable.move import RATE, Move, checked_limits, rows_of
+from dlo_casadi.cable.move import RATE, Move, rows_of
+from dlo_casadi.cable.move_checks import checked_limits, checked_pose, held_by, number
+from dlo_casadi.cable.move_limits import require_rest, used_along
 from dlo_casadi.cable.shape_in_motion import Modes, moving_cable
 from dlo_casadi.config import Obstacle
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -23,11 +25,11 @@ from dlo_casadi.errors import DloError, MotionError
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.planning.course import Course
 from dlo_casadi.planning.others import least_jerk, shaped
-from dlo_casadi.planning.predicted import Case, curvatures, held_moments, predicted
+from dlo_casadi.planning.predicted import Case, predicted
 from dlo_casadi.planning.problem import CLEAR, FIXTURES, Planned, Task, planned
 
-# Elements of the cable that is planned with: with 10 the slowest modes are exact to 0.01 %.
-_ELEMENTS = 10
+# Elements of the cable that is planned with. Between two clamps 10 leave swings 30 times as large.
+_ELEMENTS = 20
 # Steps in time in a period of the slowest mode, and in the motion at least.
 _A_PERIOD, _A_MOTION = 100, 60
 # Error of a step of the fine simulation [lengths]: some hundred steps leave a swing of 3e-5.
@@ -107,17 +109,20 @@ class CarriedCable(CableInMotion):
         EquilibriumError
             If the cable has no shape in one of the poses.
         """
-        first, last = (self.solve(**x) if isinstance(x, Mapping) else x for x in (before, after))
         asked = checked_limits(limits, obstacles)
+        shapes: list[Any] = []
+        time = None if duration is None else number("duration", duration)
+        for name, given in (("before", before), ("after", after)):
+            pose = checked_pose(self, name, given)
+            shapes.append(given if pose is None else self.solve(**pose))
+        first, last = shapes
         if not Course.between(first.pose, last.pose, 1.0).parts:
             raise DloError("move: both poses are the same, nothing moves")
         surfaces = among(self.model, self.p, obstacles)["model"].obstacles if obstacles else ()
         planner = Planner(self, first, last, asked, tuple(surfaces), robust)
-        if duration is None:
-            return planner.fastest()
-        if not (isinstance(duration, int | float) and np.isfinite(duration) and duration > 0):
-            raise DloError(f"duration: a time [s] above zero belongs here, found {duration!r}")
-        return planner.verified(float(duration), None)
+        for name, shape in (("before", first), ("after", last)):
+            require_rest(self, name, shape, asked, surfaces)
+        return planner.fastest() if time is None else planner.verified(time, None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +142,10 @@ class Planner:
     def mode(self) -> tuple[float, float]:
         """Natural frequency [Hz] and damping ratio of the slowest mode that comes back."""
         modes = self.after.modes(3)
-        k = int(np.flatnonzero(modes.frequencies > 0)[0])  # a roll between pins does not come back
+        back = np.flatnonzero(modes.frequencies > 0)  # a roll between pins does not come back
+        if not back.size:
+            raise DloError("move: nothing brings this cable back to rest, so that nothing swings")
+        k = int(back[0])
         return float(modes.frequencies[k]), float(modes.damping_ratios[k])
 
     @property
@@ -149,7 +157,7 @@ class Planner:
     def coarse(self) -> CarriedCable:
         """On the mesh that is planned with."""
         n = self.cable.model.n
-        return self.cable.with_mesh(min(n, _ELEMENTS)) if n > _ELEMENTS else self.cable
+        return self.cable.with_mesh(_ELEMENTS) if n > _ELEMENTS else self.cable
 
     def _case(self, cable: MovingCable, weight: float) -> Case:
         """A cable with the places where it rests before and after."""
@@ -275,9 +283,9 @@ class Planner:
         limits = dict(self.limits)
         for _ in range(_ROUNDS):
             course, found = self.plan(duration, limits, start)
-            self._require(found, limits, duration)
+            self._require(found, duration)
             motion = self.simulated(course, course.values(found.theta, self._times(course)))
-            used = self._used(course, found.theta, motion)
+            used = used_along(course, found.theta, motion, self.limits, self.obstacles)
             over = {name: x for name, x in used.items() if x > 1 + _OVER}
             if not over:
                 return self._result(course, found, motion, used)
@@ -322,7 +330,7 @@ class Planner:
             return limit + (share - 1) * CLEAR * self.cable.length
         return limit * share if name == "bend_radius" else limit / share
 
-    def _require(self, found: Planned, limits: dict[str, float], duration: float) -> None:
+    def _require(self, found: Planned, duration: float) -> None:
         """Raise an error if limits cannot be kept."""
         names = {"curvature": "bend_radius"}
         over = {names.get(k, k): x for k, x in found.used.items() if x > 1 + _OVER}
@@ -333,7 +341,18 @@ class Planner:
                 f"move: IPOPT found no motion of {duration:.4g} s within {found.steps} steps.\n"
                 "  Try: a longer duration"
             )
-        text = ", ".join(f"{k} {x:.3g} times its limit of {limits[k]:g}" for k, x in over.items())
+        near = CLEAR * self.cable.length
+        text = ", ".join(
+            f"{1e3 * (x - 1) * near:.3g} mm more clearance"
+            if k == "clearance"
+            else f"{k} {x:.3g} times its limit of {self.limits[k]:g}"
+            for k, x in over.items()
+        )
+        if "clearance" in over:
+            raise DloError(
+                f"move: no motion of {duration:.4g} s was found that keeps the limits: it needs "
+                f"{text}.\n  Try: a pose on the way, and two motions past the obstacles"
+            )
         factor = max(x ** (1 / max(FIXTURES.get(k, (False, 2))[1], 1)) for k, x in over.items())
         raise DloError(
             f"move: no motion of {duration:.4g} s keeps the limits: it needs {text}.\n"
@@ -342,45 +361,48 @@ class Planner:
 
     def fastest(self) -> Move:
         """The motion of shortest duration that keeps the limits and leaves little swing."""
-        low = self.shortest[0]
-        high, best = max(0.5 * self.period, 1.2 * low), None
+        low, best = self.shortest[0], None
+        high = max(0.5 * self.period, 1.2 * low)
         while best is None:
-            if high > _LONGEST * self.period:
-                raise DloError(
-                    f"move: no motion up to {high:.3g} s keeps the limits and leaves less than "
-                    f"{1e3 * _STILL * self.cable.length:.2g} mm of swing.\n  Try: wider limits"
-                )
-            best = self._possible(high, None)
-            low, high = (low, high) if best else (high, 1.5 * high)
+            best, why = self._possible(high, None)
+            if best is None:
+                low, high = high, 1.5 * high
+            if high > max(_LONGEST * self.period, 4 * self.shortest[0]):
+                raise DloError(f"no motion up to {low:.3g} s is possible; the last one: {why}")
         while high - low > _ACCURATE * high:
             middle = (low + high) / 2
-            found = self._possible(middle, best.theta)
+            found, _ = self._possible(middle, best.theta)
             if found is None:
                 low = middle
             else:
                 high, best = middle, found
         return best
 
-    def _possible(self, duration: float, start: FloatArray | None) -> Move | None:
+    def _possible(self, duration: float, start: FloatArray | None) -> tuple[Move | None, str]:
+        """A motion of a duration; None and why, if there is none."""
         try:
             found = self.verified(duration, start)
-        except DloError:
-            return None
-        return found if found.swing <= _STILL * self.cable.length else None
+        except DloError as error:
+            return None, str(error)
+        left, allowed = found.swing, _STILL * self.cable.length
+        if left <= allowed:
+            return found, ""
+        return None, (
+            f"{1e3 * left:.3g} mm of swing are left, {1e3 * allowed:.2g} mm allowed.\n"
+            "  Try: wider limits"
+        )
 
     # ---- fine simulation -------------------------------------------------------------------------
 
     def _times(self, course: Course) -> FloatArray:
         """Times [s] of the fixtures' table: at a robot's rate, and a period beyond arrival."""
-        rate = max(RATE, 10 * RATE * 0.1 / course.duration)
+        rate = max(RATE, RATE / course.duration)  # 250 rows of a short motion
         count = int(np.ceil((course.duration + self.period) * rate))
         return np.arange(count + 1) / rate
 
     def simulated(self, course: Course, values: FloatArray) -> Motion:
         """The cable along coordinates (N, C) at `_times`."""
-        pose, node = self.before.pose, self.cable.model.node
-        names = ("start", "end", f"start_{node.direction}", f"end_{node.direction}")
-        held = {x: getattr(pose, x) for x in names if getattr(pose, x) is not None}
+        held = held_by(self.before.pose)
         held |= rows_of(course, values)
         told: dict[str, Any] = {"begins": self.before, "tolerance": _FINE}
         return self.cable.simulate(self._times(course), **held, **told)
@@ -389,36 +411,6 @@ class Planner:
         """Of a motion after arrival [m]."""
         apart = motion.points[motion.t >= duration] - self.after.points
         return float(np.sqrt((apart**2).sum(axis=2).mean()))
-
-    def _used(self, course: Course, theta: FloatArray, motion: Motion) -> dict[str, float]:
-        """Largest used share of each limit, every millisecond."""
-        t = np.arange(0.0, motion.t[-1], 1e-3)
-        used, columns = {}, course.columns
-        for name, (turns, order) in FIXTURES.items():
-            if name in self.limits:
-                rows = course.values(theta, t, order)
-                sizes = [
-                    np.linalg.norm(rows[:, own], axis=1).max()
-                    for part, own in zip(course.parts, columns, strict=True)
-                    if part.turns == turns
-                ]
-                used[name] = float(max(sizes, default=0.0)) / self.limits[name]
-        way, limits = motion.way, self.limits
-        if "force" in limits:
-            sizes = [np.linalg.norm(way.at(t, x), axis=1).max() for x in way.forces]
-            used["force"] = float(max(sizes)) / limits["force"]
-        if "moment" in limits:
-            largest = max(float(held_moments(way.cable, x.moment).max()) for x in way.states)
-            used["moment"] = largest / limits["moment"]
-        if "bend_radius" in limits:
-            bent = [np.linalg.norm(curvatures(way.cable, x)[0], axis=1) for x in way.states]
-            used["bend_radius"] = float(np.max(bent)) * limits["bend_radius"]
-        if "clearance" in limits:
-            points, need = way.points(t, motion.s), self.cable.model.cable.diameter / 2
-            gaps = [float(x.near(points).distance.min()) - need for x in self.obstacles]
-            # As in the plan: 1 at the limit, and one more for each twentieth of the length.
-            used["clearance"] = 1 + (limits["clearance"] - min(gaps)) / (CLEAR * self.cable.length)
-        return used
 
     def _result(
         self, course: Course, found: Planned, motion: Motion, used: dict[str, float]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,15 +13,13 @@ from matplotlib.figure import Figure
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.motion import Motion
+from dlo_casadi.cable.move_checks import held_by, number, table_file
 from dlo_casadi.cable.moving_picture import draw_move
-from dlo_casadi.errors import DloError
 from dlo_casadi.io.files import write_file
 from dlo_casadi.planning.course import Course
-from dlo_casadi.planning.problem import FIXTURES
 
 # Rate [1/s] of tables for robots, unless asked otherwise.
 RATE = 250.0
-_LIMITS = (*FIXTURES, "force", "moment", "bend_radius", "clearance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +35,9 @@ class Move:
         Where the cable comes to rest.
     swings : dict
         Of this motion ("planned"), of least jerk ("minimum jerk") and of that shaped to leave out
-        the slowest mode ("zero vibration", if the duration allows it): root of the mean square
-        [m] of the distance from rest, over all points and one period after arrival.
+        the slowest mode ("zero vibration", if the duration allows it), both without limits: root
+        of the mean square [m] of the distance from rest, over all points and one period after
+        arrival.
     band : (float, float) [m]
         5 % and 95 % quantiles of the swing under the parameters' covariance; of a cable without
         one both are the swing.
@@ -73,12 +71,15 @@ class Move:
     def table(self, rate: float = RATE) -> dict[str, FloatArray]:
         """Where the fixtures are, as arguments of `simulate`, at `t` (N,) [s].
 
-        Only what moves is in it: `start`, `end` (N, d) [m], and their headings (N,) [rad] or
-        orientations (N, 4).
+        `start`, `end` (N, d) [m], and their headings (N,) [rad] or orientations (N, 4), of what is
+        held. Raises DloError if `rate` [1/s] is none.
         """
+        rate = number("rate", rate)
         count = max(int(np.ceil(self.duration * rate - 1e-9)), 1)
         t = np.minimum(np.arange(count + 1) / rate, self.duration)
-        return {"t": t, **rows_of(self.course, self.course.values(self.theta, t))}
+        rest = {name: np.tile(x, (len(t), 1)) for name, x in held_by(self.course.before).items()}
+        rest = {name: x[:, 0] if name.endswith("heading") else x for name, x in rest.items()}
+        return {"t": t, **rest, **rows_of(self.course, self.course.values(self.theta, t))}
 
     def save(self, path: str | PathLike[str], *, rate: float = RATE) -> Path:
         """Write the table as CSV, or all as JSON; `dlo simulate` reads the CSV.
@@ -88,13 +89,11 @@ class Move:
         DloError
             If the name ends in neither .csv nor .json, or if the file cannot be written.
         """
-        file, table = Path(path), self.table(rate)
+        file, table = table_file(path), self.table(rate)
         if file.suffix.lower() == ".json":
             rows = {name: x.tolist() for name, x in table.items()}
             write_file(file, json.dumps({**self.as_dict(), "table": rows}, indent=1) + "\n")
             return file
-        if file.suffix.lower() != ".csv":
-            raise DloError(f"{file}: a table is CSV or JSON.\n  Try: {file.with_suffix('.csv')}")
         node, names, columns = self.motion.cable.model.node, ["t_s"], [table.pop("t")[:, None]]
         for key, values in table.items():
             side, _, direction = key.partition("_")
@@ -132,22 +131,3 @@ def rows_of(course: Course, values: FloatArray) -> dict[str, FloatArray]:
     direction = course.before.node.direction
     rows = {name.replace("frame", direction): x for name, x in course.rows_of(values).items()}
     return {name: x[:, 0] if name.endswith("heading") else x for name, x in rows.items()}
-
-
-def checked_limits(
-    limits: Mapping[str, float] | None, obstacles: Sequence[Any]
-) -> dict[str, float]:
-    """Limits by name."""
-    asked = dict(limits or {})
-    for name, value in asked.items():
-        if name not in _LIMITS:
-            raise DloError(
-                f"limits: {name!r} is no limit of a motion.\n  Try: {', '.join(_LIMITS)}"
-            )
-        if not (isinstance(value, int | float) and np.isfinite(value) and value > 0):
-            raise DloError(f"limits: {name}: a number above zero belongs here, found {value!r}")
-    if obstacles and "clearance" not in asked:
-        asked["clearance"] = 0.0
-    if "clearance" in asked and not obstacles:
-        raise DloError("limits: clearance: there are no obstacles.\n  Try: obstacles=[...]")
-    return asked

@@ -39,7 +39,9 @@ def _held(words: list[str]) -> dict[str, Any]:
             values = [float(x) for x in text.split(",")]
         except ValueError:
             values = []
-        if name not in HELD or not values:
+        if name not in HELD:
+            raise DloError(f"{word}: nothing is held by {name!r}.\n  Try: {_WHERE}")
+        if not values:
             raise DloError(f"{word}: NAME=NUMBERS belongs here.\n  Try: {_WHERE}")
         found[name] = values[0] if len(values) == 1 else tuple(values)
     return found
@@ -173,11 +175,14 @@ def move(chosen: argparse.Namespace) -> None:
     dlo move results/rope --from start=0,0 --to start=0.3,0 --duration 1.2 --output way.csv
     dlo move results/rope --from start=0,0 --to start=0.3,0 --limits speed=0.5 force=2
     """
+    from dlo_casadi.cable.move_checks import table_file
     from dlo_casadi.errors import DloError
     from dlo_casadi.show.style import save_figure
 
     if not 1.0 <= chosen.rate <= 1e4:
         raise DloError(f"--rate {chosen.rate:g}: 1 to 10000 rows a second")
+    if chosen.output is not None:
+        table_file(chosen.output)  # before anything is planned
     found = _cable(chosen).move(
         _held(chosen.before),
         _held(chosen.after),

@@ -68,13 +68,8 @@ class Course:
     parts: tuple[Part, ...]
 
     @classmethod
-    def between(
-        cls, before: HeldPose, after: HeldPose, duration: float, free: tuple[str, ...] = ()
-    ) -> Course:
-        """The course whose places and directions move that differ between both poses.
-
-        `free`: names of further parts that may move, see `Part.name`.
-        """
+    def between(cls, before: HeldPose, after: HeldPose, duration: float) -> Course:
+        """The course whose places and directions move that differ between both poses."""
         node, parts = before.node, []
         for side in (0, 1):
             places = [np.array(getattr(x, ("start", "end")[side]) or ()) for x in (before, after)]
@@ -84,7 +79,7 @@ class Course:
             if node.increment == 1:
                 turn = after.frames[side] - before.frames[side]
             for part in (place, Part(side, True, np.zeros_like(turn), turn)):
-                if part.name in free or np.abs(part.last - part.first).max(initial=0.0) > _RESTS:
+                if np.abs(part.last - part.first).max(initial=0.0) > _RESTS:
                     parts.append(part)
         return cls(before, after, duration, tuple(parts))
 
@@ -224,10 +219,6 @@ class Course:
         return Numbers(p, rest, turns, *moved)
 
     # ---- tables ----------------------------------------------------------------------------------
-
-    def table(self, theta: FloatArray, t: FloatArray) -> dict[str, FloatArray]:
-        """Rows (N, ...) of the moving parts by name: places [m], frames."""
-        return self.rows_of(self.values(theta, t))
 
     def rows_of(self, values: FloatArray) -> dict[str, FloatArray]:
         """Rows by name of coordinates (N, C)."""

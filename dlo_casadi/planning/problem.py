@@ -4,7 +4,7 @@
 
 over the coefficients of a `Course` (direct single shooting). The swing is that of `predicted`, the
 effort that of least jerk is 1. Derivatives of first order are exact, through the steps of time; the
-Hessian is that of Gauss and Newton, exact for effort and fixtures, and where no swing is left.
+Hessian is that of Gauss and Newton, damped by that of the effort as long as something swings.
 """
 
 from __future__ import annotations

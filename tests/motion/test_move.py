@@ -43,6 +43,8 @@ def test_the_cable_is_at_rest_on_arrival() -> None:
     move, cable = carried(), rope()
     assert move.swing < 0.01 * move.swings["minimum jerk"]
     assert move.swing < 0.5 * move.swings["zero vibration"]
+    motion = cable.simulate(**move.table())
+    assert np.allclose(motion.points[-1], move.rest, atol=1e-3)
     table = move.table()
     t = table.pop("t")
     rest = {name: np.append(x, x[-1:], axis=0) for name, x in table.items()}
@@ -107,8 +109,28 @@ def test_what_cannot_be_kept_is_told_with_numbers() -> None:
         rope().move(held(0.0), held(0.3), duration=1.0, limits={"sped": 1.0})
     with pytest.raises(dlo.DloError, match="no obstacles"):
         rope().move(held(0.0), held(0.3), duration=1.0, limits={"clearance": 0.01})
-    with pytest.raises(dlo.DloError, match="duration: a time"):
+    with pytest.raises(dlo.DloError, match="duration: a number above zero"):
         rope().move(held(0.0), held(0.3), duration=-1.0)
+
+
+def test_meaningless_poses_are_told() -> None:
+    other = dlo.known_cable(
+        dlo.Cable(length=0.5, mass=0.06, diameter=0.008, bending_stiffness=0.009),
+        gravity=(0.0, -9.81),
+        boundary=("clamped", "free"),
+    )
+    ask = rope().move
+    with pytest.raises(dlo.DloError, match="another cable"):
+        ask(other.solve(**held(0.0)), held(0.3), duration=1.0)
+    for wrong, text in (("here", "found 'here'"), ({"heading": 1.0}, "nothing is held by heading")):
+        with pytest.raises(dlo.DloError, match=text):
+            ask(wrong, held(0.3), duration=1.0)
+    with pytest.raises(dlo.DloError, match="obstacles cannot stand in a pose"):
+        ask(held(0.0) | {"obstacles": []}, held(0.3), duration=1.0)
+    with pytest.raises(dlo.DloError, match=r"at rest in the pose 'before' .* force is 0\.5"):
+        ask(held(0.0), held(0.3), limits={"force": 0.3})
+    with pytest.raises(dlo.DloError, match="limits"):
+        ask(held(0.0), held(0.3), limits=["speed"])
 
 
 def test_tables_are_read_back(tmp_path: Path) -> None:
