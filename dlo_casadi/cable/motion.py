@@ -326,6 +326,8 @@ def _begun(
         return begins.way.states[-1]
     if begins is None:
         return moving.at_rest(rest, moving.fixtures(pose.vector))
+    if not isinstance(begins, ShapeInMotion):
+        raise DloError(f"begins: a shape or a motion belongs here, found {begins!r}")
     x, places = begins.equilibrium.x, moving.model.chain.places
     if x.shape[1] != moving.model.node.coordinates:
         raise DloError("begins: a shape in space cannot move in a plane, nor the reverse")

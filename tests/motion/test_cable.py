@@ -104,3 +104,8 @@ def test_equations_hold_at_every_step(dimension):
         fixtures = path.at(motion.way.t[k], motion.way.cable).pose[: equations.numel_in(4)]
         residual = equations(**motion.unknowns[k], fixtures=fixtures)["residual"]
         assert np.abs(np.array(residual)).max() < 1e-6
+
+
+def test_what_is_no_shape_cannot_be_let_go(cable):
+    with pytest.raises(dlo.DloError, match="begins: a shape or a motion"):
+        cable.simulate([0.0, 0.1], start=(0, 0), start_heading=0.0, begins="x")
