@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from dlo_casadi.cable.fitted_cable import Shape as Shape
     from dlo_casadi.cable.move import Move as Move
     from dlo_casadi.cable.placing import Placing as Placing
+    from dlo_casadi.cable.tracker import Tracker as Tracker
+    from dlo_casadi.cable.tracker import Update as Update
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
     from dlo_casadi.config import Clip as Clip
@@ -42,6 +44,7 @@ _PUBLIC = {
     "cable.fitted_cable": "FittedCable Shape",
     "cable.move": "Move",
     "cable.placing": "Placing",
+    "cable.tracker": "Tracker Update",
     "codegen": "CompiledSolver",
     "config": "Cable Clip FixturePath Motion Obstacle Pose",
     "effects": "EFFECTS",

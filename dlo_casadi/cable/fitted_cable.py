@@ -19,6 +19,7 @@ from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.cable.placing import Aim, Placing, placed
 from dlo_casadi.cable.shape_in_motion import POINTS, ShapeInMotion
+from dlo_casadi.cable.tracker import TrackedCable
 from dlo_casadi.config import Clip, Obstacle, Pose
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
@@ -40,7 +41,7 @@ from dlo_casadi.show.text import bend_radius, html_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FittedCable(CarriedCable):
+class FittedCable(CarriedCable, TrackedCable):
     """A fitted cable: its model with the fitted values and their uncertainty.
 
     Made by `Result.cable`, by `dlo_casadi.load` from a folder of results, or without a fit by
@@ -49,8 +50,7 @@ class FittedCable(CarriedCable):
     Parameters
     ----------
     model : CableModel
-    p : (n_parameters,)
-        In the order of `model.names` (SI).
+    p : (n_parameters,), in the order of `model.names` (SI)
     rest : (n_rests,) [1/m]
         Rest curvature before the next pose; in space twist of all cells, then k_y, then k_z.
     metadata : Metadata

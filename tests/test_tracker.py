@@ -1,0 +1,143 @@
+"""A cable that is estimated while it is handled."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import dlo_casadi as dlo
+from dlo_casadi.cable.estimate import Covariance
+from dlo_casadi.cable.tracker import IN_A_ROW, Tracker
+
+STD, S = 4e-4, np.linspace(0.1, 0.6, 8)
+NAMES = ("bending_stiffness", "lumped_mass.mass")
+SIZES = np.array([0.002, 0.004])
+
+
+def rope(stiffness: float = 0.009, load: float = 0.01) -> dlo.FittedCable:
+    """A hanging cable with a weight, whose stiffness and weight are uncertain."""
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=stiffness)
+    carried = {"name": "lumped_mass", "parameters": {"mass": load, "position": 0.5}}
+    model = {"n": 8, "effects": [carried]}
+    cable = dlo.known_cable(data, gravity=(0, -9.81), boundary=("clamped", "free"), model=model)
+    covariance, old = np.diag(SIZES**2), cable.metadata
+    uncertain = replace(old.uncertainty, names=NAMES, covariance=covariance)
+    found = Covariance(NAMES, covariance)
+    return replace(cable, metadata=replace(old, covariance=found, uncertainty=uncertain))
+
+
+def pose(cable: dlo.FittedCable, heading: float, seed: int, *, markers: bool = True) -> dlo.Pose:
+    """Points of a cable between its fixtures."""
+    held = {"start": (0.0, 0.0), "start_heading": heading}
+    s = S if markers else np.linspace(0.02, 0.58, 30)
+    points = cable.solve(**held).curve.at(s)
+    points = points + STD * np.random.default_rng(seed).normal(size=points.shape)
+    return dlo.Pose(points=points, at=s if markers else None, **held)
+
+
+HEADINGS = np.linspace(-1.2, 0.4, 8)
+
+
+def followed(tracker: Tracker, cable: dlo.FittedCable, headings: np.ndarray = HEADINGS) -> None:
+    for k, heading in enumerate(headings):
+        tracker.update(pose(cable, float(heading), k))
+
+
+def test_it_equals_the_fit_of_all_poses() -> None:
+    """Values within 0.1 std, std within 5 % of nonlinear least squares in SciPy with the prior."""
+    true, prior = rope(0.0105, 0.013), rope()
+    tracker = prior.tracker(STD)
+    followed(tracker, true)
+    poses = [pose(true, float(heading), k) for k, heading in enumerate(HEADINGS)]
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        stiffness, load = np.array([0.009, 0.01]) + SIZES * z
+        cable = rope(stiffness, load)
+        rows = [
+            (x.points - cable.solve(start=x.start, start_heading=x.start_heading).curve.at(S)) / STD
+            for x in poses
+        ]
+        return np.concatenate([np.ravel(rows), z])
+
+    best = least_squares(residual, np.zeros(2), diff_step=1e-4)
+    std = SIZES * np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
+    for name, first, size, z, s in zip(NAMES, (0.009, 0.01), SIZES, best.x, std, strict=True):
+        found = tracker.params[name]
+        assert abs(found.value - (first + size * z)) < 0.1 * s
+        assert found.std == pytest.approx(s, rel=0.05)
+
+
+def test_innovations_are_white() -> None:
+    tracker, true = rope().tracker(STD), rope(0.0105, 0.013)
+    updates = [tracker.update(pose(true, float(x), k)) for k, x in enumerate(HEADINGS)]
+    whole = np.concatenate([one.innovation for one in updates])
+    assert 0.8 < whole.std() < 1.2
+    assert not any(one.refused or one.changed_since for one in updates)
+
+
+def test_lines_tell_the_stiffness() -> None:
+    tracker, true = rope().tracker(STD), rope(0.0105, 0.013)
+    for k, heading in enumerate(HEADINGS):
+        tracker.update(pose(true, float(heading), k, markers=False))
+    found = tracker.params["bending_stiffness"]
+    assert abs(found.value - 0.0105) < 3 * found.std
+    assert found.std < 0.1 * SIZES[0]
+
+
+def test_a_pose_seen_wrong_is_refused_and_three_are_a_change() -> None:
+    true, tracker = rope(), rope().tracker(STD)
+    followed(tracker, true)
+    before = tracker.params["bending_stiffness"].value
+    wrong = pose(true, -0.5, 40)
+    seen = tracker.update(wrong.changed(points=np.asarray(wrong.points) + 0.01))
+    assert seen.refused
+    assert seen.changed_since is None
+    assert tracker.params["bending_stiffness"].value == before
+    assert not tracker.update(pose(true, -0.5, 41)).refused
+    fallen = rope(load=0.0)
+    alarms = [
+        tracker.update(pose(fallen, float(x), 50 + k)).changed_since for k, x in enumerate(HEADINGS)
+    ]
+    first = next(k for k, since in enumerate(alarms) if since)
+    assert first < IN_A_ROW
+    assert alarms[first] == len(HEADINGS) + 3
+
+
+def test_what_drifts_is_followed() -> None:
+    tracker = rope().tracker(STD, drift={"bending_stiffness": 1e-4})
+    inside = []
+    for k in range(25):
+        true = 0.009 * (1 - 0.01 * k)
+        tracker.update(pose(rope(true), float(HEADINGS[k % 8]), k))
+        found = tracker.params["bending_stiffness"]
+        inside.append(abs(found.value - true) < 2.5 * found.std)
+    assert np.mean(inside) > 0.9
+
+
+def test_it_is_saved_and_goes_on(tmp_path) -> None:
+    true, tracker = rope(0.0105, 0.013), rope().tracker(STD)
+    followed(tracker, true, HEADINGS[:4])
+    tracker.cable.save(tmp_path / "rope")
+    again = dlo.load(tmp_path / "rope").tracker(STD)
+    followed(tracker, true, HEADINGS[4:])
+    followed(again, true, HEADINGS[4:])
+    for name in NAMES:
+        assert again.params[name].value == pytest.approx(tracker.params[name].value, rel=1e-6)
+
+
+def test_meaningless_arguments_are_told() -> None:
+    with pytest.raises(dlo.DloError, match="std: the noise"):
+        rope().tracker(0.0)
+    with pytest.raises(dlo.DloError, match="forget"):
+        rope().tracker(STD, forget=1.5)
+    with pytest.raises(dlo.DloError, match="not estimated"):
+        rope().tracker(STD, drift={"mass": 1.0})
+    with pytest.raises(dlo.DloError, match="a Pose belongs here"):
+        rope().tracker(STD).update("pose")
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=0.009)
+    exact = dlo.known_cable(data, gravity=(0, -9.81), boundary=("clamped", "free"))
+    with pytest.raises(dlo.DloError, match="exact"):
+        exact.tracker(STD)
