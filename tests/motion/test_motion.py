@@ -138,5 +138,5 @@ def test_an_end_torn_out_of_reach_says_when():
 
 
 def test_what_cannot_move_is_refused():
-    with pytest.raises(DloError, match="sliding"):
+    with pytest.raises(DloError, match="has an end that slides"):
         MovingCable(replace(model_of(2), end="slide"), np.zeros(1), np.zeros(10))
