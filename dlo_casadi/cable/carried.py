@@ -284,7 +284,15 @@ class Planner:
         for _ in range(_ROUNDS):
             course, found = self.plan(duration, limits, start)
             self._require(found, duration)
-            motion = self.simulated(course, course.values(found.theta, self._times(course)))
+            try:
+                motion = self.simulated(course, course.values(found.theta, self._times(course)))
+            except MotionError as error:
+                raise MotionError(
+                    f"move: the motion that was planned for {duration:.4g} s has no solution on "
+                    f"the cable's own mesh at {error.t:.4g} s.\n  Try: a longer duration; the "
+                    f"slowest mode has a period of {self.period:.3g} s",
+                    t=error.t,
+                ) from error
             used = used_along(course, found.theta, motion, self.limits, self.obstacles)
             over = {name: x for name, x in used.items() if x > 1 + _OVER}
             if not over:

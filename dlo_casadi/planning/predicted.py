@@ -19,11 +19,9 @@ from dlo_casadi.model.functions import functions_of
 from dlo_casadi.motion import sensitivities
 from dlo_casadi.motion.sensitivities import Columns, Tangent, both_nodes
 from dlo_casadi.motion.state import State
-from dlo_casadi.motion.steps import RHO, Moving, Scheme, Stepper, still
+from dlo_casadi.motion.steps import SCHEME, Moving, Stepper, still
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.planning.course import Course
-
-_SCHEME = Scheme.of(RHO)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +89,7 @@ def predicted(
     beyond = max(round(after / dt), 1)
     now = still(case.first)
     columns = _none(cable, size) if derivatives else None
-    stepper, every = Stepper(cable, _SCHEME), []
+    stepper, every = Stepper(cable, SCHEME), []
     for k in range(1, count + beyond + 1):
         t = k * dt
         fixtures = course.fixtures(cable, theta, t)
@@ -101,7 +99,7 @@ def predicted(
         tangent = None
         if columns is not None:
             tangent, numbers = Tangent(cable, done.state, fixtures), course.numbers(cable, theta, t)
-            columns = sensitivities.stepped(now, done, columns, tangent, numbers, dt, _SCHEME)
+            columns = sensitivities.stepped(now, done, columns, tangent, numbers, dt, SCHEME)
         every.append(_rows(cable, done, columns, tangent))
         now = done
     force, moment, curvature, places = (

@@ -89,9 +89,11 @@ class Planned:
 
 
 def planned(task: Task, course: Course, start: FloatArray | None = None) -> Planned:
-    """The best course, from that of least jerk or from a start of its coefficients."""
+    """The best course, from that of least jerk or from a start of its coefficients.
+
+    Raises MotionError if the cable cannot follow that of least jerk.
+    """
     problem = _Problem(task, course)
-    problem.sigma = min(problem.sigma, SHARE * problem.first_swing())
     theta = course.least_jerk if start is None else start
     x, f, g = ca.MX.sym("x", course.size), problem.objective, problem.limits
     count = len(problem.names)
@@ -132,8 +134,11 @@ class _Problem:
 
     def __init__(self, task: Task, course: Course) -> None:
         self.task, self.course, size = task, course, course.size
-        self.sigma = SIGMA * task.length  # until that of least jerk is known
-        self._known: dict[tuple[bytes, bool], list[Predicted] | None] = {}
+        least = course.least_jerk
+        first = self._simulated(least, derivatives=False)
+        self._known: dict[tuple[bytes, bool], list[Predicted] | None]
+        self._known = {(least.tobytes(), False): first}
+        self.sigma = min(SIGMA * task.length, SHARE * self.swing(first))
         self.names = self._names()
         count = max(len(self.names), 1)
         self._callbacks = [
@@ -147,16 +152,20 @@ class _Problem:
 
     # ---- motions ---------------------------------------------------------------------------------
 
+    def _simulated(self, theta: FloatArray, *, derivatives: bool) -> list[Predicted]:
+        """Of all cases; raises MotionError if one has no solution."""
+        course, task = self.course, self.task
+        return [
+            predicted(x, course, theta, task.dt, task.after, derivatives=derivatives)
+            for x in task.cases
+        ]
+
     def motions(self, theta: FloatArray, derivatives: bool) -> list[Predicted] | None:
         """Of all cases; None if one has no solution."""
         key = theta.tobytes(), derivatives
         if key not in self._known:
-            task = self.task
             try:
-                found = [
-                    predicted(x, self.course, theta, task.dt, task.after, derivatives=derivatives)
-                    for x in task.cases
-                ]
+                found = self._simulated(theta, derivatives=derivatives)
             except MotionError:
                 found = None
             # Values come first, then derivatives of accepted steps: four motions are enough.
@@ -168,16 +177,6 @@ class _Problem:
     def _values(self, theta: FloatArray) -> list[Predicted] | None:
         known = self._known.get((theta.tobytes(), True))
         return known if known is not None else self.motions(theta, False)
-
-    def first_swing(self) -> float:
-        """Of the motion of least jerk [m]; raises MotionError if there is none."""
-        task, theta = self.task, self.course.least_jerk
-        return self.swing(
-            [
-                predicted(x, self.course, theta, task.dt, task.after, derivatives=False)
-                for x in task.cases
-            ]
-        )
 
     # ---- objective -------------------------------------------------------------------------------
 

@@ -133,7 +133,7 @@ def test_the_cable_at_rest_is_that_of_python_and_stays(swinging):
     assert np.abs(now["r"] - swinging.motion["r"]).max() < 1e-9
 
 
-def test_a_hundred_steps_are_those_of_python(swinging, monkeypatch):
+def assert_steps_agree(swinging, monkeypatch):
     """To 1e-8 of places, where Python's steps end as exactly; forces as they change with places."""
     monkeypatch.setattr(steps, "LAST_STEP", 1e-10)
     stepper, state = Stepper(swinging.cable, SCHEME), swinging.state
@@ -155,11 +155,15 @@ def test_a_hundred_steps_are_those_of_python(swinging, monkeypatch):
     )
 
 
+def test_a_hundred_steps_are_those_of_python(swinging, monkeypatch):
+    assert_steps_agree(swinging, monkeypatch)
+
+
 def test_a_dynamic_stiffness_is_that_of_python(monkeypatch):
     """Of changes from the strains of the shape at rest, as the state carries them."""
     model = model_of(2, "clamped", "free")
     swinging = Swinging(replace(model, effects=(*model.effects, DynamicStiffness())))
-    test_a_hundred_steps_are_those_of_python(swinging, monkeypatch)
+    assert_steps_agree(swinging, monkeypatch)
 
 
 def test_the_first_accelerations_are_those_of_python(swinging):
