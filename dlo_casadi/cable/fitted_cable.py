@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from os import PathLike
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -14,6 +12,7 @@ from numpy.typing import ArrayLike
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.carried import CarriedCable
 from dlo_casadi.cable.estimate import CableCurve
+from dlo_casadi.cable.exported import ExportedCable
 from dlo_casadi.cable.held import FED, all_asked, among, held_pose, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
@@ -32,8 +31,7 @@ from dlo_casadi.equilibrium.spread import (
     sides_of,
     spread_across,
 )
-from dlo_casadi.errors import DloError, EquilibriumError
-from dlo_casadi.export.targets import check_counts, samples_of, target_of, write_rods
+from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.clips import ClipLoad, clip_rows
 from dlo_casadi.model.contact import Contact, surfaces_at
 from dlo_casadi.runtime.progress import Progress
@@ -41,7 +39,7 @@ from dlo_casadi.show.text import bend_radius, html_table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FittedCable(CarriedCable, TrackedCable):
+class FittedCable(CarriedCable, TrackedCable, ExportedCable):
     """A fitted cable: its model with the fitted values and their uncertainty.
 
     Made by `Result.cable`, by `dlo_casadi.load` from a folder of results, or without a fit by
@@ -182,37 +180,6 @@ class FittedCable(CarriedCable, TrackedCable):
             If the cable has no shape in one of the poses without clips.
         """
         return placed(self, count, poses, within, limits, aim, progress)
-
-    def export(
-        self,
-        target: str,
-        path: str | PathLike[str],
-        *,
-        segments: int | None = None,
-        samples: int = 0,
-        seed: int = 0,
-        **held: Any,
-    ) -> list[Path]:
-        """Write the cable for a simulator, its ends `held` as in `solve`; return the files.
-
-        `target`: one of `export.targets.TARGETS`. `samples`: number of further cables drawn from
-        the fit's covariance: <path>_001, ... Without `segments` joints turn by 0.1 rad at most.
-
-        Raises
-        ------
-        DloError
-            If there is no such target, if a number is too small, if a file cannot be written, or as
-            in `solve`.
-        """
-        if not isinstance(path, str | PathLike):
-            raise DloError(f"path: a file name belongs here, found {path!r}")
-        check_counts(segments, samples, seed)
-        to, known, first = target_of(target), self.metadata, self.solve(**held).held
-        fitted = (known.coefficients, known.covariance.names, known.covariance.values)
-        others = samples_of(first, *fitted, samples, seed)
-        kind = "fitted" if known.covariance.names else "known"
-        origin = f"{kind} cable {known.model_hash[:16]} of {known.config}"
-        return write_rods(to, Path(path), [first, *others], origin, segments, seed)
 
     def shape_in(self, pose: HeldPose, eq: Equilibrium) -> "Shape":
         """The shape in an equilibrium."""

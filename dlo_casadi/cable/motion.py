@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.estimate import Estimate, EstimatedCable
-from dlo_casadi.cable.held import FED, held_pose
+from dlo_casadi.cable.held import HELD, held_pose
 from dlo_casadi.cable.moving_picture import (
     draw_motion,
     frame_times,
@@ -274,25 +274,45 @@ class CableInMotion(EstimatedCable):
         DloError
             If times or fixtures are no such arrays, or if motion does not know a part of the cable.
         """
-        times = _times(t)
-        node = self.model.node
+        times = times_of(t)
         asked: dict[str, Any] = {"start": start, "end": end}
         asked |= {"start_heading": start_heading, "end_heading": end_heading}
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
-        rows = {key: _rows(key, x, len(times)) for key, x in asked.items() if x is not None}
-        first = {key: (x[0] if x.ndim > 1 else x) for key, x in rows.items()}
-        given = dict.fromkeys((*asked, "turns", "branch", "clips", *FED))
-        numbers = {k: float(x[0]) if k.endswith("heading") else x for k, x in first.items()}
-        pose = held_pose(self.model, self.metadata.fixtures, {**given, "turns": 0.0, **numbers})
-        direction = node.direction
-        moving = {key.replace(direction, "frame"): x for key, x in rows.items() if x.ndim > 1}
-        path = FixturePath.of(pose, times, moving)
+        pose, path = fixture_path(self, times, asked)
         cable = moving_cable(self)
         rest = solve_equilibrium(cable.model, cable.p, cable.rest, pose)
         cable = cable.about(rest.x)
         state = _begun(self, cable, pose, rest, begins)
         way = way_of(cable, state, path, (times[0], times[-1]), tolerance)
         return Motion(self, times, way)
+
+
+def fixture_path(
+    cable: EstimatedCable, times: FloatArray, asked: Mapping[str, Any]
+) -> tuple[HeldPose, FixturePath]:
+    """The pose at the first of the times (T,) [s], and the way of fixtures from there.
+
+    `asked`: places and directions as in `CableInMotion.simulate`. Raises DloError if they are none.
+    """
+    rows = {key: _rows(key, x, len(times)) for key, x in asked.items() if x is not None}
+    first = {key: (x[0] if x.ndim > 1 else x) for key, x in rows.items()}
+    given = dict.fromkeys((*HELD, "clips"))
+    numbers = {k: float(x[0]) if k.endswith("heading") else x for k, x in first.items()}
+    pose = held_pose(cable.model, cable.metadata.fixtures, {**given, "turns": 0.0, **numbers})
+    direction = cable.model.node.direction
+    moving = {key.replace(direction, "frame"): x for key, x in rows.items() if x.ndim > 1}
+    return pose, FixturePath.of(pose, times, moving)
+
+
+def times_of(t: ArrayLike) -> FloatArray:
+    """Times in order, at least two."""
+    try:
+        times = np.asarray(t, dtype=float).ravel()
+    except (TypeError, ValueError):
+        raise DloError(f"t: times [s] belong here, found {t!r}") from None
+    if len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise DloError("t: two times [s] or more, each later than the one before, belong here")
+    return times
 
 
 def _with_rows(
@@ -363,17 +383,6 @@ def _check_ends(
                 f"{np.abs(turn).max():.3g} rad.\n  Try: the clamp's direction of the shape, at the "
                 "first instant."
             )
-
-
-def _times(t: ArrayLike) -> FloatArray:
-    """Times in order, at least two."""
-    try:
-        times = np.asarray(t, dtype=float).ravel()
-    except (TypeError, ValueError):
-        raise DloError(f"t: times [s] belong here, found {t!r}") from None
-    if len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise DloError("t: two times [s] or more, each later than the one before, belong here")
-    return times
 
 
 def _rows(key: str, values: ArrayLike, count: int) -> FloatArray:

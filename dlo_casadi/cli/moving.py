@@ -47,7 +47,7 @@ def _held(words: list[str]) -> dict[str, Any]:
     return found
 
 
-def _cable(chosen: argparse.Namespace) -> Any:
+def damped(chosen: argparse.Namespace) -> Any:
     """The cable, with the damping that is given."""
     from dlo_casadi.errors import DloError
 
@@ -78,7 +78,7 @@ def modes(chosen: argparse.Namespace) -> None:
     """
     from dlo_casadi.show.style import save_figure
 
-    shape = _cable(chosen).solve(**{name: getattr(chosen, name) for name in HELD})
+    shape = damped(chosen).solve(**{name: getattr(chosen, name) for name in HELD})
     found, page = shape.modes(chosen.count), Page(chosen)
     if chosen.figure is not None:
         save_figure(chosen.figure, found.plot())
@@ -114,7 +114,7 @@ def simulate(chosen: argparse.Namespace) -> None:
     from dlo_casadi.io.files import write_file
     from dlo_casadi.show.style import save_figure
 
-    cable = _cable(chosen)
+    cable = damped(chosen)
     t, rows = read_fixtures(cable.model.node, chosen.fixtures)
     motion, page = cable.simulate(t, **rows), Page(chosen)
     written = []
@@ -183,7 +183,7 @@ def move(chosen: argparse.Namespace) -> None:
         raise DloError(f"--rate {chosen.rate:g}: 1 to 10000 rows a second")
     if chosen.output is not None:
         table_file(chosen.output)  # before anything is planned
-    found = _cable(chosen).move(
+    found = damped(chosen).move(
         _held(chosen.before),
         _held(chosen.after),
         duration=chosen.duration,

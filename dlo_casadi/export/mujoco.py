@@ -12,11 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.export.common import Relaxed, relax
-from dlo_casadi.export.rod import Fixture, Rod
+from dlo_casadi.export.rod import Rod
 from dlo_casadi.rod.node import Frame, Heading
 
 # Time step [s]; ratio of a joint's damping to its stiffness [s] where it is not known.
 STEP, DAMPING = 0.002, 0.03
+# How a fixture that moves is driven: the rate [1/s] at which its joints settle, and their inertia
+# over that of the cable, which then moves them by some 1e-8 of its length.
+_RATE, _HEAVY = 50.0, 1e5
+# Largest number of values of one `numeric` in MuJoCo 3.2.
+_NUMERIC = 500
 # Moduli [Pa] in bending and twist of MuJoCo 3's own cable example (model/plugin/elasticity).
 DEFAULT = (4e6, 1e7)
 # From an end that may roll to a second point of its axis [m], which is held, too.
@@ -32,7 +37,9 @@ def write(rod: Rod, head: Sequence[str]) -> str:
     """The model as MJCF."""
     comment = "\n".join(f"  {line}".rstrip().replace("--", "–") for line in head)
     bodies = "\n".join(_bodies(rod))
-    ends = f"\n    {_gripper('end', rod.end)}\n    </body>" if rod.end.kind.place else ""
+    ends = ""
+    if rod.end.kind.place:
+        ends = f"\n    {_gripper(rod, 'end')}\n    {_closed(rod, 'end')}"
     return f"""<mujoco model="{_escaped(rod.name)}">
   <!--
 {comment}
@@ -46,12 +53,12 @@ contype="0" conaffinity="1" rgba="0.1 0.4 0.6 1"/>
     </default>
   </default>
   <worldbody>
-    {_gripper("start", rod.start)}
+    {_gripper(rod, "start")}
 {bodies}
-    {"</body>" * (len(rod.masses) + 1)}{ends}
-  </worldbody>{_held(rod)}
+    {"</body>" * len(rod.masses)}{_closed(rod, "start")}{ends}
+  </worldbody>{_held(rod)}{_driven(rod)}
   <keyframe>
-    <key name="pose" qpos="{_row(_angles(rod))}"/>
+    <key name="pose" qpos="{_row(_angles(rod))}"{_first(rod)}/>
   </keyframe>
 </mujoco>
 """
@@ -74,16 +81,75 @@ def _turned(frame: Rotation) -> str:
     return _row(np.roll(frame.as_quat(), 1))  # MuJoCo puts w first
 
 
-def _gripper(side: str, fixture: Fixture) -> str:
+def _gripper(rod: Rod, side: str) -> str:
     """The body that holds an end; for the end, also the site at which it holds the cable."""
+    fixture = rod.start if side == "start" else rod.end
     place, frame = fixture.offset
     site = f'<site name="{side}" pos="{_row(place)}" quat="{_turned(frame)}"/>'
     if fixture.rolls:
         site += f'<site name="{side}_axis" pos="{_row(place + frame.apply(_LEVER))}"/>'
-    return (
-        f'<body name="{side}" mocap="true" pos="{_row(fixture.place)}" '
-        f'quat="{_turned(fixture.frame)}">{site if side == "end" else ""}'
+    site = site if side == "end" else ""
+    at, turn = f'pos="{_row(fixture.place)}"', f'quat="{_turned(fixture.frame)}"'
+    if rod.driven is None or side not in rod.driven.carriages:
+        return f'<body name="{side}" mocap="true" {at} {turn}>{site}'
+    carriage, (mass, inertia) = rod.driven.carriages[side], _heavy(rod)
+    unit = {axis: _row(row) for axis, row in zip("xyz", np.eye(3), strict=True)}
+    slides = "".join(
+        f'<joint name="{side}_{x}" type="slide" axis="{row}" armature="{mass:.9g}"/>'
+        for x, row in unit.items()
     )
+    hinges = "".join(
+        f'<joint name="{side}_turn_{x}" axis="{unit[x]}" armature="{inertia:.9g}"/>'
+        for x in carriage.axes * carriage.turns
+    )
+    turning = _row(inertia / _HEAVY * np.ones(3))
+    own = f'<inertial pos="0 0 0" mass="{mass / _HEAVY:.9g}" diaginertia="{turning}"/>'
+    return (
+        f'<body name="{side}_carriage" {at} gravcomp="1">{own}{slides}'
+        f'<body name="{side}" {turn} gravcomp="1">{own}{hinges}{site}'
+    )
+
+
+def _closed(rod: Rod, side: str) -> str:
+    """The end of the body, or of the two bodies, of a gripper."""
+    return "</body>" * (1 + (rod.driven is not None and side in rod.driven.carriages))
+
+
+def _heavy(rod: Rod) -> tuple[float, float]:
+    """Mass [kg] and inertia [kg m^2] of what drives a fixture."""
+    mass, length = _HEAVY * float(rod.link_masses.sum()), rod.h * len(rod.masses)
+    return mass, mass * length**2 / 3
+
+
+def _driven(rod: Rod) -> str:
+    """Servos of the joints that drive fixtures, and what is asked of them in each step."""
+    if rod.driven is None:
+        return ""
+    servos = "".join(
+        f"""
+    <position name="{name}" joint="{name}" kp="{size * _RATE**2:.9g}" \
+kv="{2 * size * _RATE:.9g}"/>"""
+        for name in rod.driven.names
+        for size in (_heavy(rod)["_turn_" in name],)
+    )
+    values = rod.driven.controls(_RATE).ravel()
+    rows = "".join(
+        f"""
+    <numeric name="motion_{k:04d}" data="{_row(values[at : at + _NUMERIC])}"/>"""
+        for k, at in enumerate(range(0, len(values), _NUMERIC))
+    )
+    return f"""
+  <actuator>{servos}
+  </actuator>
+  <custom>{rows}
+  </custom>"""
+
+
+def _first(rod: Rod) -> str:
+    """The first row of the controls, of the keyframe."""
+    if rod.driven is None:
+        return ""
+    return f' ctrl="{_row(rod.driven.controls(_RATE)[0])}"'
 
 
 def _bodies(rod: Rod) -> list[str]:
@@ -198,7 +264,13 @@ def _angles(rod: Rod) -> FloatArray:
     )
     angles = _in_axes(rod.turns, principal(rod)[1])
     free = np.array([[name in about for name in _order(k + 1)] for k in range(len(angles))])
-    return np.concatenate([start, angles[free]])
+    carried = [
+        np.zeros(
+            0 if rod.driven is None else sum(x.startswith(f"{side}_") for x in rod.driven.names)
+        )
+        for side in ("start", "end")
+    ]
+    return np.concatenate([carried[0], start, angles[free], carried[1]])
 
 
 def settle(text: str, rod: Rod) -> Relaxed:
@@ -229,3 +301,21 @@ def settle(text: str, rod: Rod) -> Relaxed:
     on_cable = data.efc_force[data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY]
     places = on_cable[: 3 * (1 + rod.end.rolls)].reshape((-1, 3))
     return Relaxed(nodes, -places.sum(axis=0))
+
+
+def follow(text: str, rod: Rod) -> FloatArray:
+    """Nodes (T, n + 1, 3) [m] of a written model along the motion of its fixtures, each step."""
+    import mujoco as mj
+
+    model = mj.MjModel.from_xml_string(text)
+    data = mj.MjData(model)
+    mj.mj_resetDataKeyframe(model, data, 0)
+    links = [model.body(f"cable_{k}").id for k in range(len(rod.masses))]
+    found = []
+    for row in model.numeric_data.reshape((-1, model.nu)):
+        mj.mj_kinematics(model, data)
+        ahead = data.xmat[links[-1]].reshape(3, 3)[:, 0]
+        found.append(np.vstack([data.xpos[links], data.xpos[links[-1]] + rod.h * ahead]))
+        data.ctrl[:] = row
+        mj.mj_step(model, data)
+    return np.array(found)

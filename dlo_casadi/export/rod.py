@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray, unit
 from dlo_casadi.effects import (
     BoundaryEffect,
+    Damping,
     Effect,
     Kinematics,
     Load,
@@ -28,6 +29,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import DloError
 from dlo_casadi.export.common import printable
+from dlo_casadi.export.driven import Driven
 from dlo_casadi.model.cable_model import DAMPING_TIME, CableModel
 from dlo_casadi.model.clipped import rolled_with
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
@@ -52,6 +54,7 @@ Feature = Literal[
     "clips",
     "obstacles",
     "free roll of an end",
+    "damping beside the cable's own",
 ]
 # GJ / EI of a cable that was measured in a plane: that of a solid round rod.
 ROUND = 1 / 1.3
@@ -114,6 +117,8 @@ class Rod:
         Features beyond a straight uniform round cable: feature -> labels of the effects.
     damping_time : float, optional [s]
         Ratio of a joint's damping to its stiffness; None if it is not known.
+    driven : Driven, optional
+        How its fixtures move.
     """
 
     name: str
@@ -134,6 +139,7 @@ class Rod:
     end: Fixture
     features: dict[Feature, tuple[str, ...]]
     damping_time: float | None = None
+    driven: Driven | None = None
 
     @classmethod
     def of(cls, held: SolvedCable, segments: int | None = None) -> Self:
@@ -305,6 +311,8 @@ def _features(
             found.append("compliance of a clamp")
     elif isinstance(effect, StateEffect):
         found.append("change of the rest shape")
+    elif isinstance(effect, Damping):
+        found.append("damping beside the cable's own")
     return found
 
 

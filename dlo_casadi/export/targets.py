@@ -14,6 +14,7 @@ from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.errors import DloError, EquilibriumError, OutputError
 from dlo_casadi.export import mujoco, newton, pyelastica, usd
 from dlo_casadi.export.common import Relaxed, printable
+from dlo_casadi.export.driven import Driven
 from dlo_casadi.export.rod import Feature, Rod
 from dlo_casadi.io.files import is_marked, write_file
 
@@ -42,6 +43,10 @@ class Target:
         Moduli in bending and twist of the simulator's own cable example; `default_of` names it.
     places : tuple of str
         Where the file contains our numbers.
+    step : float, optional [s]
+        Of a file in which fixtures move; None where they cannot.
+    follow : callable, optional
+        Makes the nodes (T, n + 1, 3) [m] along that motion, one row a step.
     """
 
     title: str
@@ -54,6 +59,8 @@ class Target:
     default: tuple[float, float]
     default_of: str
     places: tuple[str, ...]
+    step: float | None = None
+    follow: Callable[[str, Rod], FloatArray] | None = None
 
     @property
     def installed(self) -> bool:
@@ -91,6 +98,8 @@ TARGETS = {
             "armature and the softness of the end's constraint are chosen for a step of 2 ms: they",
             "change motion, not rest (the end by < 0.1 %)",
         ),
+        step=mujoco.STEP,
+        follow=mujoco.follow,
     ),
     "pyelastica": Target(
         title="PyElastica",
@@ -186,6 +195,14 @@ def target_of(name: str) -> Target:
     return TARGETS[name]
 
 
+def step_of(target: Target) -> float:
+    """The step [s] of a target's files; raises DloError if fixtures do not move in them."""
+    if target.step is None:
+        able = ", ".join(name for name, one in TARGETS.items() if one.step is not None)
+        raise DloError(f"{target.title}: fixtures do not move in its files.\n  Try: {able}")
+    return target.step
+
+
 def require(target: Target) -> None:
     """Raise DloError if cables cannot be relaxed in a target on this computer."""
     if not target.installed:
@@ -223,10 +240,20 @@ def head(target: Target, rod: Rod, lost: Mapping[Feature, str], origin: Sequence
         "",
         "Meaning of the numbers:",
         *(f"  {line}" for line in target.places),
+        *(f"  {line}" for line in _PLAYED if rod.driven is not None),
         "",
         "Not represented:",
         *(f"  {line}" for line in costs or ["nothing"]),
     ]
+
+
+# How fixtures that move are played.
+_PLAYED = (
+    "custom numeric motion: what the servos of the joints start_x, ... are asked in each step:",
+    "  rows = model.numeric_data.reshape(-1, model.nu)",
+    "  for row in rows: data.ctrl[:] = row; mujoco.mj_step(model, data)",
+    "start_carriage, end_carriage: what they drive, 100000 times as heavy as the cable",
+)
 
 
 def _range(values: np.ndarray) -> str:
@@ -245,10 +272,12 @@ def write_rods(
     origin: str,
     segments: int | None,
     seed: int,
+    driven: Driven | None = None,
 ) -> list[Path]:
     """Write cables, the first to `path` and the others to <path>_001, ...; return the files.
 
-    `origin`: source of the first cable; the others are samples of it, drawn with the seed. Raises
+    `origin`: source of the first cable; the others are samples of it, drawn with the seed.
+    `driven`: how fixtures move, for targets with a step. Raises
     OutputError if a file cannot be written, or if it exists and is not an export.
     """
     count = len(cables) - 1
@@ -262,7 +291,7 @@ def write_rods(
             )
     texts = []
     for k, cable in enumerate(cables):
-        rod = Rod.of(cable, segments)
+        rod = replace(Rod.of(cable, segments), driven=driven)
         segments = len(rod.masses)  # samples get the same segments as the cable
         said = [origin, *[f"sample {k} of {count}, seed {seed}"] * (k > 0)]
         texts.append(target.write(rod, head(target, rod, losses(cable, target, rod), said)))
@@ -293,6 +322,8 @@ def _cost(cable: SolvedCable, rod: Rod, feature: Feature) -> str:
         model = model.without_effect(label)
     p = np.array([known[name] for name in model.names])
     named = f"{', '.join(labels)} left out; " if labels else ""
+    if feature == "damping beside the cable's own":
+        return f"{named}it changes motions, not shapes at rest"
     try:
         plain = SolvedCable.of(model, p, rest, pose)
     except EquilibriumError:

@@ -1,21 +1,23 @@
 """Compare an exported cable relaxed in its simulator with our prediction and the measurement."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.exported import AnyMotion, given_motion
 from dlo_casadi.cable.fitted_cable import FittedCable, Shape
 from dlo_casadi.config import Config, Pose, load_config
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError, counted
 from dlo_casadi.estimation.prediction import predict_poses
 from dlo_casadi.export.rod import ROUND, Rod
-from dlo_casadi.export.targets import Target, require
+from dlo_casadi.export.targets import Target, require, step_of
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.session.measure import Step, measured_poses, read_session
 
@@ -94,6 +96,30 @@ def session_of(cable: FittedCable, given: Path | None) -> Config:
         f"the session {name} that {cable.name!r} was fitted to {missing}.\n"
         "  Try: --check SESSION.yaml"
     )
+
+
+def motion_round_trip(
+    cable: FittedCable,
+    target: Target,
+    file: Path,
+    motion: AnyMotion,
+    segments: int | None,
+    held: Mapping[str, Any],
+) -> Distance:
+    """How far the links of a written cable, whose fixtures move, are from our simulation.
+
+    Raises DloError if the target is not installed; MotionError if the motion has no solution.
+    """
+    require(target)
+    given = given_motion(cable, motion, step_of(target), held)
+    shape, own = cable.solve(**given.first), cable.simulate(given.t, **given.held)
+    rod = replace(Rod.of(shape.held, segments), driven=given.driven)
+    assert target.follow is not None
+    found = target.follow(file.read_text(), rod)[..., : cable.model.node.dimension]
+    inside = (rod.s >= 0) & (rod.s <= cable.length)
+    t = np.minimum(given.t[0] + given.driven.step * np.arange(len(found)), given.t[-1])
+    apart = np.linalg.norm(found[:, inside] - own.way.points(t, rod.s[inside]), axis=2)
+    return Distance.of(apart, cable.length)
 
 
 def comparable(config: Config, target: Target) -> None:
