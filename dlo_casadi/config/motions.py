@@ -117,7 +117,10 @@ class Motion(ConfigSection):
             return given
         try:
             points = np.array(given["points"], dtype=float)
-            t, at = (np.array(given.get(key, ()), dtype=float) for key in ("t", "at"))
+            t, at = (
+                np.array(() if (x := given.get(key)) is None else x, dtype=float)
+                for key in ("t", "at")
+            )
         except (TypeError, ValueError):
             return given  # the fields themselves say what is wrong
         if points.ndim != 3:

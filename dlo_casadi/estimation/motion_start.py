@@ -83,8 +83,7 @@ def _frames(recording: Recording, fit: Fit, unknowns: Unknowns) -> FloatArray:
     measured = recording.measured
     held = recording.path.pose
     seen = np.isfinite(measured.points[0, :, 0])
-    s = None if measured.s is None else measured.s[seen]
-    pose = MeasuredPose.of_points(held, measured.points[0][seen], None, False, s)
+    pose = MeasuredPose.of_points(held, measured.points[0][seen], s=measured.s[seen])
     problem = Problem(unknowns, (pose,), fit.noise, fit.problem.priors)
     return np.asarray(measured_shapes(problem)[0].x[0])
 

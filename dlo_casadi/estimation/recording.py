@@ -178,11 +178,11 @@ class Recording:
         fine, _ = finer._seen(finer._states(steps, held, first, None), held, None)
         points, size = fine + (fine - seen) / 3, unknowns.size
         mask = np.isfinite(self.measured.points[: len(points), :, 0])
-        residual = (points - self.measured.points[: len(points)])[mask].ravel()
+        residual = self.measured.deviations(points)[mask].ravel()
         if by is None:
             none = np.zeros((0, 0))
             return Seen(residual, none, none, first, points)
-        rows = by[mask].reshape(len(residual), -1)
+        rows = self.measured.deviations(by)[mask].reshape(len(residual), -1)
         return Seen(residual, rows[:, :size], rows[:, size:], first, points)
 
     def _first(self, cable: MovingCable, own: FloatArray, near: State | None) -> State:
@@ -297,7 +297,7 @@ class Recording:
     def _markers(self, cable: MovingCable) -> tuple[IntArray, FloatArray]:
         """Segment of each marker, and its share of it."""
         low, width = cable.model.chain.layout.segments[:, :2].T
-        s = np.asarray(self.measured.s)
+        s = self.measured.s
         segment = np.clip(np.searchsorted(low, s, side="right") - 1, 0, len(low) - 1)
         return segment, (s - low[segment]) / width[segment]
 

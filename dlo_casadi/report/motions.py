@@ -39,17 +39,16 @@ def sentence_of(outcome: Outcome) -> str:
     """How well motions are met, and how well they were before."""
     *before, last = stages_of(outcome)
     held = last.rmse_held_out
-    dimension = len(outcome.config.experiment.gravity)
     said = worded(
         _SAID,
         fit=last.rmse_fit,
         held_out=worded(", held-out ones to {held:mm}", held=held) if held is not None else "",
-        noise=(outcome.measurement.std or 0.0) * dimension**0.5,
+        noise=(outcome.measurement.std or 0.0) * last.shown[0].compared ** 0.5,
     )
     if before:
         names = " and ".join(map(str, outcome.effects))
         said += worded(_BEFORE, names=names, fit=before[0].rmse_fit)
-    return said
+    return " ".join([said, *(f"{item.name}: {item.note}." for item in last.shown if item.note)])
 
 
 def motion_table(outcome: Outcome) -> Table:

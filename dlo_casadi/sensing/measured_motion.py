@@ -15,9 +15,9 @@ class MeasuredMotion:
     t : (T,) [s]
         Times from zero at the first instant.
     points : (T, K, d) [m]
-        NaN where a marker was not seen; of lines, behind their last points.
-    s : (K,) [m], optional
-        Arc lengths of markers; without them the points of an instant are a line.
+        NaN where a marker was not seen, or where a line ends before its arc length.
+    s : (K,) [m]
+        Arc lengths of the points.
     fixtures_t : (F,) [s]
         Times of the fixtures' clock, from the same zero; empty if all rests.
     moving : dict
@@ -27,14 +27,38 @@ class MeasuredMotion:
         By the same names: what is held and rests.
     at_rest : bool
         Whether the cable hangs still at the first instant.
+    across : (T, K, d - 1, d), optional
+        Of points of lines: unit vectors across the line, along which alone they are compared. Where
+        a point lies along its line is told by the line's length, to second order indifferent.
+    note : str
+        What was left out of the recording, for the report.
     """
 
     name: str
     t: FloatArray
     points: FloatArray
-    s: FloatArray | None
+    s: FloatArray
     fixtures_t: FloatArray
     moving: Mapping[str, FloatArray]
     resting: Mapping[str, FloatArray]
     at_rest: bool
     held_out: bool
+    across: FloatArray | None = None
+    note: str = ""
+
+    @property
+    def compared(self) -> int:
+        """Numbers that are compared of each point: all coordinates of markers, d - 1 of lines."""
+        return self.points.shape[2] - (self.across is not None)
+
+    def deviations(self, predicted: FloatArray) -> FloatArray:
+        """Predicted minus measured points (T', K, compared) [m] of the first T' instants.
+
+        `predicted`: (T', K, d), or columns of derivatives (T', K, d, q), of which nothing is
+        subtracted.
+        """
+        count, moved = len(predicted), predicted.ndim == 4
+        off = predicted if moved else (predicted - self.points[:count])[..., None]
+        if self.across is not None:
+            off = self.across[:count] @ off
+        return off if moved else off[..., 0]

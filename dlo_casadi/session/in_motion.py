@@ -26,9 +26,15 @@ class MotionShown(Brief):
     name, role : str
     t : (T,) [s]
     s : (K,) [m]
-        Arc lengths of the markers.
+        Arc lengths of the points.
     measured, predicted : (T, K, d) [m]
-        Markers that were not seen are NaN.
+        Points that were not seen are NaN.
+    distances : (T, K) [m]
+        Of measured and predicted points; across them where the points belong to lines.
+    compared : int
+        Numbers that are compared of each point.
+    note : str
+        What was left out of the recording.
     """
 
     name: str
@@ -37,11 +43,9 @@ class MotionShown(Brief):
     s: FloatArray
     measured: FloatArray
     predicted: FloatArray
-
-    @property
-    def distances(self) -> FloatArray:
-        """Distances (T, K) [m] of measured and predicted points; NaN where not seen."""
-        return np.asarray(np.linalg.norm(self.predicted - self.measured, axis=2))
+    distances: FloatArray
+    compared: int
+    note: str = ""
 
     @property
     def rmse(self) -> float:
@@ -140,8 +144,6 @@ def _stage(fit: MotionFit, motions: Sequence[MeasuredMotion]) -> MotionStage:
     fitted = {item.recording.measured.name: item.seen.points for item in fit.motions}
     shown = []
     for one in motions:
-        if one.s is None:
-            continue
         points = fitted.get(one.name)
         if points is None:
             try:
@@ -151,7 +153,9 @@ def _stage(fit: MotionFit, motions: Sequence[MeasuredMotion]) -> MotionStage:
         whole = np.full_like(one.points, np.nan)
         whole[: len(points)] = points
         role = "held_out" if one.held_out else "fit"
-        shown.append(MotionShown(one.name, role, one.t, one.s, one.points, whole))
+        off = np.linalg.norm(one.deviations(whole), axis=2)
+        seen = one.t, one.s, one.points, whole, off, one.compared
+        shown.append(MotionShown(one.name, role, *seen, one.note))
     both = {role: [x.distances for x in shown if x.role == role] for role in ("fit", "held_out")}
 
     def rms(role: str) -> float | None:

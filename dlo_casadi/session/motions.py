@@ -1,6 +1,8 @@
 """Read the recordings of the moving cable that a configuration names, and check them."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,14 @@ from dlo_casadi.io.motions import (
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.progress import Step, nobody
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
+from dlo_casadi.session.moving_lines import (
+    Place,
+    check_lines,
+    marks_of_lines,
+    read_video,
+    without_jumps,
+)
+from dlo_casadi.vision import VIDEO_ENDINGS
 
 # Time [s] that fixtures may be recorded less than the points: they are taken to rest there. Clocks
 # that started by hand differ by more, and are another zero, not a delay.
@@ -66,14 +76,22 @@ def _check_known(config: Config) -> None:
 
 
 def _read(config: Config, motion: Motion) -> MeasuredMotion:
-    points, track = _points(config, motion), _track(config, motion)
+    track = _track(config, motion)
+    resting = _resting(config, motion, track)
+    place = partial(_place, track, resting)
+    points, note = _points(config, motion, place)
+    across = None
     if points.s is None:
-        text = "lines of a moving cable are not compared yet"
-        raise MeasurementError(f"{text}.\n  Try: markers, with their arc lengths as s_m (at)")
+        points, across = marks_of_lines(points, place, config.cable.length)
+        if note:
+            points, note = without_jumps(points, config.cable.length, note)
+        else:
+            check_lines(points, config.cable.length)
     origin = points.t[0]
     points, track = replace(points, t=points.t - origin), replace(track, t=track.t - origin)
     if track.values:
         _check_covered(points, track, motion)
+    assert points.s is not None
     read = MeasuredMotion(
         motion.name,
         points.t,
@@ -81,24 +99,41 @@ def _read(config: Config, motion: Motion) -> MeasuredMotion:
         points.s,
         track.t,
         track.values,
-        _resting(config, motion, track),
+        resting,
         at_rest=motion.begins == "at_rest",
         held_out=motion.role == "held_out",
+        across=across,
+        note=note,
     )
     _check_reach(config, read)
     return read
 
 
-def _points(config: Config, motion: Motion) -> MotionPoints:
+def _place(
+    track: FixtureTrack, resting: Mapping[str, FloatArray], side: str, times: FloatArray
+) -> FloatArray | None:
+    """Places (T, d) [m] of a fixture at times [s] of its clock; None if it holds no place."""
+    if side in track.values:
+        rows = track.values[side].T
+        return np.stack([np.interp(times, track.t, row) for row in rows], axis=1)
+    known = resting.get(side)
+    return None if known is None else np.broadcast_to(known, (len(times), len(known)))
+
+
+def _points(config: Config, motion: Motion, place: Place) -> tuple[MotionPoints, str]:
+    """The points, and what was left out of them."""
     length, dimension = config.cable.length, len(config.experiment.gravity)
     if motion.file is not None:
-        return read_motion(_existing(motion.file), dimension, length)
+        file = _existing(motion.file)
+        if file.suffix.lower() in VIDEO_ENDINGS:
+            return read_video(config, file, place)
+        return read_motion(file, dimension, length), ""
     points = np.array(motion.points)
     if points.shape[1] != dimension:
         text = f"points have {points.shape[1]} coordinates, gravity has {dimension}"
         raise MeasurementError(f"{text}: a cable in a plane has two, in space three")
     s = None if motion.at is None else np.array(motion.at)
-    return motion_points(np.array(motion.t), points, s, length)
+    return motion_points(np.array(motion.t), points, s, length), ""
 
 
 def _track(config: Config, motion: Motion) -> FixtureTrack:
@@ -172,14 +207,7 @@ def _check_reach(config: Config, read: MeasuredMotion) -> None:
     length, slack = config.cable.length, 3 * config.experiment.tolerances.end
     std = config.experiment.measurement.std or 0.0
     t, s = read.t, read.s
-
-    def place(side: str, times: FloatArray) -> FloatArray | None:
-        if side in read.moving:
-            rows = read.moving[side].T
-            return np.stack([np.interp(times, read.fixtures_t, row) for row in rows], axis=1)
-        known = read.resting.get(side)
-        return None if known is None else np.broadcast_to(known, (len(times), len(known)))
-
+    place = partial(_place, FixtureTrack(read.fixtures_t, dict(read.moving)), read.resting)
     times = read.fixtures_t if read.moving else t
     first, last = place("start", times), place("end", times)
     if first is not None and last is not None:
@@ -190,8 +218,6 @@ def _check_reach(config: Config, read: MeasuredMotion) -> None:
                 f"at {times[k]:.3f} s the ends are {apart[k]:.4g} m apart; the cable is "
                 f"{length:.4g} m long. Are the fixtures in metres?"
             )
-    if s is None:
-        return
     for side, along in (("start", s), ("end", length - s)):
         fixture = place(side, t)
         if fixture is None:

@@ -72,13 +72,13 @@ def test_markers_by_instant_with_gaps(tmp_path: Path) -> None:
     np.testing.assert_allclose(motion.resting["start_heading"], -1.5708)
 
 
-def test_lines_are_read_and_refused(tmp_path: Path) -> None:
+def test_lines_are_read(tmp_path: Path) -> None:
     write(tmp_path, "lines.csv", "t_s,x_m,y_m", swing()[:, [0, 2, 3]])
     found = read_motion(tmp_path / "lines.csv", 2, 0.6)
     assert found.s is None
     assert np.isfinite(found.points[2, :2]).all()
     assert np.isnan(found.points[2, 2]).all()
-    with pytest.raises(dlo.MeasurementError, match="lines of a moving cable are not compared"):
+    with pytest.raises(dlo.MeasurementError, match="a line of 5 or more points stands at 0 inst"):
         read(tmp_path, points=swing()[:, [0, 2, 3]], header="t_s,x_m,y_m")
 
 
