@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "config",
         "io",
         "codegen",
+        "diagnosis",
         "show",
         "export",
         "runtime",

@@ -10,18 +10,22 @@ from scipy.optimize import least_squares
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.estimate import Covariance
-from dlo_casadi.cable.tracker import IN_A_ROW, Tracker
+from dlo_casadi.cable.inquiry import Change
+from dlo_casadi.cable.seen import with_unknowns
+from dlo_casadi.cable.tracker import IN_A_ROW, WINDOW, Tracker
 
 STD, S = 4e-4, np.linspace(0.1, 0.6, 8)
 NAMES = ("bending_stiffness", "lumped_mass.mass")
 SIZES = np.array([0.002, 0.004])
 
 
-def rope(stiffness: float = 0.009, load: float = 0.01) -> dlo.FittedCable:
+def rope(stiffness: float = 0.009, load: float = 0.01, more: float = 0.0) -> dlo.FittedCable:
     """A hanging cable with a weight, whose stiffness and weight are uncertain."""
     data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=stiffness)
-    carried = {"name": "lumped_mass", "parameters": {"mass": load, "position": 0.5}}
-    model = {"n": 8, "effects": [carried]}
+    carried = [{"name": "lumped_mass", "parameters": {"mass": load, "position": 0.5}}]
+    if more:
+        carried.append({"name": "lumped_mass", "parameters": {"mass": more, "position": 0.25}})
+    model = {"n": 8, "effects": carried}
     cable = dlo.known_cable(data, gravity=(0, -9.81), boundary=("clamped", "free"), model=model)
     covariance, old = np.diag(SIZES**2), cable.metadata
     uncertain = replace(old.uncertainty, names=NAMES, covariance=covariance)
@@ -75,7 +79,7 @@ def test_innovations_are_white() -> None:
     updates = [tracker.update(pose(true, float(x), k)) for k, x in enumerate(HEADINGS)]
     whole = np.concatenate([one.innovation for one in updates])
     assert 0.8 < whole.std() < 1.2
-    assert not any(one.refused or one.changed_since for one in updates)
+    assert not any(one.refused or one.change for one in updates)
 
 
 def test_lines_tell_the_stiffness() -> None:
@@ -94,16 +98,98 @@ def test_a_pose_seen_wrong_is_refused_and_three_are_a_change() -> None:
     wrong = pose(true, -0.5, 40)
     seen = tracker.update(wrong.changed(points=np.asarray(wrong.points) + 0.01))
     assert seen.refused
-    assert seen.changed_since is None
+    assert seen.change is None
     assert tracker.params["bending_stiffness"].value == before
     assert not tracker.update(pose(true, -0.5, 41)).refused
     fallen = rope(load=0.0)
-    alarms = [
-        tracker.update(pose(fallen, float(x), 50 + k)).changed_since for k, x in enumerate(HEADINGS)
-    ]
-    first = next(k for k, since in enumerate(alarms) if since)
+    alarms = [tracker.update(pose(fallen, float(x), 50 + k)).change for k, x in enumerate(HEADINGS)]
+    first, change = next((k, one) for k, one in enumerate(alarms) if one)
     assert first < IN_A_ROW
-    assert alarms[first] == len(HEADINGS) + 3
+    assert change.since == len(HEADINGS) + 3
+    assert change.cause == "lumped_mass"
+    assert change.values["lumped_mass.mass"] == pytest.approx(
+        -0.01, abs=5 * change.std["lumped_mass.mass"]
+    )
+    assert tracker.params["lumped_mass.mass"].value < 0.001
+
+
+def changed(tracker: Tracker, cable: dlo.FittedCable, count: int) -> Change:
+    """The change that was found when the cable is another one from now on."""
+    for k in range(count):
+        change = tracker.update(pose(cable, float(HEADINGS[3 * k % 8]), 90 + k)).change
+        if change and change.decided:
+            return change
+    raise AssertionError(tracker.change)
+
+
+def test_a_softer_cable_is_named() -> None:
+    tracker = rope().tracker(STD)
+    followed(tracker, rope())
+    change = changed(tracker, rope(0.007), 12)
+    assert (change.cause, change.since) == ("bending_stiffness", len(HEADINGS) + 1)
+    size = change.values["bending_stiffness"]
+    assert size == pytest.approx(-0.002, abs=4 * change.std["bending_stiffness"])
+    found = tracker.params["bending_stiffness"]
+    assert abs(found.value - 0.007) < 4 * found.std
+
+
+def test_a_weight_that_is_put_on_is_added_to_the_cable(tmp_path) -> None:
+    tracker, heavier = rope().tracker(STD), rope(more=0.02)
+    followed(tracker, rope())
+    change = changed(tracker, heavier, 20)
+    assert change.cause == "lumped_mass_2"
+    assert change.since == len(HEADINGS) + 1
+    tracker.cable.save(tmp_path / "rope")
+    again = dlo.load(tmp_path / "rope")
+    for name, value in (("mass", 0.02), ("position", 0.25)):
+        found = again.params[f"lumped_mass_2.{name}"]
+        assert abs(found.value - value) < 4 * found.std
+    shape = again.solve(start=(0, 0), start_heading=-0.5)
+    true = heavier.solve(start=(0, 0), start_heading=-0.5)
+    assert np.abs(shape.points - true.points).max() < 2e-3
+    assert not again.tracker(STD).update(pose(heavier, -0.9, 7)).refused
+
+
+def test_what_nothing_explains_is_a_change_without_a_cause() -> None:
+    tracker, rng = rope().tracker(STD), np.random.default_rng(1)
+    followed(tracker, rope(), HEADINGS[:4])
+    first = tracker.params["bending_stiffness"].std
+    news = []
+    for k in range(5):
+        wrong = pose(rope(), float(HEADINGS[k]), k)
+        points = np.asarray(wrong.points) + 0.03 * rng.normal(size=(8, 2))
+        news.append(tracker.update(wrong.changed(points=points)).change)
+    assert news[2] is not None
+    assert news[2].cause is None
+    assert "something unknown" in str(news[2])
+    assert tracker.params["bending_stiffness"].std > first
+
+
+def test_a_bounded_number_of_poses_is_kept() -> None:
+    tracker = rope().tracker(STD)
+    for k in range(WINDOW + 8):
+        update = tracker.update(pose(rope(), float(HEADINGS[k % 8]), k))
+        assert update.change is None
+    assert len(tracker._window) == WINDOW
+    assert len(tracker._jumps.since) <= WINDOW
+
+
+def test_a_curved_cable_is_saved_as_it_is(tmp_path) -> None:
+    data = dlo.Cable(length=0.6, mass=0.06, diameter=0.008, bending_stiffness=0.009)
+    held = {"gravity": (0, -9.81), "boundary": ("clamped", "free")}
+    cable = dlo.known_cable(data, **held, rest_curvature=[0.5, 1.0, 0.2, 0.0], model={"n": 8})
+    names = ("bending_stiffness", "rest_curvature[1]")
+    cable = with_unknowns(cable, cable.model, {}, dict(zip(names, (0.002, 0.3), strict=True)))
+    cable = replace(
+        cable, metadata=replace(cable.metadata, covariance=Covariance(names, np.eye(2)))
+    )
+    tracker = cable.tracker(STD)
+    true = replace(cable, rest=cable.rest * 1.2)
+    followed(tracker, true, HEADINGS[:3])
+    tracker.cable.save(tmp_path / "rope")
+    again = dlo.load(tmp_path / "rope")
+    shapes = [one.solve(start=(0, 0), start_heading=-0.5) for one in (tracker.cable, again)]
+    assert np.abs(shapes[0].points - shapes[1].points).max() < 1e-9
 
 
 def test_what_drifts_is_followed() -> None:

@@ -13,7 +13,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.carried import CarriedCable
 from dlo_casadi.cable.estimate import CableCurve
 from dlo_casadi.cable.exported import ExportedCable
-from dlo_casadi.cable.held import FED, all_asked, among, held_pose, reaction_texts, side_texts
+from dlo_casadi.cable.held import FED, among, posed, reaction_texts, side_texts
 from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.cable.placing import Aim, Placing, placed
@@ -114,9 +114,7 @@ class FittedCable(CarriedCable, TrackedCable, ExportedCable):
         asked["over"] = over
         asked |= {"start_orientation": start_orientation, "end_orientation": end_orientation}
         asked |= zip(FED, (start_tension, end_tension, free_length), strict=True)
-        pose = held_pose(self.model, self.metadata.fixtures, all_asked(asked))
-        held = self.with_clips([clip.kind for clip in pose.clips])
-        held = replace(held, model=replace(held.model, fed_by_length=free_length is not None))
+        held, pose = posed(self, asked)
         if obstacles or over is not None:
             held = replace(held, **among(held.model, held.p, obstacles, over))
         return held._solved(pose)

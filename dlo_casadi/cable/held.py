@@ -132,6 +132,14 @@ def all_asked(asked: Mapping[str, Any]) -> dict[str, Any]:
     return {key: getattr(pose, key) for key in asked}
 
 
+def posed(cable: Any, asked: Mapping[str, Any]) -> tuple[Any, HeldPose]:
+    """A cable with the clips of a pose, and its end conditions; see `held_pose`."""
+    pose = held_pose(cable.model, cable.metadata.fixtures, all_asked(asked))
+    held = cable.with_clips([clip.kind for clip in pose.clips])
+    by_length = pose.free_length is not None
+    return replace(held, model=replace(held.model, fed_by_length=by_length)), pose
+
+
 def held_pose(model: CableModel, shared: Mapping[str, Any], asked: Mapping[str, Any]) -> HeldPose:
     """End conditions, checked like those of a session and against the boundary.
 

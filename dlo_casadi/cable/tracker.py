@@ -1,45 +1,40 @@
 """Estimate a cable while it is handled: one measured pose after the other.
 
-The unknowns theta = theta_0 + A z with z ~ N(0, I), A A^T = P, are those of the fit. A pose tells
-y = c(theta) + B w + e: its points, with w ~ N(0, I) for what differs from pose to pose (fixtures,
-scatter, see `Repeats`) and white noise e of std sigma. With H = dc/dtheta A and the innovation r,
-
-    S = H H^T + B B^T + sigma^2 I,   K = H^T S^-1,   z = K (r + H z),   P = A (I - K H) A^T
-
-linearised anew at each z until it stays: the iterated Kalman filter, for poses that change nothing
-equal to the batch fit to first order.
+The filter is that of `seen`. Whether the cable is still the same is asked of its innovations, by
+what may have changed (`changes`), and by Page's test of their variance.
 
 References
 ----------
-Bell and Cathey, IEEE Trans. Autom. Control 38 (1993); Page, Biometrika 41 (1954); Lorden, Ann.
-Math. Statist. 42 (1971).
+Page, Biometrika 41 (1954); Lorden, Ann. Math. Statist. 42 (1971).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.stats import chi2
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.estimate import Covariance, EstimatedCable, Estimates
-from dlo_casadi.cable.saved import parameters_hash
+from dlo_casadi.cable.changes import Jumps, Probe
+from dlo_casadi.cable.estimate import Covariance, Estimate, EstimatedCable, Estimates
+from dlo_casadi.cable.inquiry import JUDGED, Change, Inquiry
+from dlo_casadi.cable.saved import cable_document, parameters_hash
+from dlo_casadi.cable.seen import Noise, Seen, Shaper, learned, with_covariance
 from dlo_casadi.config import Pose
-from dlo_casadi.equilibrium.spread import Repeats
 from dlo_casadi.errors import DloError
 
-# Relinearisations of an update, and the change of z at which they end.
-_ITERATIONS, _CHANGE = 8, 1e-3
-# Probability of a pose by chance below which it is refused; so many in a row are a change.
-OUTLIER, IN_A_ROW = 1e-5, 3
-# Clean poses between false alarms, on average at least: Page's test with the threshold ln of it.
+# So many poses in a row that are refused are a change.
+IN_A_ROW = 3
+# Clean poses between false alarms, on average at least; half of them are of each test.
 BETWEEN_ALARMS = 1e4
-# Variance of the whitened innovations that the test expects after a change.
+# Variance of the whitened innovations that Page's test expects after a change.
 _AFTER = 2.0
+# Poses that are kept: a change is seen within them. Poses between two looks at what changed; a pose
+# less likely than this is looked at once.
+WINDOW, LOOK, _ODD = 30, 5, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,30 +43,33 @@ class Update:
 
     Parameters
     ----------
+    number : int
+        Of the pose, the first is 1.
     innovation : (R,)
-        Measured minus predicted points before the pose was used, whitened: independent, of std 1.
+        Measured minus predicted before the pose was used, whitened: independent, of std 1.
     rms : float [m]
-        Root of the mean square of the same in metres.
+        Root of the mean square of the points' part of it, in metres.
     probability : float
         Of an innovation as large by chance.
     refused : bool
         Whether the pose was left out, because that is less than 1 in 100,000.
-    changed_since : int or None
-        If the cable is another one than before: number of the pose from which on, the first is 1.
+    change : Change or None
+        If the cable is another one than before: an alarm, or news of its cause.
     iterations : int
     """
 
+    number: int
     innovation: FloatArray
     rms: float
     probability: float
     refused: bool
-    changed_since: int | None
+    change: Change | None
     iterations: int
 
     def __repr__(self) -> str:
         text = f"{1e3 * self.rms:.3g} mm off the prediction, p = {self.probability:.2g}"
         text += ", refused" if self.refused else ""
-        return text + (f", changed since pose {self.changed_since}" if self.changed_since else "")
+        return text + (f", {self.change}" if self.change else "")
 
 
 @dataclass(eq=False)
@@ -80,26 +78,42 @@ class Tracker:
 
     Parameters
     ----------
-    cable : EstimatedCable
-        With its parameters and their covariance after the last pose; `save` keeps it.
-    std : float [m]
-        Of the noise of one coordinate of a point.
+    noise : Noise
+        Of points and readings.
     forget : float
         Share of what is known that is kept from pose to pose: the covariance grows by its inverse.
     drift : mapping of str to float
         Standard deviation per pose of parameters that walk at random, by name.
     count : int
         Number of poses so far.
+    change : Change or None
+        The last change.
     """
 
-    cable: Any
-    std: float
+    _cable: Any
+    noise: Noise
     forget: float = 1.0
-    drift: Mapping[str, float] | None = None
+    drift: Mapping[str, float] = field(default_factory=dict)
+    compiled: bool = False
     count: int = 0
-    _suspicion: float = 0.0
-    _since: int = 0
-    _refused: int = 0
+    change: Change | None = None
+
+    def __post_init__(self) -> None:
+        self._shaper = Shaper(self.compiled)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget the last poses, but not what they told."""
+        self._window: deque[Seen] = deque(maxlen=WINDOW)
+        self._jumps: Jumps | None = None
+        self._unseen: list[Seen] = []  # by the last look
+        self._suspicion, self._since, self._refused = 0.0, 0, 0
+        self._inquiry: Inquiry | None = None
+
+    @property
+    def cable(self) -> Any:
+        """The cable after the last pose: its parameters and their covariance; `save` keeps it."""
+        return _documented(self._cable)
 
     @property
     def params(self) -> Estimates:
@@ -107,11 +121,12 @@ class Tracker:
         return Estimates(self.cable.metadata.params)
 
     def update(self, pose: Pose) -> Update:
-        """Learn from a pose: its fixtures and the points measured on the cable.
+        """Learn from a pose: its fixtures, and what was measured of the cable.
 
         `Pose.points` (K, d) [m], with `Pose.at` (K,) [m] for markers, are used; without `at` the
-        points are anywhere along the cable, and their distances across it count. In a pose without
-        points time passes, nothing else.
+        points are anywhere along the cable, and their distances across it count. Readings of forces
+        and moments are used if the tracker knows their noise. In a pose with nothing measured time
+        passes.
 
         Raises
         ------
@@ -122,52 +137,102 @@ class Tracker:
         """
         if not isinstance(pose, Pose):
             raise DloError(f"update: a Pose belongs here, found {pose!r}\n  Try: dlo.Pose(...)")
-        prior = self._with_time()
-        self.count += 1
-        if pose.points is None:
-            self.cable = prior
-            return Update(np.zeros(0), 0.0, 1.0, False, None, 0)
-        z, first = np.zeros(len(prior.covariance.names)), np.zeros(0)
-        for iteration in range(1, _ITERATIONS + 1):
-            residual, by_z, by_own = _seen(_moved(prior, z), prior, pose)
-            spread = by_z @ by_z.T + by_own @ by_own.T + self.std**2 * np.eye(len(residual))
-            factor = cho_factor(spread, lower=True)
-            if iteration == 1:
-                first = solve_triangular(factor[0], residual, lower=True)
-                rms = float(np.sqrt((residual**2).mean()))
-                probability = float(chi2.sf(first @ first, len(first)))
-                since = self._changed(first, probability)
-                if probability < OUTLIER:
-                    self.cable = prior
-                    return Update(first, rms, probability, True, since, iteration)
-            gain = cho_solve(factor, by_z).T
-            before, z = z, gain @ (residual + by_z @ z)
-            if np.abs(z - before).max(initial=0.0) < _CHANGE:
-                break
-        left = np.eye(len(z)) - gain @ by_z
-        root = prior.metadata.uncertainty.root
-        covariance = root @ ((left + left.T) / 2) @ root.T
-        self.cable = _known(_moved(prior, z), covariance)
-        return Update(first, rms, probability, False, since, iteration)
+        prior = self._faded(self._cable)
+        after, seen = learned(prior, pose, self.noise, self.count + 1, self._shaper)
+        self.count, self._cable = self.count + 1, after
+        if seen is None:
+            return Update(self.count, np.zeros(0), 0.0, 1.0, False, None, 0)
+        change = self._judged(seen)
+        return Update(
+            *(seen.number, seen.innovation, seen.rms, seen.probability, seen.refused, change),
+            seen.iterations,
+        )
 
-    def _with_time(self) -> Any:
+    def _faded(self, cable: Any) -> Any:
         """The cable before a pose: what is known has faded, and has walked."""
-        names, values = self.cable.covariance.names, self.cable.covariance.values
-        walked = np.array([(self.drift or {}).get(name, 0.0) for name in names])
-        return _known(self.cable, values / self.forget + np.diag(walked**2))
+        if self.forget == 1 and not self.drift:
+            return cable
+        known = cable.metadata.uncertainty
+        walked = np.array([self.drift.get(name, 0.0) for name in known.names])
+        return with_covariance(cable, known.covariance / self.forget + np.diag(walked**2))
 
-    def _changed(self, innovation: FloatArray, probability: float) -> int | None:
-        """Page's test of the innovations' variance; the first pose of a change."""
-        self._refused = self._refused + 1 if probability < OUTLIER else 0
+    # ---- is it still the same cable? -------------------------------------------------------------
+
+    def _judged(self, seen: Seen) -> Change | None:
+        """A change that this pose told of."""
+        if self._window and self._window[-1].model != seen.model:
+            self._begin()  # other clips: earlier poses say nothing of these
+        self._refused = self._refused + 1 if seen.refused else 0
+        self._window.append(seen)
+        if self._inquiry is not None and self._refused < IN_A_ROW:
+            return None if seen.refused else self._followed(seen)
+        if not seen.refused:
+            self._unseen.append(seen)
+        since = self._alarm(seen)
+        return None if since is None else self._opened(since)
+
+    def _alarm(self, seen: Seen) -> int | None:
+        """First pose of a change, if one of the tests has found one."""
         if self._refused >= IN_A_ROW:
-            return self.count - self._refused + 1
+            return seen.number - self._refused + 1
         if self._refused:
             return None  # one pose that was seen wrong is no change
-        gained = (innovation @ innovation) * (1 - 1 / _AFTER) - len(innovation) * np.log(_AFTER)
+        since = self._varied(seen)
+        if since is None and (seen.probability < _ODD or len(self._unseen) >= LOOK):
+            since = self._looked()
+        return since
+
+    def _varied(self, seen: Seen) -> int | None:
+        """Page's test of the innovations' variance."""
+        r = seen.innovation
+        gained = (r @ r) * (1 - 1 / _AFTER) - len(r) * np.log(_AFTER)
         if self._suspicion <= 0:
-            self._since = self.count
+            self._since = seen.number
         self._suspicion = max(0.0, self._suspicion + gained / 2)
-        return self._since if self._suspicion > np.log(BETWEEN_ALARMS) else None
+        return self._since if self._suspicion > np.log(2 * BETWEEN_ALARMS) else None
+
+    def _looked(self) -> int | None:
+        """Likelihood ratios of what may have changed, since each of the last poses."""
+        if self._jumps is None:
+            names = self._cable.metadata.uncertainty.names
+            self._jumps = Jumps(Probe.quick(self._unseen[-1].model, names), WINDOW)
+        jumps = self._jumps
+        for one, columns in zip(self._unseen, jumps.probe.columns(self._unseen), strict=True):
+            jumps.add(one, columns)
+        self._unseen = []
+        first = min(jumps.found(), key=lambda jump: jump.log_p)
+        rare = first.log_p + np.log(2 * BETWEEN_ALARMS * jumps.tests) < 0
+        return first.since if rare else None
+
+    def _opened(self, since: int) -> Change:
+        """An alarm: what changed is asked of the poses that are kept."""
+        run = self.count - self._refused if self._refused >= IN_A_ROW else self.count
+        poses = [one for one in self._window if not one.refused or one.number > run]
+        cable = self._cable
+        self._inquiry = Inquiry(
+            poses, cable, self.noise, self._faded, self._shaper, since, self.count, WINDOW
+        )
+        return self._concluded(final=False)
+
+    def _followed(self, seen: Seen) -> Change | None:
+        """One more pose after an alarm whose cause is not sure."""
+        inquiry = self._inquiry
+        assert inquiry is not None
+        inquiry.add(seen)
+        after = self.count - inquiry.opened
+        if after not in JUDGED:
+            return None
+        return self._concluded(final=after == JUDGED[-1])
+
+    def _concluded(self, *, final: bool) -> Change:
+        inquiry = self._inquiry
+        assert inquiry is not None
+        change, self._cable = inquiry.verdict(final=final)
+        self.change = change
+        self._begin()
+        if not change.decided:
+            self._inquiry = inquiry
+        return change
 
 
 class TrackedCable(EstimatedCable):
@@ -182,8 +247,11 @@ class TrackedCable(EstimatedCable):
         self,
         std: float,
         *,
+        force_std: float | None = None,
+        moment_std: float | None = None,
         forget: float = 1.0,
         drift: Mapping[str, float] | None = None,
+        compiled: bool = False,
     ) -> Tracker:
         """Estimate the cable further, one pose after the other.
 
@@ -191,19 +259,26 @@ class TrackedCable(EstimatedCable):
         ----------
         std : float [m]
             Standard deviation of one coordinate of a measured point.
+        force_std, moment_std : float [N, N m], optional
+            Of one component of a reading; without them readings are not used.
         forget : float
             Share of what is known that is kept from pose to pose, at most 1.
         drift : mapping of str to float, optional
             Standard deviation per pose of parameters that change slowly: {"bending_stiffness":
             1e-4}.
+        compiled : bool
+            Whether equilibria are first found by compiled C; it takes some seconds to compile.
 
         Raises
         ------
         DloError
-            If a value is impossible, if there is no such parameter, or if nothing is uncertain.
+            If a value is impossible, if there is no such parameter, if nothing is uncertain, or if
+            there is no C compiler.
         """
-        if isinstance(std, bool) or not isinstance(std, int | float) or not 0 < std < np.inf:
-            raise DloError(f"std: the noise of a coordinate [m] belongs here, found {std!r}")
+        _checked("std", std, "the noise of a coordinate [m]")
+        for name, size in (("force_std", force_std), ("moment_std", moment_std)):
+            if size is not None:
+                _checked(name, size, "the noise of a component [N, N m]")
         if not isinstance(forget, int | float) or not 0.5 <= forget <= 1:
             raise DloError(f"forget: 0.5 to 1 belongs here, found {forget!r}")
         names = self.covariance.names
@@ -218,72 +293,34 @@ class TrackedCable(EstimatedCable):
                 raise DloError(f"drift: {name!r} is not estimated.\n  Try: {', '.join(names)}")
             if not 0 <= float(value) < np.inf:
                 raise DloError(f"drift: {name}: a standard deviation, found {value!r}")
-        return Tracker(self, float(std), float(forget), dict(drift or {}))
+        noise = Noise(float(std), force_std, moment_std)
+        return Tracker(self, noise, float(forget), dict(drift or {}), compiled)
 
 
-def _seen(cable: Any, prior: Any, pose: Pose) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Measured minus predicted points (R,), derivatives by z and by what differs in each pose."""
-    shape = cable.solve(_held(pose))
-    repeats = Repeats(shape._measured, prior.metadata.uncertainty)
-    points = np.asarray(pose.points, dtype=float)
-    if pose.at is not None:
-        s = np.asarray(pose.at, dtype=float)
-        curve, moved = repeats.displacements(s)
-        residual = points - curve.at(s)
-    else:
-        fine = np.linspace(0.0, cable.length, 1001)
-        curve = repeats.held.curve
-        apart = np.linalg.norm(points[:, None] - curve.at(fine)[None], axis=2)
-        s = fine[apart.argmin(axis=1)]
-        curve, moved = repeats.displacements(s)
-        across = curve.normals(s)
-        residual = np.einsum("knd,kd->kn", across, points - curve.at(s))
-        moved = np.einsum("knd,kdq->knq", across, moved)
-    rows, count = moved.reshape((residual.size, -1)), len(prior.covariance.names)
-    return residual.ravel(), rows[:, :count], rows[:, count:]
+def _checked(name: str, value: object, meant: str) -> None:
+    """Raise a DloError if a value is no positive number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+        raise DloError(f"{name}: {meant} belongs here, found {value!r}")
 
 
-def _held(pose: Pose) -> Pose:
-    """The pose without its measurements."""
-    return pose.changed(points=None, at=None)
-
-
-def _moved(cable: Any, z: FloatArray) -> Any:
-    """The cable with its unknowns changed by A z, within their bounds."""
-    uncertainty = cable.metadata.uncertainty
-    by_p, by_rest = uncertainty.unknowns_in(cable.model)
-    change = uncertainty.root @ z
-    bounds = np.array([q.bounds(estimated=True) for q in cable.model.parameters])
-    p = np.clip(cable.p + by_p @ change, bounds[:, 0], bounds[:, 1])
-    return replace(cable, p=p, rest=cable.rest + by_rest @ change)
-
-
-def _known(cable: Any, covariance: FloatArray) -> Any:
-    """The cable with this covariance, and with its values in its parameters and its document."""
-    old = cable.metadata
-    names, values = old.covariance.names, dict(zip(cable.model.names, cable.p, strict=True))
-    found = Covariance(names, covariance)
-    params, rows = {}, {}
-    for name, one in old.params.items():
-        value, std = float(values[name]), float(found.std.get(name, 0.0))
-        fitted = {"fixed": name not in names, "interval_95": None, "interval_95_if_hidden": None}
-        params[name] = replace(one, value=value, std=std, **fitted)
-        rows[name] = {**old.document["parameters"][name], "value": value, "std": std}
-        rows[name] |= {"fitted": name in names, "interval_95": None, "interval_95_if_hidden": None}
-    basis = cable.model.rest_basis
-    coefficients = np.linalg.lstsq(basis, cable.rest, rcond=None)[0]
-    document = {**old.document, "parameters": rows}
-    document["covariance"] = {"names": list(names), "values": covariance.tolist()}
-    document["rest_curvature"] = {
-        **document["rest_curvature"],
-        "coefficients": coefficients.tolist(),
+def _documented(cable: Any) -> Any:
+    """The cable with its values in its parameters and its document."""
+    old, model, known = cable.metadata, cable.model, cable.metadata.uncertainty
+    found = Covariance(known.names, known.covariance)
+    params = {
+        q.name: Estimate(
+            float(value), found.std.get(q.name, 0.0), q.unit, fixed=q.name not in known.names
+        )
+        for q, value in zip(model.parameters, cable.p, strict=True)
     }
+    coefficients = np.linalg.lstsq(model.rest_basis, cable.rest, rcond=None)[0]
+    document = {**old.document, **cable_document(model, cable.p, coefficients, cable.rest, known)}
+    document["cable"] = {**old.document["cable"], **document["cable"]}
     document["model_hash"] = parameters_hash(document)
     metadata = replace(
         old,
         params=params,
         covariance=found,
-        uncertainty=replace(old.uncertainty, covariance=covariance),
         coefficients=coefficients,
         document=document,
         model_hash=document["model_hash"],

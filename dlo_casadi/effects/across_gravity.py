@@ -56,6 +56,7 @@ class SideLoad(LoadAcrossGravity):
     """
 
     name = "side_load"
+    lasts = True
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the force per length."""

@@ -33,6 +33,7 @@ class BendingAnisotropy(SectionLaw):
     """
 
     name = "bending_anisotropy"
+    lasts = True
     dimensions = (3,)
     isotropic = False
     declared = (

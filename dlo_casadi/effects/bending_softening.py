@@ -41,6 +41,7 @@ class BendingSoftening(SectionLaw):
     """
 
     name = "bending_softening"
+    lasts = True
     inverses: ClassVar = {"softness": ("curvature_scale", "1/m")}
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:

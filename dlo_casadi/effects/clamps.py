@@ -137,6 +137,7 @@ class ClampCompliance(ClampEffect):
     """
 
     name = "clamp_compliance"
+    lasts = True
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:
         """Declare the compliances of the clamped ends."""

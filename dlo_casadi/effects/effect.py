@@ -87,6 +87,10 @@ class Effect:
     # Whether derivatives taken where the effect vanishes reveal it.
     gradual: ClassVar[bool] = True
 
+    # Whether it lasts as long as the cable, its holders or its camera, and does not come from one
+    # pose to the next.
+    lasts: ClassVar[bool] = False
+
     # Whether a cable may have any number of them, at different places.
     repeatable: ClassVar[bool] = False
 

@@ -68,6 +68,7 @@ class StartSpring(PinSpring):
     """A torsional spring at the start pin: V = k (phi(0) - heading)^2 / 2."""
 
     name = "start_spring"
+    lasts = True
     side = "start"
 
 
@@ -75,6 +76,7 @@ class EndSpring(PinSpring):
     """A torsional spring at the end pin: V = k (phi(L) - heading)^2 / 2."""
 
     name = "end_spring"
+    lasts = True
     side = "end"
 
 

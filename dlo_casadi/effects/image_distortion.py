@@ -28,6 +28,7 @@ class ImageDistortion(MeasurementEffect):
     """
 
     name = "image_distortion"
+    lasts = True
     dimensions = (2,)
 
     center: tuple[float, float] = (0.0, 0.0)

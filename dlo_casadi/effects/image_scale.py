@@ -20,6 +20,7 @@ class ImageScale(MeasurementEffect):
     """
 
     name = "image_scale"
+    lasts = True
     dimensions = (2,)
     tolerances: ClassVar = {"factor": "scale"}
     declared = (Parameter("factor", nominal=1.0, scale=0.002, lower=0.7, upper=1.4),)

@@ -56,6 +56,7 @@ class AxialStretch(Kinematics):
     """
 
     name = "axial_stretch"
+    lasts = True
     inverses: ClassVar = {"compliance": ("axial_stiffness", "N")}
     declared = (Parameter("compliance", "1/N", scale=1e-3, lower=0.0, upper=1.0),)
 

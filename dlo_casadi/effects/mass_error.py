@@ -26,6 +26,7 @@ class MassError(Load):
     """
 
     name = "mass_error"
+    lasts = True
     corrects = "mass"
     declared = (Parameter("factor", nominal=1.0, scale=0.1, lower=0.2, upper=5.0),)
 

@@ -30,6 +30,7 @@ class StandoffError(MeasurementEffect):
     """
 
     name = "standoff_error"
+    lasts = True
     dimensions = (2,)
     declared = (Parameter("distance", "m", scale=1e-3),)
 

@@ -24,6 +24,7 @@ class StiffnessGradient(SectionLaw):
     """
 
     name = "stiffness_gradient"
+    lasts = True
     declared = Parameter.symmetric(("slope",), "", 0.2, 0.95)
 
     def along(self, cell: Cell, cable: CableData, params: Params) -> ca.SX:
@@ -49,6 +50,7 @@ class StiffSection(SectionLaw):
     """
 
     name = "stiff_section"
+    lasts = True
     repeatable = True
 
     def parameters(self, cable: CableData) -> tuple[Parameter, ...]:

@@ -13,20 +13,18 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, length_of
-from dlo_casadi.cable.estimate import Covariance, Estimate
+from dlo_casadi.cable.estimate import Estimate
 from dlo_casadi.cable.file import metadata_of
 from dlo_casadi.cable.fitted_cable import FittedCable
-from dlo_casadi.cable.saved import SCHEMA, parameters_hash
+from dlo_casadi.cable.saved import cable_document, parameters_hash
 from dlo_casadi.config import Config, Limits, dump_yaml
 from dlo_casadi.config.values import AXES
 from dlo_casadi.diagnosis.if_hidden import IfHidden
-from dlo_casadi.effects import Effect, known_effect
 from dlo_casadi.equilibrium.spread import Uncertainty
-from dlo_casadi.errors import DloError
 from dlo_casadi.estimation.prediction import uncertainty_of
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.io.files import finite
-from dlo_casadi.model.cable_model import DAMPING_TIME, STIFFNESSES, CableModel
+from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.runtime.executors import software
@@ -200,7 +198,7 @@ def cable_of_known(known: Declared, coefficients: FloatArray, limits: Limits) ->
     """A cable without uncertainty, with rest coefficients [1/m], in the form of a fitted one."""
     model, p, rest = known.model, known.start, known.model.rest_basis @ coefficients
     nothing = Uncertainty((), np.zeros((0, 0)), {}, PoseScatter())
-    document = _cable_dict(model, p, coefficients, rest, nothing)
+    document = cable_document(model, p, coefficients, rest, nothing)
     document |= {"limits": limits.given, "config": model.cable.name, "versions": software()}
     document["model_hash"] = parameters_hash(document)
     return FittedCable(model, p, rest, metadata_of(document, None))
@@ -243,80 +241,7 @@ def scatter_dict(fit: Fit) -> dict[str, Any] | None:
 
 def fit_dict(fit: Fit) -> dict[str, Any]:
     """Results of the fit alone: model, parameters, covariance and state."""
-    return _cable_dict(fit.model, fit.p, fit.coefficients, fit.rest_now, uncertainty_of(fit))
-
-
-def _cable_dict(
-    model: CableModel,
-    p: FloatArray,
-    coefficients: FloatArray,
-    rest: FloatArray,
-    uncertainty: Uncertainty,
-) -> dict[str, Any]:
-    """The model of a cable, its values and their uncertainty."""
-    names, covariance = uncertainty.names, uncertainty.covariance
-    stds = Covariance(names, covariance).std
-    damped = [DAMPING_TIME] if model.cable.damping_time is not None else []
-    document: dict[str, Any] = {
-        "schema": SCHEMA,
-        "cable": {
-            **fields_of(model.cable, "name", "length", "mass", "diameter"),
-            **fields_of(model.cable, *STIFFNESSES[: 1 + model.in_space], *damped),
-            "rest_shape": "straight" if model.cable.straight else "curved",
-        },
-        "boundary": {"start": str(model.start), "end": str(model.end)},
-        "gravity": list(model.gravity),
-        **fields_of(model, "element", "n", "n_rest"),
-        "effects": [_effect_row(effect) for effect in model.effects],
-        "parameters": {
-            q.name: {
-                "value": float(value),
-                "std": stds.get(q.name, 0.0),
-                "unit": q.unit,
-                **dict(zip(("lower", "upper"), q.bounds(estimated=q.name in names), strict=True)),
-                "fitted": q.name in names,
-                # Prior standard deviation of a nuisance parameter, from its tolerance.
-                "tolerance": model.priors.get(q.name),
-            }
-            for q, value in zip(model.parameters, p, strict=True)
-        },
-        "rest_curvature": {
-            "coefficients": _by_name(coefficients, model.node.curvatures),
-            "unit": "1/m",
-            "basis": "cubic B-splines on clamped uniform knots over [0, length]",
-        },
-        "state": {
-            "rest_curvature": _by_name(rest, model.node.strains),
-            "unit": "1/m",
-            "of": "cells, last pose done",
-        },
-        "covariance": {"names": list(names), "values": covariance},
-        "scatter": {
-            "fixtures": dict(uncertainty.scatter),
-            "rest_curvature_std": uncertainty.pose_scatter.rest_std,
-            "rest_curvature_smoothness": uncertainty.pose_scatter.smoothness,
-            "from_pose_to_pose": {
-                "source": uncertainty.pose_scatter.source,
-                "std": uncertainty.pose_scatter.size(model, float(p[0]))[0],
-            },
-            "hanging": uncertainty.repeat_std,
-        },
-    }
-    return finite(document)
-
-
-def _by_name(values: FloatArray, names: Sequence[str]) -> Any:
-    """Curvatures: in the plane as they are, in space by the names of the strain components."""
-    if len(names) == 1:
-        return values
-    return dict(zip(names, values.reshape(len(names), -1), strict=True))
-
-
-def _effect_row(effect: Effect) -> dict[str, Any]:
-    """Name and label of an effect, and its other arguments."""
-    if known_effect(effect.name) is not type(effect):
-        raise DloError(f"the effect {effect.name!r} cannot be written to parameters.yaml")
-    return {"name": effect.name, **asdict(effect)}
+    return cable_document(fit.model, fit.p, fit.coefficients, fit.rest_now, uncertainty_of(fit))
 
 
 def shared_fixtures(config: Config) -> dict[str, Any]:

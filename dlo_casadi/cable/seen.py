@@ -1,0 +1,391 @@
+"""What a measured pose tells of a cable: residuals in units of the noise, and their derivatives.
+
+The unknowns theta = theta_0 + A z with z ~ N(0, I), A A^T = P, are those of the fit. A pose tells
+y = c(theta) + B w + e in units of its noise e ~ N(0, I), with w ~ N(0, I) for what differs from
+pose to pose (fixtures, scatter, see `Repeats`). With H = dc/dtheta A and the innovation r,
+
+    S = H H^T + B B^T + I,   K = H^T S^-1,   z = K (r + H z),   P = A (I - K H) A^T
+
+linearised anew at each z until it stays: the iterated Kalman filter, for poses that change nothing
+equal to the batch fit to first order.
+
+References
+----------
+Bell and Cathey, IEEE Trans. Autom. Control 38 (1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.stats import chi2
+
+from dlo_casadi.arrays import FloatArray
+from dlo_casadi.cable.held import HELD, posed
+from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.config import Pose
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.equilibrium.curve import Observed, ObservedChange
+from dlo_casadi.equilibrium.pose import HeldPose
+from dlo_casadi.equilibrium.solve import MOST_MOVED, MOST_TURNED, solve_equilibrium
+from dlo_casadi.errors import DloError
+from dlo_casadi.model.assembly import Shapes
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.ends import reaction_rows
+from dlo_casadi.rod.quantities import quantity_of
+
+# Relinearisations of an update, and the change of z at which they end.
+_ITERATIONS, _CHANGE = 8, 1e-3
+# Largest step [std] that is not linearised anew.
+_SMALL = 0.1
+# Probability of a pose by chance below which it is refused.
+OUTLIER = 1e-5
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what is measured.
+
+    Parameters
+    ----------
+    point : float [m]
+        Of one coordinate of a point.
+    force, moment : float or None [N, N m]
+        Of one component of a reading; None if readings are not used.
+    """
+
+    point: float
+    force: float | None = None
+    moment: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What was measured in a pose, at known places of the cable.
+
+    Parameters
+    ----------
+    points : (K, d) [m]
+    s : (K,) [m]
+        Their places along the cable.
+    marked : bool
+        Whether these were measured, too; else only distances across the cable count.
+    readings, rows, std : (r,)
+        Components of forces and moments, their rows in `Observed.readings`, and their noise.
+    noise : float [m]
+    """
+
+    points: FloatArray
+    s: FloatArray
+    marked: bool
+    readings: FloatArray
+    rows: list[int]
+    std: FloatArray
+    noise: float
+
+    @classmethod
+    def of(cls, pose: Pose, model: CableModel, noise: Noise) -> Measured:
+        """Measurements of a pose; points without arc lengths have no places yet."""
+        d = model.node.dimension
+        points = np.zeros((0, d)) if pose.points is None else np.asarray(pose.points, dtype=float)
+        if points.shape[1] != d:
+            raise DloError(f"points: ({d},) each belongs here, found {points.shape[1]} coordinates")
+        known = reaction_rows(model.node, len(model.clips))
+        values: list[float] = []
+        rows: list[int] = []
+        std: list[float] = []
+        for name, found in pose.readings.items():
+            size = getattr(noise, quantity_of(name).name)
+            if size is None:
+                continue
+            values += [float(x) for x in np.atleast_1d(found)]
+            rows += range(known[name].start, known[name].stop)
+            std += [size] * (known[name].stop - known[name].start)
+        if len(values) != len(rows):
+            raise DloError(f"readings: {len(rows)} components belong here, found {len(values)}")
+        s = np.zeros(len(points)) if pose.at is None else np.asarray(pose.at, dtype=float)
+        readings = np.array(values), rows, np.array(std)
+        return cls(points, s, pose.at is not None, *readings, noise.point)
+
+    @property
+    def size(self) -> int:
+        """Number of measured numbers."""
+        points, d = self.points.shape
+        return points * (d if self.marked else d - 1) + len(self.rows)
+
+    def on(self, seen: Observed) -> Measured:
+        """The same with the places of its points on a curve, if they are not known."""
+        if self.marked or not len(self.points):
+            return self
+        return replace(self, s=seen.curve.nearest(self.points))
+
+    def _rows(self, seen: Observed, moved: FloatArray) -> FloatArray:
+        """Displacements (K, d, q) as rows (., q): all coordinates, or those across the cable."""
+        if not self.marked and len(self.points):
+            moved = np.einsum("knd,kdq->knq", seen.curve.normals(self.s), moved)
+        return np.asarray(moved.reshape(-1, moved.shape[2]) / self.noise)
+
+    def off(self, seen: Observed) -> FloatArray:
+        """Measured minus predicted (R,), in units of the noise."""
+        gap = (self.points - seen.curve.at(self.s))[..., None]
+        felt = (self.readings - seen.readings[self.rows]) / self.std if self.rows else np.zeros(0)
+        return np.concatenate([self._rows(seen, gap)[:, 0], felt])
+
+    def along(self, seen: Observed, change: ObservedChange) -> FloatArray:
+        """Derivatives (R, q) of what is predicted, in units of the noise."""
+        rows = self._rows(seen, seen.curve.moved(self.s, change.curve))
+        if not self.rows:
+            return rows
+        return np.vstack([rows, change.readings[self.rows] / self.std[:, None]])
+
+    def alike(self, seen: Observed, std: float) -> FloatArray:
+        """Derivatives (R, d) by shifts of all points alike, of this standard deviation [m]."""
+        d = self.points.shape[1]
+        shift = np.broadcast_to(std * np.eye(d), (len(self.points), d, d))
+        return np.vstack([self._rows(seen, shift), np.zeros((len(self.rows), d))])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A pose as it was seen before it was used.
+
+    Parameters
+    ----------
+    number : int
+        Of the pose, the first is 1.
+    pose : Pose
+    prior : EstimatedCable
+        What was known of the cable.
+    model, held : CableModel, HeldPose
+        With the clips of the pose.
+    shapes : Shapes
+        The predicted equilibrium.
+    measured : Measured
+    factor : (R, R)
+        L of S = L L^T.
+    innovation : (R,)
+        Measured minus predicted, whitened by L.
+    rms : float [m]
+        Root of the mean square of the points' distances from where they were predicted.
+    iterations : int
+    """
+
+    number: int
+    pose: Pose
+    prior: Any
+    model: CableModel
+    held: HeldPose
+    shapes: Shapes
+    measured: Measured
+    factor: FloatArray
+    innovation: FloatArray
+    rms: float
+    iterations: int = 0
+
+    @property
+    def probability(self) -> float:
+        """Of an innovation as large by chance."""
+        return float(chi2.sf(self.innovation @ self.innovation, len(self.innovation)))
+
+    @property
+    def refused(self) -> bool:
+        """Whether it was seen wrong."""
+        return self.probability < OUTLIER
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of what was measured, up to a constant."""
+        r = self.innovation
+        return float(-(r @ r) / 2 - np.log(np.diag(self.factor)).sum())
+
+
+@dataclass(eq=False)
+class Shaper:
+    """Finds equilibria: near the last one, by compiled C, or anew.
+
+    Parameters
+    ----------
+    compiled : bool
+        Whether a cable is compiled; it is once for each number and kind of clips.
+    """
+
+    compiled: bool = False
+    last: tuple[CableModel, HeldPose, FloatArray] | None = None
+    _solvers: dict[Any, CompiledSolver] = field(default_factory=dict)
+
+    def found(self, batch: BatchEquilibrium, cable: Any, held: HeldPose, *, anew: bool) -> Shapes:
+        """The equilibrium of a pose; not the one near the last if `anew`."""
+        p, rest, model = cable.p, cable.rest, cable.model
+        start = None if anew else self._near(model, held)
+        if start is None and self.compiled:
+            start = self._by_c(cable, held)
+        if start is not None:
+            shapes, converged = batch.solve(batch.start_shapes(start[None]), p, rest)
+            if converged.all() and batch.stable(shapes, p, rest).all():
+                return shapes
+        return declared(batch, solve_equilibrium(model, p, rest, held).shapes)
+
+    def _near(self, model: CableModel, held: HeldPose) -> FloatArray | None:
+        """Nodes of the last shape if the fixtures have hardly moved since."""
+        if self.last is None or self.last[0].clips != model.clips or self.last[0].n != model.n:
+            return None
+        _, before, x = self.last
+        same = replace(before, name=held.name, **_places(held)) == held
+        if not same:
+            return None
+        gaps, d = np.abs(held.ends - before.ends), model.node.dimension
+        turned = MOST_TURNED if d == 2 else MOST_TURNED / 2  # parts of a quaternion
+        near = (
+            gaps[: 2 * d].max() <= MOST_MOVED * model.cable.length and gaps[2 * d :].max() <= turned
+        )
+        return x if near else None
+
+    def _by_c(self, cable: Any, held: HeldPose) -> FloatArray | None:
+        key = cable.model.clips
+        if key not in self._solvers:
+            self._solvers[key] = CompiledSolver(cable.model, cable.p, cable.rest)
+        found = self._solvers[key].solve(held, throw=False)
+        return found.x if found.status == "ok" else None
+
+
+def _places(held: HeldPose) -> dict[str, Any]:
+    """What may differ between poses that are near each other."""
+    turned = ("start_heading", "end_heading", "start_orientation", "end_orientation")
+    return {name: getattr(held, name) for name in ("start", "end", *turned)}
+
+
+def declared(batch: BatchEquilibrium, shapes: Shapes) -> Shapes:
+    """Shapes with fixtures where they are declared, for a batch's model."""
+    still = np.zeros((len(shapes.x), len(batch.model.deviation_names)))
+    return replace(shapes, deviation=still)
+
+
+def learned(
+    prior: Any, pose: Pose, noise: Noise, number: int, shaper: Shaper
+) -> tuple[Any, Seen | None]:
+    """The cable after a pose, and how the pose was seen; None if nothing was measured.
+
+    A pose that a shape near the last one does not explain is solved anew: cables snap.
+    """
+    own, held = posed(prior, {name: getattr(pose, name) for name in (*HELD, "clips")})
+    measured = Measured.of(pose, own.model, noise)
+    if not measured.size:
+        return prior, None
+    after, seen = _learned(prior, own, held, pose, measured, number, shaper, anew=False)
+    if seen.refused and shaper.last is not None:
+        again = _learned(prior, own, held, pose, measured, number, shaper, anew=True)
+        if again[1].probability > seen.probability:
+            after, seen = again
+    if not seen.refused:
+        shaper.last = own.model, held, seen.shapes.x[0]
+    return after, seen
+
+
+def _learned(
+    prior: Any,
+    own: Any,
+    held: HeldPose,
+    pose: Pose,
+    measured: Measured,
+    number: int,
+    shaper: Shaper,
+    *,
+    anew: bool,
+) -> tuple[Any, Seen]:
+    uncertainty = prior.metadata.uncertainty
+    batch = BatchEquilibrium(
+        uncertainty.pose_scatter.within(own.model), [held], wrenches=bool(measured.rows)
+    )
+    by_p, by_rest, by_deviation = uncertainty.ways_in(own.model)
+    count = len(uncertainty.names)
+    z, seen = np.zeros(count), None
+    shapes = shaper.found(batch, own, held, anew=anew)
+    for iterations in range(1, _ITERATIONS + 1):
+        now = moved(own, by_p[:, :count] @ z, by_rest[:, :count] @ z)
+        if iterations > 1:
+            shapes, converged = batch.solve(shapes, now.p, now.rest)
+            if not converged.all():
+                found = solve_equilibrium(own.model, now.p, now.rest, held)
+                shapes = declared(batch, found.shapes)
+        along = batch.by_rest(shapes, now.p, now.rest, by_rest, by_p, by_deviation)
+        ((told, change),) = batch.observe(shapes, now.p, now.rest, along)
+        measured = measured.on(told)
+        residual, columns = measured.off(told), measured.along(told, change)
+        by_z = columns[:, :count]
+        by_own = np.hstack([columns[:, count:], measured.alike(told, uncertainty.repeat_std)])
+        spread = by_z @ by_z.T + by_own @ by_own.T + np.eye(len(residual))
+        factor = cho_factor(spread, lower=True)
+        if seen is None:
+            whole = np.tril(factor[0])
+            white = solve_triangular(whole, residual, lower=True)
+            points = residual[: len(residual) - len(measured.rows)]
+            rms = measured.noise * float(np.sqrt((points**2).mean())) if len(points) else 0.0
+            known = (number, pose, prior, own.model, held, shapes, measured)
+            seen = Seen(*known, whole, white, rms)
+            if seen.refused:
+                break
+        gain = cho_solve(factor, by_z).T
+        before, z = z, gain @ (residual + by_z @ z)
+        step = np.abs(z - before).max(initial=0.0)
+        if step < (_SMALL if iterations == 1 else _CHANGE):
+            break
+    assert seen is not None
+    seen = replace(seen, iterations=iterations)
+    if seen.refused:
+        return prior, seen
+    left = np.eye(count) - gain @ by_z
+    covariance = uncertainty.root @ ((left + left.T) / 2) @ uncertainty.root.T
+    after = moved(prior, by_p[:, :count] @ z, by_rest[:, :count] @ z)
+    return with_covariance(after, covariance), seen
+
+
+def moved(cable: Any, by_p: FloatArray, by_rest: FloatArray) -> Any:
+    """The cable with other values, within their bounds."""
+    bounds = np.array([q.bounds(estimated=True) for q in cable.model.parameters])
+    p = np.where(by_p == 0, cable.p, np.clip(cable.p + by_p, bounds[:, 0], bounds[:, 1]))
+    return replace(cable, p=p, rest=cable.rest + by_rest)
+
+
+def with_covariance(cable: Any, covariance: FloatArray) -> Any:
+    """The cable with another covariance of its unknowns."""
+    known = cable.metadata
+    uncertainty = replace(known.uncertainty, covariance=covariance)
+    return replace(cable, metadata=replace(known, uncertainty=uncertainty))
+
+
+def with_unknowns(
+    cable: Any, model: CableModel, values: Mapping[str, float], std: Mapping[str, float]
+) -> Any:
+    """The cable with more unknowns, or less known ones.
+
+    Parameters
+    ----------
+    model : CableModel
+        With all effects that have these unknowns.
+    values : mapping
+        Their first values, rest coefficients among them.
+    std : mapping
+        Their standard deviations, in addition to what the cable's covariance has of them.
+    """
+    old = cable.metadata.uncertainty
+    names = (*old.names, *(name for name in std if name not in old.names))
+    grown = len(names) - len(old.names)
+    covariance = np.pad(old.covariance, [(0, grown)] * 2)
+    covariance += np.diag([std.get(name, 0.0) ** 2 for name in names])
+    known = dict(zip(cable.model.names, cable.p, strict=True)) | dict(values)
+    p = np.array([known.get(q.name, q.nominal) for q in model.parameters])
+    rest = cable.rest.copy()
+    for name, value in values.items():
+        if name not in model.names:
+            k = int(name.removeprefix("rest_curvature[").removesuffix("]"))
+            rest += model.rest_basis[:, k] * value
+    bounds = np.array([q.bounds(estimated=True) for q in model.parameters])
+    free = np.array([name in std for name in model.names])
+    p = np.where(free, np.clip(p, bounds[:, 0], bounds[:, 1]), p)
+    uncertainty = replace(old, names=names, covariance=covariance)
+    metadata = replace(cable.metadata, uncertainty=uncertainty)
+    return replace(cable, model=model, p=p, rest=rest, metadata=metadata)
