@@ -189,7 +189,7 @@ def test_an_interrupted_fit_keeps_the_earlier_results(config, tmp_path, capsys, 
     [
         (signal.SIGINT, "read the poses"),
         pytest.param(signal.SIGTERM, "read the poses", marks=pytest.mark.long),
-        (signal.SIGINT, "fit the declared model"),
+        pytest.param(signal.SIGINT, "fit the declared model", marks=pytest.mark.long),
     ],
 )
 def test_a_signal_interrupts_a_running_fit(config, tmp_path, number, begun):

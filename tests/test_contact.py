@@ -293,7 +293,9 @@ def test_the_lower_side_of_a_bar_and_ipopt_with_inequalities():
     ("bar", "ends"),
     [
         ((0.3, -0.3), ((0.0, 0.0), (0.6, 0.05))),
-        ((0.3, -0.05, -0.22), ((0.0, 0.0, 0.0), (0.7, 0.1, 0.0))),
+        pytest.param(
+            (0.3, -0.05, -0.22), ((0.0, 0.0, 0.0), (0.7, 0.1, 0.0)), marks=pytest.mark.long
+        ),
     ],
 )
 def test_a_pose_names_the_side_of_a_bar(bar, ends):

@@ -431,7 +431,8 @@ def test_a_known_cable_has_tolerances_of_its_clips_and_obstacles(
 
     Repeats rest on softer obstacles, which takes 18 % of the slope of this force.
     """
-    known = dlo.known_cable(ROPE, gravity=(0, -9.81), boundary=("pinned", "pinned"))
+    held = {"gravity": (0, -9.81), "boundary": ("pinned", "pinned")}
+    known = dlo.known_cable(ROPE, **held, model={"n": 16})
     shape, end = known.solve((0.6, 0.0), **around), (0.6, 0.0)
     model = shape.cable.model
     for effect in effects:

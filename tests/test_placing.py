@@ -41,6 +41,7 @@ def used(known: EstimatedCable, clips: list[dict], limits: dict, poses=POSES):
         yield from Resolved(shape, KNOWN.coefficients, Limits(**limits)).uses
 
 
+@pytest.mark.long
 def test_the_best_arc_length_at_a_given_place_is_that_of_a_grid():
     known, place = cable(), (0.25, -0.15)
     found = placed(known, 1, POSES, (place, place), LIMITS, "margin")

@@ -142,7 +142,11 @@ def test_derivatives_by_parameters(space):
 
 @pytest.mark.parametrize(
     ("space", "known"),
-    [pytest.param(False, True, marks=pytest.mark.long), (False, False), (True, True)],
+    [
+        pytest.param(False, True, marks=pytest.mark.long),
+        (False, False),
+        pytest.param(True, True, marks=pytest.mark.long),
+    ],
 )
 def test_a_session_whose_free_lengths_differ(space, known):
     """Lines of 0.3 mm noise; lengths between the ends differ by a third from pose to pose.

@@ -163,10 +163,8 @@ def test_a_straight_cable_between_swivels_needs_no_rest_curvature_declared():
     assert high - low < 0.002
 
 
-@pytest.mark.parametrize(
-    "boundary",
-    [pytest.param(("clamped", "swivel"), marks=pytest.mark.long), ("swivel", "swivel")],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("boundary", [("clamped", "swivel"), ("swivel", "swivel")])
 def test_a_session_with_swivels(boundary):
     """Simulated on a fine mesh, 0.3 mm of noise; predictions ignore the declared rolls."""
     model = CableModel(LOOM, n=60, n_rest=4, gravity=DOWN, start=boundary[0], end=boundary[1])

@@ -156,7 +156,9 @@ def test_points_of_a_function_are_those_of_its_shape(in_space):
         )
 
 
-@IN_SPACE
+@pytest.mark.parametrize(
+    "in_space", [False, pytest.param(True, marks=pytest.mark.long)], ids=["plane", "space"]
+)
 def test_derivatives_by_mass_length_and_rest_curvature(in_space):
     """Against known cables of another mass, length and constant rest curvature."""
     known, pose = cable(in_space), pose_to(in_space, [0.3, 0.1, 0.05][: 3 if in_space else 2])

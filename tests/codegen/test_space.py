@@ -101,7 +101,7 @@ def test_shape_force_moment_energy_and_radius_are_those_of_python(element, effec
         assert abs(shape.max_twist) == pytest.approx(np.abs(expected.twist).max(), rel=1e-6)
 
 
-@pytest.mark.parametrize("end", [(0.3, 0.3, 0.0), (0.0, 0.4, 0.0), (0.0, 0.2, -0.4)])
+@pytest.mark.parametrize("end", [(0.0, 0.4, 0.0), (0.0, 0.2, -0.4)])
 def test_a_straight_cable_between_ball_joints_may_lie_in_any_direction(end):
     """It turns about itself freely: what holds that turn acts about its own axis, not about x."""
     data = {"length": 0.6, "mass": 0.03, "diameter": 0.004, "bending_stiffness": 0.015}
@@ -450,7 +450,7 @@ def test_clang_compiles_without_a_warning(tmp_path, ends, element):
     assert "bend radius" in build_and_run(tmp_path, "clang", "harness_solver.c")
 
 
-@pytest.mark.parametrize("end", ["clamped", "free"])
+@pytest.mark.parametrize("end", ["clamped", pytest.param("free", marks=pytest.mark.long)])
 def test_sanitizers_and_threads_with_a_workspace_each_are_silent(tmp_path, end):
     """scripts/benchmark.py --only memory runs more, under valgrind, too."""
     generate(*problem("arc", 6, end=end)).write(tmp_path)

@@ -37,6 +37,7 @@ def test_clean_session_stiffness_and_prediction(report, truth):
     assert batch["rmse_held_out"] < 0.2 * stage(found, "algorithm1")["rmse_held_out"]
 
 
+@pytest.mark.long
 def test_a_stiffness_that_gravity_cannot_show_is_called_so(report):
     """77 N m^2 moves the cable by hundredths of a millimetre, at 0.3 mm of noise."""
     batch = stage(report("weightless_fit"), "batch")
@@ -47,7 +48,9 @@ def test_a_stiffness_that_gravity_cannot_show_is_called_so(report):
 @pytest.mark.parametrize(
     ("session", "name", "parameter", "true"),
     [
-        ("overhang", "bending_softening", "curvature_scale", 6.0),
+        pytest.param(
+            "overhang", "bending_softening", "curvature_scale", 6.0, marks=pytest.mark.long
+        ),
         pytest.param("connector", "lumped_mass", "mass", 0.07, marks=pytest.mark.long),
         pytest.param("connector", "lumped_mass", "position", 0.52, marks=pytest.mark.long),
     ],

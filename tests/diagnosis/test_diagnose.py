@@ -95,7 +95,10 @@ def test_without_the_cause_nothing_false_is_claimed(fit):
     [
         # A weight, and a pin that grips: a force along gravity, or beside the pin, fits as well.
         ("thin", {"fx": 0.0, "fy": -0.2, "position": 0.6}, "lumped_mass"),
-        ("clamped", {"fx": 0.78, "fy": -2.19, "position": 0.047}, "start_spring"),
+        pytest.param(
+            *("clamped", {"fx": 0.78, "fy": -2.19, "position": 0.047}, "start_spring"),
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_force_may_stand_for_what_was_not_tried(name, effect, untried):

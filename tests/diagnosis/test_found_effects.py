@@ -94,6 +94,7 @@ def test_a_tether_is_found_and_is_no_point_force():
         assert abs(found.fit.value(key) - true) < 3 * found.fit.std(key)
 
 
+@pytest.mark.long
 def test_wrong_causes_beside_an_unexplained_residual_are_withdrawn(monkeypatch):
     """A force and a stiff section stand for a tether in part; nothing predicts from them."""
     monkeypatch.setattr(module, "estimate_unknown_force", lambda *_: None)  # seconds, not needed

@@ -48,7 +48,9 @@ def found(coefficient: float):
 
 # Of 0.0065 per m^2 the fit finds 2.8 standard deviations: one in 200 as a single test, but one in
 # 15 as the best of 14.
-@pytest.mark.parametrize(("coefficient", "kept"), [(0.0065, False), (0.02, True)])
+@pytest.mark.parametrize(
+    ("coefficient", "kept"), [pytest.param(0.0065, False, marks=pytest.mark.long), (0.02, True)]
+)
 def test_an_effect_stays_only_while_it_is_significant_among_all_candidates(coefficient, kept):
     fit, added = found(coefficient)
     trials = Trials(fit, CENTER, (), SIGNIFICANCE, InProcess())
@@ -84,7 +86,9 @@ def test_an_effect_of_fewer_parameters_takes_the_place_of_one_that_is_not_signif
     assert [effect.name for effect in found.model.effects] == left
 
 
-@pytest.mark.parametrize(("longer", "kept"), [(0.0, False), (0.02, True)])
+@pytest.mark.parametrize(
+    ("longer", "kept"), [pytest.param(0.0, False, marks=pytest.mark.long), (0.02, True)]
+)
 def test_a_nuisance_is_held_within_its_tolerance_again_where_it_is_needless(longer, kept):
     held = nuisances(PLAIN, Tolerances())
     listed = candidates(held, setup_of(held))

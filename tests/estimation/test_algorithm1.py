@@ -215,6 +215,7 @@ def test_stiff_session_predicts_better_than_its_prior():
     assert rmse(result, held) < 0.9 * rmse(prior, held)
 
 
+@pytest.mark.long
 def test_rest_angles_of_a_stiff_cable_near_its_rest_shape():
     """Where the ends barely load a stiff cable, the mean bend is the rest bend.
 

@@ -295,6 +295,7 @@ def searched(seed, index, count, random="", among=()):
     return found, Search(Trials(fit, None, exclude, SIGNIFICANCE, InProcess()), 4, lambda *_: None)
 
 
+@pytest.mark.long
 def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
     """22 moments tell their variance as well as that: F of 18 degrees of freedom, no chi-square."""
     among = ("stiffness_gradient", "gravity_tilt", "lumped_mass")
@@ -307,6 +308,7 @@ def test_scatter_known_from_few_poses_does_not_pass_for_an_effect():
     assert found.or_better(without, EVIDENCE_APART) is found
 
 
+@pytest.mark.long
 def test_a_drift_that_a_scatter_explains_as_well_is_found_without_it():
     """Beside its scatter a drift gained nothing; alone it is e^28 likelier than that scatter."""
     truth, search = searched(2061, 25, 2, among=("rest_curvature_drift",))
@@ -331,6 +333,7 @@ def test_two_effects_that_together_look_like_random_lengths_are_found():
     assert not found.fit.scatters
 
 
+@pytest.mark.long
 def test_the_first_effect_is_judged_again_beside_the_second():
     """A tilt and a drift: alone, a force explained most; beside the drift the tilt is likelier."""
     among = ("rest_curvature_drift", "point_force", "gravity_tilt")

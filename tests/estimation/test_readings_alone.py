@@ -152,6 +152,7 @@ def test_readings_choose_the_equilibrium_of_a_curved_cable():
     assert result.stages[-1].readings_fit.force == pytest.approx(FORCE_STD, rel=0.5)
 
 
+@pytest.mark.long
 def test_a_pose_in_a_higher_equilibrium_is_compared_there():
     """Of two poses whose readings are those of the higher of two equilibria."""
     result = session(2, guess=10.0, held_out=0, higher=2).fit(diagnosis=False)

@@ -21,10 +21,11 @@ def pool():
         yield executor
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "tried", "verdict"),
     [
-        pytest.param("thin", "gravity_tilt", "unexplained", marks=pytest.mark.long),
+        ("thin", "gravity_tilt", "unexplained"),
         ("softening", "bending_softening", "effect_found"),
     ],
 )
