@@ -140,3 +140,12 @@ def test_the_cable_rests_on_the_table_but_not_on_the_hot_plate():
     found = script.moved(script.cable(), np.linspace(-0.3, 0.3, 5))
     assert all(shape.obstacle_forces[0, 2] < 0.0 for shape, _, _ in found)
     assert [allowed for _, _, allowed in found] == [True] * 4 + [False]
+
+
+@pytest.mark.long
+def test_a_connector_that_falls_off_is_missed(tmp_path):
+    cable = example("pick_and_place").main(tmp_path / "picture.png", count=18, lost=9)
+    mass = cable.params["lumped_mass.mass"]
+    assert mass.value < 0.004
+    assert mass.value < 3 * mass.std
+    assert (tmp_path / "picture.png").stat().st_size > 10_000

@@ -306,11 +306,6 @@ class Jumps:
             new["taken"] += gain @ g
         self._sums = new
 
-    @property
-    def tests(self) -> int:
-        """Number of suspects times places in time."""
-        return len(self.since) * len(self.probe.suspects)
-
     def found(self) -> list[Jump]:
         """Each suspect at the pose that explains the most, best first."""
         if not self.since:

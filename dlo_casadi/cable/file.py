@@ -269,9 +269,20 @@ def load(path: str | Path) -> FittedCable:
         raise ConfigError(f"{_DAMAGED}: {error.message}{_REMEDY}", source) from None
     if problems := [*_unlike(file, model)]:
         raise document.error(problems, _DAMAGED, _REMEDY)
+    return _cable(model, file, data, source)
+
+
+def cable_of(document: dict[str, Any]) -> FittedCable:
+    """The cable of the plain data of a parameters.yaml that a cable has written."""
+    file = ParametersFile(**document)
+    return _cable(_model(file), file, document, None)
+
+
+def _cable(
+    model: CableModel, file: ParametersFile, data: dict[str, Any], source: Path | None
+) -> FittedCable:
     p = np.array([file.parameters[name].value for name in model.names])
-    metadata = metadata_of(data, source, file)
-    return FittedCable(model, p, _rest(file, model), metadata)
+    return FittedCable(model, p, _rest(file, model), metadata_of(data, source, file))
 
 
 def _results_near(path: Path) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from dlo_casadi.cable.saved import cable_document, parameters_hash
 from dlo_casadi.cable.seen import Noise, Seen, Shaper, learned, with_covariance
 from dlo_casadi.config import Pose
 from dlo_casadi.errors import DloError
+from dlo_casadi.io.files import finite
 
 # So many poses in a row that are refused are a change.
 IN_A_ROW = 3
@@ -35,6 +36,10 @@ _AFTER = 2.0
 # Poses that are kept: a change is seen within them. Poses between two looks at what changed; a pose
 # less likely than this is looked at once.
 WINDOW, LOOK, _ODD = 30, 5, 0.01
+
+
+# What the tests carry on from pose to pose.
+_TESTS = ("_suspicion", "_since", "_refused")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,8 @@ class Tracker:
 
     def __post_init__(self) -> None:
         self._shaper = Shaper(self.compiled)
+        # The poses on which the tests look back, each with what was known before it.
+        self._kept: deque[tuple[dict[str, Any], Pose]] = deque()
         self._begin()
 
     def _begin(self) -> None:
@@ -137,12 +144,23 @@ class Tracker:
         """
         if not isinstance(pose, Pose):
             raise DloError(f"update: a Pose belongs here, found {pose!r}\n  Try: dlo.Pose(...)")
+        self._kept.append((self._now(), pose))
+        try:
+            return self._updated(pose)
+        except BaseException:
+            self._kept.pop()
+            raise
+
+    def _updated(self, pose: Pose) -> Update:
         prior = self._faded(self._cable)
         after, seen = learned(prior, pose, self.noise, self.count + 1, self._shaper)
         self.count, self._cable = self.count + 1, after
+        change = None if seen is None else self._judged(seen)
+        most = WINDOW + (0 if self._inquiry is None else JUDGED[-1])
+        while len(self._kept) > most:
+            self._kept.popleft()
         if seen is None:
             return Update(self.count, np.zeros(0), 0.0, 1.0, False, None, 0)
-        change = self._judged(seen)
         return Update(
             *(seen.number, seen.innovation, seen.rms, seen.probability, seen.refused, change),
             seen.iterations,
@@ -156,12 +174,44 @@ class Tracker:
         walked = np.array([self.drift.get(name, 0.0) for name in known.names])
         return with_covariance(cable, known.covariance / self.forget + np.diag(walked**2))
 
+    # ---- kept and resumed ------------------------------------------------------------------------
+
+    def _now(self) -> dict[str, Any]:
+        """What a pose changes."""
+        names = ("_cable", "count", "change", "_suspicion", "_since", "_refused")
+        return {name: getattr(self, name) for name in names}
+
+    def state(self) -> dict[str, Any]:
+        """Plain data from which `resume` goes on: the last poses, and the cable before them."""
+        first = self._kept[0][0] if self._kept else self._now()
+        change = first["change"]
+        return finite(
+            {
+                "parameters": _documented(first["_cable"]).metadata.document,
+                "tests": {name: first[name] for name in ("count", *_TESTS)},
+                "change": None if change is None else asdict(change),
+                "poses": [_plain(pose) for _, pose in self._kept],
+            }
+        )
+
+    def resume(self, state: Mapping[str, Any], cable: Any) -> None:
+        """Go on from a `state` of such a tracker; `cable`: that of its parameters."""
+        self._cable, self.count = cable, state["tests"]["count"]
+        self.change = None if state["change"] is None else Change(**state["change"])
+        self._kept.clear()
+        self._begin()
+        for name in _TESTS:
+            setattr(self, name, state["tests"][name])
+        for pose in state["poses"]:
+            self.update(Pose(**pose))
+
     # ---- is it still the same cable? -------------------------------------------------------------
 
     def _judged(self, seen: Seen) -> Change | None:
         """A change that this pose told of."""
-        if self._window and self._window[-1].model != seen.model:
-            self._begin()  # other clips: earlier poses say nothing of these
+        if self._window and self._window[-1].model.clips != seen.model.clips:
+            self._begin()  # earlier poses say nothing of other clips
+            self._kept = deque([self._kept[-1]])
         self._refused = self._refused + 1 if seen.refused else 0
         self._window.append(seen)
         if self._inquiry is not None and self._refused < IN_A_ROW:
@@ -178,7 +228,7 @@ class Tracker:
         if self._refused:
             return None  # one pose that was seen wrong is no change
         since = self._varied(seen)
-        if since is None and (seen.probability < _ODD or len(self._unseen) >= LOOK):
+        if since is None and (seen.probability < _ODD or seen.number % LOOK == 0):
             since = self._looked()
         return since
 
@@ -201,7 +251,8 @@ class Tracker:
             jumps.add(one, columns)
         self._unseen = []
         first = min(jumps.found(), key=lambda jump: jump.log_p)
-        rare = first.log_p + np.log(2 * BETWEEN_ALARMS * jumps.tests) < 0
+        tests = WINDOW * len(jumps.probe.suspects)
+        rare = first.log_p + np.log(2 * BETWEEN_ALARMS * tests) < 0
         return first.since if rare else None
 
     def _opened(self, since: int) -> Change:
@@ -230,7 +281,9 @@ class Tracker:
         change, self._cable = inquiry.verdict(final=final)
         self.change = change
         self._begin()
-        if not change.decided:
+        if change.decided:
+            self._kept.clear()
+        else:
             self._inquiry = inquiry
         return change
 
@@ -301,6 +354,11 @@ def _checked(name: str, value: object, meant: str) -> None:
     """Raise a DloError if a value is no positive number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
         raise DloError(f"{name}: {meant} belongs here, found {value!r}")
+
+
+def _plain(pose: Pose) -> dict[str, Any]:
+    """Arguments of a pose."""
+    return {key: x for key, x in asdict(pose).items() if x not in (None, (), "")}
 
 
 def _documented(cable: Any) -> Any:

@@ -30,6 +30,7 @@ COMMANDS = {
     "predict": ("fitted", "predict the shape of a fitted cable from where its ends are held"),
     "limits": ("fitted", "check whether a fitted cable keeps its limits in a list of poses"),
     "shape-table": ("fitted", "predict the shapes of a fitted cable in very many poses"),
+    "watch": ("watching", "track a fitted cable through poses that arrive"),
     "modes": ("moving", "frequencies and damping of small motions of a fitted cable"),
     "simulate": ("moving", "simulate a fitted cable under moving fixtures"),
     "move": ("moving", "plan a motion after which a fitted cable is at rest"),

@@ -105,6 +105,15 @@ def read_table(path: str | Path, columns: Columns, belongs: str) -> Table:
         raise MeasurementError(str(error), pose=source.name) from None
 
 
+def table_of_lines(lines: Sequence[tuple[int, str]], columns: Columns, belongs: str) -> Table:
+    """As `read_table`, of numbered lines of a file, the first of which names the columns.
+
+    Raises ValueError if they are no such table.
+    """
+    filled = [(k, line) for k, line in lines if line.strip()]
+    return _table(filled, any('"' in line for _, line in filled), columns, belongs, ())
+
+
 def read_text(path: Path) -> tuple[str, tuple[str, ...]]:
     """Text of a file, and a remark if its encoding had to be assumed.
 

@@ -13,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
+from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.report import findings, tables, words
@@ -77,6 +78,40 @@ def hints(messages: Sequence[str]) -> list[str]:
     """The advice in messages (their "Try: ..."), without duplicates."""
     found = [hint for text in messages for hint in re.findall(r"Try: (.+)", text)]
     return list(dict.fromkeys(hint[:1].upper() + hint[1:] for hint in found))
+
+
+# ---- of a cable that is watched ----------------------------------------------------------------
+
+# Poses in the table of the page.
+_LISTED = 20
+
+
+def watched_page(
+    cable: FittedCable, source: Path, total: int, rows: Sequence[tuple[str, float, bool, str]]
+) -> str:
+    """The text of watch.html, which a browser loads again every two seconds.
+
+    `rows`: of the last poses the name, the distance [m] from the prediction, whether it was
+    refused, and what it told.
+    """
+    highest = max((rms for _, rms, *_ in rows), default=0.0)
+    changed = [said for *_, said in rows if "changed since" in said]
+    return _filled(
+        "watch.html",
+        {
+            "generator": Markup(GENERATOR),
+            "style": Markup(_text("page.css")),
+            "cable": cable.name,
+            "state": "it has changed" if changed else "as it was fitted",
+            "change": changed[-1] if changed else "",
+            "source": source.name,
+            "total": total,
+            "parameters": [(k, str(x)) for k, x in cable.params.items() if not x.fixed],
+            "bars": [(rms / (highest or 1.0), refused) for _, rms, refused, _ in rows],
+            "highest": highest,
+            "lines": [(name, said) for name, *_, said in rows][: -_LISTED - 1 : -1],
+        },
+    )
 
 
 # ---- of both -----------------------------------------------------------------------------------
