@@ -104,7 +104,7 @@ def given_motion(
     times = times_of(t)
     pose, path = fixture_path(cable, times, {**held, **given})
     count = int(np.ceil((times[-1] - times[0]) / step - 1e-9))
-    rows = np.array([path.declared(times[0] + k * step)[0] for k in range(count + 1)])
+    rows = path.declared(times[0] + step * np.arange(count + 1))[0]
     first = {
         key: x[0] if np.ndim(x) > np.ndim(getattr(pose, key)) else x for key, x in given.items()
     }

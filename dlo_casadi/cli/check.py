@@ -12,8 +12,10 @@ from dlo_casadi.config import Config
 from dlo_casadi.errors import DloError, MeasurementError
 from dlo_casadi.io.files import make_folder, write_file
 from dlo_casadi.report.documents import check_dict
+from dlo_casadi.report.motions import motion_check_table
 from dlo_casadi.report.terminal import check_table
 from dlo_casadi.session import measure
+from dlo_casadi.session.checked_motions import check_motions
 from dlo_casadi.session.plausibility import find_suspicions
 from dlo_casadi.vision import encoded
 
@@ -31,7 +33,8 @@ from dlo_casadi.vision import encoded
 )
 def check(chosen: argparse.Namespace) -> int:
     """Check a configuration and its photographs or centre-lines in seconds, without fitting:
-    what the camera finds in each pose, and whether units, axes, ends and files agree.
+    what the camera finds in each pose, and whether units, axes, ends and files agree; of motions,
+    whether they are quick and long enough, and whether clocks agree.
 
     dlo check configs/cable.yaml
     dlo check rope.yaml --show look/                 pictures of each step of the camera
@@ -41,11 +44,15 @@ def check(chosen: argparse.Namespace) -> int:
         config, inputs = measure.read_session(chosen.config, watch.step)
         pictures = [] if chosen.show is None else _show(config, chosen.show, watch)
         watch.step("compare with what is declared", 0, 1)
-        result = check_dict(config, inputs, find_suspicions(config, inputs))
+        motions = check_motions(config)
+        result = check_dict(config, inputs, find_suspicions(config, inputs), motions)
         watch.step("compare with what is declared", 1, 1)
     page, errors = Page(chosen), Console(stderr=True, highlight=False, quiet=chosen.json)
     page.data({**result, "pictures": [str(path) for path in pictures]})
-    page.print(check_table(config, result["poses"]))
+    if inputs:
+        page.print(check_table(config, result["poses"]))
+    if motions:
+        page.print(motion_check_table(motions))
     for row in result["poses"]:
         for advice in row["advice"]:
             page.say(f"{row['name']}: {advice}")

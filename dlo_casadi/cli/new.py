@@ -23,6 +23,14 @@ from dlo_casadi.rod.supports import CLIPS
         option("--photographs", type=Path, metavar="DIR", help="folder of photographs"),
         option("--centerlines", type=Path, metavar="DIR", help="folder of CSV files"),
     ),
+    option(
+        "--motion",
+        nargs="+",
+        type=Path,
+        default=(),
+        metavar="FILE",
+        help="recordings of the moving cable: CSV of markers or lines, or videos",
+    ),
     option("--space", action="store_true", help="a cable that leaves the plane, held by grippers"),
     option(
         "--clips",
@@ -42,6 +50,7 @@ def new(chosen: argparse.Namespace) -> None:
     dlo new rope.yaml --centerlines measured/
     dlo new loom.yaml --space --centerlines markers/
     dlo new loom.yaml --space --clips pinned eyelet
+    dlo new rope.yaml --photographs photographs/ --motion swing.mp4
     """
     target: Path = chosen.file
     if target.suffix not in (".yaml", ".yml"):
@@ -57,7 +66,10 @@ def new(chosen: argparse.Namespace) -> None:
     elif chosen.centerlines is not None:
         files = _listed(chosen.centerlines, (".csv",), "CSV file", target.parent)
     kind: Kind = "images" if chosen.centerlines is None else "centerlines"
-    text = template(target.stem, files, kind, chosen.space, clips=chosen.clips)
+    motions = [Path(os.path.relpath(x, target.parent)).as_posix() for x in chosen.motion]
+    if missing := [str(x) for x in chosen.motion if not x.is_file()]:
+        raise DloError(f"--motion: {missing[0]} is no file")
+    text = template(target.stem, files, kind, chosen.space, clips=chosen.clips, motions=motions)
     schema = target.with_name("schema.json")
     written = [target]
     if os.path.lexists(target):
@@ -67,8 +79,10 @@ def new(chosen: argparse.Namespace) -> None:
         written.append(schema)
     write_file(target, text)
     page = Page(chosen)
-    page.data({"files": [str(path) for path in written], "poses": len(files)})
+    told = {"motions": len(motions)} if motions else {}
+    page.data({"files": [str(path) for path in written], "poses": len(files)} | told)
     poses = counted(len(files), "pose") if files else "a pose to copy"
+    poses += f", {counted(len(motions), 'motion')}" if motions else ""
     page.say(f"{target}: {poses}, {to_fill_in(text)}\nthen: dlo check {target}")
 
 

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.codegen.cases import Obstacles
 from dlo_casadi.codegen.compiler import compile_library
 from dlo_casadi.codegen.generate import Solver
 from dlo_casadi.codegen.moving import MovingCase, alone
 from dlo_casadi.codegen.stepper import CompiledStepper
+from dlo_casadi.effects import IN_MOTION, Setup
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.motion.sensitivities import Columns, Numbers, Steps
@@ -35,8 +36,9 @@ _FLAGS = ("-O1",)
 class CompiledSteps:
     """What `Steps` does, by compiled C; `records` has the layouts of its structures."""
 
-    def __init__(self, cable: MovingCable, library: ctypes.CDLL) -> None:
-        self.records = CompiledStepper(cable, library)
+    def __init__(self, cable: MovingCable, library: ctypes.CDLL, known: IntArray) -> None:
+        """`cable`: widened, see `widened`; `known`: where its model's parameters stand."""
+        self.records, self._known = CompiledStepper(cable, library), known
         self._table = np.array(MovingCase(cable.model, cable.p, cable.rest, inline=False).table)
         # The last derivatives and changes, and what they are in C.
         self._slopes: tuple[Columns | None, NDArray[Any]] = (None, np.zeros(0))
@@ -65,7 +67,7 @@ class CompiledSteps:
         c = self.records
         slopes = self._slopes[1] if self._slopes[0] is columns else _slopes_of(c, columns)
         if self._numbers[0] is not numbers:
-            self._numbers = (numbers, _given(c, numbers), _of_model(numbers))
+            self._numbers = (numbers, _given(c, numbers), self._of_model(numbers))
         _, given, of_model = self._numbers
         out = np.zeros(len(slopes), c.slope)
         states = (c.numbers_of(fixtures), c.recorded(before), c.recorded(after, dt))
@@ -76,6 +78,13 @@ class CompiledSteps:
         found = _columns(out)
         self._slopes = (found, out)
         return found
+
+    def _of_model(self, numbers: Numbers) -> FloatArray:
+        """Changes (q, ...) of parameters, then of the rest strains of each segment."""
+        count = numbers.p.shape[1]
+        p = np.zeros((count, len(self.records.cable.p)))
+        p[:, self._known] = numbers.p.T
+        return np.hstack([p, np.moveaxis(numbers.rest, -1, 0).reshape(count, -1)])
 
 
 def _slopes_of(c: CompiledStepper, columns: Columns) -> NDArray[Any]:
@@ -109,12 +118,6 @@ def _given(c: CompiledStepper, numbers: Numbers) -> NDArray[Any]:
     return given
 
 
-def _of_model(numbers: Numbers) -> FloatArray:
-    """Changes (q, ...) of parameters, then of the rest strains of each segment."""
-    rest = np.moveaxis(numbers.rest, -1, 0).reshape(numbers.p.shape[1], -1)
-    return np.ascontiguousarray(np.hstack([numbers.p.T, rest]))
-
-
 def _columns(out: NDArray[Any]) -> Columns:
     def last(*names: str) -> FloatArray:
         return np.moveaxis(np.concatenate([out[name] for name in names], axis=-1), 0, -1)
@@ -146,6 +149,7 @@ def compiled_steps(cable: MovingCable, flags: tuple[str, ...] = _FLAGS) -> Compi
     DloError
         If there is no C compiler.
     """
+    cable, known = widened(cable)
     model = replace(cable.model, n_rest=0, priors={})
     key = (model, cable.springs_on.tobytes(), flags)
     if key not in _libraries:
@@ -155,7 +159,30 @@ def compiled_steps(cable: MovingCable, flags: tuple[str, ...] = _FLAGS) -> Compi
     library = _libraries[key]
     if isinstance(library, DloError):
         raise library
-    return CompiledSteps(cable, library)
+    return CompiledSteps(cable, library, known)
+
+
+def widened(cable: MovingCable) -> tuple[MovingCable, IntArray]:
+    """The cable with all effects of motion, and where its parameters stand among those.
+
+    Effects that it has not vanish, and all stand in one order: a search that adds one after the
+    other compiles one library.
+    """
+    model = cable.model
+    setup = Setup(model.cable, model.start, model.end, model.gravity, moves=True)
+    own = {effect.name: effect for effect in model.effects if effect.name in IN_MOTION}
+    others = tuple(effect for effect in model.effects if effect.name not in IN_MOTION)
+    moving = tuple(
+        own.get(name) or kind.made_for(setup)
+        for name, kind in IN_MOTION.items()
+        if name in own or kind.applies(setup)
+    )
+    wide = replace(model, effects=(*others, *moving))
+    values = dict(zip(wide.names, wide.nominal, strict=True))
+    values |= dict(zip(model.names, cable.p, strict=True))
+    p = np.array([values[name] for name in wide.names])
+    known = np.array([wide.names.index(name) for name in model.names])
+    return MovingCable(wide, p, cable.rest, cable.still), known
 
 
 # By model without what makes no difference, and by the segments that springs are on.

@@ -109,13 +109,14 @@ def checked_config(source: Source) -> Config:
     left = tuple(pose for pose in poses if pose.name not in reasons)
     n_fit = sum(pose.role == "fit" for pose in left)
     weightless = [*_weightless(config.changed(experiment={"poses": left}))]
-    if n_fit == 0 or weightless:
+    without = not poses and len(config.experiment.motions) > 0
+    if (n_fit == 0 and not without) or weightless:
         lost = [
             ConfigProblem(("experiment", "poses", i), f"{_called(i, pose)}: {reasons[pose.name]}")
             for i, pose in enumerate(poses)
             if pose.role == "fit" and pose.name in reasons
         ]
-        if n_fit == 0:
+        if n_fit == 0 and not without:
             raise source.error(lost, "no pose to fit is left")
         raise source.error([*lost, *weightless])
     warnings = [*oddities(config)]
@@ -250,7 +251,8 @@ def _contradictions(experiment: Experiment, length: float) -> Iterator[ConfigPro
             yield ConfigProblem((*at, key) if key else at, f"{_called(i, pose)}: {message}")
         for message, k in clip_problems(pose.clips, length, len(experiment.gravity)):
             yield ConfigProblem((*at, "clips", k), f"{_called(i, pose)}: {message}")
-    if not any(pose.role == "fit" for pose in poses):
+    without = not poses and experiment.motions
+    if not without and not any(pose.role == "fit" for pose in poses):
         text = "no pose has role: fit, there is nothing to fit to"
         yield ConfigProblem(("experiment", "poses"), text)
 

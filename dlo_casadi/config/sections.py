@@ -262,9 +262,17 @@ class Experiment(ConfigSection):
     obstacles: tuple[Obstacle, ...] = ()
     """What the cable may touch, in all poses."""
     poses: tuple[Pose, ...]
-    """The poses, in the order in which they were taken."""
+    """The poses, in the order in which they were taken; they may be left out if there are motions
+    that begin or end at rest."""
     motions: tuple[Motion, ...] = ()
     """Recordings of the moving cable."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_poses(cls, given: Any) -> Any:
+        if isinstance(given, Mapping) and given.get("motions") and given.get("poses") is None:
+            return {**given, "poses": ()}
+        return given
 
     @field_validator("motions")
     @classmethod

@@ -14,10 +14,12 @@ from dlo_casadi.estimation.recording import MODES, Recording, Seen, rest_state
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.tolerances import Tolerances
 from dlo_casadi.motion.beginning import Basis, near_shape
 from dlo_casadi.motion.state import State
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.runtime.work import spend
+from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 
 # Elements of the mesh in motion: with 12, the third frequency of a cantilever is 1e-4 off.
@@ -28,6 +30,8 @@ LONGEST_STEP, IN_A_PERIOD = 1e-2, 100
 FIRST_STRETCHES = (0.0, 0.15)
 # Share of the objective that a step must gain for another one.
 _NEARLY = 2e-2
+# Share of the slowest frequency of a cable below which nothing holds a mode.
+_FREE = 0.05
 # Steps of the search for a first state, and trials of a damped step.
 _STEPS, _TRIALS = 12, 8
 
@@ -62,7 +66,8 @@ def begin(recording: Recording, fit: Fit, unknowns: Unknowns, std: float) -> Fit
     basis = Basis.of(cable, rest, fixtures, MODES)
     period = 2 * np.pi / float(basis.frequencies[0])
     dt = min(LONGEST_STEP, period / IN_A_PERIOD)
-    recording, ends = replace(recording, dt=dt, period=period), [*FIRST_STRETCHES[1:]]
+    recording = replace(recording, dt=dt, period=period, rest=rest)
+    ends = [*FIRST_STRETCHES[1:]]
     if not measured.at_rest:
         recording, ends = replace(recording, basis=basis), [*FIRST_STRETCHES]
         stds = recording.own_std(model)
@@ -76,6 +81,21 @@ def begin(recording: Recording, fit: Fit, unknowns: Unknowns, std: float) -> Fit
         own, near = found.own, found.seen.first
     assert found is not None
     return found
+
+
+def frequencies_at_first(model: CableModel, measured: MeasuredMotion, count: int) -> FloatArray:
+    """Lowest frequencies [Hz] of a model at rest between the first fixtures of a recording.
+
+    Modes that nothing holds, such as a roll about ball joints, are left out. Raises EstimationError
+    if there is no rest.
+    """
+    model = model.with_mesh(MESH)
+    cable = MovingCable(model, model.nominal, np.zeros(model.chain.n_rests))
+    recording = Recording(measured, Tolerances(), LONGEST_STEP)
+    fixtures = recording.fixtures(cable, 0.0, np.zeros(len(recording.own_std(model))))
+    rest = rest_state(cable, fixtures, None)
+    found = Basis.of(cable, rest, fixtures, count + 1).frequencies
+    return np.asarray(found[found > _FREE * cable.slowest][:count] / (2 * np.pi))
 
 
 def _frames(recording: Recording, fit: Fit, unknowns: Unknowns) -> FloatArray:

@@ -13,10 +13,10 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.codegen.fit_steps import CompiledSteps, fastest_steps
 from dlo_casadi.effects import SectionLaw
-from dlo_casadi.effects.clock_delay import CLOCK_DELAY
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.errors import EquilibriumError, EstimationError
+from dlo_casadi.estimation.moving_fixtures import GivenNumbers, HeldFixtures
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
@@ -24,7 +24,7 @@ from dlo_casadi.motion import sensitivities
 from dlo_casadi.motion.beginning import Basis, begun, columns_of
 from dlo_casadi.motion.handles import between
 from dlo_casadi.motion.path import FixturePath
-from dlo_casadi.motion.sensitivities import Columns, Numbers, Steps, Tangent
+from dlo_casadi.motion.sensitivities import Columns, Steps, Tangent
 from dlo_casadi.motion.state import Fixtures, State
 from dlo_casadi.motion.steps import Moving, begun_by, first_step
 from dlo_casadi.motion.system import MovingCable
@@ -78,6 +78,8 @@ class Recording:
         Only points up to this time are compared.
     period : float [s]
         Of the first mode.
+    rest : State, optional
+        The cable hanging still between the first fixtures, near which it is sought.
     """
 
     measured: MeasuredMotion
@@ -86,6 +88,7 @@ class Recording:
     basis: Basis | None = None
     until: float = np.inf
     period: float = 1.0
+    rest: State | None = None
 
     @cached_property
     def path(self) -> FixturePath:
@@ -142,7 +145,7 @@ class Recording:
 
     def fixtures(self, cable: MovingCable, t: float, own: FloatArray) -> Fixtures:
         """The fixtures at a time of the points' clock, with their deviations."""
-        return _Held(self, cable, own).at(t)
+        return HeldFixtures(self.path, self.ways(cable.model), cable, own).at(t)
 
     # ---- evaluation ----------------------------------------------------------------------------
 
@@ -166,12 +169,24 @@ class Recording:
         """
         model, p, rest = unknowns.model, unknowns.p(theta), unknowns.rest(theta)
         cable = MovingCable(model, p, rest)
-        if _depends_on_rest(model):
-            at_rest = rest_state(cable, self.fixtures(cable, 0.0, own), None)
-            cable = cable.about(at_rest.x)
-        numbers = _Numbers(self, cable, unknowns, theta) if derivatives else None
-        first = self._first(cable, own, near)
-        held, steps = _Held(self, cable, own), fastest_steps(cable)
+        rest_near = near if self.basis is None else self.rest
+        if self.basis is None or _depends_on_rest(model):
+            fixtures = self.fixtures(cable, 0.0, own)
+            at_rest = rest_state(cable, fixtures, rest_near)
+            cable = cable.about(at_rest.x) if _depends_on_rest(model) else cable
+        numbers = (
+            GivenNumbers(self.path, self.ways(model), cable, unknowns, theta)
+            if derivatives
+            else None
+        )
+        if self.basis is None:
+            first = cable.with_places(at_rest, fixtures)
+        else:
+            first = self._first(cable, own, near)
+        held, steps = (
+            HeldFixtures(self.path, self.ways(cable.model), cable, own),
+            fastest_steps(cable),
+        )
         seen, by = self._seen(self._states(steps, held, first, numbers), held, numbers)
         # The error of a step falls with the square of its length: extrapolated to zero.
         finer = replace(self, dt=self.dt / 2)
@@ -187,15 +202,18 @@ class Recording:
 
     def _first(self, cable: MovingCable, own: FloatArray, near: State | None) -> State:
         fixtures = self.fixtures(cable, 0.0, own)
-        if self.basis is None:
-            return rest_state(cable, fixtures, near)
         if near is None:
-            near = rest_state(cable, fixtures, None)
+            near = rest_state(cable, fixtures, self.rest)
+        assert self.basis is not None
         count = self.basis.forces.shape[1]
         return begun(cable, near, fixtures, self.basis, own[-2 * count :])
 
     def _states(
-        self, steps: Steps | CompiledSteps, held: _Held, first: State, numbers: _Numbers | None
+        self,
+        steps: Steps | CompiledSteps,
+        held: HeldFixtures,
+        first: State,
+        numbers: GivenNumbers | None,
     ) -> Iterator[tuple[State, Columns | None]]:
         """The state at each time, and its derivatives."""
         times = self.times
@@ -204,18 +222,19 @@ class Recording:
         if len(times) == 1:
             return
         dt = min(self.dt, float(times[1] - times[0]))
+        within = [_within(begin, end, self.dt) for begin, end in pairwise(times)]
+        held.prepare(np.concatenate([[dt], *(at for at, _ in within)]), numbers)
         now, columns = self._started(held, first, columns, dt, numbers)
         before = dt
-        for begin, end in pairwise(times):
-            count = int(np.ceil((end - begin) / self.dt - 1e-9))
-            dt = (end - begin) / count
-            for k in range(count):
+        for ends, dt in within:
+            for at in ends:
                 now, columns = _for_step(now, columns, dt / before)
-                at = begin + (k + 1) * dt
                 now, columns, before = self._stepped(steps, held, now, columns, at, dt, numbers)
             yield now.state, columns
 
-    def _first_columns(self, held: _Held, first: State, numbers: _Numbers | None) -> Columns | None:
+    def _first_columns(
+        self, held: HeldFixtures, first: State, numbers: GivenNumbers | None
+    ) -> Columns | None:
         """Derivatives of the first state."""
         if numbers is None:
             return None
@@ -226,11 +245,11 @@ class Recording:
 
     def _started(
         self,
-        held: _Held,
+        held: HeldFixtures,
         first: State,
         columns: Columns | None,
         dt: float,
-        numbers: _Numbers | None,
+        numbers: GivenNumbers | None,
     ) -> tuple[Moving, Columns | None]:
         cable, fixtures = held.cable, held.at(dt)
         tried = first_step(cable, first, fixtures, dt)
@@ -245,12 +264,12 @@ class Recording:
     def _stepped(
         self,
         steps: Steps | CompiledSteps,
-        held: _Held,
+        held: HeldFixtures,
         now: Moving,
         columns: Columns | None,
         at: float,
         dt: float,
-        numbers: _Numbers | None,
+        numbers: GivenNumbers | None,
     ) -> tuple[Moving, Columns | None, float]:
         """One step of time to `at`, halved where Newton's method fails; the last step [s]."""
         for halving in range(_HALVINGS + 1):
@@ -273,8 +292,8 @@ class Recording:
     def _seen(
         self,
         states: Iterator[tuple[State, Columns | None]],
-        held: _Held,
-        numbers: _Numbers | None,
+        held: HeldFixtures,
+        numbers: GivenNumbers | None,
     ) -> tuple[FloatArray, FloatArray | None]:
         """Points (T, K, d) of the markers, and their derivatives (T, K, d, q)."""
         cable, (segment, u) = held.cable, self._markers(held.cable)
@@ -302,6 +321,13 @@ class Recording:
         return segment, (s - low[segment]) / width[segment]
 
 
+def _within(begin: float, end: float, longest: float) -> tuple[list[float], float]:
+    """Ends [s] of even steps from one time to another, and their length."""
+    count = int(np.ceil((end - begin) / longest - 1e-9))
+    dt = (end - begin) / count
+    return [begin + (k + 1) * dt for k in range(count)], dt
+
+
 def _for_step(now: Moving, columns: Columns | None, factor: float) -> tuple[Moving, Columns | None]:
     """A state continued with a step of another length, and its derivatives."""
     if abs(factor - 1) < 1e-12:
@@ -316,12 +342,6 @@ def _depends_on_rest(model: CableModel) -> bool:
     """Whether an effect acts on changes from the shape at rest."""
     none = SectionLaw.dynamic
     return any(isinstance(x, SectionLaw) and type(x).dynamic is not none for x in model.effects)
-
-
-def _delay(cable: MovingCable) -> float:
-    """What the fixtures' clock shows minus what the points' clock shows [s]."""
-    names = cable.model.names
-    return float(cable.p[names.index(CLOCK_DELAY)]) if CLOCK_DELAY in names else 0.0
 
 
 def rest_state(cable: MovingCable, fixtures: Fixtures, near: State | None) -> State:
@@ -372,63 +392,3 @@ def _of_both(columns: Columns | None) -> FloatArray:
     assert columns is not None
     parts = (columns.turn[:-1], columns.turn[1:], columns.place[:-1], columns.place[1:])
     return np.concatenate(parts, axis=1)
-
-
-class _Held:
-    """Where fixtures are, with their deviations."""
-
-    def __init__(self, recording: Recording, cable: MovingCable, own: FloatArray) -> None:
-        self.cable, self._path, self._delay = cable, recording.path, _delay(cable)
-        place, turns = recording.ways(cable.model)
-        self._place, self._turns = place @ own, turns @ own
-        self._resting: Fixtures | None = None
-
-    def at(self, t: float) -> Fixtures:
-        """The fixtures at a time of the points' clock."""
-        if self._resting is not None:
-            return self._resting
-        node, (pose, rates) = self.cable.model.node, self._path.declared(t + self._delay)
-        d, c, b = node.dimension, node.coordinates, node.increment
-        pose = pose.copy()
-        pose[d : 2 * d] += self._place
-        for k in (0, 1):
-            at = slice(2 * d + c * k, 2 * d + c * (k + 1))
-            pose[at] = node.moved(pose[at], self._turns[b * k : b * (k + 1)])
-        found = self.cable.fixtures(pose, *rates)
-        if not self._path.moving:
-            self._resting = found
-        return found
-
-
-class _Numbers:
-    """Derivatives of what a motion is given, by theta and by its own unknowns."""
-
-    def __init__(
-        self, recording: Recording, cable: MovingCable, unknowns: Unknowns, theta: FloatArray
-    ) -> None:
-        model, own = cable.model, len(recording.own_std(cable.model))
-        self.recording, self.cable = recording, cable
-        self.p = np.pad(unknowns.slopes(theta), ((0, 0), (0, own)))
-        rest = model.chain.rest_inside(unknowns.rest_slopes)
-        self.rest = np.pad(rest, ((0, 0), (0, 0), (0, own)))
-        place, turns = recording.ways(model)
-        q, d = self.p.shape[1], cable.d
-        self.turns = np.pad(turns, ((0, 0), (q - own, 0)))
-        self.places = np.zeros((2, d, q))
-        self.places[1, :, q - own :] = place
-        pose = recording.path.at(_delay(cable), cable).pose
-        self.places += sensitivities.places_by_p(cable, pose) @ self.p
-        names = model.names
-        self.delay = self.p[names.index(CLOCK_DELAY)] if CLOCK_DELAY in names else None
-        none = np.zeros_like(self.places)
-        self._still = Numbers(self.p, self.rest, self.turns, self.places, none, none)
-
-    def at(self, t: float) -> Numbers:
-        """The derivatives at a time."""
-        if self.delay is None:
-            return self._still
-        cable, path = self.cable, self.recording.path
-        at = t + _delay(cable)
-        moved = [path.rates(at, order)[..., None] * self.delay for order in (1, 2, 3)]
-        turns = self.turns + path.turning(at)[:, None] * self.delay
-        return Numbers(self.p, self.rest, turns, self.places + moved[0], moved[1], moved[2])

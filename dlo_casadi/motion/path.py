@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.motion.state import Fixtures
 from dlo_casadi.motion.system import MovingCable
@@ -43,46 +43,50 @@ class FixturePath:
         }
         return cls(pose, {k: CubicSpline(t, x) for k, x in rows.items() if len(t) > 1})
 
-    def rates(self, t: float, order: int) -> FloatArray:
-        """Derivatives (2, d) by time of the places of start and end; zero outside the rows."""
-        found = np.zeros((2, self.pose.node.dimension))
+    def rates(self, t: FloatArray, order: int) -> FloatArray:
+        """Derivatives (T, 2, d) by time of the places of start and end; zero outside the rows."""
+        found = np.zeros((len(t), 2, self.pose.node.dimension))
         for k, side in enumerate(("start", "end")):
-            spline = self.moving.get(side)
-            if spline is not None and spline.x[0] <= t <= spline.x[-1]:
-                found[k] = spline(t, order)
+            if (spline := self.moving.get(side)) is not None:
+                inside = _inside(spline, t)
+                found[inside, k] = spline(t[inside], order)
         return found
 
-    def turning(self, t: float) -> FloatArray:
-        """Rates of turning (2 increment,) [rad/s] of the fixtures about their own axes."""
+    def turning(self, t: FloatArray) -> FloatArray:
+        """Rates of turning (T, 2 increment) [rad/s] of the fixtures about their own axes."""
         node, parts = self.pose.node, []
         for name in ("start_frame", "end_frame"):
-            spline = self.moving.get(name)
-            if spline is None or not spline.x[0] <= t <= spline.x[-1]:
-                parts.append(np.zeros(node.increment))
-                continue
-            frame = node.normalised(spline(t))
-            ahead = node.normalised(spline(t) + _INSTANT * spline(t, 1))
-            parts.append(np.asarray(node.difference(frame, ahead)) / _INSTANT)
-        return np.concatenate(parts)
+            turns = np.zeros((len(t), node.increment))
+            if (spline := self.moving.get(name)) is not None:
+                inside = _inside(spline, t)
+                frame = node.normalised(spline(t[inside]))
+                ahead = node.normalised(spline(t[inside]) + _INSTANT * spline(t[inside], 1))
+                turns[inside] = np.asarray(node.difference(frame, ahead)) / _INSTANT
+            parts.append(turns)
+        return np.hstack(parts)
 
     def at(self, t: float, cable: MovingCable) -> Fixtures:
         """The fixtures at a time [s]; before the first row and after the last they rest."""
-        pose, rates = self.declared(t)
+        (pose,), (rates,) = self.declared(np.array([t]))
         return cable.fixtures(pose, *rates)
 
-    def declared(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """The declared pose (n_pose,) at a time; rates of the places, once and twice (2, 2, d)."""
+    def declared(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Declared poses (T, n_pose) at times; rates of the places, once and twice (T, 2, 2, d)."""
         node, d = self.pose.node, self.pose.node.dimension
-        pose, rates = self.pose.vector, np.array([self.rates(t, 1), self.rates(t, 2)])
-        frames = dict(zip(("start_frame", "end_frame"), self.pose.frames, strict=True))
+        rates = np.stack([self.rates(t, 1), self.rates(t, 2)], axis=1)
+        pose = np.tile(self.pose.vector, (len(t), 1))
         if self.moving:
             known = next(iter(self.moving.values())).x
-            t = float(np.clip(t, known[0], known[-1]))
-        for k, side in enumerate(("start", "end")):
+            t = np.clip(t, known[0], known[-1])
+        for k, (side, frame) in enumerate(zip(("start", "end"), self.pose.frames, strict=True)):
             if side in self.moving:
-                pose[k * d : (k + 1) * d] = self.moving[side](t)
-            if (name := f"{side}_frame") in self.moving:
-                frames[name] = node.normalised(self.moving[name](t))
+                pose[:, k * d : (k + 1) * d] = self.moving[side](t)
             at = 2 * d + k * node.coordinates
-            pose[at : at + node.coordinates] = frames[name]
+            spline = self.moving.get(f"{side}_frame")
+            given = frame if spline is None else node.normalised(spline(t))
+            pose[:, at : at + node.coordinates] = given
         return pose, rates
+
+
+def _inside(spline: Any, t: FloatArray) -> BoolArray:
+    return np.asarray((t >= spline.x[0]) & (t <= spline.x[-1]))

@@ -366,12 +366,16 @@ class MovingCable:
         accelerations: FloatArray | None = None,
     ) -> Fixtures:
         """The fixtures in a declared pose (n_pose,), at rest by default."""
-        size, d = EndConditions.size(self.model.node), self.d
-        given = (self.p[None, None], pose[None, None, :size])
-        places = self.segment.mapped("true_places")(*given)[0].reshape(2, d)
-        none = np.zeros((2, d))
+        places, none = self.true_places(pose[None])[0], np.zeros((2, self.d))
         moving = (none if x is None else x for x in (velocities, accelerations))
         return Fixtures(pose, places, *moving)
+
+    def true_places(self, poses: FloatArray) -> FloatArray:
+        """True places (T, 2, d) [m] of the fixtures in declared poses (T, n_pose)."""
+        given = poses[None, :, : EndConditions.size(self.model.node)]
+        p = np.broadcast_to(self.p, (1, len(poses), len(self.p)))
+        found = self.segment.mapped("true_places")(p, given)[0]
+        return np.asarray(found).reshape(len(poses), 2, self.d)
 
     def at_rest(self, eq: Equilibrium, fixtures: Fixtures) -> State:
         """The state in an equilibrium."""

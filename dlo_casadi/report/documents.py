@@ -29,6 +29,7 @@ from dlo_casadi.model.pose_scatter import PoseScatter
 from dlo_casadi.rod.quantities import QUANTITIES
 from dlo_casadi.runtime.executors import software
 from dlo_casadi.runtime.work import Part
+from dlo_casadi.session.checked_motions import CheckedMotion
 from dlo_casadi.session.fitting import Declared
 from dlo_casadi.session.in_motion import MotionStage
 from dlo_casadi.session.outcome import Outcome, PoseInput, RestCurvatureEstimate, Stage
@@ -128,14 +129,18 @@ def motion_dict(motion: MotionStage | None) -> dict[str, Any]:
 
 
 def check_dict(
-    config: Config, inputs: Sequence[PoseInput], found: Sequence[Suspicion]
+    config: Config,
+    inputs: Sequence[PoseInput],
+    found: Sequence[Suspicion],
+    motions: Sequence[CheckedMotion] = (),
 ) -> dict[str, Any]:
-    """Results of `dlo check` in SI units: ok, mistakes, warnings, and a row for each pose."""
+    """Results of `dlo check` in SI units: ok, mistakes, warnings, a row for each pose, motion."""
     unread = [f"{item.name}: {item.problem}" for item in inputs if item.problem]
     known = {item.name for item in inputs}
     left_out = [f"{item.name}: {item.reason}" for item in config.skipped if item.name not in known]
     mistakes = [*(item.message for item in found), *left_out, *unread]
-    warnings = list(config.warnings)
+    mistakes += [f"{one.name}: {one.problem}" for one in motions if one.problem]
+    warnings = [*config.warnings, *(f"{x.name}: {text}" for x in motions for text in x.warnings)]
     seen = [item for item in inputs if item.readable and not item.unseen]
     if seen and not any(len(item.points) for item in seen):
         warnings.append(
@@ -149,6 +154,7 @@ def check_dict(
             "mistakes": mistakes,
             "warnings": warnings,
             "poses": [_checked(config, item) for item in inputs],
+            **({"motions": [asdict(one) for one in motions]} if motions else {}),
         }
     )
 

@@ -1,11 +1,13 @@
 """What a report says of recorded motions."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.table import Table
 
 from dlo_casadi.errors import worded
 from dlo_casadi.report.terminal import plain_table
+from dlo_casadi.session.checked_motions import CheckedMotion
 from dlo_casadi.session.in_motion import MotionStage
 from dlo_casadi.session.outcome import Outcome
 from dlo_casadi.show.text import millimetres
@@ -59,4 +61,19 @@ def motion_table(outcome: Outcome) -> Table:
     for row in found["motion_rows"]:
         cells = [row["role"], *([row["before"]] if found["motion_before"] else []), row["rms"]]
         table.add_row(row["name"], *cells)
+    return table
+
+
+def motion_check_table(checked: Sequence[CheckedMotion]) -> Table:
+    """One line for each motion of `dlo check`."""
+    columns = ["role", "duration [s]", "pictures/s", "points", "seen", "declared cable [Hz]"]
+    table = plain_table("Recordings of the moving cable", ["motion"], columns)
+    for one in checked:
+        told = (one.duration, one.rate)
+        cells = ["-" if x is None else f"{x:.3g}" for x in told]
+        cells.append("-" if one.points is None else str(one.points))
+        cells.append("-" if one.seen is None else f"{100 * one.seen:.0f} %")
+        cells.append(", ".join(f"{x:.2g}" for x in one.frequencies) or "-")
+        style = "red" if one.problem else ""
+        table.add_row(one.name, one.role.replace("_", " "), *cells, style=style)
     return table

@@ -159,7 +159,7 @@ def _stage(fit: MotionFit, motions: Sequence[MeasuredMotion]) -> MotionStage:
     both = {role: [x.distances for x in shown if x.role == role] for role in ("fit", "held_out")}
 
     def rms(role: str) -> float | None:
-        rows = [x.ravel() for x in both[role]]
-        return float(np.sqrt(np.nanmean(np.concatenate(rows) ** 2))) if rows else None
+        known = np.concatenate([np.zeros(0), *(x[np.isfinite(x)] for x in both[role])])
+        return float(np.sqrt(np.mean(known**2))) if len(known) else None
 
     return MotionStage(rms("fit") or 0.0, rms("held_out"), fit.chi2_per_dof, tuple(shown))

@@ -16,8 +16,8 @@ from dlo_casadi.io.motions import (
     fixture_track,
     motion_points,
     read_fixtures,
-    read_motion,
 )
+from dlo_casadi.io.motions import read_motion as read_points
 from dlo_casadi.rod.chain import ELEMENTS
 from dlo_casadi.runtime.progress import Step, nobody
 from dlo_casadi.sensing.measured_motion import MeasuredMotion
@@ -48,18 +48,18 @@ def read_motions(config: Config, step: Step = nobody) -> tuple[MeasuredMotion, .
     """
     motions, found = config.experiment.motions, []
     if motions:
-        _check_known(config)
+        check_known(config)
     for k, motion in enumerate(motions):
         step(f"read {motion.shown_by}", k, len(motions))
         try:
-            found.append(_read(config, motion))
+            found.append(read_motion(config, motion))
         except MeasurementError as error:
             named = error.pose or motion.shown_by
             raise MeasurementError(error.message.removeprefix(f"{named}: "), named) from None
     return tuple(found)
 
 
-def _check_known(config: Config) -> None:
+def check_known(config: Config) -> None:
     """Refuse what a moving cable cannot have yet."""
     experiment, what = config.experiment, ""
     if experiment.clips:
@@ -75,11 +75,12 @@ def _check_known(config: Config) -> None:
         raise ConfigError(f"{text}.\n  Try: a session of its own for the motions", config.path)
 
 
-def _read(config: Config, motion: Motion) -> MeasuredMotion:
+def read_motion(config: Config, motion: Motion, most: int | None = None) -> MeasuredMotion:
+    """Read one motion; `most`: frames of a video, by default all. Raises as `read_motions` does."""
     track = _track(config, motion)
     resting = _resting(config, motion, track)
     place = partial(_place, track, resting)
-    points, note = _points(config, motion, place)
+    points, note = _points(config, motion, place, most)
     across = None
     if points.s is None:
         points, across = marks_of_lines(points, place, config.cable.length)
@@ -120,14 +121,16 @@ def _place(
     return None if known is None else np.broadcast_to(known, (len(times), len(known)))
 
 
-def _points(config: Config, motion: Motion, place: Place) -> tuple[MotionPoints, str]:
+def _points(
+    config: Config, motion: Motion, place: Place, most: int | None
+) -> tuple[MotionPoints, str]:
     """The points, and what was left out of them."""
     length, dimension = config.cable.length, len(config.experiment.gravity)
     if motion.file is not None:
         file = _existing(motion.file)
         if file.suffix.lower() in VIDEO_ENDINGS:
-            return read_video(config, file, place)
-        return read_motion(file, dimension, length), ""
+            return read_video(config, file, place, most)
+        return read_points(file, dimension, length), ""
     points = np.array(motion.points)
     if points.shape[1] != dimension:
         text = f"points have {points.shape[1]} coordinates, gravity has {dimension}"

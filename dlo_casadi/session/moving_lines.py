@@ -132,8 +132,8 @@ def read_video(
     """Lines of a video's frames, and how many frames were left out.
 
     Each frame is read as a photograph is. Frames in which no line is found are lost; those with an
-    error far above the usual one, or with half a line, are blurred. `most`: only this number of
-    frames, from the first one on.
+    error far above the usual one, or with half a line, are blurred. `most`: only about this number
+    of frames, evenly spaced.
 
     Raises
     ------
@@ -148,7 +148,9 @@ def read_video(
     times: list[float] = []
     found: list[vision.ExtractedCenterline | MeasurementError] = []
     with ThreadPoolExecutor(THREADS) as threads:
-        frames = islice(vision.frames_of(file), most)
+        frames = vision.frames_of(file)
+        if most is not None:
+            frames = islice(frames, 0, None, max(1, vision.count_of(file) // most))
         # A few at a time: a minute of pictures does not fit into the memory.
         while some := list(islice(frames, 4 * THREADS)):
             t = np.array([t for t, _ in some])

@@ -33,12 +33,13 @@ from dlo_casadi.session import fitting, remarks
 from dlo_casadi.session.fit_remarks import fit_warnings
 from dlo_casadi.session.found_effects import found_effects
 from dlo_casadi.session.in_motion import fit_moving
-from dlo_casadi.session.measure import measured_poses, read_session
+from dlo_casadi.session.measure import calibrated, measured_poses, read_inputs
 from dlo_casadi.session.motions import read_motions
 from dlo_casadi.session.outcome import MeasurementSummary, Outcome, PoseInput, Stage
 from dlo_casadi.session.outliers import outliers_of
 from dlo_casadi.session.plausibility import without_implausible
 from dlo_casadi.session.stages import checked_limits, fit_stage, fitted_parameters
+from dlo_casadi.session.still_in_motion import with_still_poses
 
 TIMED = ("vision", "algorithm1", "batch", "diagnosis", "motion")
 
@@ -67,8 +68,10 @@ def run_session(
     warn = getattr(progress, "warn", nobody)
     executor = executor or InProcess()
     begin(executor, software)  # meanwhile another process starts and imports what fits need
-    config, inputs = read_session(config, step)
+    config = calibrated(config, step)
     motions = read_motions(config, step)
+    config = with_still_poses(config, motions)
+    inputs = read_inputs(config, step)
     try:
         with one_thread(), accounted() as work:
             outcome = _Run(config, step, warn, executor, began, motions).outcome(inputs)

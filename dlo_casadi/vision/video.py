@@ -11,6 +11,24 @@ from dlo_casadi.vision.camera import Picture
 VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm")
 
 
+def rate_of(path: Path) -> float:
+    """Frames a second, as the file declares them."""
+    return _told(path, cv2.CAP_PROP_FPS)
+
+
+def count_of(path: Path) -> int:
+    """Number of frames, as the file declares it."""
+    return int(_told(path, cv2.CAP_PROP_FRAME_COUNT))
+
+
+def _told(path: Path, what: int) -> float:
+    video = cv2.VideoCapture(str(path))
+    try:
+        return float(video.get(what))
+    finally:
+        video.release()
+
+
 def frames_of(path: Path) -> Iterator[tuple[float, Picture]]:
     """Time [s] and picture (H, W, 3) of each frame, one after the other.
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import dlo_casadi as dlo
-from dlo_casadi.config import load_config
+from dlo_casadi.config import Config, load_config
 from dlo_casadi.io.motions import read_motion
 from dlo_casadi.session.motions import read_motions
+from dlo_casadi.session.still_in_motion import with_still_poses
 
 T = np.arange(60) / 50
 S = np.array([0.1, 0.3, 0.6])
@@ -190,3 +191,49 @@ def test_shapes_of_arrays_are_checked() -> None:
         dlo.Motion(t=T[:5], points=np.zeros((60, 3, 2)), at=S)
     with pytest.raises(dlo.ConfigError, match="one of file and points"):
         dlo.Motion(start=(0, 0))
+
+
+# ---- sessions without still poses ---------------------------------------------------------------
+
+NO_POSES = re.sub(r"  poses:\n  - .*\n", "", SESSION)
+
+
+def carried_then_still(folder: Path, begins: str, *, until: float = 0.5) -> Config:
+    """A session of one motion: still for 0.2 s, carried aside until `until`, still again."""
+    t = np.arange(0, 1.2, 0.02)
+    aside = 0.1 * np.clip((t - 0.2) / (until - 0.2), 0, 1)
+    rows = [(x, s, a, -s) for x, a in zip(t, aside, strict=True) for s in S]
+    write(folder, "swing.csv", "t_s,s_m,x_m,y_m", np.array(rows))
+    ends = np.stack([t, aside, 0 * t], axis=1)
+    write(folder, "ends.csv", "t_s,start_x_m,start_y_m", ends)
+    motion = f"{{file: swing.csv, fixtures: ends.csv, start_heading: -1.57, begins: {begins}}}"
+    (folder / "session.yaml").write_text(NO_POSES.replace("MOTION", motion))
+    return load_config(folder / "session.yaml")
+
+
+def test_poses_may_be_left_out_if_a_motion_is_ever_at_rest(tmp_path: Path) -> None:
+    config = carried_then_still(tmp_path, "at_rest")
+    assert not config.experiment.poses
+    motions = read_motions(config)
+    found = with_still_poses(config, motions)
+    first, last = found.experiment.poses
+    assert [first.name, last.name] == ["swing_begins", "swing_ends"]
+    np.testing.assert_allclose(first.points, [(0, -s) for s in S], atol=1e-4)
+    np.testing.assert_allclose(last.points, [(0.1, -s) for s in S], atol=1e-4)
+    np.testing.assert_allclose(last.start, (0.1, 0), atol=1e-4)
+    assert first.start_heading == -1.57
+    np.testing.assert_allclose(first.at, S)
+    assert with_still_poses(found, motions) is found
+    (only,) = with_still_poses(
+        config, read_motions(carried_then_still(tmp_path, "moving"))
+    ).experiment.poses
+    assert only.name == "swing_ends"
+
+
+def test_without_rest_it_is_said_what_to_add(tmp_path: Path) -> None:
+    config = carried_then_still(tmp_path, "moving", until=1.2)
+    with pytest.raises(dlo.ConfigError, match=r"no motion to fit begins or ends at rest"):
+        with_still_poses(config, read_motions(config))
+    (tmp_path / "session.yaml").write_text(NO_POSES.split("  motions")[0])
+    with pytest.raises(dlo.ConfigError, match="poses"):
+        load_config(tmp_path / "session.yaml")
