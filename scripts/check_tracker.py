@@ -204,7 +204,30 @@ def changes(d: int, runs: int, first: int) -> None:
         )
 
 
-PANELS = {"changes": changes}
+# ---- speed ---------------------------------------------------------------------------------------
+
+
+def speed(d: int, runs: int, first: int) -> None:
+    """Processor time of an update: `runs` poses of a wandering gripper, 12 markers, n = 20."""
+    rng = np.random.default_rng(first)
+    cable, ways = rope(d), wandering(d, rng)
+    poses = [seen(cable, next(ways), rng) for _ in range(runs)]
+    for compiled in (False, True):
+        known = {"bending_stiffness": 1e-3, "lumped_mass.mass": 1e-3}
+        known |= {"torsional_stiffness": 1e-3} if d == 3 else {}
+        tracker, times = uncertain(cable, known).tracker(STD, compiled=compiled), []
+        for pose in poses:
+            begun = time.process_time()
+            tracker.update(pose)
+            times.append(1e3 * (time.process_time() - begun))
+        steady = times[40:]  # before, functions are prepared for many evaluations
+        print(
+            f"{d}D, {'C' if compiled else 'Python'}: median {np.median(steady):.1f} ms, "
+            f"99 % {np.quantile(steady, 0.99):.1f} ms; the first update {times[0]:.0f} ms"
+        )
+
+
+PANELS = {"changes": changes, "speed": speed}
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -212,6 +213,18 @@ def test_it_is_saved_and_goes_on(tmp_path) -> None:
     followed(again, true, HEADINGS[4:])
     for name in NAMES:
         assert again.params[name].value == pytest.approx(tracker.params[name].value, rel=1e-6)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_compiled_equilibria_are_the_same() -> None:
+    true, trackers = rope(0.0105), [rope().tracker(STD, compiled=on) for on in (False, True)]
+    for k in (0, 7, 3):  # far apart, so that none is found from the one before
+        for tracker in trackers:
+            tracker.update(pose(true, float(HEADINGS[k]), k))
+    for name in NAMES:
+        one, other = (tracker.params[name] for tracker in trackers)
+        assert one.value == pytest.approx(other.value, rel=1e-7)
+        assert one.std == pytest.approx(other.std, rel=1e-7)
 
 
 def test_meaningless_arguments_are_told() -> None:

@@ -157,7 +157,7 @@ class Inquiry:
     @property
     def _last(self) -> Any:
         last = self.poses[-1]
-        return last.model, last.held, last.shapes.x[0]
+        return last.model, last.held, last.shapes
 
     def verdict(self, *, final: bool) -> tuple[Change, Any]:
         """What changed, and the cable after it."""
@@ -265,7 +265,7 @@ class Inquiry:
         try:
             for one in poses:
                 prior = self.faded(cable) if seen else cable
-                last = (seen[-1].model, seen[-1].held, seen[-1].shapes.x[0]) if seen else None
+                last = (seen[-1].model, seen[-1].held, seen[-1].shapes) if seen else None
                 cable, told = learned(prior, one.pose, self.noise, one.number, Shaper(False, last))
                 assert told is not None
                 seen.append(told)

@@ -18,15 +18,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.held import HELD, posed
-from dlo_casadi.codegen import CompiledSolver
+from dlo_casadi.codegen import CompiledShape, CompiledSolver
 from dlo_casadi.config import Pose
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.equilibrium.curve import Observed, ObservedChange
@@ -35,13 +36,15 @@ from dlo_casadi.equilibrium.solve import MOST_MOVED, MOST_TURNED, solve_equilibr
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.rod.band import Vector
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
 
-# Relinearisations of an update, and the change of z at which they end.
-_ITERATIONS, _CHANGE = 8, 1e-3
-# Largest step [std] that is not linearised anew.
-_SMALL = 0.1
+# Relinearisations of an update, and the step at which they end, in standard deviations after it: a
+# smaller one is as good as linear.
+_ITERATIONS, _SMALL = 8, 0.1
+# Largest last step [rad] of Newton's method: a thousandth of what any camera sees.
+_EXACT = 1e-7
 # Probability of a pose by chance below which it is refused.
 OUTLIER = 1e-5
 
@@ -186,10 +189,10 @@ class Seen:
     rms: float
     iterations: int = 0
 
-    @property
+    @cached_property
     def probability(self) -> float:
         """Of an innovation as large by chance."""
-        return float(chi2.sf(self.innovation @ self.innovation, len(self.innovation)))
+        return float(chdtrc(len(self.innovation), self.innovation @ self.innovation))
 
     @property
     def refused(self) -> bool:
@@ -214,26 +217,25 @@ class Shaper:
     """
 
     compiled: bool = False
-    last: tuple[CableModel, HeldPose, FloatArray] | None = None
-    _solvers: dict[Any, CompiledSolver] = field(default_factory=dict)
+    last: tuple[CableModel, HeldPose, Shapes] | None = None
+    _solvers: dict[Any, tuple[CompiledSolver, CompiledShape | None]] = field(default_factory=dict)
 
     def found(self, batch: BatchEquilibrium, cable: Any, held: HeldPose, *, anew: bool) -> Shapes:
         """The equilibrium of a pose; not the one near the last if `anew`."""
         p, rest, model = cable.p, cable.rest, cable.model
-        start = None if anew else self._near(model, held)
-        if start is None and self.compiled:
-            start = self._by_c(cable, held)
+        near = None if anew else self._near(model, held)
+        start = self._by_c(batch, cable, held, near) if self.compiled else near
         if start is not None:
-            shapes, converged = batch.solve(batch.start_shapes(start[None]), p, rest)
+            shapes, converged = batch.solve(declared(batch, start), p, rest, tolerance=_EXACT)
             if converged.all() and batch.stable(shapes, p, rest).all():
                 return shapes
         return declared(batch, solve_equilibrium(model, p, rest, held).shapes)
 
-    def _near(self, model: CableModel, held: HeldPose) -> FloatArray | None:
-        """Nodes of the last shape if the fixtures have hardly moved since."""
+    def _near(self, model: CableModel, held: HeldPose) -> Shapes | None:
+        """The last shape if the fixtures have hardly moved since."""
         if self.last is None or self.last[0].clips != model.clips or self.last[0].n != model.n:
             return None
-        _, before, x = self.last
+        _, before, shapes = self.last
         same = replace(before, name=held.name, **_places(held)) == held
         if not same:
             return None
@@ -242,14 +244,22 @@ class Shaper:
         near = (
             gaps[: 2 * d].max() <= MOST_MOVED * model.cable.length and gaps[2 * d :].max() <= turned
         )
-        return x if near else None
+        return shapes if near else None
 
-    def _by_c(self, cable: Any, held: HeldPose) -> FloatArray | None:
+    def _by_c(
+        self, batch: BatchEquilibrium, cable: Any, held: HeldPose, near: Shapes | None
+    ) -> Shapes | None:
+        """A shape by C, of the cable as it was when it was compiled."""
         key = cable.model.clips
         if key not in self._solvers:
-            self._solvers[key] = CompiledSolver(cable.model, cable.p, cable.rest)
-        found = self._solvers[key].solve(held, throw=False)
-        return found.x if found.status == "ok" else None
+            self._solvers[key] = CompiledSolver(cable.model, cable.p, cable.rest), None
+        solver, before = self._solvers[key]
+        found = solver.solve(held, warm=None if near is None else before, throw=False)
+        if found.status != "ok":
+            return near
+        self._solvers[key] = solver, found
+        shapes = batch.start_shapes(found.x[None])
+        return shapes if near is None else replace(shapes, lam=near.lam)
 
 
 def _places(held: HeldPose) -> dict[str, Any]:
@@ -281,7 +291,7 @@ def learned(
         if again[1].probability > seen.probability:
             after, seen = again
     if not seen.refused:
-        shaper.last = own.model, held, seen.shapes.x[0]
+        shaper.last = own.model, held, seen.shapes
     return after, seen
 
 
@@ -307,7 +317,7 @@ def _learned(
     for iterations in range(1, _ITERATIONS + 1):
         now = moved(own, by_p[:, :count] @ z, by_rest[:, :count] @ z)
         if iterations > 1:
-            shapes, converged = batch.solve(shapes, now.p, now.rest)
+            shapes, converged = batch.solve(shapes, now.p, now.rest, tolerance=_EXACT)
             if not converged.all():
                 found = solve_equilibrium(own.model, now.p, now.rest, held)
                 shapes = declared(batch, found.shapes)
@@ -330,14 +340,16 @@ def _learned(
                 break
         gain = cho_solve(factor, by_z).T
         before, z = z, gain @ (residual + by_z @ z)
-        step = np.abs(z - before).max(initial=0.0)
-        if step < (_SMALL if iterations == 1 else _CHANGE):
+        left = np.eye(count) - gain @ by_z
+        step = z - before
+        if step @ np.linalg.solve(left, step) < _SMALL**2:
             break
+        ahead = along.x[..., :count] @ step, along.lam[..., :count] @ step
+        shapes = batch.moved(shapes, Vector(ahead[0][..., None], ahead[1][..., None]))
     assert seen is not None
     seen = replace(seen, iterations=iterations)
     if seen.refused:
         return prior, seen
-    left = np.eye(count) - gain @ by_z
     covariance = uncertainty.root @ ((left + left.T) / 2) @ uncertainty.root.T
     after = moved(prior, by_p[:, :count] @ z, by_rest[:, :count] @ z)
     return with_covariance(after, covariance), seen

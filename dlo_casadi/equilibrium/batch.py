@@ -26,6 +26,7 @@ from dlo_casadi.equilibrium.minima import (
     stepped,
     violation,
 )
+from dlo_casadi.equilibrium.newton import Factored
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spans import border_of
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes, Tangents
@@ -184,12 +185,15 @@ class BatchEquilibrium:
         coupled = self._coupled(rest)
         active, last = np.arange(self.m), np.full(self.m, np.inf)
         stale, matrix = np.ones(self.m, dtype=bool), None
+        factored: Factored | None = None
         for _ in range(max_iterations):
             here = self.at(now, p, rest).subset(active)
             fresh = stale[active] | coupled
             force, matrix = self._linearized(here, active, fresh, matrix)
             try:
-                own = self._newton(force, matrix, active)
+                if factored is None or not factored.of(matrix, active):
+                    factored = Factored.made(matrix, active)
+                own = factored.newton(force)
                 step = self._handed_on(here, matrix, own) if coupled else own
             except np.linalg.LinAlgError:
                 break
@@ -260,16 +264,6 @@ class BatchEquilibrium:
             force = here.imbalance()
             _, _, new = here.subset(fresh).balance()
         return force, new if matrix is None else matrix.replaced(active[fresh], new)
-
-    @staticmethod
-    def _newton(force: Vector, matrix: BandMatrix, active: IntArray) -> Vector:
-        """Newton step, one column, of the active poses; not finite for a shape that is not."""
-        finite = np.isfinite(matrix.diagonal[active]).all(axis=(1, 2, 3))
-        step = Vector(np.full_like(force.x, np.nan), np.full_like(force.y, np.nan))
-        right = Vector(-force.x[finite], -force.y[finite])
-        found = matrix.subset(active[finite]).factor().solve(right)
-        step.x[finite], step.y[finite] = found.x, found.y
-        return step
 
     def _handed_on(self, here: Assembly, matrix: BandMatrix, step: Vector) -> Vector:
         """Newton step including the change of the rest curvature by the poses before."""
