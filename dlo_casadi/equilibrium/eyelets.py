@@ -6,7 +6,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.assembly import Assembly, Shapes
-from dlo_casadi.model.clips import placed_nodes
+from dlo_casadi.model.clips import laid_for, placed_nodes
 from dlo_casadi.rod.chain import Chain
 
 # Least distance [elements] of an eyelet from what is beside it; of an end that slides one element.
@@ -14,8 +14,9 @@ CLOSEST = 1e-3
 # Another node is moved to an eyelet if this makes the shorter segment beside it longer by more than
 # this factor: an eyelet between two nodes does not change from one to the other and back.
 LONGER = 2.0
-# Length [elements] fed through an end after which all nodes are laid anew.
-FED = 0.5
+# Distance [elements] of an end from that for which nodes are laid, beyond which they are laid anew:
+# a little more than the middle of an element may be away.
+FED = 0.55
 
 
 def slid(before: Assembly, shapes: Shapes) -> Shapes:
@@ -32,10 +33,13 @@ def slid(before: Assembly, shapes: Shapes) -> Shapes:
     nodes, places = placed_nodes(chain, old.near, held, loose)
     near = old.near.copy()
     near[:, slides] = held[:, slides]
+    ends = [k for k in slides if k in (0, held.shape[1] - 1)]
+    fed = np.abs(near - old.near)[:, ends] > FED * chain.h
+    if ends:
+        near[:, ends] = laid_for(chain, near[:, [0, -1]])[:, [min(k, 1) for k in ends]]
     others, elsewhere = placed_nodes(chain, near, held, loose)
     eyelets = [k - 1 for k in slides if 0 < k < held.shape[1] - 1]
     poor = _shorter(places, nodes[:, eyelets]) * LONGER < _shorter(elsewhere, others[:, eyelets])
-    fed = np.abs(near - old.near)[:, [0, -1]] > FED * chain.h
     changed = poor.any(axis=1) | fed.any(axis=1)
     near[~changed] = old.near[~changed]
     x = shapes.x

@@ -122,6 +122,17 @@ def placed_nodes(
     return nodes, moved_with(nodes, even, at, loose)
 
 
+def laid_for(chain: Chain, at: FloatArray) -> FloatArray:
+    """Arc lengths (..., 2) [m] of both ends for which nodes are laid: middles of elements near `at`.
+
+    Shapes that were reached in different ways then have the same nodes; and no middle of evenly
+    laid nodes is on the edge of an even cell.
+    """
+    middles = np.floor(at / chain.h) + 0.5
+    middles[..., 1] = np.maximum(middles[..., 1], middles[..., 0] + 1)
+    return np.asarray(middles * chain.h)
+
+
 def moved_with(
     nodes: IntArray, others: FloatArray, at: FloatArray, loose: tuple[bool, bool]
 ) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 from dlo_casadi.arrays import FloatArray, IntArray
 from dlo_casadi.model.cable_model import FREE_LENGTH, VIEWPOINT_SIZE, CableModel
 from dlo_casadi.model.clipped import Clipped
-from dlo_casadi.model.clips import clip_size
+from dlo_casadi.model.clips import clip_size, laid_for
 from dlo_casadi.model.contact import DEPTH, Touching, outwards
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.slides import Ends
@@ -71,6 +71,10 @@ class Evaluation:
             slides, rows = [*model.sliding], [*model.sliding.values()]
             held[:, slides], own = self.shapes.lam[:, rows], self.shapes.near_each(len(rows))
             near[:, slides] = np.where(np.isnan(own), held[:, slides], own)
+            fed = np.zeros(near.shape, dtype=bool)
+            fed[:, slides] = np.isnan(own)
+            fed, ends = fed[:, [0, -1]], near[:, [0, -1]]
+            near[:, [0, -1]] = np.where(fed, laid_for(model.chain, ends), ends)
         return Clipped.of(model, declared[..., d:-1], near, held, given.p @ turns, x)
 
     @property
