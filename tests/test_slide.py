@@ -9,7 +9,6 @@ from perturbed import assert_derivatives
 from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
-from dlo_casadi.codegen import generate
 from dlo_casadi.config import load_config
 from dlo_casadi.effects import CableData, LengthError, MassError, PointForce
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
@@ -408,8 +407,6 @@ def test_what_a_sliding_end_has_not():
     rest = np.zeros(model.chain.n_rests)
     with pytest.raises(DloError, match="no rest curvature that slides"):
         CasadiCable(model, model.nominal, rest + 1.0).function()
-    with pytest.raises(DloError, match="slides through its end yet"):
-        generate(model, model.nominal, rest, "wire")
     with pytest.raises(DloError, match="cannot be exported"):
         Rod.of(SolvedCable.of(model, model.nominal, rest, pose))
 

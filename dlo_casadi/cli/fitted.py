@@ -294,8 +294,10 @@ def shape_table(chosen: argparse.Namespace) -> None:
         )
     cable = load(chosen.parameters)
     if pose_size(cable.model) != len(COLUMNS):
+        what = "clips" if cable.model.clips else "an end that slides"
+        where = "is in space" if cable.model.in_space else f"has {what}"
         raise DloError(
-            f"{cable.model.cable.name!r} is in space: tables hold shapes in a plane.\n"
+            f"{cable.model.cable.name!r} {where}: tables hold shapes in a plane, of two ends.\n"
             "  Try: dlo predict, or dlo generate-solver for many shapes"
         )
     cable = cable.with_mesh(chosen.elements, chosen.element)

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.resources import files
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.c_text import c_number
+from dlo_casadi.codegen.feeding import feed_marks
 from dlo_casadi.codegen.kernels import Holding, Kernels, Moved, kernels_of
+from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.statuses import STATUS_TEXTS
 from dlo_casadi.effects import Load
 from dlo_casadi.equilibrium.guess_table import HALF_ANGLE, NUMBERS, SLACKS, GuessRow, guess_table
@@ -22,10 +24,8 @@ from dlo_casadi.equilibrium.sides import NEAR_BAR
 from dlo_casadi.equilibrium.solve import MOST_SHED, coarse_rest
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.model.contact import surfaces_at
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import Lagrangian, lagrangian_of
-from dlo_casadi.rod.obstacles import Obstacle, Plane
 from dlo_casadi.rod.supports import SupportKind
 
 # Newton steps of a descent, and for a part of a path, as in the templates.
@@ -37,84 +37,16 @@ def template(name: str) -> str:
     return (files("dlo_casadi.codegen") / "templates" / name).read_text(encoding="utf-8")
 
 
-@dataclass(frozen=True)
-class Obstacles:
-    """Obstacles of a solver: at most `most` per call, and those of the model if a fit has them."""
-
-    most: int = 0
-    declared: tuple[Obstacle, ...] = ()
-
-    @classmethod
-    def of(cls, model: CableModel, p: FloatArray, most: int) -> Self:
-        """Make room for at least the model's own obstacles.
-
-        Raises
-        ------
-        DloError
-            If `most` is not a valid number, or the cable is one of links.
-        """
-        whole = isinstance(most, int | np.integer) and not isinstance(most, bool)
-        if not whole or not 0 <= most <= 1000:
-            raise DloError(f"obstacles: a whole number, 0 to 1000, found {most!r}\n  Try: 1")
-        if most and not model.chain.kind.smooth:
-            raise DloError(
-                "a cable of links cannot lie on obstacles\n"
-                "  Try: another element, --element quadratic"
-            )
-        declared = surfaces_at(model, p)
-        return cls(max(int(most), len(declared)), declared)
-
-    @property
-    def words(self) -> dict[str, str]:
-        """Text parts of the templates, by mark; empty for a solver without obstacles."""
-        found = {
-            "AMONG": "const dlo_obstacle *obstacles, size_t n_obstacles,\n                     ",
-            "GIVEN": "obstacles, n_obstacles, ",
-            "TAKEN": "take_obstacles(w, obstacles, n_obstacles)",
-            "DECLARED_GIVEN": "DECLARED_OBSTACLES, DLO_DECLARED, " if self.declared else "0, 0, ",
-            "NO_OBSTACLES": "NULL, 0, ",
-            "OBSTACLES_ARE": _SAID,
-            "HPP_OBSTACLES": "    std::vector<dlo_obstacle> obstacles; "
-            "/* on which the cable may lie */\n\n",
-            "HPP_GIVEN": "obstacles.data(), obstacles.size(), ",
-            "DECLARED_OBSTACLES": ", ".join(map(_initializer, self.declared)),
-        }
-        none = dict.fromkeys(found, "") | {"TAKEN": "take_obstacles(w, 0, 0)"}
-        return found if self.most else none
-
-
-# Text about obstacles in the header.
-_SAID = """\
- *   obstacles  in   [n_obstacles], rigid and without friction, on which the cable may lie. Where
- *                   the status is DLO_OK the whole cable, its radius and its fixtures are outside
- *                   of them but for 1e-6 of its length. Places at which it touches slide along
- *                   it in derivatives. Along a path it touches down and lifts off without a jump
- *   n_obstacles in  at most DLO_OBSTACLES
-"""
-
-
-def row_of(obstacle: Obstacle) -> tuple[int, tuple[float, ...], tuple[float, ...], float]:
-    """Kind, places a and b, and radius of an obstacle: the layout of dlo_obstacle."""
-    if isinstance(obstacle, Plane):
-        return 1, obstacle.point, obstacle.normal, 0.0
-    return 0, obstacle.a, obstacle.b, obstacle.radius
-
-
-def _initializer(obstacle: Obstacle) -> str:
-    """An obstacle as an initialiser of dlo_obstacle."""
-    kind, *places, radius = row_of(obstacle)
-    a, b = (", ".join(c_number(float(x)) for x in place) for place in places)
-    name = ("DLO_CAPSULE", "DLO_HALF_SPACE")[kind]
-    return f"{{{name}, {{{a}}}, {{{b}}}, {c_number(radius)}}}"
-
-
 def case_of(
     model: CableModel, p: FloatArray, rest: FloatArray, inline: bool, obstacles: Obstacles
 ) -> "Case":
     """Contents of the templates for this cable."""
-    if model.slides:
+    if model.slides and model.n_springs:
         side = "start" if model.start.slides else "end"
-        raise DloError(f"no solver can be generated for a cable that slides through its {side} yet")
+        raise DloError(
+            f"no solver can be generated for a cable with a tether that slides through its {side}\n"
+            "  Try: solve, which knows both, or a clip in place of the tether."
+        )
     kind = {1: _PlaneCase, 3: _SpaceCase}[model.node.increment]
     return kind(model, p, rest, inline, obstacles)
 
@@ -139,18 +71,27 @@ class Case:
     def meshes(self) -> dict[str, Kernels]:
         """Kernels of its meshes by their names in C, the cable's own first."""
         moved = Moved.SOME if self.model.clips else Moved.NONE
+        moved = Moved.ALL if self.model.slides else moved
         return {"kernel": self.kernels(self.model, self.rest, moved)}
 
     def kernels(self, model: CableModel, rest: FloatArray, moved: Moved) -> Kernels:
         """Kernels of a mesh without the supports between the ends."""
         others = [x for x in model.effects if not (isinstance(x, Load) and x.n_springs)]
-        bare = replace(model, clips=(), effects=tuple(others))
+        still = [SupportKind.SWIVEL if kind.slides else kind for kind in (model.start, model.end)]
+        bare = replace(
+            model,
+            start=still[0],
+            end=still[1],
+            clips=(),
+            effects=tuple(others),
+            fed_by_length=False,
+        )
         p = np.array([self.p[model.names.index(name)] for name in bare.names])
         if not bare.end.place and (self.obstacles.most or self.holds):
             bare = replace(
                 bare, end=SupportKind.PINNED
             )  # segments before a clip or a contact carry a force
-        if not self.holds:
+        if not (self.holds or self.model.slides):
             return kernels_of(bare, p, rest, self.inline)
         if not bare.chain.kind.smooth:
             raise DloError(
@@ -158,7 +99,8 @@ class Case:
                 "  Try: another element, --element quadratic"
             )
         tethers = [x for x in model.effects if x not in others]
-        held = Holding(moved, bool(model.sliding), tethers[0] if tethers else None)
+        fed = model.slides
+        held = Holding(moved, bool(model.sliding), tethers[0] if tethers else None, fed)
         return kernels_of(bare, p, rest, self.inline, held)
 
     @property
@@ -167,11 +109,16 @@ class Case:
         return len(self.model.clips) + len(self.tethers)
 
     @property
+    def eyelets(self) -> list[int]:
+        """Indices of the clips through which the cable slides."""
+        return [k for k, kind in enumerate(self.model.clips) if kind.slides]
+
+    @property
     def eyelet_rows(self) -> list[int]:
         """Row of each holder's arc length in the border; 0 for holders that do not slide."""
         first, rows = self.model.node.dimension * (1 + self.holds), [0] * self.holds
-        for k, support in enumerate(self.model.sliding):
-            rows[support - 1] = first + k
+        for k, clip in enumerate(self.eyelets):
+            rows[clip] = first + k
         return rows
 
     @property
@@ -256,13 +203,17 @@ class Case:
         found = [self.length, model.cable.length, *model.gravity, *self.load, *offset, *turned]
         found += [*self.stiffnesses, *(chain.places / model.cable.length)]
         found += [*(1 / (np.diff(chain.cells, axis=1).ravel() * stretch)), *self.resting]
-        return [*found, *self.holding]
+        compliance = ca.Function(
+            "compliance", [self.lagrangian.p], [self.lagrangian.axial_compliance]
+        )
+        axial = [float(compliance(self.p))] * model.slides
+        return [*found, *self.holding, *axial]
 
     @property
     def rows(self) -> tuple[GuessRow, ...]:
         """First guesses by spans."""
         model = self.model
-        return guess_table(len(model.clips) + 1, model.in_space, bool(model.sliding))
+        return guess_table(len(model.clips) + 1, model.in_space, bool(self.eyelets))
 
     @property
     def guesses(self) -> int:
@@ -285,7 +236,8 @@ class Case:
     def values(self) -> dict[str, int | str]:
         """Values that replace the templates' marks."""
         model, chain, coefficients = self.model, self.model.chain, map(c_number, HALF_ANGLE)
-        joined = not model.in_space and model.clamped_between and not self.obstacles.most
+        joined = not (model.in_space or model.slides or self.obstacles.most)
+        joined = joined and model.clamped_between
         table = (
             _braces([str(row.slack), str(int(row.rolled)), _braces(map(str, row.sides))])
             for row in self.rows
@@ -304,6 +256,7 @@ class Case:
             "MOST_SHED": c_number(MOST_SHED),
             "NEAR_BAR": c_number(NEAR_BAR),
             **{name: c_number(number) for name, number in NUMBERS.items()},
+            **feed_marks(model, self.border),
         }
 
     @property
@@ -379,7 +332,7 @@ class _SpaceCase(Case):
     @property
     def coarse_elements(self) -> int:  # type: ignore[override]
         model = self.model
-        eyelets = len(model.sliding) if model.clamped_between else 0
+        eyelets = len(self.eyelets) if model.clamped_between else 0
         spans = len(model.clips) - eyelets + 1
         if not (model.end.place or model.clips):
             return 0
@@ -397,7 +350,7 @@ class _SpaceCase(Case):
             return found
         coarse = self.model.with_mesh(self.coarse_elements, "arc")
         rest = coarse_rest(self.model, coarse, self.rest)
-        moved = Moved.ALL if self.model.clips else Moved.NONE
+        moved = Moved.ALL if self.model.moves_nodes else Moved.NONE
         return found | {"coarse_kernel": self.kernels(coarse, rest, moved)}
 
     @property

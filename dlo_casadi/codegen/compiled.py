@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.codegen.cases import row_of
 from dlo_casadi.codegen.compiler import compile_library, workspace_of
 from dlo_casadi.codegen.generate import generate
+from dlo_casadi.codegen.obstacles import row_of
 from dlo_casadi.codegen.shapes import (
     QUANTITIES,
     AnyObstacle,

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.codegen.cases import Obstacles
 from dlo_casadi.codegen.compiler import compile_library
 from dlo_casadi.codegen.generate import Solver
 from dlo_casadi.codegen.moving import MovingCase, alone
+from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.stepper import CompiledStepper
 from dlo_casadi.effects import IN_MOTION, Setup
 from dlo_casadi.errors import DloError

@@ -11,16 +11,10 @@ import numpy as np
 from dlo_casadi import __version__
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.c_text import c_number, helpers_of, marked, table_to_c
-from dlo_casadi.codegen.cases import (
-    ITERATIONS,
-    TRY_STEPS,
-    Case,
-    Obstacles,
-    case_of,
-    template,
-)
+from dlo_casadi.codegen.cases import ITERATIONS, TRY_STEPS, Case, case_of, template
 from dlo_casadi.codegen.kernels import kernel_texts, size_of_code
 from dlo_casadi.codegen.moving import MovingCase
+from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.shapes import records_of
 from dlo_casadi.effects import ContactEffect, MeasurementEffect, StateEffect
 from dlo_casadi.errors import DloError, counted
@@ -112,6 +106,8 @@ def solver_hash(model: CableModel, p: FloatArray, rest: FloatArray) -> str:
         },
         "rest": list(map(float, rest)),
     }
+    if model.slides and model.fed_by_length:
+        content["fed_by_length"] = True
     if model.surfaces:
         content["obstacles"] = [one.drawn for one in model.surfaces]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
@@ -164,7 +160,7 @@ def _values(case: Case, prefix: str, digest: str) -> dict[str, int | str]:
             "CLAMPS": sum(kind.direction for kind in model.clips),
             "CLAMP_KINDS": ", ".join(str(kind.direction * (1 + (not kind.roll))) for kind in held)
             or "0",
-            "EYELETS": len(model.sliding),
+            "EYELETS": len(case.eyelets),
             "EYELET_ROWS": ", ".join(str(row) for row in case.eyelet_rows) or "0",
             "EXAMPLE_CLIPS": case.example_clips,
             "OBSTACLES": among,

@@ -13,6 +13,7 @@ import numpy as np
 
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.c_text import ends_text, helpers_of, statements
+from dlo_casadi.codegen.feeding import load_beyond, load_text, with_rows_beyond
 from dlo_casadi.effects import Effect
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.framed import SegmentNumbers, in_frame
@@ -86,7 +87,8 @@ class Kernels:
     function of the first and last node. `shared` (n_parameters,) or (0,) are the parameters in the
     table, before the segments' rows. `even` (n, k): rows of all segments between even nodes, from
     which those between moved ones are made. `holder` is a segment with a tether inside, at a share
-    of its length that follows its row; `edges` the derivatives of one by where its ends are.
+    of its length that follows its row; `edges` the derivatives of one by where its ends are; `load`
+    the force of all distributed loads beyond an arc length.
     """
 
     segments: tuple[Kernel, ...]
@@ -95,6 +97,7 @@ class Kernels:
     even: FloatArray
     holder: Kernel | None = None
     edges: Kernel | None = None
+    load: ca.Function | None = None
 
     @property
     def all(self) -> list[Kernel]:
@@ -145,9 +148,10 @@ def kernel_texts(meshes: dict[str, Kernels]) -> dict[str, int | str]:
             at += kernels.even.size
         loops.append("\n".join(statements))
     text, ends = "\n".join(functions), "\n".join(ends_text(x.ends) for x in meshes.values())
-    helpers = helpers_of(text + ends)
+    load = load_text(meshes["kernel"].load)
+    helpers = helpers_of(text + ends + load)
     return {
-        "KERNELS": "\n".join([*helpers, text]),
+        "KERNELS": "\n".join([*helpers, text, load]),
         "LOOPS": _by_mesh(loops),
         "HELD": _by_mesh(alone["held"]),
         "EDGES": _by_mesh(alone["edges"]),
@@ -186,13 +190,14 @@ class Moved(Enum):
 class Holding:
     """How a cable is held between its ends.
 
-    `moved`: nodes that are moved to clips; `slides`: whether the cable slides through one;
-    `tether`: an effect that holds it inside a segment.
+    `moved`: nodes that are moved to clips; `slides`: whether the cable slides through one, or an
+    end; `tether`: an effect that holds it inside a segment; `fed`: whether an end slides.
     """
 
     moved: Moved
     slides: bool
     tether: Effect | None
+    fed: bool = False
 
 
 def kernels_of(
@@ -220,7 +225,11 @@ def kernels_of(
     if moved != Moved.NONE:
         beside = [Kernel(whole, none, partial(_from_row, model, parameters, width), moved=True)]
     even = none if held is None else rows
-    told = _ends(model, parameters), shared, even, holder, edges
+    load = None
+    if held is not None and held.fed:
+        even = with_rows_beyond(rows)
+        load = load_beyond(model, parameters, _symbols(parameters))
+    told = _ends(model, parameters), shared, even, holder, edges, load
     if moved == Moved.ALL:
         return Kernels(tuple(beside), *told)
     kinds = places[:, 1:] - [0, 1, 0, 0, 0] * places[:, :1]

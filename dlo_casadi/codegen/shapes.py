@@ -58,7 +58,12 @@ class CompiledShape:
     clip_moments : (n_clips + n_tethers, increment) [N m]
         With clamped clips: of the cable on them; in space about the world's axes.
     places : (n + 1,)
-        With clips or tethers: arc lengths over length of points and nodes; clips have one each.
+        With clips or tethers, or ends that slide: arc lengths over length of points and nodes;
+        clips have one each.
+    fed : float [m]
+        Length between the ends beside the cable's own, without load, where it slides through one.
+    laid : (2 + n_clips,)
+        Then: arc lengths over length of the ends, then the clips, for which nodes are laid.
     contact_forces : (obstacles, 4 n) [N]
         Magnitudes of the forces on each obstacle, normal to its surface, at places of the cable; 0
         without contact.
@@ -91,6 +96,8 @@ class CompiledShape:
     contact_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
     contact_places: FloatArray = field(default_factory=lambda: np.zeros(0))
     obstacle_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
+    fed: float = 0.0
+    laid: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -112,8 +119,8 @@ class Slope:
     In a plane: end x, y [m], start heading, end heading [rad]; k = 4. In space: start x, y, z [m],
     rotation of the start about the world's axes x, y, z [rad], and the same for the end; k = 12.
     Then for each clip: its arc length, its place [m] and, if any clip is clamped, its heading, or
-    its rotation about the world's axes [rad]. In a plane with obstacles the start x, y [m] come
-    last.
+    its rotation about the world's axes [rad]. Then tensions beyond ends that slide [N], or the free
+    length [m]. In a plane with obstacles the start x, y [m] come last.
 
     Parameters
     ----------
@@ -127,6 +134,10 @@ class Slope:
         Of those of CompiledShape.
     energy_by_at : (n_clips,) [N]
         Derivatives of the energy by the clips' arc lengths.
+    energy_by_feed : (ends that slide,)
+        By the tensions [m], or the free length [N].
+    fed, start_force : (k,), (dimension, k)
+        Of those, where an end slides.
     obstacle_forces : (obstacles, dimension, k)
     degenerate : int
         Number of contacts that begin or end at the smallest change of the pose: the derivatives
@@ -146,6 +157,9 @@ class Slope:
     energy_by_at: FloatArray = field(default_factory=lambda: np.zeros(0))
     obstacle_forces: FloatArray = field(default_factory=lambda: np.zeros(0))
     degenerate: int = 0
+    fed: FloatArray = field(default_factory=lambda: np.zeros(0))
+    start_force: FloatArray = field(default_factory=lambda: np.zeros(0))
+    energy_by_feed: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -227,11 +241,13 @@ def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
     clips, holds = len(model.clips), len(model.clips) + model.n_springs
     clamps, turns = model.clamped_between, turn * model.clamped_between
     starts = model.in_space or n_obstacles > 0
-    k = 2 * turn + (2 * d if starts else d) + (1 + d + turns) * clips
+    k = 2 * turn + (2 * d if starts else d) + (1 + d + turns) * clips + sum(model.loose)
+    laid, fed = n * bool(holds or model.slides), sum(model.loose)
     forces: dict[str, tuple[int, ...]] = {"start_force": (d,), "end_force": (d,)}
     forces |= {"clip_forces": (holds, d), "clip_grip": (holds,), "clip_at": (holds,)}
     forces |= {
-        "places": (n * bool(holds),),
+        "places": (laid,),
+        **({"fed": (), "laid": (2 + clips,)} if fed else {}),
         "clip_moments": (holds * clamps, turn),
         "contact_forces": (n_obstacles, 4 * model.n),
         "contact_places": (n_obstacles, 4 * model.n),
@@ -242,7 +258,9 @@ def records_of(model: CableModel, n_obstacles: int = 0) -> Records:
     scalars += ["end_error", "imbalance"]
     slope: dict[str, tuple[int, ...]] = {"points": (n, d, k), "rotations": (nodes, turn, k)}
     slope |= {"end_force": (d, k), "clip_forces": (holds, d, k), "clip_at": (holds, k)}
-    slope |= {"places": (n * bool(holds), k), "clip_moments": (holds * clamps, turn, k)}
+    slope |= {"places": (laid, k), "fed": (k * bool(fed),)}
+    slope |= {"start_force": (d * bool(fed), k), "energy_by_feed": (fed,)}
+    slope |= {"clip_moments": (holds * clamps, turn, k)}
     slope |= {"energy_by_at": (clips,), "obstacle_forces": (n_obstacles, d, k)}
     slope |= {"moments": (2, turn, k)}
     slope |= {"min_bend_radius": (k,), "max_twist": (k,)}
@@ -351,6 +369,8 @@ def _row(model: CableModel, pose: object) -> FloatArray:
     if kinds != model.clips:
         mine, others = (", ".join(x) or "none" for x in (kinds, model.clips))
         raise DloError(f"{said}the pose has the clips {mine}, the solver {others}")
+    if fed := pose.wrongly_fed((model.start, model.end), by_length=model.fed_by_length):
+        raise DloError(f"{said}{fed}")
     return pose.numbers
 
 

@@ -43,6 +43,7 @@ NUMBERS = {
     "TIE": TIE,
     "TAUT": TAUT,
     "ONE_POINT": ONE_POINT,
+    "FED_SLACK": SLACK,
 }
 
 

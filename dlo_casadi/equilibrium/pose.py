@@ -152,15 +152,15 @@ class HeldPose:
         """The numbers of dlo_pose in the C header, in their order; 0 or identity where not held.
 
         Start, end [m]; in a plane the headings of both [rad], in space their quaternions and the
-        turns; tensions beyond ends that slide [N]; then of each clip its arc length and place [m]
-        and, if one holds a direction, frames.
+        turns; tensions beyond ends that slide [N], or the free length [m]; then of each clip its
+        arc length and place [m] and, if one holds a direction, frames.
         """
         turns = [self.turns] if self.node.twists else []
         held, clips = any(clip.kind.direction for clip in self.clips), []
         for clip in self.clips:
             frame = self.node.identity if clip.frame is None else clip.frame
             clips += [clip.at or 0.0, *clip.place, *(frame if held else ())]
-        beyond = [x for x in self.tensions if x is not None]
+        beyond = [x for x in (*self.tensions, self.free_length) if x is not None]
         return np.array([*self.ends, *turns, *beyond, *clips], dtype=float)
 
     @property

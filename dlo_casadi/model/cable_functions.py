@@ -76,7 +76,12 @@ class CableFunctions:
 
     @cached_property
     def dead_load(self) -> ca.Function:
-        """(p) -> sum of the dead loads (dimension,) [N], excluding forces of single poses."""
+        """(p) -> sum of the dead loads (dimension,) [N], excluding forces of single poses.
+
+        These are the loads on the declared length, whatever is fed through ends.
+        """
         still = ca.SX.zeros(len(self.model.deviation_names))
-        load = ca.substitute(self.terms.total_load, self.terms.deviation, still)
+        forces = (force.force for force in self.terms.dead_forces)
+        load = sum(forces, start=self.terms.resultant(0.0))
+        load = ca.substitute(load, self.terms.deviation, still)
         return ca.Function("dead_load", [self.terms.p], [ca.densify(load)])

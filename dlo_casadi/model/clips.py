@@ -123,7 +123,7 @@ def placed_nodes(
 
 
 def laid_for(chain: Chain, at: FloatArray) -> FloatArray:
-    """Arc lengths (..., 2) [m] of both ends for which nodes are laid: middles of elements near `at`.
+    """Arc lengths (..., 2) [m] of both ends for which nodes are laid: middles of elements there.
 
     Shapes that were reached in different ways then have the same nodes; and no middle of evenly
     laid nodes is on the edge of an even cell.

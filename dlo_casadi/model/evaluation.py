@@ -67,6 +67,7 @@ class Evaluation:
             end, sign = self._fed_end
             near[:, end] += sign * (free - model.cable.length)
             held[:, end] = near[:, end] + sign * self.shapes.deviation[:, self._free_length]
+            near[:, end] = laid_for(model.chain, near[:, [0, -1]])[:, end]
         if model.sliding:
             slides, rows = [*model.sliding], [*model.sliding.values()]
             held[:, slides], own = self.shapes.lam[:, rows], self.shapes.near_each(len(rows))

@@ -15,8 +15,9 @@ from solvers import QUICK, STRICT, WARNINGS, all_zero, moved
 
 import dlo_casadi as dlo
 from dlo_casadi.codegen import STATUSES, CompiledSolver, generate
-from dlo_casadi.codegen.cases import Obstacles, case_of
+from dlo_casadi.codegen.cases import case_of
 from dlo_casadi.codegen.compiler import compile_library, workspace_of
+from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.effects import AxialStretch, BendingSoftening, CableData, LumpedMass, PointForce
 from dlo_casadi.equilibrium.guesses import guessed_frames
 from dlo_casadi.equilibrium.pose import HeldPose
