@@ -1,6 +1,6 @@
 """Recordings of each format beside the session they are rendered from.
 
-    python scripts/check_import.py [FORMAT ...] [clouds]
+    python scripts/check_import.py [FORMAT ...] [clouds] [moving]
 
 For each format: poses found, offset of clocks found, and EI and GJ of the imported session from
 those of the CSV session, in its standard deviations. RENDERED, not real: a take of
@@ -8,8 +8,10 @@ configs/markers_in_space.yaml at 100 Hz, led from pose to pose, with noise in ev
 clock of the grippers that is 80 ms ahead.
 
 Clouds: ten poses of tests/data/space/space_photos, cast with 2 mm of noise in depth and 30 % of the
-cable hidden: distance of the lines from the true ones, and EI and GJ beside the true values. All of
-it takes two minutes of processor time. Exit code 1 if anything is not as it should be.
+cable hidden: distance of the lines from the true ones, and EI and GJ beside the true values.
+Moving: a simulated cable that is carried from pose to pose, imported with its motions: EI, GJ and
+the damping time beside the true values. All of it takes three minutes of processor time. Exit
+code 1 if anything is not as it should be.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ import numpy as np
 import yaml
 from harness import options, run
 from recorded.clouds import CABLE, depth_cloud, write_ply
+from recorded.moved import CABLE as MOVED
+from recorded.moved import DAMPING, STIFFNESS, TORSION, moved
 from recorded.takes import OFFSET, WRITERS, led, rendered, write_grippers
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
@@ -99,17 +103,40 @@ def clouds(folder: Path) -> bool:
     return right
 
 
+def moving(folder: Path) -> bool:
+    """Print stiffnesses and damping from a simulated take with motions; whether all is right."""
+    files, options = WRITERS["c3d"](moved(), folder)
+    for key, value in (*MOVED.items(), ("bending_stiffness", 0.01)):
+        options += [f"--{key.replace('_', '-')}", str(value)]
+    target = folder / "loom"
+    options += ["--motions", "3", "--quiet"]
+    if command(["import", *map(str, files), "--output", str(target), *options]):
+        return False
+    result, right = dlo.fit(target / "session.yaml", diagnosis=False), True
+    true = dict(zip((*STIFFNESSES, "damping_time"), (STIFFNESS, TORSION, DAMPING), strict=True))
+    print("\nmoving:")
+    for name, value in true.items():
+        own = result.params[name]
+        low, high = own.interval_95 or (np.nan, np.nan)
+        print(f"  {name} {own.value:.5f}, 95 % {low:.5f} to {high:.5f}, true {value}")
+        right &= bool(low <= value <= high)
+    return right
+
+
 def main() -> int:
     """Print the table; 1 if anything is off."""
     parser = options(__doc__, jobs=True)
-    parser.add_argument("kinds", nargs="*", help=f"{', '.join(WRITERS)}, clouds; all by default")
+    parser.add_argument("kinds", nargs="*", help=f"{', '.join(WRITERS)}, clouds, moving")
     chosen = parser.parse_args()
     kinds = chosen.kinds
     right = True
     if not kinds or "clouds" in kinds:
         with tempfile.TemporaryDirectory() as folder:
             right = clouds(Path(folder))
-    kinds = [kind for kind in kinds or WRITERS if kind != "clouds"]
+    if not kinds or "moving" in kinds:
+        with tempfile.TemporaryDirectory() as folder:
+            right &= moving(Path(folder))
+    kinds = [kind for kind in kinds or WRITERS if kind not in ("clouds", "moving")]
     if not kinds:
         return not right
     own = fitted(SESSION)

@@ -15,6 +15,7 @@ from dlo_casadi.config import load_config
 from dlo_casadi.errors import MeasurementError
 from dlo_casadi.io.points import read_points
 from dlo_casadi.recordings import FORMATS, Recording, Stream, Wishes, make_session, read_recording
+from dlo_casadi.session.motions import read_motions
 
 SESSION = Path(__file__).parents[1] / "configs" / "markers_in_space.yaml"
 CABLE = ("--mass", "0.03", "--diameter", "0.004")
@@ -371,3 +372,25 @@ def test_markers_that_are_never_seen_together(take):
     }
     with pytest.raises(MeasurementError, match=r"no pose shows one of the markers .*\n  Try: fill"):
         make_session("loom", recorded(replace(take, markers=markers)), Wishes())
+
+
+@pytest.mark.parametrize("kind", ["c3d", "motive", "vicon"])
+def test_what_moves_between_poses_is_written_as_motions(kind, tmp_path):
+    take = rendered(SESSION, poses=3)
+    files, options = WRITERS[kind](take, tmp_path)
+    target = tmp_path / "loom"
+    known = ["--mass", "0.03", "--diameter", "0.004", "--bending-stiffness", "0.0197"]
+    command = ["import", *map(str, files), "--output", str(target), *options, *known, "--quiet"]
+    assert main([*command, "--motions", "4"]) == 0
+    config = load_config(target / "session.yaml")
+    assert config.experiment.tolerances.delay == 0.03
+    motions = read_motions(config)
+    assert len(motions) == 2
+    for motion, pose in zip(motions, config.experiment.poses, strict=False):
+        assert motion.at_rest
+        assert 1.0 < motion.t[-1] < 2.0
+        assert motion.s.shape == (12,)
+        assert np.linalg.norm(motion.moving["end"][0] - pose.end) < 4e-4  # noise of 0.2 mm
+        turned = np.abs(motion.moving["end_orientation"][0] @ np.array(pose.end_orientation))
+        assert turned > 1 - 1e-6
+        assert np.linalg.norm(np.ptp(motion.moving["end"], axis=0)) > 0.1

@@ -11,6 +11,7 @@ from pathlib import Path
 import dlo_casadi
 from dlo_casadi.cli.common import Page, command, one_of, option
 from dlo_casadi.config.load import IMAGE_ENDINGS
+from dlo_casadi.config.problems import PLACEHOLDER
 from dlo_casadi.config.template import Kind, schema_text, template, to_fill_in
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import write_file
@@ -66,7 +67,16 @@ def new(chosen: argparse.Namespace) -> None:
     elif chosen.centerlines is not None:
         files = _listed(chosen.centerlines, (".csv",), "CSV file", target.parent)
     kind: Kind = "images" if chosen.centerlines is None else "centerlines"
-    motions = [Path(os.path.relpath(x, target.parent)).as_posix() for x in chosen.motion]
+    held = ["start", "start_orientation", "end", "end_orientation"]
+    motions = [
+        {
+            "file": Path(os.path.relpath(path, target.parent)).as_posix(),
+            **dict.fromkeys(held if chosen.space else held[::2], PLACEHOLDER),
+            "begins": "moving",
+            "role": "fit",
+        }
+        for path in chosen.motion
+    ]
     if missing := [str(x) for x in chosen.motion if not x.is_file()]:
         raise DloError(f"--motion: {missing[0]} is no file")
     text = template(target.stem, files, kind, chosen.space, clips=chosen.clips, motions=motions)

@@ -65,6 +65,7 @@ def _vector(name: str, axes: str, text: str) -> Option:
     option("--units", choices=("m", "cm", "mm"), help="of files that do not name theirs"),
     option("--hold", type=float, default=0.5, metavar="S", help="shortest pose; %(default)s s"),
     option("--held-out", type=int, default=4, metavar="N", help="one in N; default %(default)s"),
+    option("--motions", type=int, default=0, metavar="N", help="write up to N moving stretches"),
     *(
         option(f"--{key.replace('_', '-')}", type=float, help=text, metavar="X")
         for key, text in _CABLE.items()
@@ -137,6 +138,8 @@ def _assuming(recording: Recording) -> Iterator[None]:
 def _write(session: Imported, folder: Path) -> None:
     for name, (points, s) in session.points.items():
         write_points(folder / name, points, s)
+    for name, text in session.tables.items():
+        write_file(folder / name, text)
     write_file(folder / "schema.json", schema_text())
     write_file(folder / _NAME, session.text())
 

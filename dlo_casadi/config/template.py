@@ -29,7 +29,7 @@ def template(
     clips: Sequence[str] = (),
     tolerances: Mapping[str, str] = {},
     remarks: Sequence[str] = (),
-    motions: Sequence[str] = (),
+    motions: Sequence[Mapping[str, str]] = (),
 ) -> str:
     """Text of a configuration with placeholders for what only the user knows.
 
@@ -55,8 +55,8 @@ def template(
         In space: tolerances that differ from the usual ones, by key.
     remarks : sequence of str
         Comment lines at the top of the configuration.
-    motions : sequence of str
-        Files of recordings of the moving cable; none by default.
+    motions : sequence of mapping of str to str
+        Keys and values of recordings of the moving cable; none by default.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def template(
         clips=[_clip(one, in_space) for one in clips],
         tolerances=tolerances,
         remarks=remarks,
-        motions=[_quoted(file) for file in motions],
+        motions=[{**one, "file": _quoted(one["file"])} for one in motions],
     )
 
 

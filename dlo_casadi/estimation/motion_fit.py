@@ -56,6 +56,8 @@ REPEATED = {BENDING_STIFFNESS: 5e-3, DAMPING_TIME: 1.5e-2}
 # How far a point of a moving cable is predicted wrongly by mesh and steps of time, in lengths: the
 # std of photographs that are drawn without any fault is 4 um, that of their frames in motion 22 um.
 MESH_ERROR = 1e-4
+# Ratio of the noise from frame to frame to that of still poses from which on it counts.
+_NOISIER = 1.2
 # Share of the largest eigenvalue of the scaled Hessian below which motions tell nothing.
 _SHOWN = 1e-10
 
@@ -149,7 +151,8 @@ def fit_motions(
     Parameters
     ----------
     std : float, optional [m]
-        Noise of a marker's coordinate; by default that of the still poses. MESH_ERROR is added.
+        Noise of a marker's coordinate; by default that of the still poses, or from frame to frame
+        where that is clearly more. MESH_ERROR is added.
     damping_time : float, optional [s]
         A first guess.
     until : float [s]
@@ -163,7 +166,10 @@ def fit_motions(
     tolerances = fit.problem.priors.tolerances
     model = moving_model(fit.model, damping_time, tolerances.delay)
     fit = refit(fit, model)
-    std = float(np.hypot(std or fit.noise.std, MESH_ERROR * model.cable.length))
+    std = std or fit.noise.std
+    # Still poses may be means of many frames.
+    own = float(np.median([one.noise for one in measured if not one.held_out]))
+    std = float(np.hypot(own if own > _NOISIER * std else std, MESH_ERROR * model.cable.length))
     moving = unknowns_in_motion(fit.problem.unknowns)
     begun = [
         begin(Recording(one, tolerances, LONGEST_STEP), fit, moving, std)

@@ -307,6 +307,8 @@ class Wishes:
     """Shortest still stretch that is a pose [s]."""
     held_out: int = 4
     """One in this many poses is held out; 0 for none."""
+    motions: int = 0
+    """Most moving stretches between poses that are written as motions, the quickest ones."""
     known: Mapping[str, float] = field(default_factory=dict)
     """Keys and values of the section `cable`."""
 
@@ -315,6 +317,7 @@ class Wishes:
         for key, value in {"hold": self.hold, **self.known}.items():
             positive = bool(np.isfinite(value) and value > 0.0)
             require(positive, key, value, "a positive number")
+        require(self.motions >= 0, "motions", self.motions, "0 or more")
         few = self.held_out == 0 or self.held_out > 1
         require(few, "held_out", self.held_out, "0 for no pose, or 2 or more: one in so many")
         for side, offset in (("start", self.start_offset), ("end", self.end_offset)):

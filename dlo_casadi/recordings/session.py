@@ -20,6 +20,7 @@ from dlo_casadi.recordings.fixtures import (
     full_names,
     readings_of,
 )
+from dlo_casadi.recordings.moving import MovingStretch, moving_stretches
 from dlo_casadi.recordings.order import (
     LONGER,
     arc_lengths,
@@ -35,6 +36,10 @@ _COLUMNS = 98  # width of a comment
 # from one session: below 0.1 % for eight markers or more, up to 0.15 % for six, 0.9 % for four, 2.9
 # % for three; errors of arc lengths are 0.5 to 1.6 times the scatter. Grippers 20 mm off: 0.3 %.
 _DOUBTFUL = 2e-3
+# How well clocks are aligned by the motion of grippers and markers [s]: these lag, as cables do.
+_DELAY = 0.03
+# Speed [lengths/s] from which on a stretch between two poses is a motion.
+_QUICK = 0.1
 _LENGTH = DeclaredTolerances().length  # m
 
 Points = tuple[FloatArray, FloatArray | None]  # (K, 3) [m], and arc lengths (K,) [m] of markers
@@ -58,6 +63,10 @@ class Imported:
     """Those of the remarks that may spoil the result."""
     tolerances: Mapping[str, float] = field(default_factory=dict)
     """How well values of the cable are known, where that is worse than usual."""
+    motions: tuple[dict[str, str], ...] = ()
+    """Entries of the configuration."""
+    tables: Mapping[str, str] = field(default_factory=dict)
+    """Text of the CSV files of the motions."""
 
     def text(self, cable: Mapping[str, str] | None = None) -> str:
         """Text of the configuration; with other values of the cable, if given."""
@@ -70,6 +79,7 @@ class Imported:
             poses=self.poses,
             end=self.end,
             tolerances={key: f"{value:.2g}" for key, value in self.tolerances.items()},
+            motions=self.motions,
             remarks=[line for remark in self.remarks for line in wrap(remark, _COLUMNS)],
         )
 
@@ -101,6 +111,8 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
     if wishes.end != FREE:
         end = find_gripper(wishes.end, wishes.end_offset, "end", stills, recording)
     doubts: list[str] = []
+    motions: list[dict[str, str]] = []
+    tables: dict[str, str] = {}
     tolerances: dict[str, float] = {}
     remarks = [*recording.assumptions, *recording.unread, *(offset.told for offset in offsets)]
     holders = wishes.holders.values()
@@ -155,6 +167,12 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
             (np.round(line, 6), np.round(s[here], 6))
             for line, here in zip(lines, seen.T, strict=True)
         ]
+        if start is not None and (end is not None or wishes.end == FREE):
+            stretches = moving_stretches(recording, stills, names, wishes, (start, end))
+            motions, tables, on_motions = _motions(stretches, np.round(s, 6), length, wishes)
+            remarks += on_motions
+            if motions and offsets:
+                tolerances["delay"] = _DELAY
     called = {side: [*names, *asked[side]] for side, names in wishes.holders.items()}
     readings, on_forces = readings_of(recording, stills, called)
     remarks += on_forces
@@ -180,7 +198,32 @@ def make_session(name: str, recording: Recording, wishes: Wishes) -> Imported:
         (*remarks, *doubts),
         tuple(doubts),
         tolerances,
+        tuple(motions),
+        tables,
     )
+
+
+def _motions(
+    stretches: Sequence[MovingStretch], s: FloatArray, length: float, wishes: Wishes
+) -> tuple[list[dict[str, str]], dict[str, str], list[str]]:
+    """Entries and files of the quickest moving stretches, in their order, and what to say."""
+    quick = [one for one in stretches if one.speed > _QUICK * length]
+    if not quick:
+        return [], {}, []
+    if not wishes.motions:
+        longest = max(one.t[-1] for one in quick)
+        said = f"between poses the cable moves quickly {counted(len(quick), 'time')}, for up to"
+        return [], {}, [f"{said} {longest:.1f} s; --motions 4 writes the quickest as motions"]
+    least = sorted((one.speed for one in quick), reverse=True)[: wishes.motions][-1]
+    entries: list[dict[str, str]] = []
+    tables: dict[str, str] = {}
+    for k, one in enumerate([x for x in quick if x.speed >= least], start=1):
+        file, ends = f"motion_{k:02d}.csv", f"motion_{k:02d}_ends.csv"
+        tables |= {file: one.points_table(s), ends: one.fixtures_table()}
+        left_out = wishes.held_out and not k % wishes.held_out
+        role = "held_out" if left_out else "fit"
+        entries.append({"file": file, "fixtures": ends, "begins": "at_rest", "role": role})
+    return entries, tables, []
 
 
 def _guess(mass: float, length: float) -> float:

@@ -23,7 +23,7 @@ def motion_figure(outcome: Outcome) -> Figure | None:
     size = canvas.WIDTH, len(last.shown) * _ROW + 0.8
     with style.styled(size) as drawing:
         axes = drawing.subplots(len(last.shown), 2, sharex=True, squeeze=False)
-        noise = 1e3 * (outcome.measurement.std or 0.0) * np.sqrt(last.shown[0].compared)
+        noise = 1e3 * last.noise * np.sqrt(last.shown[0].compared)
         for k, (item, (left, right)) in enumerate(zip(last.shown, axes, strict=True)):
             _draw_path(left, item)
             if before is not None:

@@ -45,7 +45,7 @@ def sentence_of(outcome: Outcome) -> str:
         _SAID,
         fit=last.rmse_fit,
         held_out=worded(", held-out ones to {held:mm}", held=held) if held is not None else "",
-        noise=(outcome.measurement.std or 0.0) * last.shown[0].compared ** 0.5,
+        noise=last.noise * last.shown[0].compared ** 0.5,
     )
     if before:
         names = " and ".join(map(str, outcome.effects))

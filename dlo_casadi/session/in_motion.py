@@ -63,12 +63,15 @@ class MotionStage:
         Over all points and times; None without motions of that role.
     chi2_per_dof : float
         Of the fitted motions.
+    noise : float [m]
+        Of a coordinate of a point.
     shown : tuple of MotionShown
     """
 
     rmse_fit: float
     rmse_held_out: float | None
     chi2_per_dof: float
+    noise: float
     shown: tuple[MotionShown, ...]
 
 
@@ -162,4 +165,4 @@ def _stage(fit: MotionFit, motions: Sequence[MeasuredMotion]) -> MotionStage:
         known = np.concatenate([np.zeros(0), *(x[np.isfinite(x)] for x in both[role])])
         return float(np.sqrt(np.mean(known**2))) if len(known) else None
 
-    return MotionStage(rms("fit") or 0.0, rms("held_out"), fit.chi2_per_dof, tuple(shown))
+    return MotionStage(rms("fit") or 0.0, rms("held_out"), fit.chi2_per_dof, fit.std, tuple(shown))
