@@ -130,7 +130,8 @@ def in_mujoco(move: dlo.Move, before: dlo.Shape) -> tuple[float, float]:
     """Swings [lengths] of the planned motion, and of least jerk, in MuJoCo."""
     cable, course = before.cable, move.course
     t = np.arange(0.0, move.motion.t[-1], 1 / RATE)
-    still = {name: x for name, x in held_by(before.pose).items() if name not in move.table()}
+    moving = rows_of(course, course.values(move.theta, t))
+    still = {name: x for name, x in held_by(before.pose).items() if name not in moving}
     rod = Rod.of(before.held, LINKS)
     found = []
     for values in (course.values(move.theta, t), least_jerk(course, t)):

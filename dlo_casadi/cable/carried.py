@@ -1,61 +1,20 @@
-"""Move a cable so that it is at rest on arrival: plans on a coarse mesh, fine simulations."""
+"""A fitted cable that is carried: motions of its fixtures after which it is at rest."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from dlo_casadi.arrays import FloatArray
 from dlo_casadi.cable.held import among
-from dlo_casadi.cable.motion import CableInMotion, Motion
-from dlo_casadi.cable.move import RATE, Move, rows_of
-from dlo_casadi.cable.move_checks import checked_limits, checked_pose, held_by, number
-from dlo_casadi.cable.move_limits import require_rest, used_along
-from dlo_casadi.cable.shape_in_motion import Modes, moving_cable
+from dlo_casadi.cable.motion import CableInMotion
+from dlo_casadi.cable.move import Move
+from dlo_casadi.cable.move_checks import checked_limits, checked_pose, number
+from dlo_casadi.cable.move_limits import require_rest
+from dlo_casadi.cable.planner import Planner, Shape
 from dlo_casadi.config import Obstacle
-from dlo_casadi.equilibrium.equilibrium import Equilibrium
-from dlo_casadi.equilibrium.pose import HeldPose
-from dlo_casadi.equilibrium.solve import solve_equilibrium
-from dlo_casadi.errors import DloError, MotionError
-from dlo_casadi.motion.system import MovingCable
+from dlo_casadi.errors import DloError
 from dlo_casadi.planning.course import Course
-from dlo_casadi.planning.others import least_jerk, shaped
-from dlo_casadi.planning.predicted import Case, predicted
-from dlo_casadi.planning.problem import CLEAR, FIXTURES, Planned, Task, planned
-
-# Elements of the cable that is planned with. Between two clamps 10 leave swings 30 times as large.
-_ELEMENTS = 20
-# Steps in time in a period of the slowest mode, and in the motion at least.
-_A_PERIOD, _A_MOTION = 100, 60
-# Error of a step of the fine simulation [lengths]: some hundred steps leave a swing of 3e-5.
-_FINE = 3e-7
-# Share of a limit that a fine simulation may exceed, and rounds of planning with stricter ones.
-_OVER, _ROUNDS = 1e-3, 3
-# Swing [lengths] up to which the fastest motion is sought, and the accuracy of its duration.
-_STILL, _ACCURATE = 1e-3, 0.01
-# Longest duration that is tried, in periods of the slowest mode.
-_LONGEST = 16.0
-# Directions of the parameters' covariance in which a robust motion is planned, draws of the band.
-_DIRECTIONS, _DRAWS = 2, 2000
-
-
-class Shape(Protocol):
-    """What is used of a `FittedCable`'s shape."""
-
-    pose: HeldPose
-    equilibrium: Equilibrium
-
-    @property
-    def points(self) -> FloatArray:
-        """Points (101, d) [m]."""
-
-    def modes(self, count: int = 6) -> Modes:
-        """Small motions about it."""
+from dlo_casadi.runtime.progress import Progress, nobody
 
 
 class CarriedCable(CableInMotion):
@@ -75,6 +34,7 @@ class CarriedCable(CableInMotion):
         limits: Mapping[str, float] | None = None,
         obstacles: Sequence[Obstacle | Mapping[str, Any]] = (),
         robust: bool = False,
+        progress: Progress | None = None,
     ) -> Move:
         """A motion of the fixtures from one pose to another after which the cable is at rest.
 
@@ -99,11 +59,13 @@ class CarriedCable(CableInMotion):
         robust : bool
             Whether the mean square of the swing under the parameters' covariance is minimised,
             instead of the swing of the likeliest cable.
+        progress : Progress, optional, as of `Session.fit`
 
         Raises
         ------
         DloError
-            If no such motion keeps the limits, with what it would need; or for meaningless input.
+            If no such motion keeps the limits, with what it would need and the shortest duration
+            that was found to keep them; or for meaningless input.
         MotionError
             If the cable cannot follow, e.g. if an end is torn out of reach.
         EquilibriumError
@@ -119,321 +81,8 @@ class CarriedCable(CableInMotion):
         if not Course.between(first.pose, last.pose, 1.0).parts:
             raise DloError("move: both poses are the same, nothing moves")
         surfaces = among(self.model, self.p, obstacles)["model"].obstacles if obstacles else ()
-        planner = Planner(self, first, last, asked, tuple(surfaces), robust)
+        step = nobody if progress is None else progress.step
+        planner = Planner(self, first, last, asked, tuple(surfaces), robust, step)
         for name, shape in (("before", first), ("after", last)):
             require_rest(self, name, shape, asked, surfaces)
-        return planner.fastest() if time is None else planner.verified(time, None)
-
-
-@dataclass(frozen=True, eq=False)
-class Planner:
-    """Plans on a coarse mesh, and verifies on the cable's own one."""
-
-    cable: CarriedCable
-    before: Shape
-    after: Shape
-    limits: dict[str, float]
-    obstacles: tuple[Any, ...]
-    robust: bool
-
-    # ---- the cable that is planned with ----------------------------------------------------------
-
-    @cached_property
-    def mode(self) -> tuple[float, float]:
-        """Natural frequency [Hz] and damping ratio of the slowest mode that comes back."""
-        modes = self.after.modes(3)
-        back = np.flatnonzero(modes.frequencies > 0)  # a roll between pins does not come back
-        if not back.size:
-            raise DloError("move: nothing brings this cable back to rest, so that nothing swings")
-        k = int(back[0])
-        return float(modes.frequencies[k]), float(modes.damping_ratios[k])
-
-    @property
-    def period(self) -> float:
-        """Of the slowest mode [s]."""
-        return 1.0 / self.mode[0]
-
-    @cached_property
-    def coarse(self) -> CarriedCable:
-        """On the mesh that is planned with."""
-        n = self.cable.model.n
-        return self.cable.with_mesh(_ELEMENTS) if n > _ELEMENTS else self.cable
-
-    def _case(self, cable: MovingCable, weight: float) -> Case:
-        """A cable with the places where it rests before and after."""
-        found = []
-        for shape in (self.before, self.after):
-            known = np.linspace(0.0, self.cable.length, len(shape.equilibrium.x))
-            x = cable.model.node.interpolated(cable.model.chain.places, known, shape.equilibrium.x)
-            found.append(solve_equilibrium(cable.model, cable.p, cable.rest, shape.pose, x_init=x))
-        cable = cable.about(found[0].x)
-        first, last = (
-            cable.at_rest(eq, cable.fixtures(shape.pose.vector))
-            for eq, shape in zip(found, (self.before, self.after), strict=True)
-        )
-        return Case(cable, first, last.r, weight)
-
-    @cached_property
-    def directions(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Changes of p and of the rest curvature by one standard deviation in each direction."""
-        cable = self.coarse
-        found: list[tuple[FloatArray, FloatArray]] = []
-        names, values = cable.covariance.names, cable.covariance.values
-        if not len(names):
-            return []
-        sizes, vectors = np.linalg.eigh(values / np.sqrt(np.outer(*[np.diag(values)] * 2)))
-        std = np.sqrt(np.diag(values))
-        for size, vector in zip(sizes[::-1], vectors.T[::-1], strict=True):
-            p, rest = np.zeros(len(cable.p)), np.zeros(len(cable.rest))
-            for name, change in zip(names, np.sqrt(max(size, 0.0)) * std * vector, strict=True):
-                if name in cable.model.names:
-                    p[cable.model.names.index(name)] = change
-                elif name.startswith("rest_curvature["):
-                    rest[int(name[15:-1])] = change
-            found.append((p, rest))
-        return found
-
-    def _changed(self, p: FloatArray, rest: FloatArray) -> MovingCable:
-        return moving_cable(replace(self.coarse, p=self.coarse.p + p, rest=self.coarse.rest + rest))
-
-    @cached_property
-    def nominal(self) -> Case:
-        """The cable as it is likeliest."""
-        return self._case(moving_cable(self.coarse), 1.0)
-
-    def task(self, course: Course, cases: Sequence[Case], limits: dict[str, float]) -> Task:
-        """What is asked of a course: the swing is looked at for half a period."""
-        dt = min(self.period / _A_PERIOD, course.duration / _A_MOTION)
-        own = {name: x for name, x in limits.items() if name != "bend_radius"}
-        if "bend_radius" in limits:
-            own["curvature"] = 1 / limits["bend_radius"]
-        return Task(cases, dt, self.period / 2, own, self.obstacles)
-
-    # ---- what parameters do to the swing ---------------------------------------------------------
-
-    def _slopes(self, course: Course, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Swing (R,), and its change (R, D) by one standard deviation in each direction."""
-        task = self.task(course, [self.nominal], {})
-
-        def rows(case: Case) -> FloatArray:
-            found = predicted(case, course, theta, task.dt, task.after, derivatives=False)
-            return found.swing.value
-
-        first, columns = rows(self.nominal), []
-        for p, rest in self.directions:
-            both = [rows(self._case(self._changed(k * p, k * rest), 1.0)) for k in (0.5, -0.5)]
-            columns.append(both[0] - both[1])
-        return first, np.array(columns).reshape((-1, len(first))).T
-
-    def band(self, course: Course, theta: FloatArray) -> tuple[float, float]:
-        """5 % and 95 % quantiles of the swing [m] under the covariance, to first order."""
-        first, slopes = self._slopes(course, theta)
-        draws = np.random.default_rng(0).standard_normal((slopes.shape[1], _DRAWS))
-        sizes = np.linalg.norm(first[:, None] + slopes @ draws, axis=0)
-        low, high = np.quantile(sizes, (0.05, 0.95))
-        return float(low), float(high)
-
-    def _robust_cases(self, course: Course, theta: FloatArray) -> list[Case]:
-        """Cables to both sides in the directions that change the swing most."""
-        _, slopes = self._slopes(course, theta)
-        _, sizes, vectors = np.linalg.svd(slopes, full_matrices=False)
-        count = min(_DIRECTIONS, int((sizes > 0).sum()))
-        cases = []
-        for vector in vectors[:count]:
-            p, rest = (
-                np.sqrt(count) * sum(v * x[k] for v, x in zip(vector, self.directions, strict=True))
-                for k in (0, 1)
-            )
-            for sign in (1, -1):
-                changed = self._changed(sign * p, sign * rest)
-                cases.append(self._case(changed, 0.5 / count))
-        return cases or [self.nominal]
-
-    # ---- planning --------------------------------------------------------------------------------
-
-    def plan(
-        self, duration: float, limits: dict[str, float], start: FloatArray | None
-    ) -> tuple[Course, Planned]:
-        """The best course of a duration."""
-        course = Course.between(self.before.pose, self.after.pose, duration)
-        try:
-            found = planned(self.task(course, [self.nominal], limits), course, start)
-            if self.robust and self.directions:
-                cases = [*self._robust_cases(course, found.theta)]
-                # Limits are those of the first case, the likeliest cable, which has no weight.
-                cases = [replace(self.nominal, weight=0.0), *cases]
-                found = planned(self.task(course, cases, limits), course, found.theta)
-        except MotionError as error:
-            raise MotionError(
-                f"move: the motion of least jerk in {duration:.4g} s has no solution: {error}\n"
-                f"  Try: a longer duration; the slowest mode has a period of {self.period:.3g} s.",
-                t=error.t,
-            ) from error
-        return course, found
-
-    def verified(self, duration: float, start: FloatArray | None) -> Move:
-        """The best motion of a duration, whose limits are kept in a fine simulation.
-
-        Raises
-        ------
-        DloError
-            If no motion of this duration keeps them.
-        """
-        self._require_time(duration)
-        limits = dict(self.limits)
-        for _ in range(_ROUNDS):
-            course, found = self.plan(duration, limits, start)
-            self._require(found, duration)
-            try:
-                motion = self.simulated(course, course.values(found.theta, self._times(course)))
-            except MotionError as error:
-                raise MotionError(
-                    f"move: the motion that was planned for {duration:.4g} s has no solution on "
-                    f"the cable's own mesh at {error.t:.4g} s.\n  Try: a longer duration; the "
-                    f"slowest mode has a period of {self.period:.3g} s",
-                    t=error.t,
-                ) from error
-            used = used_along(course, found.theta, motion, self.limits, self.obstacles)
-            over = {name: x for name, x in used.items() if x > 1 + _OVER}
-            if not over:
-                return self._result(course, found, motion, used)
-            for name, share in over.items():
-                limits[name] = self._stricter(name, limits[name], share)
-            start = found.theta
-        worst = max(over, key=lambda name: over[name])
-        raise DloError(
-            f"move: in a fine simulation {worst} needs {over[worst]:.3f} times its limit of "
-            f"{self.limits[worst]:g}.\n  Try: a longer duration than {duration:.4g} s"
-        )
-
-    def _require_time(self, duration: float) -> None:
-        """Raise an error if not even a cable without mass could be moved so fast."""
-        shortest = self.shortest
-        if duration < shortest[0]:
-            least, name = shortest
-            raise DloError(
-                f"move: {duration:.4g} s is too short for {name} = {self.limits[name]:g}: the "
-                f"fixtures alone need {least:.4g} s.\n  Try: duration={1.5 * least:.3g}, or "
-                "duration=None for the shortest"
-            )
-
-    @cached_property
-    def shortest(self) -> tuple[float, str]:
-        """Least time [s] that the fixtures' limits leave, and the name of the limit.
-
-        A way D takes D / v with the speed v, 2 sqrt(D / a), and (32 D / j)^(1/3).
-        """
-        found = [(0.0, "")]
-        for part in Course.between(self.before.pose, self.after.pose, 1.0).parts:
-            way = float(np.linalg.norm(part.last - part.first))
-            for name, (turns, order) in FIXTURES.items():
-                if turns == part.turns and name in self.limits:
-                    size = (1.0, 4.0, 32.0)[order - 1] * way / self.limits[name]
-                    found.append((size ** (1 / order), name))
-        return max(found)
-
-    def _stricter(self, name: str, limit: float, share: float) -> float:
-        """A limit that makes up for what the plan's coarse cable does not see."""
-        if name == "clearance":
-            return limit + (share - 1) * CLEAR * self.cable.length
-        return limit * share if name == "bend_radius" else limit / share
-
-    def _require(self, found: Planned, duration: float) -> None:
-        """Raise an error if limits cannot be kept."""
-        names = {"curvature": "bend_radius"}
-        over = {names.get(k, k): x for k, x in found.used.items() if x > 1 + _OVER}
-        if found.converged and not over:
-            return
-        if not over:
-            raise DloError(
-                f"move: IPOPT found no motion of {duration:.4g} s within {found.steps} steps.\n"
-                "  Try: a longer duration"
-            )
-        near = CLEAR * self.cable.length
-        text = ", ".join(
-            f"{1e3 * (x - 1) * near:.3g} mm more clearance"
-            if k == "clearance"
-            else f"{k} {x:.3g} times its limit of {self.limits[k]:g}"
-            for k, x in over.items()
-        )
-        if "clearance" in over:
-            raise DloError(
-                f"move: no motion of {duration:.4g} s was found that keeps the limits: it needs "
-                f"{text}.\n  Try: a pose on the way, and two motions past the obstacles"
-            )
-        factor = max(x ** (1 / max(FIXTURES.get(k, (False, 2))[1], 1)) for k, x in over.items())
-        raise DloError(
-            f"move: no motion of {duration:.4g} s keeps the limits: it needs {text}.\n"
-            f"  Try: duration={1.1 * factor * duration:.3g}, or duration=None for the shortest"
-        )
-
-    def fastest(self) -> Move:
-        """The motion of shortest duration that keeps the limits and leaves little swing."""
-        low, best = self.shortest[0], None
-        high = max(0.5 * self.period, 1.2 * low)
-        while best is None:
-            best, why = self._possible(high, None)
-            if best is None:
-                low, high = high, 1.5 * high
-            if high > max(_LONGEST * self.period, 4 * self.shortest[0]):
-                raise DloError(f"no motion up to {low:.3g} s is possible; the last one: {why}")
-        while high - low > _ACCURATE * high:
-            middle = (low + high) / 2
-            found, _ = self._possible(middle, best.theta)
-            if found is None:
-                low = middle
-            else:
-                high, best = middle, found
-        return best
-
-    def _possible(self, duration: float, start: FloatArray | None) -> tuple[Move | None, str]:
-        """A motion of a duration; None and why, if there is none."""
-        try:
-            found = self.verified(duration, start)
-        except DloError as error:
-            return None, str(error)
-        left, allowed = found.swing, _STILL * self.cable.length
-        if left <= allowed:
-            return found, ""
-        return None, (
-            f"{1e3 * left:.3g} mm of swing are left, {1e3 * allowed:.2g} mm allowed.\n"
-            "  Try: wider limits"
-        )
-
-    # ---- fine simulation -------------------------------------------------------------------------
-
-    def _times(self, course: Course) -> FloatArray:
-        """Times [s] of the fixtures' table: at a robot's rate, and a period beyond arrival."""
-        rate = max(RATE, RATE / course.duration)  # 250 rows of a short motion
-        count = int(np.ceil((course.duration + self.period) * rate))
-        return np.arange(count + 1) / rate
-
-    def simulated(self, course: Course, values: FloatArray) -> Motion:
-        """The cable along coordinates (N, C) at `_times`."""
-        held = held_by(self.before.pose)
-        held |= rows_of(course, values)
-        told: dict[str, Any] = {"begins": self.before, "tolerance": _FINE}
-        return self.cable.simulate(self._times(course), **held, **told)
-
-    def swing(self, motion: Motion, duration: float) -> float:
-        """Of a motion after arrival [m]."""
-        apart = motion.points[motion.t >= duration] - self.after.points
-        return float(np.sqrt((apart**2).sum(axis=2).mean()))
-
-    def _result(
-        self, course: Course, found: Planned, motion: Motion, used: dict[str, float]
-    ) -> Move:
-        """The motion beside those of least jerk and of zero vibration."""
-        t, duration = self._times(course), course.duration
-        swings = {"planned": self.swing(motion, duration)}
-        others = {
-            "minimum jerk": least_jerk(course, t),
-            "zero vibration": shaped(course, t, *self.mode),
-        }
-        for name, values in others.items():
-            if values is not None:
-                with suppress(MotionError):  # it may tear the cable out of reach
-                    swings[name] = self.swing(self.simulated(course, values), duration)
-        band = self.band(course, found.theta) if self.directions else (swings["planned"],) * 2
-        own = found.steps, course, found.theta
-        return Move(duration, motion, self.after.points, swings, band, self.limits, used, *own)
+        return planner.fastest() if time is None else planner.within(time)

@@ -9,7 +9,7 @@ import numpy as np
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.held import HELD
 from dlo_casadi.cable.moving_table import read_fixtures
-from dlo_casadi.cli.common import PARAMETERS, Page, command, figure, option
+from dlo_casadi.cli.common import PARAMETERS, Page, Watch, command, figure, option
 from dlo_casadi.cli.fitted import OBSTACLES, POSE, listed, named
 
 DAMPING = option(
@@ -183,14 +183,16 @@ def move(chosen: argparse.Namespace) -> None:
         raise DloError(f"--rate {chosen.rate:g}: 1 to 10000 rows a second")
     if chosen.output is not None:
         table_file(chosen.output)  # before anything is planned
-    found = damped(chosen).move(
-        _held(chosen.before),
-        _held(chosen.after),
-        duration=chosen.duration,
-        limits=named("limits", chosen),
-        obstacles=listed(chosen, "obstacles"),
-        robust=chosen.robust,
-    )
+    with Watch(quiet=chosen.quiet) as watch:
+        found = damped(chosen).move(
+            _held(chosen.before),
+            _held(chosen.after),
+            duration=chosen.duration,
+            limits=named("limits", chosen),
+            obstacles=listed(chosen, "obstacles"),
+            robust=chosen.robust,
+            progress=watch,
+        )
     page = Page(chosen)
     page.data(found.as_dict())
     page.say(found)

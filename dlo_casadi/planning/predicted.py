@@ -7,8 +7,9 @@ The cable is simulated in equal steps. The swing is the distance of the nodes fr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,12 +17,29 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MotionError
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.motion import sensitivities
-from dlo_casadi.motion.sensitivities import Columns, Tangent, both_nodes
-from dlo_casadi.motion.state import State
-from dlo_casadi.motion.steps import SCHEME, Moving, Stepper, still
+from dlo_casadi.motion.sensitivities import Columns, Numbers, both_nodes
+from dlo_casadi.motion.state import Fixtures, State
+from dlo_casadi.motion.steps import Moving, still
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.planning.course import Course
+
+
+class Stepping(Protocol):
+    """Steps in time and derivatives through them: those of Python, or compiled ones."""
+
+    def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
+        """The state dt later; None if there is no step."""
+
+    def derived(
+        self,
+        before: Moving,
+        after: Moving,
+        columns: Columns,
+        fixtures: Fixtures,
+        numbers: Numbers,
+        dt: float,
+    ) -> Columns:
+        """Derivatives after a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +53,8 @@ class Case:
         At rest before the motion.
     rest : (n_nodes, d) [m]
         Places where it rests after it.
+    steps : Stepping
+        Its steps in time.
     weight : float
         Of its swing among those of other cases; they sum up to one.
     """
@@ -42,6 +62,7 @@ class Case:
     cable: MovingCable
     first: State
     rest: FloatArray
+    steps: Stepping
     weight: float = 1.0
 
 
@@ -89,29 +110,41 @@ def predicted(
     beyond = max(round(after / dt), 1)
     now = still(case.first)
     columns = _none(cable, size) if derivatives else None
-    stepper, every = Stepper(cable, SCHEME), []
+    states, slopes = [], []
     for k in range(1, count + beyond + 1):
         t = k * dt
         fixtures = course.fixtures(cable, theta, t)
-        done = stepper.step(now, fixtures, dt)
+        done = case.steps.step(now, fixtures, dt)
         if done is None:
             raise MotionError(f"no step in time has a solution at {t:.4g} s", t=t)
-        tangent = None
         if columns is not None:
-            tangent, numbers = Tangent(cable, done.state, fixtures), course.numbers(cable, theta, t)
-            columns = sensitivities.stepped(now, done, columns, tangent, numbers, dt, SCHEME)
-        every.append(_rows(cable, done, columns, tangent))
+            numbers = course.numbers(cable, theta, t)
+            columns = case.steps.derived(now, done, columns, fixtures, numbers, dt)
+            slopes.append(columns)
+        states.append(done.state)
         now = done
-    force, moment, curvature, places = (
-        Rows(np.array([x[i].value for x in every]), np.array([x[i].by for x in every]))
-        for i in range(4)
-    )
+    places = Rows(*_stacked([x.r for x in states], [x.place for x in slopes]))
     share = 1 / np.sqrt(beyond * cable.n_nodes)
     swing = Rows(
         share * (places.value[count:] - case.rest).ravel(),
         share * places.by[count:].reshape(beyond * case.rest.size, -1),
     )
-    return Predicted(swing, force, moment, curvature, places)
+    moments = [held_moments(cable, x.moment) for x in states]
+    moment = Rows(*_stacked(moments, [held_moments(cable, x.moment) for x in slopes]))
+    bent, by_turns = zip(*(curvatures(cable, x) for x in states), strict=True)
+    both = [
+        one @ np.concatenate([x.turn[:-1], x.turn[1:]], axis=1)
+        for one, x in zip(by_turns, slopes, strict=False)
+    ]
+    curvature = Rows(*_stacked(bent, both))
+    return Predicted(swing, _held_forces(cable, states, slopes), moment, curvature, places)
+
+
+def _stacked(
+    values: Sequence[FloatArray], slopes: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Of all steps; no derivatives without any."""
+    return np.stack(values), np.stack(slopes) if slopes else np.zeros((len(values), 0, 0))
 
 
 def _none(cable: MovingCable, q: int) -> Columns:
@@ -123,49 +156,31 @@ def _none(cable: MovingCable, q: int) -> Columns:
     return Columns(turn, place, rates, rates, rates, force, np.zeros((cable.n_moments, q)))
 
 
-def _rows(
-    cable: MovingCable, now: Moving, columns: Columns | None, tangent: Tangent | None
-) -> list[Rows]:
-    """Forces, moments, curvatures and places of one step."""
-    state, none = now.state, np.zeros((0, 0))
-    forces, moments = _held_forces(cable, state), held_moments(cable, state.moment)
-    curvature, by_turns = curvatures(cable, state)
-    if columns is None or tangent is None:
-        return [Rows(x, none) for x in (forces, moments, curvature, state.r)]
-    both = np.concatenate([columns.turn[:-1], columns.turn[1:]], axis=1)
-    return [
-        Rows(forces, _forces_by(cable, columns, tangent)),
-        Rows(moments, held_moments(cable, columns.moment)),
-        Rows(curvature, by_turns @ both),
-        Rows(state.r, columns.place),
-    ]
-
-
-def _held_forces(cable: MovingCable, state: State) -> FloatArray:
-    """Forces (2, d) [N] of the cable on its fixtures."""
+def _held_forces(cable: MovingCable, states: Sequence[State], slopes: Sequence[Columns]) -> Rows:
+    """Forces (S, 2, d) [N] of the cable on its fixtures, from its first and last segments."""
     b, d = cable.b, cable.d
-    (rows,) = cable.segments("residual", state)
-    first, last = rows[0, 2 * b : 2 * b + d, 0], rows[-1, 2 * b + d : 2 * (b + d), 0]
+    edges = [0, cable.n_segments - 1]
+    every = zip(*(cable.arguments(state) for state in states), strict=True)
+    rows = [np.stack([x[edges] for x in own]) for own in every]
+    (found,) = cable.segment.mapped("residual")(*rows)
     load = np.array(functions_of(cable.model).dead_load(cable.p)).ravel()
-    return np.array([load - first, -last if cable.model.end.place else 0 * last])
-
-
-def _forces_by(cable: MovingCable, columns: Columns, tangent: Tangent) -> FloatArray:
-    """Their derivatives (2, d, q)."""
-    b, d = cable.b, cable.d
-    size, found = 2 * (b + d), []
-    moved, rates, changed = (
-        both_nodes(cable, x) for x in (columns.moved, columns.rates, columns.accelerations)
-    )
-    for k, first in ((0, 2 * b), (-1, 2 * b + d)):
-        stiff, damp, mass = (
-            x[0][k, first : first + d] for x in (tangent.stiffness, tangent.damping, tangent.mass)
-        )
-        total = stiff[:, :size] @ moved[k] + stiff[:, size:] @ columns.force[k]
-        found.append(-(total + damp[:, :size] @ rates[k] + mass[:, :size] @ changed[k]))
-    if not cable.model.end.place:
-        found[1] = np.zeros_like(found[1])
-    return np.array(found)
+    value, by = np.zeros((len(states), 2, d)), np.zeros((len(states), 2, d, 0))
+    if slopes:
+        by = np.zeros((len(states), 2, d, slopes[0].place.shape[-1]))
+        stiff, damp, mass = cable.segment.mapped("linear")(*rows)[:3]
+    sides = ((0, 2 * b, load), (1, 2 * b + d, np.zeros(d)))
+    for k, first, known in sides[: 1 + cable.model.end.place]:
+        own = slice(first, first + d)
+        value[:, k] = known - found[:, k, own, 0]
+        for n, x in enumerate(slopes):
+            node, size = edges[k], 2 * (b + d)
+            moved, rates, changed = (
+                both_nodes(cable, one)[node] for one in (x.moved, x.rates, x.accelerations)
+            )
+            total = stiff[n, k, own, :size] @ moved + stiff[n, k, own, size:] @ x.force[node]
+            total = total + damp[n, k, own, :size] @ rates + mass[n, k, own, :size] @ changed
+            by[n, k] = -total
+    return Rows(value, by)
 
 
 def held_moments(cable: MovingCable, moment: FloatArray) -> FloatArray:

@@ -23,8 +23,9 @@ from dlo_casadi.planning.predicted import Case, Predicted, predicted
 from dlo_casadi.rod.obstacles import Obstacle
 
 # Swing that is worth as much as the effort of least jerk: in lengths, a camera does not see less;
-# as a share of the swing of least jerk, where that is small.
-SIGMA, SHARE = 1e-4, 2e-3
+# as a share of the swing of least jerk, where that is small; motions are not exact below the third,
+# a motion along a cable that hangs swings less.
+SIGMA, SHARE, EXACT = 1e-4, 2e-3, 1e-7
 # Levenberg's damping: the weight of the effort in the Hessian over the objective. Courses of 0.6
 # periods converge in 22 steps with 0.01, in 25 with 0.001, in more than 60 without.
 _DAMPED = 0.01
@@ -138,7 +139,7 @@ class _Problem:
         first = self._simulated(least, derivatives=False)
         self._known: dict[tuple[bytes, bool], list[Predicted] | None]
         self._known = {(least.tobytes(), False): first}
-        self.sigma = min(SIGMA * task.length, SHARE * self.swing(first))
+        self.sigma = min(SIGMA * task.length, max(SHARE * self.swing(first), EXACT * task.length))
         self.names = self._names()
         count = max(len(self.names), 1)
         self._callbacks = [

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import dlo_casadi as dlo
-from dlo_casadi.cable.carried import Planner
 from dlo_casadi.cable.move import Move
 from dlo_casadi.cable.moving_table import read_fixtures
+from dlo_casadi.cable.planner import Planner
 from dlo_casadi.planning.course import Course
 from dlo_casadi.planning.predicted import predicted
 from dlo_casadi.rod.obstacles import Capsule
+from dlo_casadi.runtime.progress import nobody
 
 PERIOD = 1.08  # s, of the slowest mode
 
@@ -61,7 +62,7 @@ def test_derivatives_of_a_motion_are_exact() -> None:
     down = {"start_orientation": (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))}
     tilted = {"start_orientation": (0.1, np.sqrt(0.5), 0.0, np.sqrt(0.49))}
     shapes = cable.solve(start=(0, 0, 0), **down), cable.solve(start=(0.2, 0.1, 0), **tilted)
-    case = Planner(cable, *shapes, {}, (), False).nominal
+    case = Planner(cable, *shapes, {}, (), False, nobody).nominal
     course = Course.between(shapes[0].pose, shapes[1].pose, 0.5)
     way = 1e-2 * np.random.default_rng(1).standard_normal(course.size)
     h, first = 1e-3, course.least_jerk
@@ -100,9 +101,23 @@ def test_limits_are_kept_along_the_way() -> None:
     assert np.linalg.norm(move.motion.start_force, axis=1).max() < 0.62 * 1.001
 
 
-def test_what_cannot_be_kept_is_told_with_numbers() -> None:
-    with pytest.raises(dlo.DloError, match=r"1\.08 s is too short for speed = 0\.2: .* 1\.5 s"):
+@pytest.mark.long
+def test_advice_that_is_followed_helps() -> None:
+    with pytest.raises(
+        dlo.DloError, match=r"1\.08 s is too short for speed = 0\.2: .* 1\.5 s"
+    ) as told:
         rope().move(held(0.0), held(0.3), duration=PERIOD, limits={"speed": 0.2})
+    longer = float(str(told.value).partition("duration=")[2].partition(",")[0])
+    rope().move(held(0.0), held(0.3), duration=longer, limits={"speed": 0.2})
+
+
+def test_what_swings_nothing_is_planned() -> None:
+    lift = {"start": (0.0, 0.1), "start_heading": -np.pi / 2}
+    move = rope().move({**lift, "start": (0.0, 0.0)}, lift, duration=0.3)
+    assert move.swing < 1e-5
+
+
+def test_what_cannot_be_kept_is_told_with_numbers() -> None:
     with pytest.raises(dlo.DloError, match="both poses are the same"):
         rope().move(held(0.0), held(0.0), duration=1.0)
     with pytest.raises(dlo.DloError, match="is no limit of a motion"):
