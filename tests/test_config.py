@@ -88,7 +88,7 @@ def test_files_of_the_repository_load_completely(path):
 
 def test_the_repository_holds_what_the_readme_promises():
     names = {"cable", "black_wire", "white_wire", "black_wire_photo", "glass_strip"}
-    assert {path.stem for path in CONFIGS} == names | {"markers_in_space"}
+    assert {path.stem for path in CONFIGS} == names | {"markers_in_space", "swing"}
     assert len(SESSIONS) == 17
     truths = {path.parent.name for path in ROOT.glob("tests/data/bench_truth/*/truth.yaml")}
     assert truths == {path.parent.name for path in SESSIONS} | {"connector"}

@@ -6,6 +6,7 @@ from typing import Any
 from rich.table import Table
 
 from dlo_casadi.errors import worded
+from dlo_casadi.report.moving_picture import moving_picture
 from dlo_casadi.report.terminal import plain_table
 from dlo_casadi.session.checked_motions import CheckedMotion
 from dlo_casadi.session.in_motion import MotionStage
@@ -34,7 +35,12 @@ def context_of(outcome: Outcome) -> dict[str, Any]:
         }
         for k, item in enumerate(stages[-1].shown)
     ]
-    return {"motion_rows": rows, "motion_before": before, "motion_sentence": sentence_of(outcome)}
+    return {
+        "motion_rows": rows,
+        "motion_before": before,
+        "motion_sentence": sentence_of(outcome),
+        "motion_picture": moving_picture(stages[-1].shown),
+    }
 
 
 def sentence_of(outcome: Outcome) -> str:
