@@ -378,6 +378,30 @@ def test_the_shape_as_a_function_of_pose_and_tension(space, side):
             np.testing.assert_allclose(derivative, expected, atol=1e-8 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize(("space", "side"), [(False, "start"), (True, "end")])
+def test_the_function_of_a_bent_cable_and_of_its_free_length(space, side):
+    """By the tension and by the length; the rest curvature slides with the cable."""
+    model, pose, rest = held_between(space, (), n=8)
+    told = replace(pose, end_tension=None, free_length=0.72)
+    for by_length, here in ((False, pose), (True, told)):
+        own, at, bent = replace(model, fed_by_length=by_length), here, rest
+        if side == "start":
+            back, at, bent = reversed_case(model, here, rest)
+            own = replace(back, fed_by_length=by_length)
+            at = replace(at, free_length=here.free_length)
+        eq = solve_equilibrium(own, own.nominal, bent, at)
+        function, numbers = CasadiCable(own, own.nominal, bent).function(), at.numbers
+        points, end_force, _, energy, *_ = function(numbers)
+        np.testing.assert_allclose(np.array(points).T, eq.points, atol=1e-12)
+        np.testing.assert_allclose(np.array(end_force).ravel(), eq.end_force, atol=1e-10)
+        assert float(energy) == pytest.approx(eq.energy, abs=1e-12)
+        u = ca.MX.sym("u", len(numbers))
+        slope = ca.Function("slope", [u], [ca.gradient(function(u)[3], u)])(numbers)
+        step = 1e-5 * np.eye(len(numbers))[-1]
+        after, before = (float(function(numbers + h * step)[3]) for h in (1, -1))
+        assert float(slope[-1]) == pytest.approx((after - before) / 2e-5, rel=1e-6)
+
+
 def test_a_fed_cable_in_a_problem_of_ones_own():
     """The tension with which the middle is at a height: found again by solving."""
     model, pose, _ = case(False, 0.8, 10)
@@ -398,6 +422,12 @@ def test_what_a_sliding_end_has_not():
         solved(model, replace(pose, end_tension=None))
     with pytest.raises(EquilibriumError, match="free_length is missing"):
         solved(replace(model, fed_by_length=True), replace(pose, end_tension=None))
+    by_length = replace(model, fed_by_length=True)
+    for free, said in ((0.6, "the free length is 0.6000 m"), (60.0, "60 m, the cable is 1 m long")):
+        with pytest.raises(EquilibriumError, match=said):
+            solved(by_length, replace(pose, end_tension=None, free_length=free))
+    with pytest.raises(EquilibriumError, match=r"end_tension -3 N.*\n.*more tension"):
+        solved(model, replace(pose, end_tension=-3.0))
     with pytest.raises(DloError, match="through both ends"):
         replace(model, start="slide", fed_by_length=True)
     with pytest.raises(DloError, match="runs out or falls"):
@@ -405,8 +435,6 @@ def test_what_a_sliding_end_has_not():
     with pytest.raises(DloError, match="smooth element"):
         replace(model, element="link")
     rest = np.zeros(model.chain.n_rests)
-    with pytest.raises(DloError, match="no rest curvature that slides"):
-        CasadiCable(model, model.nominal, rest + 1.0).function()
     with pytest.raises(DloError, match="cannot be exported"):
         Rod.of(SolvedCable.of(model, model.nominal, rest, pose))
 

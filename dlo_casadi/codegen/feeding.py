@@ -7,6 +7,7 @@ from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen.c_text import statements
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.chain import with_cells_beyond
 
 
 def feed_marks(model: CableModel, border: int) -> dict[str, int | str]:
@@ -35,13 +36,11 @@ def feed_marks(model: CableModel, border: int) -> dict[str, int | str]:
 
 
 def with_rows_beyond(rows: FloatArray) -> FloatArray:
-    """Rows of even segments, and one before and one after them, see `Clipped.rest_inside`."""
-    first, last = rows[0].copy(), rows[-1].copy()
-    for row, side in ((first, -1), (last, 1)):
-        row[0] += side * row[1]
-        row[2::3] += side * row[3::3] / 2 + row[4::3] / 6
-        row[3::3] = row[4::3] = 0.0
-    return np.vstack([first, rows, last])
+    """Rows of even segments, and one before and one after them."""
+    first, length = rows[0, :2]
+    starts = first + length * np.arange(-1, len(rows) + 1)
+    rest = with_cells_beyond(rows[:, 2:, None])[..., 0]
+    return np.column_stack([starts, np.full(len(starts), length), rest])
 
 
 def load_beyond(model: CableModel, p: ca.SX, given: ca.SX) -> ca.Function:

@@ -57,8 +57,9 @@ def pose_of(model: CableModel, numbers: FloatArray, branch: Branch | None = None
         if getattr(model, side).direction:
             held[f"{side}_{model.node.direction}"] = model.node.declared(frame)
     both = model.start.roll and model.end.roll
-    pulled = [side for side, slides in zip(SIDES, model.loose, strict=True) if slides]
-    held |= {f"{side}_tension": float(x) for side, x in zip(pulled, beyond, strict=False)}
+    fed = [f"{side}_tension" for side, own in zip(SIDES, model.loose, strict=True) if own]
+    fed = ["free_length"] * len(fed) if model.fed_by_length else fed
+    held |= {name: float(x) for name, x in zip(fed, beyond, strict=False)}
     return HeldPose(
         start=tuple(start.tolist()),
         end=tuple(end.tolist()) if model.end.place else None,

@@ -30,13 +30,13 @@ from dlo_casadi.equilibrium.spans import (
     border_of,
     first_guesses,
     no_equilibrium,
+    nothing_found,
     out_of_reach,
 )
 from dlo_casadi.errors import EquilibriumError
 from dlo_casadi.model.assembly import Assembly, Inputs, Shapes
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clipped import Clipped
-from dlo_casadi.rod.node import Frame
 
 # Largest move of an end in one step [lengths, rad], so that a shape can be followed up to a fold.
 MOST_MOVED, MOST_TURNED = 0.05, 0.2
@@ -207,19 +207,9 @@ def _chosen(
             return no_equilibrium(pose, what, hint)
         found = [eq for eq, kept in zip(found, passing, strict=True) if kept]
     if not found:
-        space = pose.node is Frame
-        checked = "stiffnesses and orientations" if space else "stiffness and the headings"
-        hint = f"a finer mesh (model.n), or check the {checked}."
-        if pose.turns:
-            where += f" and {pose.turns:g} turns"
-            hint = f"fewer turns (a twisted cable loops), {hint}"
-        beside = [*(clip.name for clip in pose.clips), *(one.name for one in model.surfaces)]
-        if beside:
-            where += f", beside {', '.join(beside)}"
-            hint = f"more room between them, {hint}"
-        guessed = "its first guesses" if start is None else "a nearby shape"
-        what = f"no equilibrium found from {guessed} with {where}"
-        return no_equilibrium(pose, what, hint)
+        return nothing_found(
+            model, pose, "its first guesses" if start is None else "a nearby shape"
+        )
     if named is not None and model.start.turns and model.end.turns:
         for eq in found:
             if eq.stable and eq.has_branch(named):

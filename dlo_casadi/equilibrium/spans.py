@@ -34,6 +34,8 @@ from dlo_casadi.rod.node import Frame
 
 # Distance [lengths] within which two places are one; eyelets 1 mm apart are no difficulty.
 ONE_PLACE = 1e-6
+# Largest free length over the cable's: one beyond it is given in another unit.
+MOST_FED = 10.0
 # Number of candidate places along the axis of a bar at one of which the cable passes it.
 _ALONG = 21
 
@@ -302,6 +304,25 @@ def no_equilibrium(pose: HeldPose, what: str, hint: str) -> EquilibriumError:
     return EquilibriumError(f"{what}.\n  Try: {hint}", pose.name, pose.end)
 
 
+def nothing_found(model: CableModel, pose: HeldPose, start: str) -> EquilibriumError:
+    """The error of a pose for which no equilibrium was found from this start."""
+    where = "its end free" if pose.end is None else f"its end at {pose.end} m"
+    checked = "stiffnesses and orientations" if pose.node is Frame else "stiffness and the headings"
+    hint = f"a finer mesh (model.n), or check the {checked}."
+    if pose.turns:
+        where += f" and {pose.turns:g} turns"
+        hint = f"fewer turns (a twisted cable loops), {hint}"
+    for side, tension in zip(("start", "end"), pose.tensions, strict=True):
+        if tension is not None:
+            where += f" and {side}_tension {tension:g} N"
+            hint = f"more tension, without which it runs through the guide, {hint}"
+    beside = [*(clip.name for clip in pose.clips), *(one.name for one in model.surfaces)]
+    if beside:
+        where += f", beside {', '.join(beside)}"
+        hint = f"more room between them, {hint}"
+    return no_equilibrium(pose, f"no equilibrium found from {start} with {where}", hint)
+
+
 def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> EquilibriumError | None:
     """Why a pose is out of reach: its end is missing or too far, or a number is meaningless."""
     if fed := pose.wrongly_fed((model.start, model.end), by_length=model.fed_by_length):
@@ -311,18 +332,27 @@ def out_of_reach(model: CableModel, p: FloatArray, pose: HeldPose) -> Equilibriu
         return no_equilibrium(pose, what, "Pose(start, end).")
     if wrong := _meaningless(pose) or _wrong_clips(model, p, pose) or _inside(model, p, pose):
         return no_equilibrium(pose, *wrong)
-    if pose.end is None or model.extensible or model.slides:
+    if pose.free_length is not None and pose.free_length > MOST_FED * model.cable.length:
+        what = f"free_length is {pose.free_length:g} m, the cable is {model.cable.length:g} m long"
+        return no_equilibrium(pose, f"no equilibrium: {what}", "free_length in metres?")
+    by_length, free = pose.free_length is not None, pose.free_length or 0.0
+    if pose.end is None or model.extensible or (model.slides and not by_length):
         return None
     (start, end), _, length = true_ends(model, p, pose)
     distance = float(np.linalg.norm(end - start))
+    if by_length:
+        length = free * float(functions_of(model).stretch(p))
     if distance < length:
         return None
     where = ", ".join(f"{x:.4f}" for x in pose.end)
+    told = "the free length" if by_length else "the cable"
     what = (
         f"no equilibrium: the end ({where}) m is {distance:.4f} m "
-        f"from the start, the cable is {length:.4f} m long"
+        f"from the start, {told} is {length:.4f} m"
     )
-    return no_equilibrium(pose, what, "end in metres? cable.length?")
+    what += " long" * (not by_length)
+    asked = "a longer free_length?" if by_length else "cable.length?"
+    return no_equilibrium(pose, what, f"end in metres? {asked}")
 
 
 def _meaningless(pose: HeldPose) -> tuple[str, str] | None:

@@ -338,9 +338,6 @@ class CasadiCable:
         """The cable's numbers, and symbols of the pose and of the parameters asked for."""
         model = self.model
         wrong = ["clips"] * bool(model.clips) + ["obstacles"] * bool(model.surfaces)
-        wrong += ["free length"] * (model.slides and model.fed_by_length)
-        bent = model.n_rest > 0 or bool(np.any(self.rest))
-        wrong += ["rest curvature that slides"] * (model.slides and bent)
         if wrong:
             said = " and ".join(wrong)
             raise DloError(f"a function of the pose has no {said} yet.\n  Try: solve(...).")

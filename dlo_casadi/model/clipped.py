@@ -16,7 +16,7 @@ from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, cross
 from dlo_casadi.model.clips import ClipLoad, moved_with, placed_nodes
 from dlo_casadi.model.slides import Ends
 from dlo_casadi.rod.band import BandMatrix, Vector
-from dlo_casadi.rod.chain import Chain
+from dlo_casadi.rod.chain import Chain, with_cells_beyond
 from dlo_casadi.rod.node import Node
 from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 from dlo_casadi.rod.supports import SupportKind
@@ -172,16 +172,8 @@ class Clipped:
         inside = self.chain.rest_inside(means)
         if self._resting is None:
             return inside
-        each = inside.reshape((*inside.shape[:2], inside.shape[2] // 3, 3, inside.shape[3]))
-        beyond = []
-        for k, side in ((0, -1), (-1, 1)):
-            mean, a, c = np.moveaxis(each[:, k], 2, 0)
-            still = np.zeros_like(each[:, :1])
-            still[:, 0, :, 0] = mean + side * a / 2 + c / 6
-            beyond.append(still)
-        every = np.concatenate([beyond[0], each, beyond[1]], axis=1)
-        own = every[np.arange(len(every))[:, None], self._resting + 1]
-        return own.reshape((*self._resting.shape, *inside.shape[2:]))
+        rows = np.arange(len(inside))[:, None]
+        return np.asarray(with_cells_beyond(inside)[rows, self._resting + 1])
 
     @property
     def before(self) -> FloatArray:

@@ -14,11 +14,12 @@ import casadi as ca
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.model.cable_model import VIEWPOINT_SIZE, CableModel
 from dlo_casadi.model.functions import Functions, functions_of
 from dlo_casadi.model.lagrangian import MODELS
 from dlo_casadi.model.summed import Element, Elements, summed
 from dlo_casadi.model.whole_pose import Laid, PoseSymbols
+from dlo_casadi.rod.chain import with_cells_beyond
 from dlo_casadi.rod.ends import EndConditions
 
 # Arguments that may vary, in the order in which they are stacked; the others are constant.
@@ -156,15 +157,23 @@ class _Parts:
             "lam": self._shared("lam", len(own)),
             "p": self._shared("p", len(own)),
             "rest": ca.sparsify(ca.DM(inside)),
+            "pose": self._shared("pose", len(own)),
         }
-        places = chain.layout.segments.T
+        places, cells = chain.layout.segments.T, 0
+        known = self.known.copy()
         if self.model.slides:
             u = chain.places / chain.length
-            places = np.array([u[:-1], u[1:], places[5], places[0]])
-        known = self.known | {"place": places}
-        if "rest" in known:
+            places = np.array([u[:-1], u[1:], places[5]])
+            every = with_cells_beyond(inside.reshape((len(own), -1, chain.n_rests)))
+            every = every.reshape((-1, chain.n_rests))
+            takes["rest"] = ca.sparsify(ca.DM(np.tile(every, (len(own), 1))))
+            cells = len(own)
+            if "rest" in known:
+                known["rest"] = every @ known["rest"]
+        elif "rest" in known:
             known["rest"] = (inside @ known["rest"]).reshape((len(own), -1)).T
-        element = _element(functions_of(self.model), name, tuple(self.sizes), rows)
+        known["place"] = places
+        element = _element(functions_of(self.model), name, tuple(self.sizes), rows, cells)
         return self._elements(element, takes, known, adds, len(own))
 
     def _of_ends(self, adds: ca.DM, name: str = "end_slope", rows: int | None = None) -> Elements:
@@ -216,40 +225,56 @@ def _every(size: int) -> ca.DM:
     return ca.DM.eye(size)
 
 
-def _between_ends(functions: Functions, name: str) -> ca.Function:
+def _between_ends(functions: Functions, name: str, cells: int) -> ca.Function:
     """A function of a segment of which `place` has the shares of the cable that its ends are at.
 
-    Ends that slide have their arc lengths in the border; see `Slides` for the gradient by these.
+    Ends that slide have their arc lengths in the border, see `Slides` for the gradient by these, or
+    a pose tells the length between them. The rest strains are those of all `cells` and of one
+    before and one after them: of these it has those of the cell in which it is laid, `laid_for`.
     """
     model, base = functions.model, functions.compact(name)
-    given = [ca.SX.sym("x", *base.size_in(i)) for i in range(base.n_in())]
-    _, lam, *_, row, _ = given
-    ends = {0: ca.SX(0.0), 1: ca.SX(model.cable.length)}
+    x, lam, p, rest, _, deviation = (
+        ca.SX.sym("given", *base.size_in(i)) for i in range(base.n_in())
+    )
+    pose, every = ca.SX.sym("pose", model.n_pose), ca.SX.sym("rest", rest.numel(), cells + 2)
+    row, length = ca.SX.sym("place", 3), model.cable.length
+    u, mesh, ends = row[:2], row[2], {0: ca.SX(0.0), 1: ca.SX(length)}
     ends |= {k: lam[own] for k, own in model.sliding.items()}
-    places = [ends[0] + u * (ends[1] - ends[0]) for u in (row[0], row[1])]
-    arguments = [*given[:4], ca.vertcat(*places, row[2:]), given[5]]
+    if model.fed_by_length:
+        free = pose[EndConditions.size(model.node) + VIEWPOINT_SIZE]
+        ends[1 if model.end.slides else 0] = free if model.end.slides else length - free
+    low, high = (
+        (ca.floor(ends[k] / mesh) + 0.5) * mesh if slides else ends[k]
+        for k, slides in enumerate(model.loose)
+    )
+    middle = low + (high - low) * (u[0] + u[1]) / 2
+    cell = ca.fmin(ca.fmax(ca.floor(middle / mesh), -1), cells)
+    chosen = every @ (ca.SX(np.arange(-1.0, cells + 1)) == cell)
+    places = [ends[0] + share * (ends[1] - ends[0]) for share in (u[0], u[1])]
+    arguments = [x, lam, p, chosen, ca.vertcat(*places, mesh, cell * mesh), deviation]
     outputs: list[ca.SX] = base.call(arguments)
-    if name == "segment_slope":
+    if name == "segment_slope" and model.sliding:
         (edges,) = functions.compact("edge_slope").call(arguments)
         for k, own in model.sliding.items():
-            u = row[:2] if k else 1 - row[:2]
-            outputs[0][2 * model.node.increment + own] += ca.dot(u, edges)
-    return ca.Function(name, given, outputs)
+            moved = u if k else 1 - u
+            outputs[0][2 * model.node.increment + own] += ca.dot(moved, edges)
+    return ca.Function(name, [x, lam, p, ca.vec(every), row, pose, deviation], outputs)
 
 
 @lru_cache(maxsize=4 * MODELS)
 def _element(
-    functions: Functions, name: str, varying: tuple[str, ...], rows: int | None
+    functions: Functions, name: str, varying: tuple[str, ...], rows: int | None, cells: int = 0
 ) -> tuple[Element, tuple[str, ...], tuple[str, ...]]:
     """A function of `Functions` as an `Element`: what varies, and the rest of its arguments.
 
-    `rows`: number of rows that count; all by default. Deviations are zero.
+    `rows`: number of rows that count; all by default. `cells`: of a cable that slides through ends.
+    Deviations are zero.
     """
     of_segment = name.startswith("segment")
     function = functions.compact(name) if of_segment else getattr(functions, name)
-    if of_segment and functions.model.slides:
-        function = _between_ends(functions, name)
     names = ("x", "lam", "p", *(("rest", "place") if of_segment else ("pose",)))
+    if cells:
+        function, names = _between_ends(functions, name, cells), (*names, "pose")
     own = tuple(key for key in names if key in varying)
     fixed = tuple(key for key in names if key not in varying)
     symbols = {key: ca.SX.sym(key, function.numel_in(i)) for i, key in enumerate(names)}

@@ -17,6 +17,7 @@ from dlo_casadi.model.clipped import Clipped
 from dlo_casadi.model.clips import clip_size
 from dlo_casadi.model.functions import functions_of
 from dlo_casadi.model.lagrangian import lagrangian_of
+from dlo_casadi.rod.chain import with_cells_beyond
 from dlo_casadi.rod.ends import EndConditions
 from dlo_casadi.rod.quaternions import conjugate, quaternion_product
 
@@ -307,17 +308,40 @@ def _with_slides(model: CableModel, segments: Any, edges: Sequence[Any]) -> Any:
     return ca.horzcat(*found)
 
 
+def _resting(model: CableModel, s: PoseSymbols, places: Any) -> tuple[Any, Any]:
+    """Rest strains of segments whose nodes are at `places`, and where their cells start [m].
+
+    Without clips; as `Clipped.rest_inside`.
+    """
+    chain, known = model.chain, (0.0, model.chain.length)
+    inside = chain.rest_inside(np.eye(chain.n_rests)).reshape((chain.n, -1, chain.n_rests))
+    every = ca.DM(with_cells_beyond(inside).reshape((-1, chain.n_rests)))
+    every = ca.reshape(ca.sparsify(every) @ s.rest, -1, chain.n + 2)
+    low, high = (
+        (ca.floor(end / chain.h) + 0.5) * chain.h if slides else ca.DM(at)
+        for end, slides, at in zip((places[0], places[-1]), model.loose, known, strict=True)
+    )
+    middle = low + (high - low) * ca.DM((np.arange(chain.n) + 0.5) / chain.n).T
+    cell = ca.fmin(ca.fmax(ca.floor(middle / chain.h), -1), chain.n)
+    cells = ca.repmat(ca.DM(np.arange(-1, chain.n + 1)), 1, chain.n)
+    return every @ (cells == ca.repmat(cell, chain.n + 2, 1)), cell * chain.h
+
+
 def _segment_arguments(model: CableModel, s: PoseSymbols, laid: Laid | None = None) -> list[Any]:
     """One column for each segment, or a single column if all segments share it."""
     chain, x = model.chain, _nodes(model, s)
     inside = chain.rest_inside(np.eye(chain.n_rests)).reshape((-1, chain.n_rests))
     rest = ca.reshape(ca.sparsify(ca.DM(inside)) @ s.rest, -1, chain.n_segments)
     place: Any = ca.DM(chain.layout.segments.T)
-    if laid is None and model.moves_nodes and not model.clips:
+    fed = model.slides and not model.clips
+    if laid is None and fed:
         laid = Laid.of(model)
     if laid is not None and model.moves_nodes:
         places, moved = laid.places(model, s), laid.moved
-        place = ca.vertcat(places[:, :-1], places[:, 1:], place[5, :], place[0, :])
+        even = place[0, :]
+        if fed:
+            rest, even = _resting(model, s, places)
+        place = ca.vertcat(places[:, :-1], places[:, 1:], place[5, :], even)
         for k, frame in _clip_frames(model, s, moved).items():
             x = x * (1 - ca.repmat(moved[k, :], x.shape[0], 1)) + frame @ moved[k, :]
     after = np.minimum(np.arange(chain.n_segments) + 1, chain.n_nodes - 1)

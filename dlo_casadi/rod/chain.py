@@ -186,3 +186,18 @@ class RestCurvature:
     def roughness(self) -> FloatArray:
         """Second differences (n_coefficients - 2, n_coefficients) of the coefficients."""
         return np.diff(np.eye(self.n_coefficients), n=2, axis=0)
+
+
+def with_cells_beyond(inside: FloatArray) -> FloatArray:
+    """Rest strains (..., n + 2, 3 strains, q) with those of a cell before and one after n cells.
+
+    Before and after the declared length they stay as at its ends. `inside`: (..., n, 3 strains, q),
+    see `Chain.rest_inside`.
+    """
+    beyond = []
+    for k, side in ((0, -1), (-1, 1)):
+        own = inside[..., [k], :, :]
+        still, (mean, a, c) = np.zeros_like(own), (own[..., i::3, :] for i in range(3))
+        still[..., ::3, :] = mean + side * a / 2 + c / 6
+        beyond.append(still)
+    return np.concatenate([beyond[0], inside, beyond[1]], axis=-3)
