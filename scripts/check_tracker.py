@@ -21,7 +21,9 @@ from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.estimate import Covariance
-from dlo_casadi.cable.seen import with_unknowns
+from dlo_casadi.cable.seen import moved, with_unknowns
+from dlo_casadi.equilibrium.batch import BatchEquilibrium
+from dlo_casadi.linear_mixed import LinearMixed
 
 LENGTH, STD = 0.6, 4e-4
 S = np.linspace(0.04, 0.56, 12)
@@ -204,6 +206,172 @@ def changes(d: int, runs: int, first: int) -> None:
         )
 
 
+# ---- where nothing changes -----------------------------------------------------------------------
+
+
+def at_once(cable: dlo.FittedCable, poses: list[dlo.Pose]) -> tuple[Any, np.ndarray]:
+    """The cable after all poses, by Gauss and Newton's method for all at once, and its std."""
+    known, model = cable.metadata.uncertainty, cable.model
+    held = [cable.solve(pose.changed(points=None, at=None)) for pose in poses]
+    batch = BatchEquilibrium(known.pose_scatter.within(model), [one.pose for one in held])
+    by_p, by_rest, by_deviation = known.ways_in(model)
+    count, z = len(known.names), np.zeros(len(known.names))
+    shapes = batch.start_shapes(np.array([one.equilibrium.x for one in held]))
+    for _ in range(8):
+        now = moved(cable, by_p[:, :count] @ z, by_rest[:, :count] @ z)
+        rise = np.where([q.log for q in model.parameters], now.p / np.where(cable.p, cable.p, 1), 1)
+        shapes, _ = batch.solve(shapes, now.p, now.rest)
+        ways = by_rest, rise[:, None] * by_p, by_deviation
+        along = batch.by_rest(shapes, now.p, now.rest, *ways)
+        rows = [
+            (
+                ((pose.points - told.curve.at(S)) / STD).ravel(),
+                -told.curve.moved(S, change.curve).reshape(len(S) * model.node.dimension, -1) / STD,
+            )
+            for pose, (told, change) in zip(
+                poses, batch.observe(shapes, now.p, now.rest, along), strict=True
+            )
+        ]
+        own = rows[0][1].shape[1] - count
+        mixed = LinearMixed(
+            [r for r, _ in rows],
+            [columns[:, :count] for _, columns in rows],
+            [columns[:, count:] for _, columns in rows],
+            np.zeros((len(rows), own)),
+            np.ones(own),
+            z,
+            np.eye(count),
+        )
+        z = z - np.linalg.solve(mixed.normal.hessian, mixed.normal.gradient)
+    scale = [dict(zip(model.names, rise, strict=True)).get(name, 1.0) for name in known.names]
+    root = np.array(scale)[:, None] * known.root
+    variances = np.diag(root @ np.linalg.inv(mixed.normal.hessian) @ root.T)
+    return now, np.sqrt(variances)
+
+
+def batch(d: int, runs: int, first: int) -> None:
+    """Sessions of 12 poses: tracked from the fit of the first 6, against all others at once.
+
+    And against the fit of all 12, which estimates the fixtures' scatter anew.
+    """
+    torsion = {"torsional_stiffness": TORSION} if d == 3 else {}
+    data = dlo.Cable(
+        length=LENGTH,
+        mass=0.06,
+        diameter=0.008,
+        rest_shape="straight",
+        bending_stiffness=STIFFNESS,
+        **torsion,
+    )
+    known: dict[str, Any] = {"gravity": (*(0.0,) * (d - 1), -9.81), "std": STD}
+    known |= {"boundary": ("clamped", "clamped"), "diagnosis": {"enabled": False}}
+    away: dict[str, list[float]] = {"at once": [], "fit": []}
+    wider: dict[str, list[float]] = {"at once": [], "fit": []}
+    for k in range(runs):
+        rng = np.random.default_rng(first + k)
+        stiffness = STIFFNESS * rng.uniform(0.7, 1.4)
+        cable, ways = (
+            with_values(rope(d, "none"), {"bending_stiffness": stiffness}),
+            wandering(d, rng),
+        )
+        poses = [seen(cable, next(ways), rng) for _ in range(12)]
+        half, whole = (
+            dlo.Session(data, listed, **known, model={"n": 20}).fit().cable
+            for listed in (poses[:6], poses)
+        )
+        tracker = half.tracker(STD)
+        for pose in poses[6:]:
+            tracker.update(pose)
+        once, std = at_once(half, poses[6:])
+        values = dict(zip(once.model.names, once.p, strict=True))
+        for name, size in zip(half.metadata.uncertainty.names, std, strict=True):
+            found, one = tracker.params[name], whole.params[name]
+            for key, value, other in (("at once", values[name], size), ("fit", one.value, one.std)):
+                away[key].append((found.value - value) / other)
+                wider[key].append(found.std / other - 1)
+    for key in away:
+        off, wide = np.abs(away[key]), np.abs(wider[key])
+        print(
+            f"{d}D, {key}: {len(off)} parameters of {runs} sessions: {np.mean(off < 0.1):.0%} "
+            f"within 0.1 std (largest {off.max():.3f}), {np.mean(wide < 0.05):.0%} with std to 5 % "
+            f"(median {100 * np.median(wide):.1f} %, largest {100 * wide.max():.1f} %)"
+        )
+
+
+def prior_of(cable: dlo.FittedCable, rng: np.random.Generator) -> dlo.FittedCable:
+    """The cable as it may be known before: drawn from what is said of it."""
+    std = {"bending_stiffness": 0.05 * STIFFNESS, "torsional_stiffness": 0.05 * TORSION}
+    std |= {"lumped_mass.mass": 0.05 * LOAD}
+    std = {name: x for name, x in std.items() if name in cable.model.names}
+    values = dict(zip(cable.model.names, cable.p, strict=True))
+    drawn = {name: values[name] + x * rng.normal() for name, x in std.items()}
+    return uncertain(with_values(cable, drawn), std)
+
+
+def drift(d: int, runs: int, first: int) -> None:
+    """EI falls by 30 % over 200 poses: share of poses whose 95 % interval holds it, and alarms."""
+    inside, alarms = [], 0
+    for k in range(runs):
+        rng = np.random.default_rng(first + k)
+        cable, ways = rope(d, "none"), wandering(d, rng)
+        tracker = prior_of(cable, rng).tracker(STD, drift={"bending_stiffness": 3e-5})
+        for j in range(200):
+            stiffness = STIFFNESS * (1 - 0.3 * j / 199)
+            own = with_values(cable, {"bending_stiffness": stiffness})
+            alarms += tracker.update(seen(own, next(ways), rng)).change is not None
+            found = tracker.params["bending_stiffness"]
+            inside.append(abs(found.value - stiffness) < 1.96 * found.std)
+    print(f"{d}D: {runs} runs of 200 poses, {np.mean(inside):.1%} inside, alarms {alarms}")
+
+
+def clean(d: int, runs: int, first: int) -> None:
+    """Alarms in `runs` hundreds of clean poses: every 100 poses a tracker with a prior anew."""
+    rng = np.random.default_rng(first)
+    cable, ways, alarms, refused, low = rope(d), wandering(d, rng), 0, 0, []
+    listed = [seen(cable, next(ways), rng, 0.0) for _ in range(100)]
+    for _ in range(runs):
+        tracker = prior_of(cable, rng).tracker(STD)
+        for pose in listed:
+            points = np.asarray(pose.points) + STD * rng.normal(size=(len(S), d))
+            update = tracker.update(pose.changed(points=points))
+            refused += update.refused
+            low.append(update.probability)
+            if update.change:
+                alarms += 1
+                print(f"  {update.change}", flush=True)
+                break
+    share = float(np.mean(np.array(low) < 0.05))
+    print(
+        f"{d}D: {len(low)} clean poses, {alarms} alarms, {refused} refused; p < 0.05: {share:.3f}"
+    )
+
+
+def outliers(d: int, runs: int, first: int) -> None:
+    """One pose in twenty is seen wrong: distance of the parameters from those without it [std]."""
+    away, missed = [], 0
+    for k in range(runs):
+        rng = np.random.default_rng(first + k)
+        cable, ways = rope(d), wandering(d, rng)
+        both = [prior_of(cable, np.random.default_rng(k)).tracker(STD) for _ in range(2)]
+        for _ in range(60):
+            pose = seen(cable, next(ways), rng)
+            if rng.uniform() < 0.05:
+                points = np.asarray(pose.points).copy()
+                if rng.uniform() < 0.5:  # another strand
+                    points += 0.02 * rng.normal(size=d)
+                else:  # a hand
+                    at = rng.integers(0, 8)
+                    points[at : at + 4] += 0.03 * rng.normal(size=(4, d))
+                missed += not both[0].update(pose.changed(points=points)).refused
+                continue
+            for tracker in both:
+                tracker.update(pose)
+        for name, one in both[1].params.items():
+            if not one.fixed:
+                away.append(abs(both[0].params[name].value - one.value) / one.std)
+    print(f"{d}D: {runs} runs of 60 poses, largest distance {max(away):.2f} std, missed {missed}")
+
+
 # ---- speed ---------------------------------------------------------------------------------------
 
 
@@ -227,7 +395,14 @@ def speed(d: int, runs: int, first: int) -> None:
         )
 
 
-PANELS = {"changes": changes, "speed": speed}
+PANELS = {
+    "batch": batch,
+    "changes": changes,
+    "clean": clean,
+    "drift": drift,
+    "outliers": outliers,
+    "speed": speed,
+}
 
 
 def main() -> None:

@@ -39,6 +39,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "io",
         "codegen",
         "diagnosis",
+        "sensing",
         "show",
         "export",
         "runtime",

@@ -59,7 +59,8 @@ def test_it_equals_the_fit_of_all_poses() -> None:
     poses = [pose(true, float(heading), k) for k, heading in enumerate(HEADINGS)]
 
     def residual(z: np.ndarray) -> np.ndarray:
-        stiffness, load = np.array([0.009, 0.01]) + SIZES * z
+        # Stiffnesses are Gaussian in their logarithms, as in a fit.
+        stiffness, load = 0.009 * np.exp(SIZES[0] / 0.009 * z[0]), 0.01 + SIZES[1] * z[1]
         cable = rope(stiffness, load)
         rows = [
             (x.points - cable.solve(start=x.start, start_heading=x.start_heading).curve.at(S)) / STD
@@ -69,9 +70,11 @@ def test_it_equals_the_fit_of_all_poses() -> None:
 
     best = least_squares(residual, np.zeros(2), diff_step=1e-4)
     std = SIZES * np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
-    for name, first, size, z, s in zip(NAMES, (0.009, 0.01), SIZES, best.x, std, strict=True):
+    values = 0.009 * np.exp(SIZES[0] / 0.009 * best.x[0]), 0.01 + SIZES[1] * best.x[1]
+    std[0] *= values[0] / 0.009
+    for name, value, s in zip(NAMES, values, std, strict=True):
         found = tracker.params[name]
-        assert abs(found.value - (first + size * z)) < 0.1 * s
+        assert abs(found.value - value) < 0.1 * s
         assert found.std == pytest.approx(s, rel=0.05)
 
 
@@ -90,6 +93,33 @@ def test_lines_tell_the_stiffness() -> None:
     found = tracker.params["bending_stiffness"]
     assert abs(found.value - 0.0105) < 3 * found.std
     assert found.std < 0.1 * SIZES[0]
+
+
+def test_correlated_lines_tell_less() -> None:
+    trackers = [rope().tracker(STD, correlated=size) for size in (0.0, 0.05)]
+    held = {"start": (0.0, 0.0), "start_heading": -0.5}
+    points = rope().solve(**held).curve.at(np.linspace(0.02, 0.58, 30))
+    for tracker in trackers:
+        assert not tracker.update(dlo.Pose(points=points, **held)).refused
+    white, alike = (tracker.params["bending_stiffness"].std for tracker in trackers)
+    assert 1.1 * white < alike < 4 * white
+
+
+def test_a_force_without_a_shape_tells_the_weight() -> None:
+    """The start carries the cable and its weight: 0.01 N of noise are 1 g, and 0.5 g in four."""
+    true, trackers = rope(load=0.013), [rope().tracker(STD, force_std=x) for x in (0.01, None)]
+    rng = np.random.default_rng(1)
+    for k in range(4):
+        held = {"start": (0.0, 0.0), "start_heading": float(HEADINGS[k])}
+        force = true.solve(**held).start_force + 0.01 * rng.normal(size=2)
+        for tracker in trackers:
+            update = tracker.update(dlo.Pose(start_force=force, **held))
+            assert not update.refused
+    found, unused = (tracker.params["lumped_mass.mass"] for tracker in trackers)
+    assert found.std == pytest.approx(0.01 / 9.81 / 2, rel=0.1)
+    assert abs(found.value - 0.013) < 3 * found.std
+    assert (unused.value, unused.std) == pytest.approx((0.01, 0.004))
+    assert trackers[1].count == 4
 
 
 def test_a_pose_seen_wrong_is_refused_and_three_are_a_change() -> None:

@@ -86,7 +86,7 @@ class Jump:
     score : float
         T.
     price : float
-        What as many unknowns and rows gain by chance (Schwarz).
+        What as many unknowns gain by chance in as many poses (Schwarz).
     log_p : float
         Logarithm of the probability of T by chance, at this pose, of this suspect.
     step, std : dict of str to float
@@ -291,7 +291,7 @@ class Jumps:
             "information": np.zeros((1, q, q)),
             "slope": np.zeros((1, q)),
             "square": np.zeros((1, q)),
-            "rows": np.zeros(1),
+            "poses": np.zeros(1),
         }
         if self._sums:
             new = {k: np.concatenate([self._sums[k], x])[-self.most :] for k, x in new.items()}
@@ -300,7 +300,7 @@ class Jumps:
         new["information"] += g.swapaxes(1, 2) @ g
         new["slope"] += g.swapaxes(1, 2) @ seen.innovation
         new["square"] += (d**2).sum(axis=0)
-        new["rows"] += len(h)
+        new["poses"] += 1
         if not seen.refused:
             gain = seen.prior.metadata.uncertainty.covariance @ h.T
             new["taken"] += gain @ g
@@ -323,7 +323,7 @@ class Jumps:
             )
             k = self._likeliest(own)
             score, step, std = self._tried(k, own, vanish)
-            price = one.size * float(np.log(self._sums["rows"][k]))
+            price = one.size * float(np.log(self._sums["poses"][k]))
             log_p = float(chi2.logsf(score, len(one.names)))
             steps, stds = (dict(zip(one.names, x.tolist(), strict=True)) for x in (step, std))
             out.append(Jump(one, self.since[k], score, price, log_p, steps, stds))

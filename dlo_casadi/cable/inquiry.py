@@ -83,16 +83,19 @@ class Replayed:
     cable : EstimatedCable
         After the last pose.
     seen : list of Seen
+    before : float
+        Logarithm of the likelihood of the poses before the change.
     """
 
     jump: Jump
     cable: Any
     seen: list[Seen]
+    before: float
 
     @property
     def evidence(self) -> float:
-        """Logarithm of the likelihood of the poses."""
-        return sum(one.log_likelihood for one in self.seen)
+        """Logarithm of the likelihood of all poses of the inquiry."""
+        return self.before + sum(one.log_likelihood for one in self.seen)
 
     @property
     def probability(self) -> float:
@@ -165,12 +168,18 @@ class Inquiry:
         top = ranked[0]
         margin = max(_APART, _ERROR * top.score)
         near = [jump for jump in ranked if jump.worth > top.worth - margin]
-        valued = [(jump.worth, jump) for jump in near]
+        valued = [(jump.worth, jump.price, jump) for jump in near]
         if top.score > _LINEAR:
             lines = [line for x in near[:_REFITTED] if (line := self._line(x)) and not line.gone]
-            valued = [(2 * line.evidence, line.jump) for line in lines]
-            valued.sort(key=lambda pair: -pair[0])
-        tied = [jump for value, jump in valued if value > valued[0][0] - _APART]
+            price = 2 * float(np.log(_WIDE))
+            valued = [(2 * x.evidence, price * x.jump.suspect.size, x.jump) for x in lines]
+            valued.sort(key=lambda one: -one[0])
+        # A rival with more unknowns is out only if it explains less, whatever its price.
+        tied = [
+            jump
+            for value, price, jump in valued
+            if value + max(price - valued[0][1], 0.0) > valued[0][0] - _APART
+        ]
         if not tied or tied[0].worth <= 0:
             return self._unknown(final)
         first = tied[0]
@@ -239,6 +248,7 @@ class Inquiry:
     def _replayed(self, jump: Jump) -> Replayed | None:
         """The poses since a change, learned with it; twice, the second time about what it found."""
         start, poses = self._before(jump), [x for x in self.poses if x.number >= jump.since]
+        before = sum(x.log_likelihood for x in self.poses if x.number < jump.since)
         step, model, candidate = dict(jump.step), start.model, jump.suspect.candidate
         width = {k: max(_WIDE * x, _BENT * abs(step[k])) for k, x in jump.std.items()}
         first = _jumped(start, step)
@@ -250,7 +260,7 @@ class Inquiry:
         found: Replayed | None = None
         for _ in range(2):
             cable = with_unknowns(start, model, first, width)
-            now = self._going_on(Replayed(jump, cable, []), poses)
+            now = self._going_on(Replayed(jump, cable, [], before), poses)
             if now is None:
                 break
             found = now
@@ -271,7 +281,7 @@ class Inquiry:
                 seen.append(told)
         except EquilibriumError:
             return None
-        return Replayed(line.jump, cable, seen)
+        return Replayed(line.jump, cable, seen, line.before)
 
 
 def _stds(cable: Any) -> dict[str, float]:

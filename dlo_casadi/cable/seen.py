@@ -25,7 +25,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import chdtrc
 
-from dlo_casadi.arrays import FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray
 from dlo_casadi.cable.held import HELD, posed
 from dlo_casadi.codegen import CompiledShape, CompiledSolver
 from dlo_casadi.config import Pose
@@ -39,10 +39,15 @@ from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.rod.band import Vector
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
+from dlo_casadi.sensing.noise import correlation
 
 # Relinearisations of an update, and the step at which they end, in standard deviations after it: a
 # smaller one is as good as linear.
 _ITERATIONS, _SMALL = 8, 0.1
+# Share of the noise of a line that is correlated, if any is; the rest keeps close points apart.
+_SHARE = 0.99
+# Largest change of a logarithm in an update.
+_LOGS = 3.0
 # Largest last step [rad] of Newton's method: a thousandth of what any camera sees.
 _EXACT = 1e-7
 # Probability of a pose by chance below which it is refused.
@@ -59,11 +64,15 @@ class Noise:
         Of one coordinate of a point.
     force, moment : float or None [N, N m]
         Of one component of a reading; None if readings are not used.
+    along : float [m]
+        Distance along a line at which errors of its points are correlated by 1/e; 0 if they are
+        independent. Markers are.
     """
 
     point: float
     force: float | None = None
     moment: float | None = None
+    along: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +88,9 @@ class Measured:
         Whether these were measured, too; else only distances across the cable count.
     readings, rows, std : (r,)
         Components of forces and moments, their rows in `Observed.readings`, and their noise.
-    noise : float [m]
+    noise : Noise
+    mixed : (K, K) or None
+        L of the correlations L L^T of errors along a line.
     """
 
     points: FloatArray
@@ -88,7 +99,8 @@ class Measured:
     readings: FloatArray
     rows: list[int]
     std: FloatArray
-    noise: float
+    noise: Noise
+    mixed: FloatArray | None = None
 
     @classmethod
     def of(cls, pose: Pose, model: CableModel, noise: Noise) -> Measured:
@@ -112,7 +124,7 @@ class Measured:
             raise DloError(f"readings: {len(rows)} components belong here, found {len(values)}")
         s = np.zeros(len(points)) if pose.at is None else np.asarray(pose.at, dtype=float)
         readings = np.array(values), rows, np.array(std)
-        return cls(points, s, pose.at is not None, *readings, noise.point)
+        return cls(points, s, pose.at is not None, *readings, noise)
 
     @property
     def size(self) -> int:
@@ -124,13 +136,31 @@ class Measured:
         """The same with the places of its points on a curve, if they are not known."""
         if self.marked or not len(self.points):
             return self
-        return replace(self, s=seen.curve.nearest(self.points))
+        s, mixed = seen.curve.nearest(self.points), self.mixed
+        if mixed is None and self.noise.along:
+            apart = np.abs(s[:, None] - s) / self.noise.along
+            alike = _SHARE * correlation("exponential", apart) + (1 - _SHARE) * np.eye(len(s))
+            mixed = np.linalg.cholesky(alike)
+        return replace(self, s=s, mixed=mixed)
+
+    def _across(self, seen: Observed, moved: FloatArray) -> FloatArray:
+        """Displacements (K, d, q), or of a line those across it (K, d - 1, q)."""
+        if self.marked or not len(self.points):
+            return moved
+        return np.asarray(np.einsum("knd,kdq->knq", seen.curve.normals(self.s), moved))
 
     def _rows(self, seen: Observed, moved: FloatArray) -> FloatArray:
-        """Displacements (K, d, q) as rows (., q): all coordinates, or those across the cable."""
-        if not self.marked and len(self.points):
-            moved = np.einsum("knd,kdq->knq", seen.curve.normals(self.s), moved)
-        return np.asarray(moved.reshape(-1, moved.shape[2]) / self.noise)
+        """Displacements (K, d, q) as rows (., q) with independent errors of one."""
+        rows = self._across(seen, moved) / self.noise.point
+        if self.mixed is not None:
+            flat = rows.reshape(len(rows), -1)
+            rows = solve_triangular(self.mixed, flat, lower=True).reshape(rows.shape)
+        return np.asarray(rows.reshape(-1, moved.shape[2]))
+
+    def rms(self, seen: Observed) -> float:
+        """Root mean square [m] of a coordinate's distance from its prediction."""
+        gap = (self.points - seen.curve.at(self.s))[..., None]
+        return float(np.sqrt(np.square(self._across(seen, gap)).mean())) if gap.size else 0.0
 
     def off(self, seen: Observed) -> FloatArray:
         """Measured minus predicted (R,), in units of the noise."""
@@ -321,7 +351,8 @@ def _learned(
             if not converged.all():
                 found = solve_equilibrium(own.model, now.p, now.rest, held)
                 shapes = declared(batch, found.shapes)
-        along = batch.by_rest(shapes, now.p, now.rest, by_rest, by_p, by_deviation)
+        rate = _rises(own.model, now.p, own.p)
+        along = batch.by_rest(shapes, now.p, now.rest, by_rest, rate[:, None] * by_p, by_deviation)
         ((told, change),) = batch.observe(shapes, now.p, now.rest, along)
         measured = measured.on(told)
         residual, columns = measured.off(told), measured.along(told, change)
@@ -332,10 +363,8 @@ def _learned(
         if seen is None:
             whole = np.tril(factor[0])
             white = solve_triangular(whole, residual, lower=True)
-            points = residual[: len(residual) - len(measured.rows)]
-            rms = measured.noise * float(np.sqrt((points**2).mean())) if len(points) else 0.0
             known = (number, pose, prior, own.model, held, shapes, measured)
-            seen = Seen(*known, whole, white, rms)
+            seen = Seen(*known, whole, white, measured.rms(told))
             if seen.refused:
                 break
         gain = cho_solve(factor, by_z).T
@@ -350,16 +379,32 @@ def _learned(
     seen = replace(seen, iterations=iterations)
     if seen.refused:
         return prior, seen
-    covariance = uncertainty.root @ ((left + left.T) / 2) @ uncertainty.root.T
+    rates = dict(zip(own.model.names, rate, strict=True))
+    root = (
+        np.array([rates.get(name, 1.0) for name in uncertainty.names])[:, None] * uncertainty.root
+    )
+    covariance = root @ ((left + left.T) / 2) @ root.T
     after = moved(prior, by_p[:, :count] @ z, by_rest[:, :count] @ z)
     return with_covariance(after, covariance), seen
 
 
 def moved(cable: Any, by_p: FloatArray, by_rest: FloatArray) -> Any:
-    """The cable with other values, within their bounds."""
+    """The cable with other values, within their bounds; logarithms change by as much as a share."""
     bounds = np.array([q.bounds(estimated=True) for q in cable.model.parameters])
-    p = np.where(by_p == 0, cable.p, np.clip(cable.p + by_p, bounds[:, 0], bounds[:, 1]))
+    rise = np.exp(np.clip(_rises(cable.model, by_p, cable.p), -_LOGS, _LOGS))
+    new = np.where(_logs(cable.model), cable.p * rise, cable.p + by_p)
+    p = np.where(by_p == 0, cable.p, np.clip(new, bounds[:, 0], bounds[:, 1]))
     return replace(cable, p=p, rest=cable.rest + by_rest)
+
+
+def _logs(model: CableModel) -> BoolArray:
+    """Whether each parameter is Gaussian in its logarithm, as in the fit."""
+    return np.array([q.log for q in model.parameters], dtype=bool)
+
+
+def _rises(model: CableModel, new: FloatArray, old: FloatArray) -> FloatArray:
+    """Ratios of values that are logarithms, 1 for others."""
+    return np.divide(new, old, out=np.ones(len(old)), where=_logs(model))
 
 
 def with_covariance(cable: Any, covariance: FloatArray) -> Any:

@@ -131,9 +131,9 @@ class Tracker:
         """Learn from a pose: its fixtures, and what was measured of the cable.
 
         `Pose.points` (K, d) [m], with `Pose.at` (K,) [m] for markers, are used; without `at` the
-        points are anywhere along the cable, and their distances across it count. Readings of forces
-        and moments are used if the tracker knows their noise. In a pose with nothing measured time
-        passes.
+        points are those of a line, anywhere along the cable, and their distances across it count.
+        Readings of forces and moments are used if the tracker knows their noise. In a pose with
+        nothing measured time passes.
 
         Raises
         ------
@@ -302,6 +302,7 @@ class TrackedCable(EstimatedCable):
         *,
         force_std: float | None = None,
         moment_std: float | None = None,
+        correlated: float = 0.0,
         forget: float = 1.0,
         drift: Mapping[str, float] | None = None,
         compiled: bool = False,
@@ -314,6 +315,9 @@ class TrackedCable(EstimatedCable):
             Standard deviation of one coordinate of a measured point.
         force_std, moment_std : float [N, N m], optional
             Of one component of a reading; without them readings are not used.
+        correlated : float [m]
+            Distance along a line at which errors of its points are correlated by 1/e: the report's
+            `correlation_length_m`. Points with arc lengths have independent errors.
         forget : float
             Share of what is known that is kept from pose to pose, at most 1.
         drift : mapping of str to float, optional
@@ -332,6 +336,8 @@ class TrackedCable(EstimatedCable):
         for name, size in (("force_std", force_std), ("moment_std", moment_std)):
             if size is not None:
                 _checked(name, size, "the noise of a component [N, N m]")
+        if correlated:
+            _checked("correlated", correlated, "a distance along the cable [m]")
         if not isinstance(forget, int | float) or not 0.5 <= forget <= 1:
             raise DloError(f"forget: 0.5 to 1 belongs here, found {forget!r}")
         names = self.covariance.names
@@ -346,7 +352,7 @@ class TrackedCable(EstimatedCable):
                 raise DloError(f"drift: {name!r} is not estimated.\n  Try: {', '.join(names)}")
             if not 0 <= float(value) < np.inf:
                 raise DloError(f"drift: {name}: a standard deviation, found {value!r}")
-        noise = Noise(float(std), force_std, moment_std)
+        noise = Noise(float(std), force_std, moment_std, float(correlated))
         return Tracker(self, noise, float(forget), dict(drift or {}), compiled)
 
 

@@ -33,6 +33,9 @@ _PAGE = "watch.html"
     option("--std", type=float, metavar="M", help="noise of a coordinate [m]; the fit's without"),
     option("--force-std", type=float, metavar="N", help="noise of a force; not used without"),
     option("--moment-std", type=float, metavar="NM", help="noise of a moment; not used without"),
+    option(
+        "--correlated", type=float, metavar="M", help="of a line's noise [m]; the fit's without"
+    ),
     option("--forget", type=float, default=1.0, metavar="X", help="share kept from pose to pose"),
     option("--drift", nargs="+", metavar="NAME=STD", help="parameters that walk at random, a pose"),
     option("--compiled", action="store_true", help="compile the equilibria (needs a C compiler)"),
@@ -56,8 +59,15 @@ def watch(chosen: argparse.Namespace) -> None:
     given = chosen.parameters
     beside = given if given.is_dir() else given.parent
     into = chosen.into or beside / "watch"
+    known = _noise(beside)
+    if not (chosen.std or known):
+        raise DloError(
+            f"the noise of the points is not known: {beside / 'report.json'} does not tell it.\n"
+            "  Try: --std 4e-4 [m]"
+        )
     settings: dict[str, Any] = {
-        "std": chosen.std or _noise(beside),
+        "std": chosen.std or known.get("std"),
+        "correlated": known.get("along", 0.0) if chosen.correlated is None else chosen.correlated,
         "force_std": chosen.force_std,
         "moment_std": chosen.moment_std,
         "forget": chosen.forget,
@@ -89,18 +99,13 @@ def watch(chosen: argparse.Namespace) -> None:
             watched.close()
 
 
-def _noise(folder: Path) -> float:
-    """Noise of the fit's points [m]."""
-    path = folder / "report.json"
+def _noise(folder: Path) -> dict[str, float]:
+    """Noise of the fit's points, and its correlation length [m]; empty if that is not known."""
     try:
-        std = json.loads(path.read_text("utf-8"))["measurement"]["std"]
+        found = json.loads((folder / "report.json").read_text("utf-8"))["measurement"]
+        return {"std": float(found["std"]), "along": float(found["correlation_length_m"] or 0.0)}
     except (OSError, ValueError, KeyError, TypeError):
-        std = None
-    if not isinstance(std, float):
-        raise DloError(
-            f"the noise of the points is not known: {path} does not tell it.\n  Try: --std 4e-4 [m]"
-        )
-    return std
+        return {}
 
 
 def _said(line: dict[str, Any]) -> str:
