@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 import dlo_casadi as dlo
 from dlo_casadi.cable.move import RATE, rows_of
 from dlo_casadi.cable.move_checks import held_by
-from dlo_casadi.export.mujoco import STEP, follow
+from dlo_casadi.export.mujoco import follow
 from dlo_casadi.export.rod import Rod
 from dlo_casadi.planning.others import least_jerk
 
@@ -129,7 +129,7 @@ def work(case: Case) -> Row:
 def in_mujoco(move: dlo.Move, before: dlo.Shape) -> tuple[float, float]:
     """Swings [lengths] of the planned motion, and of least jerk, in MuJoCo."""
     cable, course = before.cable, move.course
-    t = np.arange(0.0, move.motion.t[-1], 1 / RATE)
+    t = np.arange(0.0, move.motion.t[-1], 1 / max(RATE, RATE / move.duration))
     moving = rows_of(course, course.values(move.theta, t))
     still = {name: x for name, x in held_by(before.pose).items() if name not in moving}
     rod = Rod.of(before.held, LINKS)
@@ -141,7 +141,7 @@ def in_mujoco(move: dlo.Move, before: dlo.Shape) -> tuple[float, float]:
             (file,) = cable.export("mujoco", name, segments=LINKS, motion=motion, **still)
             nodes = follow(file.read_text(), rod)
         moved = nodes[:, 1:-1] - nodes[0, 1:-1]
-        late = moved[STEP * np.arange(len(nodes)) > move.duration]
+        late = moved[np.linspace(0, t[-1], len(nodes)) > move.duration]
         # Where it comes to rest follows from where it was: the mean of a period would, too, swing.
         rest = move.rest - move.motion.points[0]
         s = np.linspace(0.0, cable.length, len(rest))

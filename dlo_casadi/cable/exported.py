@@ -20,6 +20,10 @@ from dlo_casadi.export.targets import check_counts, samples_of, step_of, target_
 AnyMotion = Move | Mapping[str, Any] | str | PathLike[str]
 
 
+# Steps of a motion at least: a short one swings fast.
+_LEAST = 1000
+
+
 class ExportedCable(CableInMotion):
     """A fitted cable that is written for simulators."""
 
@@ -87,11 +91,14 @@ class Given(NamedTuple):
 def given_motion(
     cable: CableInMotion, motion: AnyMotion, step: float, held: Mapping[str, Any]
 ) -> Given:
-    """Fixtures at each step [s], beside what is `held`; raises as `ExportedCable.export`."""
+    """Fixtures at steps of at most `step` [s], beside what is `held`.
+
+    Raises as `ExportedCable.export`.
+    """
     if isinstance(motion, str | PathLike):
         t, given = read_fixtures(cable.model.node, Path(motion))
     else:
-        table = motion.table() if isinstance(motion, Move) else motion
+        table = motion.table(_LEAST / motion.duration) if isinstance(motion, Move) else motion
         if not isinstance(table, Mapping) or "t" not in table:
             raise DloError(
                 "motion: a table, the result of `move`, or arguments of `simulate` belong here."
@@ -102,6 +109,7 @@ def given_motion(
     if twice := sorted(held.keys() & given.keys()):
         raise DloError(f"{twice[0]} is held, and moves.\n  Try: one of both")
     times = times_of(t)
+    step = float(f"{min(step, (times[-1] - times[0]) / _LEAST):.3g}")
     pose, path = fixture_path(cable, times, {**held, **given})
     count = int(np.ceil((times[-1] - times[0]) / step - 1e-9))
     rows = path.declared(times[0] + step * np.arange(count + 1))[0]

@@ -45,7 +45,7 @@ def write(rod: Rod, head: Sequence[str]) -> str:
 {comment}
   -->
   <compiler angle="radian"/>
-  <option timestep="{STEP}" gravity="{_row(rod.gravity)}" integrator="implicitfast"/>
+  <option timestep="{_step(rod):g}" gravity="{_row(rod.gravity)}" integrator="implicitfast"/>
   <default>
     <default class="cable">
       <geom type="capsule" size="{rod.radius:.9g}" fromto="0 0 0 {rod.h:.9g} 0 0" \
@@ -58,10 +58,15 @@ contype="0" conaffinity="1" rgba="0.1 0.4 0.6 1"/>
     {"</body>" * len(rod.masses)}{_closed(rod, "start")}{ends}
   </worldbody>{_held(rod)}{_driven(rod)}
   <keyframe>
-    <key name="pose" qpos="{_row(_angles(rod))}"{_first(rod)}/>
+    <key name="pose" qpos="{_row(_angles(rod))}"/>
   </keyframe>
 </mujoco>
 """
+
+
+def _step(rod: Rod) -> float:
+    """Time step [s]."""
+    return STEP if rod.driven is None else rod.driven.step
 
 
 def _damping_time(rod: Rod) -> float:
@@ -145,13 +150,6 @@ kv="{2 * size * _RATE:.9g}"/>"""
   </custom>"""
 
 
-def _first(rod: Rod) -> str:
-    """The first row of the controls, of the keyframe."""
-    if rod.driven is None:
-        return ""
-    return f' ctrl="{_row(rod.driven.controls(_RATE)[0])}"'
-
-
 def _bodies(rod: Rod) -> list[str]:
     stiffness, axes = principal(rod)
     stiffness[1::2] = stiffness[1::2, ::-1]
@@ -210,8 +208,9 @@ def _pin(rod: Rod) -> str:
 def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: FloatArray) -> str:
     """Hinges about the principal axes; for a cable in a plane only the one normal to it.
 
-    Their armature keeps each from oscillating by more than a radian per step: MuJoCo integrates
-    springs explicitly, and a link of a few millimetres has almost no inertia about its axis.
+    Their armature keeps the chain, whose fastest mode has four times the stiffness of a joint, from
+    oscillating by more than a radian per step: MuJoCo integrates springs explicitly, and a link of
+    a few millimetres has almost no inertia about its axis.
     """
     about = dict(zip("xyz", axes.as_matrix().T, strict=True))
     text = ""
@@ -220,7 +219,7 @@ def _hinges(rod: Rod, k: int, stiffness: FloatArray, axes: Rotation, rest: Float
             text += (
                 f'<joint name="{name}_{k}" axis="{_row(about[name])}" stiffness="{value:.9g}" '
                 f'springref="{angle:.9g}" damping="{_damping_time(rod) * value:.9g}" '
-                f'armature="{STEP**2 * value:.9g}"/>'
+                f'armature="{(2 * _step(rod)) ** 2 * value:.9g}"/>'
             )
     return text
 
@@ -247,7 +246,7 @@ def _held(rod: Rod) -> str:
     kind = "weld" if rod.end.kind.direction and not rod.end.rolls else "connect"
     held = "".join(
         f"""
-    <{kind} name="{name}" site1="cable_{name}" site2="{name}" solref="{2 * STEP:g} 1" \
+    <{kind} name="{name}" site1="cable_{name}" site2="{name}" solref="{2 * _step(rod):g} 1" \
 solimp="0.9999 0.9999 0.001"/>"""
         for name in ("end", "end_axis")[: 1 + rod.end.rolls]
     )
@@ -273,49 +272,64 @@ def _angles(rod: Rod) -> FloatArray:
     return np.concatenate([carried[0], start, angles[free], carried[1]])
 
 
+class _Chain:
+    """A written model in MuJoCo, at its keyframe."""
+
+    def __init__(self, text: str, rod: Rod) -> None:
+        import mujoco as mj
+
+        self.mj, self.h = mj, rod.h
+        self.model = mj.MjModel.from_xml_string(text)
+        self.model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET
+        self.data = mj.MjData(self.model)
+        mj.mj_resetDataKeyframe(self.model, self.data, 0)
+        self.links = [self.model.body(f"cable_{k}").id for k in range(len(rod.masses))]
+
+    @property
+    def nodes(self) -> FloatArray:
+        """Places (n + 1, 3) [m] of the ends of the links."""
+        places, last = self.data.xpos[self.links], self.links[-1]
+        ahead = self.data.xmat[last].reshape(3, 3)[:, 0]
+        return np.vstack([places, self.data.xpos[last] + self.h * ahead])
+
+    def advance(self, many: int) -> FloatArray:
+        """The nodes after steps."""
+        if many:
+            self.mj.mj_step(self.model, self.data, nstep=many)
+        self.mj.mj_forward(self.model, self.data)
+        return self.nodes
+
+    def energy(self) -> float:
+        """Kinetic energy [J], without that of the servos, whose noise would hide it."""
+        self.mj.mj_energyVel(self.model, self.data)
+        squares = self.model.dof_armature * self.data.qvel**2
+        driven = self.model.actuator_trnid[:, 0]
+        return float(self.data.energy[1] - squares[self.model.jnt_dofadr[driven]].sum() / 2)
+
+    def halt(self) -> None:
+        """Stop all that moves."""
+        self.data.qvel[:] = 0.0
+
+    def at_rest(self) -> FloatArray:
+        """The nodes at rest."""
+        return relax(self.advance, self.energy, self.halt, self.model.opt.timestep, "MuJoCo")
+
+
 def settle(text: str, rod: Rod) -> Relaxed:
     """Relax a written model in MuJoCo."""
-    import mujoco as mj
-
-    model = mj.MjModel.from_xml_string(text)
-    model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET
-    data = mj.MjData(model)
-    mj.mj_resetDataKeyframe(model, data, 0)
-    links = [model.body(f"cable_{k}").id for k in range(len(rod.masses))]
-
-    def advance(many: int) -> FloatArray:
-        if many:
-            mj.mj_step(model, data, nstep=many)
-        mj.mj_forward(model, data)
-        ahead = data.xmat[links[-1]].reshape(3, 3)[:, 0]
-        return np.vstack([data.xpos[links], data.xpos[links[-1]] + rod.h * ahead])
-
-    def energy() -> float:
-        mj.mj_energyVel(model, data)
-        return float(data.energy[1])
-
-    def halt() -> None:
-        data.qvel[:] = 0.0
-
-    nodes = relax(advance, energy, halt, model.opt.timestep, "MuJoCo")
-    on_cable = data.efc_force[data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY]
+    chain = _Chain(text, rod)
+    nodes = chain.at_rest()
+    kinds, forces = chain.data.efc_type, chain.data.efc_force
+    on_cable = forces[kinds == chain.mj.mjtConstraint.mjCNSTR_EQUALITY]
     places = on_cable[: 3 * (1 + rod.end.rolls)].reshape((-1, 3))
     return Relaxed(nodes, -places.sum(axis=0))
 
 
 def follow(text: str, rod: Rod) -> FloatArray:
-    """Nodes (T, n + 1, 3) [m] of a written model along the motion of its fixtures, each step."""
-    import mujoco as mj
-
-    model = mj.MjModel.from_xml_string(text)
-    data = mj.MjData(model)
-    mj.mj_resetDataKeyframe(model, data, 0)
-    links = [model.body(f"cable_{k}").id for k in range(len(rod.masses))]
-    found = []
-    for row in model.numeric_data.reshape((-1, model.nu)):
-        mj.mj_kinematics(model, data)
-        ahead = data.xmat[links[-1]].reshape(3, 3)[:, 0]
-        found.append(np.vstack([data.xpos[links], data.xpos[links[-1]] + rod.h * ahead]))
-        data.ctrl[:] = row
-        mj.mj_step(model, data)
+    """Nodes (T, n + 1, 3) [m] of a written model, from rest along the motion of its fixtures."""
+    chain = _Chain(text, rod)
+    found = [chain.at_rest()]
+    for row in chain.model.numeric_data.reshape((-1, chain.model.nu))[:-1]:
+        chain.data.ctrl[:] = row
+        found.append(chain.advance(1))
     return np.array(found)
