@@ -19,7 +19,7 @@ from dlo_casadi.codegen.generate import Solver
 from dlo_casadi.codegen.moving import MovingCase, alone
 from dlo_casadi.codegen.obstacles import Obstacles
 from dlo_casadi.codegen.stepper import CompiledStepper
-from dlo_casadi.effects import IN_MOTION, Setup
+from dlo_casadi.effects import EFFECTS, IN_MOTION, Effect, Load, Setup
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.motion.sensitivities import Columns, Numbers, Steps
@@ -29,6 +29,12 @@ from dlo_casadi.motion.system import MovingCable
 
 # Libraries that are kept.
 _MOST = 32
+# Effects for which a search in motion looks.
+_SEARCHED: dict[str, type[Effect]] = IN_MOTION | {
+    name: kind
+    for name, kind in EFFECTS.items()
+    if issubclass(kind, Load) and kind.masses is not Load.masses
+}
 # Without much optimisation: a library is used for some ten thousand steps.
 _FLAGS = ("-O1",)
 
@@ -163,18 +169,18 @@ def compiled_steps(cable: MovingCable, flags: tuple[str, ...] = _FLAGS) -> Compi
 
 
 def widened(cable: MovingCable) -> tuple[MovingCable, IntArray]:
-    """The cable with all effects of motion, and where its parameters stand among those.
+    """The cable with all effects of motion and a weight, and where its parameters stand there.
 
     Effects that it has not vanish, and all stand in one order: a search that adds one after the
     other compiles one library.
     """
     model = cable.model
     setup = Setup(model.cable, model.start, model.end, model.gravity, moves=True)
-    own = {effect.name: effect for effect in model.effects if effect.name in IN_MOTION}
-    others = tuple(effect for effect in model.effects if effect.name not in IN_MOTION)
+    own = {effect.label: effect for effect in model.effects if effect.label in _SEARCHED}
+    others = tuple(effect for effect in model.effects if effect.label not in _SEARCHED)
     moving = tuple(
         own.get(name) or kind.made_for(setup)
-        for name, kind in IN_MOTION.items()
+        for name, kind in _SEARCHED.items()
         if name in own or kind.applies(setup)
     )
     wide = replace(model, effects=(*others, *moving))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ MODES = 8
 # Standard deviation of the amplitude of the first mode, in lengths; of higher ones in proportion to
 # the inverse of their frequencies.
 AMPLITUDE = 0.3
+# States whose points are evaluated at once.
+_AT_ONCE = 200
 # Halvings of a step of time whose Newton's method fails.
 _HALVINGS = 4
 
@@ -296,6 +298,21 @@ class Recording:
         numbers: GivenNumbers | None,
     ) -> tuple[FloatArray, FloatArray | None]:
         """Points (T, K, d) of the markers, and their derivatives (T, K, d, q)."""
+        # All derivatives of all states of a minute in space would take a gigabyte.
+        parts = []
+        while some := list(islice(states, _AT_ONCE)):
+            parts.append(self._seen_in(some, held, numbers))
+        points = np.concatenate([x for x, _ in parts])
+        by = [x for _, x in parts if x is not None]
+        return points, np.concatenate(by) if by else None
+
+    def _seen_in(
+        self,
+        states: Sequence[tuple[State, Columns | None]],
+        held: HeldFixtures,
+        numbers: GivenNumbers | None,
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """The same of some states."""
         cable, (segment, u) = held.cable, self._markers(held.cable)
         known, columns = zip(*states, strict=True)
         p, _, place = (np.broadcast_to(x, (len(known), *x.shape)) for x in cable.numbers[:3])
