@@ -101,8 +101,11 @@ def main() -> int:
                 shorter += [part] * (found.swing <= 1e-3 * cable.length)
             names = [name for name in UNSURE if name in cable.model.names]
             std = STD * np.array([cable.p[cable.model.names.index(name)] for name in names])
+            given = {"names": tuple(names), "covariance": np.diag(std**2)}
+            uncertainty = replace(cable.metadata.uncertainty, **given)
             covariance = Covariance(tuple(names), np.diag(std**2))
-            unsure = replace(cable, metadata=replace(cable.metadata, covariance=covariance))
+            own = {"covariance": covariance, "uncertainty": uncertainty}
+            unsure = replace(cable, metadata=replace(cable.metadata, **own))
             moves = [unsure.move(*poses, duration=float(period), robust=x) for x in (False, True)]
             drawn = [np.array(swings(unsure, move, poses)) for move in moves]
             low, high = moves[0].band

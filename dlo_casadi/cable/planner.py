@@ -15,7 +15,7 @@ from dlo_casadi.cable.motion import CableInMotion, Motion
 from dlo_casadi.cable.move import RATE, Move, rows_of
 from dlo_casadi.cable.move_checks import held_by
 from dlo_casadi.cable.move_limits import used_along
-from dlo_casadi.cable.shape_in_motion import Modes, moving_cable
+from dlo_casadi.cable.shape_in_motion import Modes, directions, moving_cable
 from dlo_casadi.codegen.fit_steps import fastest_steps
 from dlo_casadi.equilibrium.equilibrium import Equilibrium
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -125,22 +125,7 @@ class Planner:
     @cached_property
     def directions(self) -> list[tuple[FloatArray, FloatArray]]:
         """Changes of p and of the rest curvature by one standard deviation in each direction."""
-        cable = self.coarse
-        found: list[tuple[FloatArray, FloatArray]] = []
-        names, values = cable.covariance.names, cable.covariance.values
-        if not len(names):
-            return []
-        sizes, vectors = np.linalg.eigh(values / np.sqrt(np.outer(*[np.diag(values)] * 2)))
-        std = np.sqrt(np.diag(values))
-        for size, vector in zip(sizes[::-1], vectors.T[::-1], strict=True):
-            p, rest = np.zeros(len(cable.p)), np.zeros(len(cable.rest))
-            for name, change in zip(names, np.sqrt(max(size, 0.0)) * std * vector, strict=True):
-                if name in cable.model.names:
-                    p[cable.model.names.index(name)] = change
-                elif name.startswith("rest_curvature["):
-                    rest[int(name[15:-1])] = change
-            found.append((p, rest))
-        return found
+        return directions(self.coarse)
 
     def _changed(self, p: FloatArray, rest: FloatArray) -> MovingCable:
         return moving_cable(replace(self.coarse, p=self.coarse.p + p, rest=self.coarse.rest + rest))

@@ -82,7 +82,7 @@ def modes(chosen: argparse.Namespace) -> None:
     found, page = shape.modes(chosen.count), Page(chosen)
     if chosen.figure is not None:
         save_figure(chosen.figure, found.plot())
-    names = ("frequencies", "damping_ratios")
+    names = ("frequencies", "frequency_std", "damping_ratios", "damping_ratio_std")
     page.data({name: getattr(found, name).tolist() for name in names})
     page.say(found)
     if chosen.figure is not None:

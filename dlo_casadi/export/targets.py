@@ -95,7 +95,7 @@ TARGETS = {
             "geom mass [kg]; geom size [m]: half the diameter; option gravity [m/s^2]",
             "body start, body end: the clamps (mocap), move them; key pose: the shape in this pose",
             "joint damping [N m s/rad]: damping_time times stiffness, 0.03 s where it is unknown;",
-            "armature and the softness of the end's constraint are chosen for option timestep: they",
+            "armature and the softness of the end's constraint are chosen for this timestep: they",
             "change motion, not rest (the end by < 0.1 %)",
         ),
         step=mujoco.STEP,
