@@ -5,7 +5,8 @@ finds from starts of its own; one shape against scipy's solve_bvp with an interi
 obstacles`: one to three obstacles against IPOPT with inequalities on the same energy, from our
 shape, from that without obstacles, from the documented guesses and from random shapes; closed
 forms of a heavy beam laid on a table, a cable over a cylinder, a rod between walls. `--held
-obstacles-in-c`: the generated C solver, see cables/in_c.py. Cables that differ are listed by their
+obstacles-in-c`: the generated C solver, see cables/in_c.py. `--held slides-in-c`: cables fed
+through an end, C beside Python, see cables/fed.py. Cables that differ are listed by their
 numbers; --only tries one of them alone. With a folder of sessions (--fixtures), what their fits say
 beside the truth next to it.
 """
@@ -21,7 +22,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from cables import closed_forms, in_c
+from cables import closed_forms, fed, in_c
 from cables.draw import Case, Draw, drawn, with_clips, with_obstacles
 from cables.in_c import LIGHTEST
 from cables.ipopt import Ipopt
@@ -194,7 +195,7 @@ def check_fixtures(folder: Path) -> None:
         print(f"{time.process_time() - began:.0f} s", flush=True)
 
 
-HELD = ("clips", "obstacles", "obstacles-in-c")
+HELD = ("clips", "obstacles", "obstacles-in-c", "slides-in-c")
 
 
 def main() -> None:
@@ -229,6 +230,10 @@ def main() -> None:
     if "obstacles-in-c" in chosen.held:
         cases = [(where, kinds) for where in chosen.where for kinds in chosen.kinds]
         run(partial(in_c.check, chosen=chosen), cases, chosen, lambda case, text, seconds: text)
+    if "slides-in-c" in chosen.held:
+        work = partial(fed.check, count=chosen.count, seed=chosen.seed)
+        both = [(where, clips) for where in chosen.where for clips in (False, True)]
+        run(work, both, chosen, lambda case, text, seconds: text)
     if chosen.fixtures is not None:
         check_fixtures(chosen.fixtures)
 
