@@ -269,6 +269,7 @@ def test_a_compliance_of_ones_own_stretches_the_cable():
     assert own.points == pytest.approx(known.points, abs=1e-12)
 
 
+@pytest.mark.long
 def test_an_effect_of_ones_own_may_differ_at_random_from_pose_to_pose(monkeypatch):
     class Draught(SideLoad):
         name = "draught"

@@ -127,6 +127,7 @@ def test_the_first_order_model_is_the_derivative_of_solved_shapes(aim):
         np.testing.assert_allclose(here.aims * least, forces, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_no_place_near_a_clip_in_space_is_better():
     known = cable(8, gravity=(0.0, 0.0, -9.81), also={"torsional_stiffness": 0.015})
     poses, box = [{"end": (0.5, 0.1, 0.0)}], ((0.1, -0.1, -0.3), (0.4, 0.2, 0.0))

@@ -119,6 +119,7 @@ def test_a_nuisance_is_held_within_its_tolerance_again_where_it_is_needless(long
     assert (smaller.model.priors == held.priors) is not kept
 
 
+@pytest.mark.long
 def test_an_effect_that_stands_for_the_error_of_the_mesh_is_dropped_on_a_finer_one():
     """On a table 20 elements are 5 mm off, which a section of another stiffness makes up for."""
     cable = CableData(0.8, 0.08, 0.006, 0.02, straight=True)

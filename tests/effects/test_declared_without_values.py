@@ -96,14 +96,15 @@ def poses_in(where: str, pinned: bool) -> list[HeldPose]:
 def cases():
     """Effects on cables in the plane and in space that have them, and that have not.
 
-    Long are those in space of effects that are in the plane, too, and most of cables that have
-    not: all fits begin where effects vanish.
+    Long are those in space of effects that are in the plane, too, most of cables that have not,
+    for all fits begin where effects vanish, and those that take more than a second.
     """
+    slow = ("bending_anisotropy", "contact_plane", "obstacle_offset")
     for where, gravity in GRAVITY.items():
         for name, kind in EFFECTS.items():
             if len(gravity) not in kind.dimensions:
                 continue
-            again = where == "space" and 2 in kind.dimensions
+            again = (where == "space" and 2 in kind.dimensions) or name in slow
             few = where == "plane" and name in ("rest_curvature_drift", "start_spring")
             yield pytest.param(name, where, True, marks=[pytest.mark.long] * again)
             yield pytest.param(name, where, False, marks=[pytest.mark.long] * (not few))
