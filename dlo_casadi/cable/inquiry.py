@@ -26,9 +26,9 @@ from dlo_casadi.thresholds import EVIDENCE_APART, NEAR_END
 JUDGED = (1, 2, 4, 8, 16, 32)
 # Difference of twice the log evidence beyond which a cause is no rival.
 _APART = 2 * EVIDENCE_APART
-# Suspects that are fitted to the poses, and the score beyond which derivatives alone do not decide:
-# they err by a fifth of it.
-_REFITTED, _LINEAR, _ERROR = 6, 50.0, 0.2
+# Suspects that are fitted to the poses, and the share of the score by which derivatives at places
+# some way apart may err.
+_REFITTED, _ERROR = 6, 0.4
 # Width of the priors of a jump, in its standard deviations to first order.
 _WIDE = 10.0
 # Their least width, as a share of the jump: derivatives err by less.
@@ -133,7 +133,6 @@ class Inquiry:
     shaper: Shaper
     since: int
     opened: int
-    most: int
     _jumps: list[Jumps] = field(default_factory=list)
     _lines: dict[tuple[str, int], Replayed | None] = field(default_factory=dict)
 
@@ -141,7 +140,7 @@ class Inquiry:
         last = self.poses[-1]
         unknown = last.prior.metadata.uncertainty.names
         for probe in Probe.every(last.model, unknown):
-            jumps = Jumps(probe, self.most)
+            jumps = Jumps(probe, len(self.poses) + JUDGED[-1])
             for seen, columns in zip(self.poses, probe.columns(self.poses), strict=True):
                 jumps.add(seen, columns)
             self._jumps.append(jumps)
@@ -166,14 +165,12 @@ class Inquiry:
         """What changed, and the cable after it."""
         ranked = self._ranked()
         top = ranked[0]
-        margin = max(_APART, _ERROR * top.score)
-        near = [jump for jump in ranked if jump.worth > top.worth - margin]
-        valued = [(jump.worth, jump.price, jump) for jump in near]
-        if top.score > _LINEAR:
-            lines = [line for x in near[:_REFITTED] if (line := self._line(x)) and not line.gone]
-            price = 2 * float(np.log(_WIDE))
-            valued = [(2 * x.evidence, price * x.jump.suspect.size, x.jump) for x in lines]
-            valued.sort(key=lambda one: -one[0])
+        least = top.worth - max(_APART, _ERROR * top.score)
+        near = [jump for jump in ranked if jump.worth > least][:_REFITTED]
+        lines = [line for jump in near if (line := self._line(jump)) and not line.gone]
+        price = 2 * float(np.log(_WIDE))
+        valued = [(2 * x.evidence, price * x.jump.suspect.size, x.jump) for x in lines]
+        valued.sort(key=lambda one: -one[0])
         # A rival with more unknowns is out only if it explains less, whatever its price.
         tied = [
             jump

@@ -261,7 +261,7 @@ class Tracker:
         poses = [one for one in self._window if not one.refused or one.number > run]
         cable = self._cable
         self._inquiry = Inquiry(
-            poses, cable, self.noise, self._faded, self._shaper, since, self.count, WINDOW
+            poses, cable, self.noise, self._faded, self._shaper, since, self.count
         )
         return self._concluded(final=False)
 
