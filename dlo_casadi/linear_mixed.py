@@ -29,7 +29,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dlo_casadi.arrays import BoolArray, FloatArray, root_of
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray, root_of
 from dlo_casadi.errors import EstimationError
 
 
@@ -144,7 +144,7 @@ class Score:
         information = self.information / np.outer(self.size, self.size)
         return Score(self.slope / self.size, information, np.ones(len(self.size)))
 
-    def among(self, kept: BoolArray) -> Score:
+    def among(self, kept: BoolArray | IntArray) -> Score:
         """Of some of the columns alone."""
         return Score(self.slope[kept], self.information[np.ix_(kept, kept)], self.size[kept])
 

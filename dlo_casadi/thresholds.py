@@ -35,13 +35,6 @@ KEPT_VARIANCE = 0.05
 # In 35 steps of nineteen sessions in space, with a limit of 0.1, the chosen one had 0.43 or more.
 REFITTED = 6
 WORTH = 0.3
-# The same for a model that lacks something large and is scored at the measured shapes. Relative to
-# the leading score, the true effect had 1 in six cables simulated by this program; in four sessions
-# of another simulator (space_pull, space_taper, space_drift, space_flat) 1, 1, 0.86 and 0.71.
-NEAR_LEADER = 0.3
-# Smallest score, relative to the chosen candidate, at which one with fewer parameters may be the
-# larger of two effects that the chosen one combines: the larger of two has half.
-LARGER_OF_TWO = 0.5
 # Difference in log likelihood beyond which the data reject a rival: "very strong" evidence (Kass
 # and Raftery, J. Am. Stat. Assoc. 90, 1995).
 EVIDENCE_APART = 5.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,10 +77,6 @@ class Candidate:
             prefix + q.name: float(np.clip(own[q.name], q.lower, q.upper))
             for q in self.effect.parameters(cable)
         }
-
-
-# Candidates for a fit: `candidates_of` with the session's centre and exclusions.
-Listing = Callable[[Fit], Sequence[Candidate]]
 
 
 def setup_of(model: CableModel, **seen: Any) -> Setup:

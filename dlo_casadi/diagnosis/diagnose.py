@@ -8,26 +8,21 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-
 from dlo_casadi.diagnosis.candidates import equivalents
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_pose_to_pose import (
     as_repeating,
-    at_random_instead,
+    at_random,
     bends_at_random,
     with_loose_poses,
 )
 from dlo_casadi.diagnosis.if_hidden import IfHidden, if_hidden
-from dlo_casadi.diagnosis.screening import p_values_of
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
     Found,
     Ranked,
-    added_by,
-    choose,
+    decide,
     ranking,
-    with_new_noise,
 )
 from dlo_casadi.diagnosis.structure import Structure, screening_degrees, structure_of
 from dlo_casadi.diagnosis.trials import Trials, pruned
@@ -41,7 +36,6 @@ from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.runtime.work import Bound, accounted_as
 from dlo_casadi.thresholds import (
     EVIDENCE_APART,
-    LARGER_OF_TWO,
     LEAST_PROMISED,
     LEAST_PROMISED_BY_TWO,
     SIGNIFICANCE,
@@ -52,7 +46,6 @@ from dlo_casadi.thresholds import (
 # candidate reaches the noise at first, 1480: a step of it takes 0.12 s on a loaded machine.
 DIAGNOSIS_STEPS = 4000
 Verdict = Literal["complete", "effect_found", "unexplained"]
-RAN_AWAY = "its fit ran away: no noise can be estimated from it"
 
 
 @dataclass(frozen=True)
@@ -130,11 +123,15 @@ def diagnose(
 
 @dataclass(frozen=True)
 class Search:
-    """Search for effects that a declared model lacks: the arguments of `diagnose`."""
+    """Search for effects that a declared model lacks: the arguments of `diagnose`.
+
+    `force`: an unknown one whose causes are tried in the first step; without it all effects.
+    """
 
     trials: Trials
     max_effects: int
     step: Callable[[str, int, int], None]
+    force: UnknownForce | None = None
 
     @property
     def declared(self) -> Fit:
@@ -155,22 +152,25 @@ class Search:
         """Whether another search may begin."""
         return self.several and not self.trials.bound.met
 
+    @property
+    def may_be_far(self) -> bool:
+        """Whether a model that comes near the shapes may have begun too far from the effects."""
+        return self.several and self.declared.noise.source != "misfit"
+
     def diagnosis(self) -> Diagnosis:
         """Result of the search, without effects that explain too little."""
-        trials, force = self.trials, None
-        fit = trials.declared
+        trials, fit = self.trials, self.declared
         many = enough_poses(fit.problem.history, fit.model)
         misfit = fit.noise.source == "misfit" and many
         near = with_loose_poses(fit, trials.relaxed[0], trials.finest) if misfit else None
         if near is not None:
             return self.beginning_with(declared=near).diagnosis()
-        found = self._searched()
-        again = misfit and self.goes_on
-        near = at_random_instead(fit, found, trials.finest) if again else None
-        if near is not None:
+        found, _ = self.best()
+        if misfit and self.goes_on and (found.unexplained or found.fit.scatters):
+            near = at_random(fit, found.fit.model.n, trials.finest)
+        if near is not None and self._random_is_better(found, near):
             return self.beginning_with(declared=near).diagnosis()
-        if found.unexplained:
-            found, force = self._or_causes(found)
+        found, force = self.best((CAUSES,), found)
         if found.unexplained and found.added:
             if not found.leaves_little(trials.validation):
                 found = self._ended(fit, [], found.ranked)
@@ -181,83 +181,62 @@ class Search:
             replace(x, equivalents=equivalents(found.fit, x.candidate, tried, x.rival_candidates))
             for x in found.added
         )
+        gram = None if found.unexplained else trials.gram_beside(found.fit)
         return Diagnosis(
             **vars(replace(found, added=tuple(added))),
             before=fit,
             validation_before=trials.validation,
             structure_before=structure_of(fit, screening_degrees(fit)),
             unknown_force=force if found.unexplained else None,
-            if_hidden=self._if_hidden(found),
+            if_hidden={} if gram is None else if_hidden(found.fit, gram),
             cut_off=trials.bound.met,
         )
 
-    def _if_hidden(self, found: Found) -> dict[str, IfHidden]:
-        """What one effect could do to the stiffnesses of a model that explains the data."""
-        if found.unexplained:
-            return {}
-        return if_hidden(found.fit, self.trials.screened_last(found.fit))
+    def _random_is_better(self, found: Found, near: Fit) -> bool:
+        """Whether effects that were found in a misfit are no better than a random difference.
 
-    def _searched(self) -> Found:
-        """Search from the measured shapes: first if the fit leaves far more than noise, else last.
-
-        A first search that finds nothing does not count: it has tried the nearest candidates only.
-        A scatter from pose to pose explains anything: if the declared model and the result have
-        one, the search is repeated as if there were none, unless that promises nothing better, and
-        from the measured shapes, if what scatters bends the cable, as missing effects do.
+        They were never tested against the scatter that they leave: the mean over 12 poses of a
+        scatter of 8 mm was taken for an offset. From that fit on they are.
         """
-        of_shapes = self.beginning_with(from_shapes=True)
-        may_be_far = self.several and self.declared.noise.source != "misfit"
-        # In such a fit the first effect may stand for two; the next ones then only fit its error.
-        first = of_shapes.run() if may_be_far and not explains(self.declared) else None
-        if first is not None and first.added and not first.unexplained:
-            return first
-        found = self._forwards()
-        if self.goes_on and found.fit.scatters and self.declared.scatters:
-            with suppress(EstimationError):
-                repeating = self.beginning_with(declared=as_repeating(self.declared))
-                if found.unexplained or repeating._may_gain(self.declared):
-                    found = found.or_better(repeating._forwards(), EVIDENCE_APART)
-        if may_be_far and (found.unexplained or bends_at_random(found.fit)):
-            other = first or (of_shapes.run() if self.goes_on else None)
-            found = found.or_better(other)
-        # If left-out poses are not even reached, refits may have started too far from the effect.
-        lost = may_be_far and not found.unexplained and not self.trials.validation.complete
-        return self._or_causes(found)[0] if lost and self.goes_on else found
+        return found.or_better(self._ended(near, [], ()), -EVIDENCE_APART) is not found
 
-    def _may_gain(self, scattering: Fit) -> bool:
+    def best(
+        self, beginnings: Sequence[Beginning] | None = None, found: Found | None = None
+    ) -> tuple[Found, UnknownForce | None]:
+        """The best result of searches that begin in different ways, and the last unknown force.
+
+        From the measured shapes first if the fit leaves far more than noise: in such a fit the
+        first effect may stand for two, and the next ones then only fit its error.
+        """
+        force = None
+        if beginnings is None:
+            lost = self.may_be_far and not explains(self.declared)
+            beginnings = (SHAPES, *NEAR) if lost else (*NEAR, SHAPES)
+        for beginning in beginnings:
+            if found is not None and not (self.goes_on and beginning.applies(self, found)):
+                continue
+            with suppress(EstimationError):
+                search = beginning.begin(self, found)
+                force = search.force
+                result = search.run() if force is not None or beginning is not CAUSES else None
+                found = result if found is None else found.or_better(result, beginning.margin)
+        assert found is not None
+        return found, force
+
+    def may_gain(self, scattering: Fit) -> bool:
         """Whether one or two scores promise a fair share of what the scatter gains."""
         gained = 2 * (scattering.log_evidence - self.declared.log_evidence)
         least, by_two = LEAST_PROMISED * gained, LEAST_PROMISED_BY_TWO * gained
         if not self.declared.converged or any(item.score > least for item in self.trials.first):
             return True
-        refitted = self.trials.tried(self.declared, pairs=self.max_effects > 1).refits
+        refitted = self.trials.tried(self.declared, largest=min(2, self.max_effects)).refits
         best = sorted(refitted, key=lambda item: -item.gain)[:1]
         return any(x.gain + y.score > by_two for x in best for y in self.trials.screened(x.fit))
 
-    def _forwards(self) -> Found:
-        """Result of `run`, or of the same among simpler effects if that is better.
-
-        The first estimate of slow noise is rough, and a large one hides an effect. If nothing is
-        found, and the noise of a complete model is smaller, the search begins anew with that.
-        """
-        found = (first := self.run()).or_better(self.of_simpler_effects(first))
-        settled = self.beginning_with(declared=found.fit)
-        met = self.trials.bound.met
-        if not (found.added or met) and found.fit.noise.std < self.declared.noise.std:
-            with suppress(EstimationError):
-                best = min(p_values_of(settled.trials.first).values(), default=1.0)
-                if best <= self.trials.significance and (again := settled.run()).added:
-                    return again
-        return found
-
     @accounted_as("searches")
-    def run(self, force: UnknownForce | None = None) -> Found:
-        """Add effects until the residual is noise or left-out data are predicted no better.
-
-        `force`: its causes are tried in the first step; without it all effects, starting from the
-        declared model.
-        """
-        trials = self.trials
+    def run(self) -> Found:
+        """Add effects until the residual is noise or left-out data are predicted no better."""
+        trials, force = self.trials, self.force
         current, validation = trials.declared, trials.validation
         added: list[AddedEffect] = []
         ranked: list[Ranked] = []
@@ -266,59 +245,95 @@ class Search:
             if force is not None and not added:
                 tried = trials.tried_as_causes(force)
             else:
-                tried = trials.tried(current, pairs=len(added) + 2 <= self.max_effects)
-            chosen, lost = choose(tried.refits, current, validation, trials.doubt)
-            lost |= tried.far
-            better, p_value = current, 1.0
-            if chosen:
-                winner, *rivals = chosen
-                better, p_value = with_new_noise(
-                    winner, current, tried.p_values, trials.starts_at_shapes(current)
-                )
-                if p_value > trials.significance:
-                    names = [x.candidate.name for item in chosen for x in item.each]
-                    lost |= dict.fromkeys(names, f"not significant: p = {p_value:.2g}")
-                    if better is current:
-                        lost |= dict.fromkeys((x.candidate.name for x in winner.each), RAN_AWAY)
+                tried = trials.tried(current, largest=self.max_effects - len(added))
+            from_shapes = trials.starts_at_shapes(current)
+            decision = decide(current, validation, tried, *trials.limits, from_shapes=from_shapes)
             if not ranked:
                 rows = ranking(tried, current, validation)
-                ranked = [replace(row, reason=lost.get(row.name, "")) for row in rows]
-            if p_value > trials.significance:
+                why = decision.reasons
+                ranked = [replace(row, reason=why.get(row.name, "")) for row in rows]
+            if not decision.chosen:
                 break
-            if trials.starts_at_shapes(current) and force is None:
+            current, before = decision.fit, validation
+            if from_shapes and force is None:
                 # The mesh of a misfit is coarse; its error would look like the next effect.
-                better = trials.fine(better)
-            current, before = better, validation
+                current = trials.fine(current)
             validation = cross_validate(current)
-            added += added_by(winner, rivals, p_value, before, validation)
+            added += decision.added(before, validation)
         self.step("search for a missing effect", self.max_effects, self.max_effects)
         return self._ended(*pruned(trials, current, added), tuple(ranked))
-
-    def of_simpler_effects(self, found: Found) -> Found | None:
-        """Search among effects with fewer parameters, if one of these may be the larger of two.
-
-        An effect of many parameters may stand for two effects of one parameter each.
-        """
-        if not found.added or self.declared.noise.source == "misfit" or not self.goes_on:
-            return None
-        trials, winner = self.trials, found.added[0].candidate
-        scores = {item.candidate.name: item.score for item in trials.first}
-        free = {item.candidate.name: len(item.candidate.frees) for item in trials.first}
-        others = [name for name in scores if free[name] >= len(winner.frees)]
-        best = max((scores[name] for name in scores.keys() - others), default=0.0)
-        # An effect that only a larger model could screen has no score here.
-        if best < LARGER_OF_TWO * scores.get(winner.name, np.inf):
-            return None
-        return self.beginning_with(exclude=[*trials.exclude, *others], wider=trials).run()
-
-    def _or_causes(self, found: Found) -> tuple[Found, UnknownForce | None]:
-        """The found effects, or causes of an unknown force if these are better; and the force."""
-        start = self.declared if found.added else found.fit
-        force = estimate_unknown_force(start, self.trials.executor)
-        causes = self.run(force) if force is not None and self.goes_on else None
-        return found.or_better(causes), force
 
     def _ended(self, fit: Fit, added: list[AddedEffect], ranked: tuple[Ranked, ...]) -> Found:
         """The effects found, and whether they explain the data."""
         fit = fit if added or fit.noise.known else settle(fit)
         return Found.of(fit, added, ranked, self.trials.significance)
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """One way to begin a search, once others have found something.
+
+    Parameters
+    ----------
+    applies : callable
+        Whether it may find something better than what was found.
+    begin : callable
+        The search that begins so.
+    margin : float
+        Log evidence by which its result has to be better.
+    """
+
+    applies: Callable[[Search, Found], bool]
+    begin: Callable[[Search, Found | None], Search]
+    margin: float = 0.0
+
+
+def _as_if_repeating(search: Search, found: Found) -> bool:
+    """Whether a scatter may hide effects: it explains anything."""
+    if not (found.fit.scatters and search.declared.scatters):
+        return False
+    return found.unexplained or _repeating(search).may_gain(search.declared)
+
+
+def _repeating(search: Search, _: Found | None = None) -> Search:
+    return search.beginning_with(declared=as_repeating(search.declared))
+
+
+def _noise_is_smaller(search: Search, found: Found) -> bool:
+    """Whether the noise of a complete model is smaller than the first estimate, which is rough."""
+    return not found.added and found.fit.noise.std < search.declared.noise.std
+
+
+def _under_its_noise(search: Search, found: Found | None) -> Search:
+    assert found is not None
+    return search.beginning_with(declared=found.fit)
+
+
+def _with_force(search: Search, found: Found | None) -> Search:
+    assert found is not None
+    start = search.declared if found.added else found.fit
+    return replace(search, force=estimate_unknown_force(start, search.trials.executor))
+
+
+# What scatters may bend the cable, as missing effects do; a model that does not even reach left-out
+# poses may have begun too far from the effect.
+SHAPES = Beginning(
+    lambda search, found: search.may_be_far and (found.unexplained or bends_at_random(found.fit)),
+    lambda search, _: search.beginning_with(from_shapes=True),
+)
+NEAR = (
+    Beginning(lambda _, found: found.unexplained or not found.added, lambda search, _: search),
+    Beginning(_noise_is_smaller, _under_its_noise),
+    Beginning(_as_if_repeating, _repeating, EVIDENCE_APART),
+)
+CAUSES = Beginning(
+    lambda search, found: (
+        found.unexplained
+        or (
+            search.may_be_far
+            and explains(search.declared)
+            and not search.trials.validation.complete
+        )
+    ),
+    _with_force,
+)

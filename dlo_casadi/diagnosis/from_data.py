@@ -1,23 +1,19 @@
 """Candidates tried at the measured shapes, for when the declared model's equilibria mislead.
 
 The fit starts with a relaxed balance of forces, which needs no equilibrium, see
-`estimation.relaxation`. The imbalance shows which effect is missing. With each likely candidate the
-fit starts again at the measured shapes and continues until the balance is nearly strict; what is
-left then measures how well the candidate fits. If no candidate fits well alone, each of them is
-tried with a second one, screened again in its presence.
+`estimation.relaxation`. The imbalance shows which effects are missing: with each likely subset of
+candidates the fit starts again at the measured shapes and continues until the balance is nearly
+strict; what is left then measures how well they fit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Candidate, Listing
-from dlo_casadi.diagnosis.screening import RelaxedScreen, Screened, in_order
+from dlo_casadi.diagnosis.gram import Screened
 from dlo_casadi.estimation.fit import FIRST_STD
 from dlo_casadi.estimation.measured_shapes import measured_shapes
 from dlo_casadi.estimation.problem import Priors, Problem
@@ -34,43 +30,26 @@ from dlo_casadi.estimation.start import (
 )
 from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.model.cable_model import END_ROLL, CableModel
-from dlo_casadi.runtime.parallel import map_in_order
-from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
+from dlo_casadi.runtime.work import accounted_as
 from dlo_casadi.sensing.noise import NoiseModel
-from dlo_casadi.thresholds import NEAR_LEADER
 
 # Softness [rad] at which candidates may be scored; largest sum of squares per residual at which
 # relaxed shapes still count as the measured ones.
 SCORED, MEASURED = (1e-1, 3e-2, 1e-2), 2.0
 # Softness [rad] through which candidates are relaxed before they are compared; largest objective of
-# a candidate relative to the least one. In two sessions in space the hidden effect left 3105 and
-# 8250, its only rival 8051, and all others 27800 and more. If the least is noise, differences are
-# twice those of log likelihoods: a tenth of hundreds is beyond doubt. A soft balance is less
-# informative for a contact, but hidden tables left least in five sessions, and in eight 1.2 to 1.9
-# times what shapes leave that need not balance; in three sessions without a table, a contact left 5
-# to 22 times the least.
-COMPARED, NEAR_LEAST, NEAR_NOISE = SOFTNESS[:4], 3.0, 1.1
+# a candidate relative to the least one where that is noise: differences are then twice those of log
+# likelihoods, a tenth of hundreds is beyond doubt. A soft balance is less informative for a
+# contact, but hidden tables left least in five sessions, and in eight 1.2 to 1.9 times what shapes
+# leave that need not balance; in three sessions without a table, a contact left 5 to 22 times the
+# least.
+COMPARED, NEAR_NOISE = SOFTNESS[:4], 1.1
 # Largest sum of squares per residual at which a start counts as having reached the noise; where
 # shapes that need not balance leave more than the noise, relative to what they leave.
 REACHED = 1.5
-# Multiples of that sum, including REACHED, below which single candidates are fitted before pairs
-# are tried, and a pair before others are. Evidence: in a session in space a softening left 1.35
-# times it, all others 17 times and more. Eighteen pairs were tried in vain; the next step of the
-# search found the tilt beside it. In another one the first of a hidden pair left 2.6 times it; once
-# it was fitted alone, the second was not found. In a third one the hidden pair left 2.4 times it,
-# all others 4.5 times and more.
-CLOSE, CLOSE_PAIR = 2.0, 3.0
-# Multiple of the expected sum below which a pair is the last one tried. In four sessions in space
-# the hidden pair left 1.01, 1.10, 1.14 and 1.54 times the relaxed shapes, others 1.5 and more.
-SURELY_REACHED = 1.2
 # Sum of squares per residual that most poses leave, above which no pose is tried again: not a pose,
 # but the candidate is wrong. In a session in space seven of thirteen such starts gained by a second
 # trial of outlying poses, but none came below 20 times the noise, and it took half of the time.
 WRONG = 10.0
-# Number of candidates that get a second one at a time, and number of second ones. In a
-# session with a drift and a force, the drift left second least, and the force scored highest beside
-# it. Beside a tether, a drift had no score: the pair was found from the drift, which came seventh.
-FIRST, SECOND = 3, 3
 # Trial bending stiffnesses for a contact, in weights times length squared: from cables that their
 # weight hardly bends down to chains.
 STIFFNESSES_OF_CONTACT = (1e-1, 1e-2, 1e-3)
@@ -144,54 +123,42 @@ def left_without(near: Fit) -> float:
     return Relaxation(near.problem, COMPARED[-1]).objective(values)
 
 
-def screened_from_data(near: Fit, softness: float, listed: Sequence[Candidate]) -> list[Screened]:
-    """Score tests in a relaxed model, best first.
-
-    For effects without derivative where they vanish, a soft balance is less informative than a
-    fit: they come last, without a score.
-    """
-    gradual = [x for x in listed if x.effect.gradual]
-    found = RelaxedScreen(near, gradual, softness).run(np.inf) if gradual else []
-    others = (x for x in listed if not x.effect.gradual)
-    return [*in_order(found), *(Screened(x, 0.0, 1.0, dict(x.scans[0])) for x in others)]
-
-
 @dataclass(frozen=True)
 class RelaxedStart:
-    """A candidate added to a relaxed fit, with a nearly strict balance: no equilibrium yet.
+    """Candidates added to a relaxed fit, with a nearly strict balance: no equilibrium yet.
 
     Parameters
     ----------
     near : Fit
-        The relaxed fit without the candidate.
+        The relaxed fit without the candidates.
+    each : tuple of Screened
+        The candidates.
     begun, values : Values
         Values before and after the relaxation.
-    beside : tuple of Screened
-        Candidates that `near` already has.
     left : float
         Twice the objective; infinite while the balance is still soft.
     """
 
     near: Fit
-    screened: Screened
+    each: tuple[Screened, ...]
     problem: Problem
     begun: Values
     values: Values
-    beside: tuple[Screened, ...] = ()
     left: float = np.inf
 
     @classmethod
-    def of(cls, near: Fit, screened: Screened, beside: tuple[Screened, ...] = ()) -> RelaxedStart:
+    def of(cls, near: Fit, each: tuple[Screened, ...]) -> RelaxedStart:
         """Best start from the measured shapes; for a contact also from several stiffnesses.
 
         The stiffer a cable, the less a soft balance shows what pushes it up: with a contact, a
         stiffness that has grown a hundredfold never returns. Trials that reach the same minimum are
         followed once.
         """
-        known = [{}] if screened.candidate.effect.gradual else [{}, *_stiffnesses(near)]
+        gradual = all(x.candidate.effect.gradual for x in each)
+        known = [{}] if gradual else [{}, *_stiffnesses(near)]
         apart: list[RelaxedStart] = []
         for values in known:
-            loose = cls._loose(near, screened, beside, values)
+            loose = cls._loose(near, each, values)
             if not any(loose._like(other) for other in apart):
                 apart.append(loose)
         return min((x._strict() for x in apart), key=lambda x: x.left)._retried()
@@ -200,30 +167,28 @@ class RelaxedStart:
     def _loose(
         cls,
         near: Fit,
-        screened: Screened,
-        beside: tuple[Screened, ...],
+        each: tuple[Screened, ...],
         known: Mapping[str, float],
         *,
         rolls: bool = False,
     ) -> RelaxedStart:
-        """Relax from the measured shapes and known values, with the candidate initially absent.
+        """Relax from the measured shapes and known values, with the candidates initially absent.
 
-        Uses the parameters in which the candidate is linear: a tether without force has no anchor.
+        Uses the parameters in which a candidate is linear: a tether without force has no anchor.
         The relaxed shapes and parameters of `near` are distorted by what that model lacks. The
         balance is still soft.
         """
-        candidate = screened.candidate
-        scan = {k: v for k, v in screened.start.items() if k in candidate.scans[0]}
-        others = {name: near.value(name) for x in beside for name in x.candidate.frees}
-        values = {**others, **scan, **known}
-        linear, begun = _as_measured(near, candidate.add_linear_to(near.model), values)
-        # Keep place and direction of the effect where its score is largest until it acts: before, a
+        scans = {k: v for x in each for k, v in x.start.items() if k in x.candidate.scans[0]}
+        model = near.model
+        for x in each:
+            model = x.candidate.add_linear_to(model)
+        linear, begun = _as_measured(near, model, {**scans, **known})
+        # Keep place and direction of an effect where its score is largest until it acts: before, a
         # step in them leads anywhere.
-        fixed = np.isin(linear.unknowns.names, list(candidate.scans[0]))
+        fixed = np.isin(linear.unknowns.names, list(scans))
         if rolls:
             linear, begun = begin(linear, begun.theta, fixed)
-        reached = loosely_relaxed(linear, begun, fixed)
-        return cls(near, screened, linear, begun, reached, beside)
+        return cls(near, each, linear, begun, loosely_relaxed(linear, begun, fixed))
 
     def _like(self, other: RelaxedStart) -> bool:
         """Whether both have nearly the same stiffnesses, so that they lead to the same minimum."""
@@ -234,8 +199,7 @@ class RelaxedStart:
     def _strict(self) -> RelaxedStart:
         """Follow a loosely relaxed start to a nearly strict balance, in its own parameters."""
         reached = relaxed(self.problem, self.values, COMPARED[1:-1])
-        candidate = self.screened.candidate
-        problem, reached = _in_own_parameters(self.near, candidate, self.problem, reached)
+        problem, reached = _in_own_parameters(self.near, self.each, self.problem, reached)
         return self._at(problem, relaxed(problem, reached, COMPARED[-1:]))
 
     def _retried(self) -> RelaxedStart:
@@ -256,18 +220,7 @@ class RelaxedStart:
     @property
     def names(self) -> set[str]:
         """Names of its candidates."""
-        return {x.candidate.name for x in (*self.beside, self.screened)}
-
-    @accounted_as("pairs")
-    def and_second(
-        self, softness: float, executor: Executor, listing: Listing
-    ) -> list[RelaxedStart]:
-        """Starts with a likely second candidate added to this one, screened at a softness."""
-        values = relaxed(self.problem, self.values, (softness,))
-        near = Fit(self.problem, self.problem.evaluate(values))
-        likely = likeliest(screened_from_data(near, softness, listing(near)))[:SECOND]
-        second = partial(RelaxedStart.of, near, beside=(*self.beside, self.screened))
-        return map_in_order(executor, second, likely)
+        return {x.candidate.name for x in self.each}
 
     def fit(self) -> Fit | None:
         """Fit reached from this start; None if some pose has no equilibrium there."""
@@ -281,87 +234,8 @@ class RelaxedStart:
         """
         if END_ROLL not in self.problem.unknowns.names:
             return None
-        loose = self._loose(self.near, self.screened, self.beside, {}, rolls=True)
+        loose = self._loose(self.near, self.each, {}, rolls=True)
         return loose._strict()._retried()
-
-
-def likeliest(screened: Sequence[Screened]) -> list[Screened]:
-    """Candidates whose score at the measured shapes is close to the highest."""
-    scored = [x for x in screened if x.candidate.effect.gradual]
-    return [x for x in scored if x.score >= NEAR_LEADER * scored[0].score]
-
-
-def nearest(
-    near: Fit,
-    softness: float,
-    alone: Sequence[RelaxedStart],
-    later: Sequence[Screened],
-    executor: Executor,
-    listing: Listing,
-    *,
-    pairs: bool = True,
-    least: float = np.inf,
-    bound: Bound = UNBOUNDED,
-) -> Iterator[list[RelaxedStart]]:
-    """Starts whose objective is close to the least one, best first; then those for a further try.
-
-    The least one is one of the starts `alone`, each with one candidate, or `least` of another. If
-    it comes within CLOSE times REACHED of the noise, single candidates are returned at once.
-
-    Then pairs are tried, provided `pairs` may be added: of FIRST candidates and likely second ones,
-    then of the next ones, at last of the `later` ones unless a single candidate is within REACHED.
-    A pair that comes within CLOSE_PAIR times REACHED, and leaves least so far, is returned at once.
-    The first ones within REACHED are the last ones tried, one within SURELY_REACHED is the last.
-    Pairs are returned if no single candidates are left to return, or if REACHED times their
-    objective is less than that of those. Once the `bound` is met no further pairs are tried.
-    """
-    expected = expected_left(near)
-    noise, start = REACHED * expected, partial(RelaxedStart.of, near)
-    second = partial(RelaxedStart.and_second, softness=softness, executor=executor, listing=listing)
-    begun = _near_least(alone, noise, least)
-    nearest_left = begun[0].left if begun else np.inf
-    told = begun if nearest_left < CLOSE * noise or not pairs else []
-    if told or not pairs:
-        yield told
-    if not pairs:
-        return
-    own: dict[frozenset[str], RelaxedStart] = {}
-    kept: list[RelaxedStart] = []
-    firsts = sorted(alone, key=lambda x: x.left) if begun else []
-    while firsts and not (bound.met or (kept and kept[0].left < noise)):
-        for first in firsts[:FIRST]:
-            ordered = sorted((*own.values(), *second(first)), key=lambda x: -x.left)
-            own = {frozenset(x.names): x for x in ordered}
-            kept = _near_least(own.values(), noise)
-            if kept and kept[0].left < SURELY_REACHED * expected:
-                break
-            if kept and kept[0].left < CLOSE_PAIR * noise and not _known(told, kept[0]):
-                told = [*told, kept[0]]
-                yield [kept[0]]
-        firsts = firsts[FIRST:]
-        if not firsts and later and nearest_left >= noise:
-            firsts, later = sorted(map_in_order(executor, start, later), key=lambda x: x.left), []
-            begun = _near_least((*begun, *firsts), noise, least)
-            if begun[0].left < noise:
-                yield [x for x in begun if not _known(told, x)]
-                return
-    new, more = ([x for x in some if not _known(told, x)] for some in (begun, kept))
-    yield more if not new or (kept and REACHED * kept[0].left < new[0].left) else new
-
-
-def _known(starts: Iterable[RelaxedStart], start: RelaxedStart) -> bool:
-    """Whether starts have the same candidates as this one, and leave hardly more."""
-    return any(x.names == start.names and x.left < NEAR_NOISE * start.left for x in starts)
-
-
-def _near_least(
-    begun: Iterable[RelaxedStart], noise: float, least: float = np.inf
-) -> list[RelaxedStart]:
-    """Starts whose objective is close to the least one, best first."""
-    ordered = sorted(begun, key=lambda x: x.left)
-    least = min([least, *(x.left for x in ordered[:1])])
-    most = least * (NEAR_NOISE if least < noise else NEAR_LEAST)
-    return [start for start in ordered if start.left <= most]
 
 
 def _as_measured(
@@ -402,16 +276,19 @@ def _stiffnesses(near: Fit) -> list[dict[str, float]]:
 
 
 def _in_own_parameters(
-    near: Fit, candidate: Candidate, linear: Problem, values: Values
+    near: Fit, each: Sequence[Screened], linear: Problem, values: Values
 ) -> tuple[Problem, Values]:
-    """Convert relaxed values from a candidate's linear parameters to its own ones."""
-    before, model = linear.unknowns.model, candidate.add_to(near.model)
+    """Convert relaxed values from the candidates' linear parameters to their own ones."""
+    before, model = linear.unknowns.model, near.model
+    for x in each:
+        model = x.candidate.add_to(model)
     if before == model:
         return linear, values
     known = dict(zip(before.names, linear.unknowns.p(values.theta).tolist(), strict=True))
-    prefix = f"{candidate.effect.label}."
-    part = {name: value for name, value in known.items() if name.startswith(prefix)}
-    known |= candidate.of_linear(model.cable, part)
+    for x in each:
+        prefix = f"{x.candidate.effect.label}."
+        part = {name: value for name, value in known.items() if name.startswith(prefix)}
+        known |= x.candidate.of_linear(model.cable, part)
     problem, rest = _beside(near, model), linear.unknowns.coefficients(values.theta)
     p = np.array([known[name] for name in model.names])
     return problem, replace(values, theta=problem.unknowns.pack(p, rest))

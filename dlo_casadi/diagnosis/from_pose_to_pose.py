@@ -4,7 +4,6 @@ from contextlib import suppress
 from dataclasses import replace
 
 from dlo_casadi.diagnosis.from_data import COMPARED, NEAR_NOISE, expected_left
-from dlo_casadi.diagnosis.selection import Found, likelier_by
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
 from dlo_casadi.estimation.fit import explains, fine_enough, refine_mesh
@@ -15,7 +14,6 @@ from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.estimation.variances import pose_scatter_of, refine
 from dlo_casadi.model.pose_scatter import PoseScatter, sources_in
 from dlo_casadi.runtime.work import accounted_as
-from dlo_casadi.thresholds import EVIDENCE_APART
 
 # Standard deviations of what is loose in each pose: of a place or a length, as a share of the
 # length; of a clamp's turns [rad]; of the curvature by a pin's moment, in 1 / length. A judgement:
@@ -87,10 +85,12 @@ def with_loose_poses(misfit: Fit, near: Fit, finest: int | None = None) -> Fit |
     return None
 
 
-def at_random(fit: Fit) -> Fit | None:
+@accounted_as("random differences")
+def at_random(fit: Fit, n: int = 0, finest: int | None = None) -> Fit | None:
     """Refit with the likeliest random effect from pose to pose; None if none explains the points.
 
-    A misfit is fitted with the noise that it had before.
+    A misfit is fitted with the noise that it had before. `n`: number of elements at least, up to
+    `finest`; by default those of the fit.
     """
     known = fit.noise.before or fit.noise
     found = pose_scatter_of(fit.reweighed(known), known).scatter
@@ -99,23 +99,9 @@ def at_random(fit: Fit) -> Fit | None:
     with suppress(EstimationError):
         priors = replace(fit.problem.priors, pose_scatter=found)
         near = refine(fit.reweighed(known, priors), first=True)
+        if not explains(near):
+            return None
+        if finest:
+            near = fine_enough(near, max(near.model.n, min(n, finest)), finest=finest)
         return near if explains(near) else None
     return None
-
-
-@accounted_as("random differences")
-def at_random_instead(misfit: Fit, found: Found, finest: int | None = None) -> Fit | None:
-    """Refit of a misfit with a random effect, if that explains it as well as found effects do.
-
-    Effects found in a misfit were never tested against the scatter that they leave: the mean over
-    12 poses of a scatter of 8 mm was taken for an offset. From this fit on they are. `finest`: as
-    in `with_loose_poses`.
-    """
-    near = at_random(misfit) if found.unexplained or found.fit.scatters else None
-    if near is None:
-        return None
-    if finest:
-        n = max(near.model.n, min(found.fit.model.n, finest))
-        near = fine_enough(near, n, finest=finest)
-    likelier = found.unexplained or likelier_by(found.fit, near) > -EVIDENCE_APART
-    return near if likelier and explains(near) else None

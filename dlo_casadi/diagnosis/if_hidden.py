@@ -12,19 +12,20 @@ Leamer, Specification Searches (1978): bounds of an estimate over models that da
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from dlo_casadi.diagnosis.gram import Gram
 from dlo_casadi.diagnosis.next_measurement import Telling, telling
-from dlo_casadi.diagnosis.screening import Screened
 from dlo_casadi.diagnosis.widened import Widened
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.constrained import threshold
 from dlo_casadi.estimation.descent import refit
 from dlo_casadi.estimation.result import Fit
+from dlo_casadi.model.cable_model import STIFFNESSES
 from dlo_casadi.thresholds import NORMAL_95
 
 # Share of the widest interval (of its logarithm) from which on a candidate with fewer parameters
@@ -68,16 +69,13 @@ class IfHidden:
     telling: Telling | None
 
 
-def if_hidden(fit: Fit, screened: Iterable[Screened]) -> dict[str, IfHidden]:
+def if_hidden(fit: Fit, gram: Gram) -> dict[str, IfHidden]:
     """What one effect could do to each estimated stiffness, by its name.
 
-    `screened`: the candidates beside the fit, or beside one of the same effects.
+    `gram`: of the candidates beside the fit, or beside one of the same effects.
     """
-    found: dict[str, list[Widened]] = {}
-    for item in screened:
-        for name, row in item.widest.items():
-            found.setdefault(name, []).append(row)
-    return {name: _widest(fit, name, rows) for name, rows in found.items()}
+    known = [name for name in STIFFNESSES if name in fit.problem.unknowns.names]
+    return {name: _widest(fit, name, gram.widened(name)) for name in known}
 
 
 def _widest(fit: Fit, name: str, rows: Sequence[Widened]) -> IfHidden:

@@ -13,17 +13,14 @@ from functools import partial
 
 import numpy as np
 
-from dlo_casadi.diagnosis.candidates import Listing
-from dlo_casadi.diagnosis.from_data import (
-    CLOSE,
-    NEAR_LEAST,
-    NEAR_NOISE,
-    REACHED,
-    SURELY_REACHED,
-    RelaxedStart,
-    likeliest,
-    nearest,
-    screened_from_data,
+from dlo_casadi.diagnosis.candidates import Candidate
+from dlo_casadi.diagnosis.from_data import NEAR_NOISE, REACHED, RelaxedStart, expected_left
+from dlo_casadi.diagnosis.gram import (
+    Screened,
+    in_order,
+    p_values_of,
+    sidak,
+    survival,
 )
 from dlo_casadi.diagnosis.refits import (
     MOST_STEPS,
@@ -33,7 +30,7 @@ from dlo_casadi.diagnosis.refits import (
     followed,
     loads_from_best,
 )
-from dlo_casadi.diagnosis.screening import Screened, in_order, p_values_of, sidak, survival
+from dlo_casadi.diagnosis.screening import RelaxedScreen, Screen
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import NEARLY, descend
 from dlo_casadi.estimation.fit import explains, misfits
@@ -41,6 +38,20 @@ from dlo_casadi.estimation.result import Fit
 from dlo_casadi.runtime.parallel import map_in_order
 from dlo_casadi.runtime.work import UNBOUNDED, Bound, accounted_as
 from dlo_casadi.thresholds import REFITTED
+
+# Number of subsets of each size started at the measured shapes, of each point of linearisation. Of
+# 40 sessions with hidden effects the true subset was among the best 3 of its size at the declared
+# fit in 37, at the relaxed one in 37, at either in all.
+BEST = 3
+# Largest number of candidates found at once.
+LARGEST = 3
+# Largest objective of a start that is fitted, relative to the least one. In two sessions in space
+# the hidden effect left 3105 and 8250, its only rival 8051, and all others 27800 and more.
+NEAR_LEAST = 3.0
+# Sum of squares per residual, in multiples of the noise, up to which single candidates are fitted
+# before pairs are started; a fit below it ends the search: what it lacks is found in the
+# next step.
+CLOSE = 3.0
 
 NOT_NEAR = "does not come near the measured shapes"
 LESS_NEAR = "comes less near the measured shapes than one that explains them"
@@ -57,7 +68,7 @@ def confirm_from_data(base: Fit, start: RelaxedStart) -> Confirmed | None:
             fit = descend(fit.reweighed(base.noise, base.problem.priors), tolerance=NEARLY)
         if fit is not None and not misfits(fit):
             fit = at_noise(fit, start.problem.noise)
-        return Confirmed.of(start.screened, base, fit, start.beside)
+        return Confirmed.of(start.each[-1], base, fit, start.each[:-1])
     return None
 
 
@@ -65,104 +76,134 @@ def near_data(
     base: Fit,
     relaxed: tuple[Fit, float],
     executor: Executor,
-    listing: Listing,
+    listed: Sequence[Candidate],
     *,
-    pairs: bool,
+    largest: int = LARGEST,
     bound: Bound = UNBOUNDED,
 ) -> Tried:
-    """Fits, started at the measured shapes, of the candidates or `pairs` that fit them best.
+    """Fits, started at the measured shapes, of the subsets of candidates that fit them best.
 
-    In a misfit scores are useless, and a refit follows the declared model's error. Contacts are
-    fitted first, unless their starts leave far more than the best one. If no likely candidate
-    reaches the noise, all others are tried before any pair. If the best candidate does not explain
-    the shapes, or only by a scatter, its end roll is searched again, then that of the next. If all
-    fits misfit, too, pairs are tried even where a single candidate's start came close to the noise.
-    `relaxed`: the relaxed base and its softness, see `from_data`. `bound`: once it is met no pair
-    and no other end roll is tried.
+    In a misfit scores are useless alone, and a refit follows the declared model's error. The best
+    single candidates by the Gram matrix at the relaxed fit are started; those near the best one are
+    fitted if that comes near the noise. If none does, or no fit explains the shapes, pairs are
+    started, then triples, those of the Gram matrix at the base among them: effects that rank low at
+    one point rank high at the other. Contacts, which have no score, are fitted first, unless their
+    starts leave far more than the best one; if one explains the shapes, only single candidates are
+    compared with it. If the best subset does not explain the shapes, or only by a scatter, its end
+    roll is searched again, then that of the next.
+
+    Parameters
+    ----------
+    relaxed : (Fit, float)
+        The relaxed base and its softness, see `from_data`.
+    largest : int
+        Largest number of candidates in a subset.
+    bound : Bound
+        Once it is met no larger subset and no other end roll is tried.
     """
     near, softness = relaxed
-    screened = screened_from_data(near, softness, listing(near))
-    likely = likeliest(screened)
-    contacts = [x for x in screened if not x.candidate.effect.gradual]
-    first = [*contacts, *likely[:REFITTED]]
-    begun = map_in_order(executor, partial(RelaxedStart.of, near), first)
-    touches, singles = begun[: len(contacts)], begun[len(contacts) :]
-    if not any(start.reached for start in begun):
-        # So far off, scores mislead: that of a hidden stretch was 0.7 % of the highest one.
-        names = {x.candidate.name for x in (*contacts, *likely)}
-        others = [x for x in screened if x.candidate.name not in names]
-        more = map_in_order(executor, partial(RelaxedStart.of, near), others)
-        singles += [start for start in more if start.reached]
+    gradual = [x for x in listed if x.effect.gradual]
+    contacts = [Screened(x, 0.0, 1.0, dict(x.scans[0])) for x in listed if not x.effect.gradual]
+    gram = RelaxedScreen(near, gradual, softness).gram(np.inf) if gradual else None
+    begin = partial(RelaxedStart.of, near)
+    first = gram.subsets(1, REFITTED) if gram else []
+    begun = map_in_order(executor, begin, [*((x,) for x in contacts), *first])
+    touches, starts = begun[: len(contacts)], begun[len(contacts) :]
     most = NEAR_LEAST * min((start.left for start in begun), default=np.inf)
     touches = [start for start in touches if start.left <= most]
     touching = [x for x in map_in_order(executor, partial(confirm_contact, base), touches) if x]
     explained = any(explains(item.fit) for item in touching)
     least = min(start.left for start in touches) if explained else np.inf
-    later = likely[REFITTED:]
-    pairs = pairs and not explained
+    noise = expected_left(near)
     kept: list[RelaxedStart] = []
     tried: list[Confirmed] = []
-    far = dict.fromkeys((x.candidate.name for x in (*contacts, *likely[:REFITTED])), NOT_NEAR)
-    for starts in nearest(
-        near, softness, singles, later, executor, listing, pairs=pairs, least=least, bound=bound
-    ):
+    far: dict[str, str] = {x.candidate.name: NOT_NEAR for x in contacts}
+    far |= {name: NOT_NEAR for start in starts for name in start.names}
+    points = [] if gram is None else [gram]
+    largest = 1 if explained else min(largest, LARGEST)
+    for size in range(1, largest + 1):
+        if size > 1 or not any(start.left < CLOSE * noise for start in begun):
+            if len(points) == 1 and not explained:
+                points.append(Screen(base, gradual).gram(np.inf, executor))
+            known = [start.names for start in starts]
+            new = [x for point in points for x in point.subsets(size, BEST)]
+            new = [x for x in _distinct(new) if _names(x) not in known]
+            starts += map_in_order(executor, begin, new)
+        close = _near_least([x for x in starts if x not in kept], REACHED * noise, least)
+        if size == 1 < largest and not bound.met and not (close and close[0].left < CLOSE * noise):
+            continue
         rolls = not (explained or bound.met)
-        close, found = confirmed(base, starts[:REFITTED], executor, rolls=rolls)
-        kept += close
+        fitted, found = confirmed(base, close[:REFITTED], rolls=rolls)
+        kept += fitted
         tried += found
-        far |= {x.screened.candidate.name: LESS_NEAR for x in starts[len(close) : REFITTED]}
-        if any(map(_is_last, tried)):
+        far |= {name: LESS_NEAR for x in close[len(fitted) : REFITTED] for name in x.names}
+        if any(map(_is_last, tried)) or bound.met:
             break
+    screened = in_order([*(gram.singles if gram else ()), *contacts])
     tried = loads_from_best(base, screened, tried, executor)
-    fitted = {item.name: item.screened for item in touching}
-    screened = in_order([fitted.get(x.candidate.name, x) for x in screened])
-    names = {x.candidate.name for item in tried for x in item.each}.union(
-        *(start.names for start in kept)
-    )
-    names |= fitted.keys()
+    by_fit = {item.name: item.screened for item in touching}
+    screened = in_order([by_fit.get(x.candidate.name, x) for x in screened])
+    names = {x.candidate.name for item in tried for x in item.each}
+    names = names.union(by_fit, *(start.names for start in kept))
     far = {name: why for name, why in far.items() if name not in names}
     p_values = p_values_of(screened)
-    # Those that fit the shapes best, and loads started from the forces of one; of pairs the second.
-    for item in (*(start.screened for start in kept), *(x.screened for x in tried)):
+    # Those that fit the shapes best, and loads started from the forces of one.
+    subsets = [*(start.each for start in kept), *(item.each for item in tried)]
+    for item in (x for subset in subsets for x in subset):
         single, name = sidak(item.p_value, len(screened)), item.candidate.name
         p_values[name] = min(single, p_values.get(name, 1.0))
     return Tried(screened, p_values, [*touching, *tried], far)
 
 
-def _is_last(item: Confirmed) -> bool:
-    """Whether the search ends with this fit of a single candidate or a pair.
+def _names(each: Sequence[Screened]) -> set[str]:
+    return {x.candidate.name for x in each}
 
-    A second effect may be found beside a single one in the next step, unless its fit was lost on
-    the way: one left 20 times the noise, its start twice; the hidden pair was found from the start.
-    A pair that barely explains the shapes may be wrong: one left 1.46 times the noise, the hidden
-    pair 1.18 times.
-    """
-    most = SURELY_REACHED if item.beside else CLOSE * REACHED
-    return item.fit.noise.source != "misfit" and item.fit.chi2_per_dof < most
+
+def _distinct(subsets: Sequence[tuple[Screened, ...]]) -> list[tuple[Screened, ...]]:
+    """The first of each set of candidates."""
+    return list({frozenset(_names(x)): x for x in reversed(subsets)}.values())[::-1]
+
+
+def _near_least(
+    begun: Sequence[RelaxedStart], noise: float, least: float = np.inf
+) -> list[RelaxedStart]:
+    """Starts whose objective is close to the least one, best first."""
+    ordered = sorted(begun, key=lambda x: x.left)
+    least = min([least, *(x.left for x in ordered[:1])])
+    most = least * (NEAR_NOISE if least < noise else NEAR_LEAST)
+    return [start for start in ordered if start.left <= most]
+
+
+def _is_last(item: Confirmed) -> bool:
+    """Whether no larger subset is tried: what this fit still lacks is found in the next step."""
+    return item.fit.noise.source != "misfit" and item.fit.chi2_per_dof < CLOSE
 
 
 @accounted_as("fits from the shapes")
 def confirmed(
-    base: Fit, starts: Sequence[RelaxedStart], executor: Executor, *, rolls: bool
+    base: Fit, starts: Sequence[RelaxedStart], *, rolls: bool
 ) -> tuple[list[RelaxedStart], list[Confirmed]]:
     """The starts that are fitted, best first, and their fits.
 
-    If the first fit explains the shapes, others are fitted only if their starts leave less than
-    REACHED times as much. Until one explains them, with `rolls` other end rolls are tried.
+    Once a fit explains the shapes, others are fitted only if their starts leave less than REACHED
+    times as much as the best. Until one does, with `rolls` other end rolls are tried.
     """
     fitted: list[RelaxedStart] = []
-    tried: list[Confirmed] = []
-    for group in (starts[:1], starts[1:]):
-        explained = any(explains(item.fit) for item in tried)
-        close = [x for x in group if not explained or x.left < REACHED * starts[0].left]
-        fitted += close
-        found = map_in_order(executor, partial(confirm_from_data, base), close)
-        for k, start in enumerate(close) if rolls and not explained else ():
-            item = found[k] = confirm_rolled(base, start, found[k])
-            if item is not None and explains(item.fit):
-                break
-        tried += filter(None, found)
-    return fitted, tried
+    found: list[Confirmed | None] = []
+
+    def explained() -> bool:
+        return any(item is not None and explains(item.fit) for item in found)
+
+    for start in starts:
+        if explained() and start.left >= REACHED * starts[0].left:
+            continue
+        item = confirm_from_data(base, start)
+        fitted.append(start)
+        found.append(item if fitted[1:] or not rolls else confirm_rolled(base, start, item))
+    for k in range(1, len(found)):
+        if rolls and not explained():
+            found[k] = confirm_rolled(base, fitted[k], found[k])
+    return fitted, [item for item in found if item is not None]
 
 
 def confirm_rolled(base: Fit, start: RelaxedStart, found: Confirmed | None) -> Confirmed | None:
@@ -188,7 +229,7 @@ def confirm_contact(base: Fit, start: RelaxedStart) -> Confirmed | None:
     For a contact, a soft balance is less informative than a fit. The gain is computed with the
     noise of the base, which may hide what the base lacks: it is at least this large.
     """
-    item, screened = confirm_from_data(base, start), start.screened
+    item, (screened,) = confirm_from_data(base, start), start.each
     if item is None:
         return None
     try:

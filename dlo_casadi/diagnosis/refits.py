@@ -29,7 +29,8 @@ from dlo_casadi.diagnosis.from_data import (
     left_without,
     priors_without_scatter,
 )
-from dlo_casadi.diagnosis.screening import Screen, Screened, in_order, survival
+from dlo_casadi.diagnosis.gram import Gram, Screened, in_order, survival
+from dlo_casadi.diagnosis.screening import Screen
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, places_in, start_from
 from dlo_casadi.effects import PointLoad
 from dlo_casadi.errors import EstimationError
@@ -66,6 +67,8 @@ class Confirmed:
         Decrease of twice the objective.
     beside : tuple of Screened
         Other candidates that the fit has and its base lacks.
+    settled : bool
+        Whether its noise was estimated with the candidates in the model.
     """
 
     screened: Screened
@@ -73,6 +76,7 @@ class Confirmed:
     validation: CrossValidation
     gain: float
     beside: tuple[Screened, ...] = ()
+    settled: bool = False
 
     @classmethod
     def of(
@@ -135,8 +139,8 @@ def scored(
     noise_dof: float,
     significance: float,
     executor: Executor,
-) -> list[Screened]:
-    """Score tests of candidates, best first; see `Screen.run`.
+) -> tuple[list[Screened], Gram | None]:
+    """Score tests of candidates, best first, and their Gram matrix; see `Screen.gram`.
 
     Contacts also start at the measured shapes if the base leaves more than noise, or if its noise
     is estimated and some score is significant. An estimated noise may hide a contact, but not from
@@ -144,12 +148,13 @@ def scored(
     with the table found 0.12 or more.
     """
     gradual = [x for x in listed if x.effect.gradual]
-    found = Screen(base, gradual).run(noise_dof, executor) if gradual else []
+    gram = Screen(base, gradual).gram(noise_dof, executor) if gradual else None
+    found = gram.singles if gram else []
     significant = not found or found[0].p_value < significance
     lacks = base.beyond_noise or (significant and not base.noise.known)
     others = (x for x in listed if not x.effect.gradual)
     tested = (scored_by_refit(base, x, noise_dof, from_shapes=lacks) for x in others)
-    return in_order([*found, *tested])
+    return in_order([*found, *tested]), gram
 
 
 def scored_by_refit(
@@ -167,7 +172,7 @@ def scored_by_refit(
         most = left_without(near) / NEAR_NOISE
         fit = None
         if near.point.data < most:  # a start hardly leaves less than shapes that need not balance
-            begun = RelaxedStart.of(near, Screened(candidate, 0.0, 1.0, start))
+            begun = RelaxedStart.of(near, (Screened(candidate, 0.0, 1.0, start),))
             fit = begun.fit() if begun.left < most else None
         if fit is not None:
             fit = fit.reweighed(base.noise, base.problem.priors)
@@ -189,7 +194,7 @@ def confirm(
     effect in the candidate's place, with the candidate's one-step estimate and without: lacking
     any, the base's other effects may have moved, and its estimate may have the wrong sign.
     """
-    found = screened.fit or refit_with(base, screened, ceiling)
+    found = screened.fit or refit_with(base, screened, ceiling=ceiling)
     if beside is not None:
         same = beside.weighed_as(base)
         model = screened.candidate.add_to(base.model)
@@ -235,16 +240,20 @@ def followed(
     return None
 
 
-def refit_with(base: Fit, screened: Screened, ceiling: float = np.inf) -> Fit | None:
-    """Fit the model with a candidate added, from its one-step estimate."""
-    model = screened.candidate.add_to(base.model)
+def refit_with(base: Fit, *each: Screened, ceiling: float = np.inf) -> Fit | None:
+    """Fit the model with candidates added, from their one-step estimates."""
+    model = base.model
+    for x in each:
+        model = x.candidate.add_to(model)
     begin = dict(zip(model.names, base.values_in(model), strict=True))
+    linear = {name for x in each for name in x.candidate.screened}
+    start = {name: value for x in each for name, value in x.start.items()}
     best: Fit | None = None
     hopeless = 0
     for share in SHARES:
         values = {
-            name: begin[name] + (share if name in screened.candidate.screened else 1.0) * way
-            for name, way in ((q, value - begin[q]) for q, value in screened.start.items())
+            name: begin[name] + (share if name in linear else 1.0) * (value - begin[name])
+            for name, value in start.items()
         }
         fit = followed(base, model, values, MOST_STEPS, ceiling)
         if fit is None:
@@ -254,10 +263,17 @@ def refit_with(base: Fit, screened: Screened, ceiling: float = np.inf) -> Fit | 
             best = fit
         gain = 2 * (base.point.objective - best.point.objective)
         hopeless += fit.point.objective > ceiling
-        kept = gain > 0 and (best.converged or gain > PROMISED * screened.score)
+        kept = gain > 0 and (best.converged or gain > PROMISED * each[-1].score)
         if same or hopeless == 2 or kept:
             break
     return best
+
+
+def confirm_subset(
+    base: Fit, each: tuple[Screened, ...], ceiling: float = np.inf
+) -> Confirmed | None:
+    """Refit with several candidates added at once; None if its equilibria cannot be followed."""
+    return Confirmed.of(each[-1], base, refit_with(base, *each, ceiling=ceiling), each[:-1])
 
 
 def refit_without(fit: Fit, candidate: Candidate, declared: Fit) -> Fit | None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from dlo_casadi.diagnosis.candidates import Candidate
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
+from dlo_casadi.diagnosis.gram import Screened, sidak, survival
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
-from dlo_casadi.diagnosis.screening import Screened, sidak, survival
 from dlo_casadi.diagnosis.structure import Structure, noise_degrees, structure_of
 from dlo_casadi.errors import EstimationError
 from dlo_casadi.estimation.descent import descend
@@ -19,6 +19,8 @@ from dlo_casadi.estimation.fit import refine_mesh
 from dlo_casadi.estimation.result import Fit
 from dlo_casadi.estimation.variances import errors_of, settle
 from dlo_casadi.thresholds import EVIDENCE_APART, LEFT, UNSEEN
+
+RAN_AWAY = "its fit ran away: no noise can be estimated from it"
 
 
 @dataclass(frozen=True)
@@ -162,66 +164,138 @@ def _on_mesh(fit: Fit, n: int) -> Fit:
     return fit
 
 
+@dataclass(frozen=True)
+class Decision:
+    """What is added to a base: the one place in which refits are accepted or refused.
+
+    Parameters
+    ----------
+    fit : Fit
+        The accepted refit with its noise estimated anew, or the base.
+    chosen : tuple of Confirmed
+        The accepted refit, then its rivals; empty if none is accepted.
+    p_value : float
+        Of the accepted refit.
+    reasons : dict of str
+        By name, why candidates are neither accepted nor rivals.
+    """
+
+    fit: Fit
+    chosen: tuple[Confirmed, ...]
+    p_value: float
+    reasons: dict[str, str]
+
+    def added(self, before: CrossValidation, after: CrossValidation) -> list[AddedEffect]:
+        """The effects of the accepted refit; their rivals differ in one effect alone."""
+        winner, *rivals = self.chosen
+        others = [turned for rival in rivals for turned in rival.beside_others()]
+        return [
+            AddedEffect(
+                own.candidate,
+                self.p_value,
+                before,
+                after,
+                tuple(x for x in others if _names(x.beside) == _names(own.beside)),
+            )
+            for own in winner.beside_others()
+        ]
+
+
+def decide(
+    base: Fit,
+    before: CrossValidation,
+    tried: Tried,
+    significance: float,
+    doubt: float | None,
+    *,
+    from_shapes: bool = False,
+) -> Decision:
+    """Accept the best of the refits tried beside a base that is significant, or none.
+
+    Adding, keeping and replacing an effect are the same decision: for the latter two the base is
+    the fit without it, and the fit that has it is one of the refits.
+
+    Parameters
+    ----------
+    before : CrossValidation
+        Of the base.
+    doubt : float or None
+        See `shortcoming`.
+    from_shapes : bool
+        Whether the refits started at the measured shapes, see `with_new_noise`.
+    """
+    chosen, reasons = choose(tried.refits, base, before, doubt)
+    reasons |= tried.far
+    for winner in chosen:
+        fit, p_value = with_new_noise(winner, base, tried.p_values, from_shapes)
+        if p_value <= significance:
+            others = (item for item in chosen if item is not winner)
+            return Decision(fit, (winner, *others), p_value, reasons)
+        why = RAN_AWAY if fit is base else f"not significant: p = {p_value:.2g}"
+        reasons |= dict.fromkeys((x.candidate.name for x in winner.each), why)
+    return Decision(base, (), 1.0, reasons)
+
+
 def with_new_noise(
-    winner: Confirmed, current: Fit, p_values: Mapping[str, float], from_shapes: bool
+    winner: Confirmed, base: Fit, p_values: Mapping[str, float], from_shapes: bool
 ) -> tuple[Fit, float]:
     """A refit with its noise estimated anew, and its p-value, also under that noise.
 
-    `from_shapes`: the refit started at the measured shapes, because the current fit is too far from
-    them for that second p-value. A refit that is weighed by its misfit stays so. If a refit has run
-    away (no noise can be estimated, or poses are lost), the current fit and 1 are returned.
-    """
-    p_value, fit = max(p_values[item.candidate.name] for item in winner.each), winner.fit
-    with suppress(EstimationError):
-        fit = settle(fit) if fit.noise.source != "misfit" else descend(fit)
-        if from_shapes or not (current.scatters or not fit.errors_known):
-            return fit, p_value
-        again = p_with_new_noise(current, fit, winner, len(p_values))
-        # A scatter from pose to pose may be due to the effect alone.
-        return fit, again if current.scatters else max(p_value, again)
-    return current, 1.0
-
-
-def p_with_new_noise(before: Fit, after: Fit, winner: Confirmed, tried: int) -> float:
-    """Significance of an effect under the noise that is left once it is in the model.
-
-    Noise estimated without the effect includes part of the effect or, where it was kept out, lacks
-    part of the noise. If nothing else is missing, all that is left is noise, including its slow
+    Noise estimated without an effect includes part of it or, where it was kept out, lacks part of
+    the noise. If nothing else is missing, all that is left with it is noise, including its slow
     modes; otherwise the noise is too large and the significance too low.
+
+    A refit that is weighed by its misfit stays so. If a refit has run away (no noise can be
+    estimated, or poses are lost), the base and 1 are returned. `from_shapes`: the base is too far
+    from the measured shapes for a test of their likelihoods.
     """
+    if winner.settled:
+        return winner.fit, p_of(winner, winner.fit, base, len(p_values))
+    fit, p_value = winner.fit, max(p_values[item.candidate.name] for item in winner.each)
+    try:
+        fit = settle(fit) if fit.noise.source != "misfit" else descend(fit)
+    except EstimationError:
+        return base, 1.0
+    if from_shapes or not (base.scatters or not fit.errors_known):
+        return fit, p_value
+    again = p_under_new_noise(winner, fit, base, len(p_values))
+    # A scatter from pose to pose may be due to the effect alone.
+    return fit, again if base.scatters else max(p_value, again)
+
+
+def p_under_new_noise(winner: Confirmed, fit: Fit, base: Fit, tried: int) -> float:
+    """`p_of` under the noise and the scatter that are left in a refit's settled fit."""
     try:
         noise, pose_scatter = errors_of(
-            after,
+            fit,
             modes=0,
-            estimated=not after.noise.known,
-            repeats=after.problem.priors.pose_scatter.std == 0,
+            estimated=not fit.noise.known,
+            repeats=fit.problem.priors.pose_scatter.std == 0,
         )
     except EstimationError:  # too few points are left with the effect to show anything
         return 1.0
-    priors = replace(before.problem.priors, pose_scatter=pose_scatter)
-    larger = after.reweighed(noise, priors)
+    priors = replace(base.problem.priors, pose_scatter=pose_scatter)
+    larger = fit.reweighed(noise, priors)
     try:
-        without = descend(before.weighed_as(larger))
+        without = descend(base.weighed_as(larger))
     except EstimationError:  # with this scatter alone a pose has no equilibrium near its shape
         return 0.0
-    gain = max(2 * (without.point.objective - descend(larger).point.objective), 0.0)
-    dof = len(winner.candidate.frees)
-    p_value = survival(gain, dof, noise_degrees(larger))
-    return sidak(p_value, tried * winner.candidate.alike)
+    return p_of(winner, descend(larger), without, tried, settled=False)
 
 
-def p_of_removal(fit: Fit, smaller: Fit, candidate: Candidate, tried: int) -> float:
-    """Significance of an effect, from a fit and the same without the effect.
+def p_of(item: Confirmed, fit: Fit, smaller: Fit, tried: int, *, settled: bool = True) -> float:
+    """Significance of the effects of a refit, from its fit and one without them of equal weights.
 
-    A scatter from pose to pose is estimated anew without the effect, as it may explain as much: a
-    length 9 tolerances off, which no scatter explains, was not significant beside the given one.
-    If both fits estimate one variance of Gaussian residuals, with the effect from nu degrees of
-    freedom, twice the log likelihood ratio is (nu + dof) log(1 + dof F / nu). F is computed from
-    this, with the ratio of the evidences, which also counts the parameters, for the likelihoods'.
+    If the fit is `settled`, a scatter from pose to pose is estimated anew without the effects, as
+    it may explain as much: a length 9 tolerances off, which no scatter explains, was not
+    significant beside the given one. If both fits estimate one variance of Gaussian residuals, with
+    the effect from nu degrees of freedom, twice the log likelihood ratio is (nu + dof) log(1 + dof
+    F / nu). F is computed from this, with the ratio of the evidences, which also counts the
+    parameters, for the likelihoods'.
     """
     gain = 2 * (smaller.point.objective - fit.point.objective)
-    dof, degrees = len(candidate.frees), noise_degrees(fit)
-    if fit.scatters:
+    dof, degrees = len(item.candidate.frees), noise_degrees(fit)
+    if settled and fit.scatters:
         try:
             gain = 2 * (fit.log_evidence - settle(smaller).log_evidence)
         except EstimationError:  # without the effect there is no fit
@@ -229,7 +303,7 @@ def p_of_removal(fit: Fit, smaller: Fit, candidate: Candidate, tried: int) -> fl
         if np.isfinite(degrees):
             # A larger exponent would overflow; its probability is zero anyway.
             gain = degrees * np.expm1(min(gain / (degrees + dof), 500.0))
-    return sidak(survival(gain, dof, degrees), tried)
+    return sidak(survival(max(gain, 0.0), dof, degrees), tried * item.candidate.alike)
 
 
 def support(item: Confirmed, base: Fit, validation: CrossValidation) -> float:
@@ -272,49 +346,28 @@ def choose(
     validation: CrossValidation,
     doubt: float | None,
 ) -> tuple[list[Confirmed], dict[str, str]]:
-    """The best refit by `support` and its rivals; by name, why candidates are not in `added_by`.
+    """The best refit by `support` and its rivals; by name, why candidates are neither of these.
 
     Both gains have to be positive. Rivals fall short of the best by less than EVIDENCE_APART. Of a
     candidate in several refits the likeliest one's reason counts.
     """
-    why = {item.name: shortcoming(item, base, validation, doubt) for item in refits}
-    order = {item.name: support(item, base, validation) for item in refits}
-    better = [item for item in refits if not why[item.name]]
-    better.sort(key=lambda item: -order[item.name])
-    behind = {item.name: order[better[0].name] - order[item.name] for item in better}
-    chosen = [item for item in better if behind[item.name] < EVIDENCE_APART]
+    why = {id(item): shortcoming(item, base, validation, doubt) for item in refits}
+    order = {id(item): support(item, base, validation) for item in refits}
+    better = [item for item in refits if not why[id(item)]]
+    better.sort(key=lambda item: -order[id(item)])
+    behind = {id(item): order[id(better[0])] - order[id(item)] for item in better}
+    chosen = [item for item in better if behind[id(item)] < EVIDENCE_APART]
     for item in better[1:]:
-        why[item.name] = f"log likelihood {behind[item.name]:.3g} behind {better[0].name}"
+        why[id(item)] = f"log likelihood {behind[id(item)]:.3g} behind {better[0].name}"
     reasons = {
-        x.candidate.name: why[item.name]
-        for item in sorted(refits, key=lambda item: order[item.name])
+        x.candidate.name: why[id(item)]
+        for item in sorted(refits, key=lambda item: order[id(item)])
         for x in item.each
     }
     beside = [_names(own.beside) for item in chosen[:1] for own in item.beside_others()]
     turned = (x for item in chosen for x in item.beside_others())
     kept = {x.candidate.name for x in turned if _names(x.beside) in beside}
     return chosen, {name: reason for name, reason in reasons.items() if name not in kept}
-
-
-def added_by(
-    winner: Confirmed,
-    rivals: Iterable[Confirmed],
-    p_value: float,
-    before: CrossValidation,
-    after: CrossValidation,
-) -> list[AddedEffect]:
-    """The effects of a refit; rivals of an effect are refits that differ in that effect alone."""
-    others = [turned for rival in rivals for turned in rival.beside_others()]
-    return [
-        AddedEffect(
-            own.candidate,
-            p_value,
-            before,
-            after,
-            tuple(x for x in others if _names(x.beside) == _names(own.beside)),
-        )
-        for own in winner.beside_others()
-    ]
 
 
 def _names(screened: Iterable[Screened]) -> set[str]:

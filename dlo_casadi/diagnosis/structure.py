@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtri
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.diagnosis.screening import sidak, survival
+from dlo_casadi.diagnosis.gram import sidak, survival
 from dlo_casadi.estimation.prediction import noise_distance
 from dlo_casadi.estimation.repeats import enough_poses, repeatability
 from dlo_casadi.estimation.result import Fit

@@ -6,7 +6,7 @@ that others have made superfluous, or replaces them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,15 +18,12 @@ from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import Candidate, candidates_of
 from dlo_casadi.diagnosis.crossval import CrossValidation, cross_validate
 from dlo_casadi.diagnosis.from_data import from_data
-from dlo_casadi.diagnosis.near_data import near_data
+from dlo_casadi.diagnosis.gram import Gram, Screened, p_values_of, sidak, survival
+from dlo_casadi.diagnosis.near_data import BEST, near_data
 from dlo_casadi.diagnosis.refits import Confirmed, Tried
-from dlo_casadi.diagnosis.screening import Screened, p_values_of, sidak, survival
 from dlo_casadi.diagnosis.selection import (
     AddedEffect,
-    added_by,
-    choose,
-    p_of_removal,
-    with_new_noise,
+    decide,
 )
 from dlo_casadi.diagnosis.structure import noise_degrees, screening_degrees
 from dlo_casadi.diagnosis.unknown_force import UnknownForce
@@ -55,8 +52,6 @@ class Trials:
     """Once it is met no further effect, pair or rival is tried."""
     from_shapes: bool = False
     """Whether the first candidates are tried at the measured shapes."""
-    wider: Trials | None = None
-    """Of the same fit among more candidates, whose tests and refits hold here, too."""
 
     @cached_property
     def validation(self) -> CrossValidation:
@@ -70,16 +65,19 @@ class Trials:
         count = different_poses(problem.history, self.declared.model)
         return self.significance if count < min(DIFFERENT, len(problem.used)) else None
 
+    @property
+    def limits(self) -> tuple[float, float | None]:
+        """Significance and doubt, see `decide`."""
+        return self.significance, self.doubt
+
     @cached_property
     def first(self) -> list[Screened]:
         """Score tests in the declared model."""
-        if self.wider is not None:
-            return [x for x in self.wider.first if x.candidate.name not in self.exclude]
         return self.screened(self.declared)
 
     @cached_property
-    def known_scores(self) -> list[tuple[Fit, list[Screened]]]:
-        """Fits with the score tests of all candidates beside them, as they were made."""
+    def known_grams(self) -> list[tuple[Fit, Gram]]:
+        """Fits with the Gram matrices of all candidates beside them, as they were made."""
         return []
 
     @cached_property
@@ -90,7 +88,7 @@ class Trials:
     @cached_property
     def refitted(self) -> dict[str, Confirmed | None]:
         """Refits of the declared model with a candidate, by name, made only as needed."""
-        return self.wider.refitted if self.wider is not None else {}
+        return {}
 
     def listed(self, current: Fit) -> list[Candidate]:
         """All `candidates_of` a fit."""
@@ -102,36 +100,66 @@ class Trials:
         listed = [x for x in self.listed(current) if among is None or x.name in among]
         given = screening_degrees(current), self.significance, self.executor
         try:
-            found = refits.scored(current, listed, *given)
+            found, gram = refits.scored(current, listed, *given)
         except EstimationError:
             # A held-out pose has no equilibrium: what poses leave behind cannot be determined.
             listed = [x for x in listed if not isinstance(x.effect, StateEffect)]
-            found = refits.scored(current, listed, *given)
-        if among is None:
-            self.known_scores.append((current, found))
+            found, gram = refits.scored(current, listed, *given)
+        if among is None and gram is not None:
+            self.known_grams.append((current, gram))
         return found
 
-    def screened_last(self, fit: Fit) -> list[Screened]:
-        """The last score tests of all candidates beside the effects of a fit, here or made now."""
+    def gram_beside(self, fit: Fit) -> Gram | None:
+        """The last Gram matrix of all candidates beside the effects of a fit; made now if none."""
         labels = {effect.label for effect in fit.model.effects}
-        for known, found in reversed(self.known_scores):
-            if {effect.label for effect in known.model.effects} == labels:
-                return found
-        return self.screened(fit)
+        for other, gram in reversed(self.known_grams):
+            if {effect.label for effect in other.model.effects} == labels:
+                return gram
+        self.screened(fit)
+        return self.known_grams[-1][1] if self.known_grams else None
 
     @accounted_as("candidates")
-    def tried(self, current: Fit, *, pairs: bool) -> Tried:
+    def tried(self, current: Fit, *, largest: int) -> Tried:
         """Candidates screened and refitted beside the effects of a fit.
 
-        `pairs`: whether two at once may be tried, see `near_data`.
+        `largest`: number of candidates that may be tried at once, see `near_data`.
         """
         if self.starts_at_shapes(current):
             near = self.relaxed if current is self.declared else from_data(current)
-            given = current, near, self.executor, self.listed
-            return near_data(*given, pairs=pairs, bound=self.bound)
+            given = current, near, self.executor, self.listed(near[0])
+            return near_data(*given, largest=largest, bound=self.bound)
         screened = self.first if current is self.declared else self.screened(current)
         known = self.refitted if current is self.declared else {}
-        return Tried(screened, p_values_of(screened), self.leading(current, screened, known))
+        tried = self.leading(current, screened, known)
+        p_values = p_values_of(screened)
+        pairs = self._simple_pairs(current, tried, p_values) if largest > 1 else []
+        for x in (x for item in pairs for x in item.each):
+            name = x.candidate.name
+            p_values[name] = min(p_values[name], sidak(x.p_value, len(screened)))
+        return Tried(screened, p_values, [*tried, *pairs])
+
+    def _simple_pairs(
+        self, current: Fit, tried: Sequence[Confirmed], p_values: Mapping[str, float]
+    ) -> list[Confirmed]:
+        """Refits of pairs with no more parameters than a single candidate, which may stand for two.
+
+        Both have to be significant beside one another, and to promise more than any single one.
+        """
+        gram, n = self.gram_beside(current), len(p_values)
+        if gram is None or not tried:
+            return []
+        most = max(len(item.candidate.frees) for item in tried)
+        promised = max(item.screened.score for item in tried)
+        pairs = [
+            pair
+            for pair in gram.subsets(2, BEST)
+            if sum(len(x.candidate.frees) for x in pair) <= most
+            and all(sidak(x.p_value, n) < self.significance for x in pair)
+            and gram.gain(pair) > promised
+        ]
+        ceiling = min(refits.ceiling_beside(item.fit) for item in tried)
+        confirm = partial(refits.confirm_subset, current, ceiling=ceiling)
+        return [x for x in map_in_order(self.executor, confirm, pairs) if x]
 
     @accounted_as("causes of a force")
     def tried_as_causes(self, force: UnknownForce) -> Tried:
@@ -197,94 +225,75 @@ def pruned(trials: Trials, fit: Fit, added: list[AddedEffect]) -> tuple[Fit, lis
 
     A removed nuisance is held within its declared tolerance again.
 
-    An effect has to be worth its parameters, and as significant as when it was added. The last
-    one is significant, but it may have led out of a local minimum and no longer be needed, or
-    stand for an error of the mesh: 80 elements on a table were 0.6 mm off. An effect found from
-    the measured shapes may stand for a scatter. One with fewer parameters may take the place of a
-    removed one: for a mass off by 30 %, a force gained as much, but was not significant.
+    The fit without an effect is a base beside which the effect is one of the candidates; see
+    `judged`. The last one has just been compared with all others, but it may have led out of a
+    local minimum and no longer be needed, or stand for an error of the mesh: 80 elements on a table
+    were 0.6 mm off. An effect found from the measured shapes may stand for a scatter.
     """
-    before, fit = fit, trials.fine(fit, FINEST_MESH) if added else fit
-    significant = added[-1:] if fit is before and not trials.from_shapes else []
+    accepted, fit = fit, trials.fine(fit, FINEST_MESH) if added else fit
     last = [effect for effect in added if effect.after is added[-1].after]
-    compared = last if len(last) == 1 else []  # a pair was compared with few other pairs
     for effect in added:
         smaller = refits.refit_without(fit, effect.candidate, trials.declared)
         if smaller is None:
             continue
-        needless = smaller.log_evidence > fit.log_evidence
-        if not needless and effect not in significant:
-            tried = len(trials.listed(smaller))
-            needless = p_of_removal(fit, smaller, effect.candidate, tried) > trials.significance
-        if needless:
-            with suppress(EstimationError):  # else there is no fit without it
-                fit, instead = in_its_place(trials, settle(smaller), effect)
-                added = [x for item in added for x in (instead if item is effect else [item])]
-        elif trials.bound.met:
-            continue
-        elif effect not in compared and (effect.rivals or not misfits(smaller)):
-            fit, chosen = judged_again(trials, fit, smaller, effect)
-            added = [chosen if item is effect else item for item in added]
+        compared = len(last) == 1 and effect in last  # a pair was compared with few other pairs
+        before, after = effect.before, effect.after
+        if not (compared and fit is accepted):
+            before, after = cross_validate(smaller), cross_validate(fit)
+        gain = 2 * (smaller.point.objective - fit.point.objective)
+        start = Screened(effect.candidate, gain, 1.0, {})
+        own = Confirmed(start, fit, after, gain, settled=True)
+        others = not (compared or trials.bound.met)
+        fit, found = judged(trials, own, smaller, before, effect, others=others)
+        if compared and not found and not trials.bound.met:
+            fit, found = judged(trials, own, smaller, before, effect)
+        added = [x for item in added for x in (found if item is effect else [item])]
     return fit, added
 
 
-def judged_again(
-    trials: Trials, fit: Fit, smaller: Fit, effect: AddedEffect
-) -> tuple[Fit, AddedEffect]:
-    """The likeliest candidate beside effects that were added later or with it, and its rivals.
+def judged(
+    trials: Trials,
+    own: Confirmed,
+    smaller: Fit,
+    before: CrossValidation,
+    effect: AddedEffect,
+    *,
+    others: bool = True,
+) -> tuple[Fit, list[AddedEffect]]:
+    """The likeliest candidate beside a fit without one of its effects, that effect among them.
 
     Sequential replacement (Miller 1990): an effect may be the best one alone, and another one,
     or that of another clip, beside what was still missing then. Alone, a force explained a tilt
-    and a drift better than either. `smaller` lacks the effect; if it misfits, scores are
-    useless and only known rivals are judged.
+    and a drift better than either. One with fewer parameters may be significant where it is not:
+    for a mass off by 30 %, a force gained as much, but was not significant.
+
+    Parameters
+    ----------
+    own : Confirmed
+        The fit with the effect.
+    smaller : Fit
+        The fit without it. If that misfits, scores are useless and only known rivals are judged.
+    before : CrossValidation
+        Of the fit without it.
+    others : bool
+        Whether other candidates are judged.
     """
-    before, name, label = cross_validate(smaller), effect.name, effect.candidate.effect.label
-    rivals_only = {name, *(rival.name for rival in effect.rival_candidates)}
-    screened = trials.screened(smaller, rivals_only if misfits(smaller) else None)
-    own = [item for item in screened if item.candidate.effect.label == label]
-    known = {item.candidate.name: Confirmed.of(item, smaller, fit) for item in own}
-    tried = trials.leading(smaller, screened, known, fit)
-    chosen, _ = choose(tried, smaller, before, trials.doubt)
-    others = tuple(item for item in chosen if item.name != name)
-    if len(others) < len(chosen):
-        effect = replace(effect, rivals=others)
-    if not chosen or (chosen[0].name == name and own):
-        return fit, effect
-    if found := _winner_added(trials, smaller, before, chosen, screened, fit.log_evidence):
-        return found
-    rivals = {item.name: item for item in (*effect.rivals, chosen[0]) if item.name != name}
-    return fit, replace(effect, rivals=tuple(rivals.values()))
-
-
-def in_its_place(
-    trials: Trials, smaller: Fit, effect: AddedEffect
-) -> tuple[Fit, list[AddedEffect]]:
-    """The fit without a removed effect, or the likeliest other candidate added to it."""
-    label = effect.candidate.effect.label
-    screened = [] if misfits(smaller) else trials.screened(smaller)  # in a misfit no score counts
-    screened = [item for item in screened if item.candidate.effect.label != label]
-    tried = trials.leading(smaller, screened, {})
-    before = cross_validate(smaller)
-    chosen, _ = choose(tried, smaller, before, trials.doubt)
-    found = _winner_added(trials, smaller, before, chosen, screened, smaller.log_evidence)
-    return (found[0], [found[1]]) if found else (smaller, [])
-
-
-def _winner_added(
-    trials: Trials,
-    base: Fit,
-    before: CrossValidation,
-    chosen: Sequence[Confirmed],
-    screened: Sequence[Screened],
-    least: float,
-) -> tuple[Fit, AddedEffect] | None:
-    """The best of the chosen refits, if it is significant and its log evidence above the least."""
-    if not chosen:
-        return None
-    winner, *rivals = chosen
-    from_shapes = trials.starts_at_shapes(base)
-    fit, p_value = with_new_noise(winner, base, p_values_of(screened), from_shapes)
+    label, screened = own.candidate.effect.label, []
+    if others and (effect.rivals or not misfits(smaller)):
+        rivals = {effect.name, *(rival.name for rival in effect.rival_candidates)}
+        screened = trials.screened(smaller, rivals if misfits(smaller) else None)
+    known: dict[str, Confirmed | None] = {}
+    if any(x.candidate.effect.label == label for x in screened):
+        known[effect.name] = own
+    refitted = trials.leading(smaller, screened, known, own.fit) if screened else []
+    refitted = [own, *(item for item in refitted if item is not own)]
+    p_values = {x.name: 1.0 for x in trials.listed(smaller)} | p_values_of(screened)
+    decision = decide(smaller, before, Tried(screened, p_values, refitted), *trials.limits)
     with suppress(EstimationError):
-        if fit.log_evidence > least and p_value <= trials.significance:
-            (effect,) = added_by(winner, rivals, p_value, before, cross_validate(fit))
-            return fit, effect
-    return None
+        if not decision.chosen:
+            return settle(smaller), []
+        if decision.chosen[0] is not own:
+            return decision.fit, decision.added(before, cross_validate(decision.fit))
+    compared = decision.chosen and len(screened) > len(known)
+    rivals_now = tuple(decision.chosen[1:]) if compared else effect.rivals
+    return own.fit, [replace(effect, rivals=rivals_now)]

@@ -19,15 +19,16 @@ Ramsay et al., Parameter estimation for differential equations: a generalized sm
 J. R. Statist. Soc. B 69 (2007).
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
-from dlo_casadi.arrays import BoolArray, FloatArray
+from dlo_casadi.arrays import BoolArray, FloatArray, IntArray
 from dlo_casadi.equilibrium.curve import Observed
 from dlo_casadi.estimation.problem import Problem
+from dlo_casadi.estimation.relaxed_rows import Linearized, Reduced, bounded
 from dlo_casadi.estimation.unknowns import Values
 from dlo_casadi.linear_mixed import NO_INFORMATION, LinearMixed
 from dlo_casadi.model.assembly import Assembly, Shapes, Tangents
@@ -59,36 +60,8 @@ REFUSED = 6
 STEPS, CONVERGED = 20, 2e-2
 
 
-@dataclass(frozen=True)
-class _Linearized:
-    """Rows of a Gauss-Newton step: derivatives by a pose's unknowns, its state, theta; then target.
-
-    Parameters
-    ----------
-    poses : list of (n_j, own + r + size + 1)
-        One array per pose; the balance of forces comes first, in the order of the unknowns.
-    states : list of (r, own + r + size + 1)
-        Derivatives of each pose's state by the unknowns of the pose before; r = 0 without a state.
-    prior : (size, size + 1)
-    """
-
-    poses: list[FloatArray]
-    states: list[FloatArray]
-    prior: FloatArray
-
-
-@dataclass(frozen=True)
-class _Reduced:
-    """Triangular factors of a Gauss-Newton step: each pose's own unknowns, and the rest for theta.
-
-    It also holds the states' derivatives by the free unknowns, without their target, and the rows
-    for theta alone, without its prior and damping.
-    """
-
-    own: list[FloatArray]
-    states: list[FloatArray]
-    shared: FloatArray
-    rows: FloatArray
+# A relaxation, values of it, and some of its unknowns.
+Further = tuple["Relaxation", Values, Sequence[int]]
 
 
 @dataclass(frozen=True)
@@ -112,6 +85,18 @@ class Relaxation:
         own = border + len(self.problem.equilibria.used_deviations)
         known = own + (model.chain.n_rests if model.has_state else 0)
         return nodes, border, own, known, known + self.problem.unknowns.size
+
+    def _rows_in(self, larger: "Relaxation") -> IntArray:
+        """Rows of the balance of forces of a pose among those of a model with more conditions."""
+        every = larger.problem.unknowns.model.border_names
+        nodes, known = self._counts[0], self.problem.unknowns.model.border_names
+        return np.concatenate([np.arange(nodes), [nodes + every.index(x) for x in known]])
+
+    def _poses_in(self, larger: "Relaxation") -> dict[int, int]:
+        """By pose of a larger model its pose here; a state is carried through unmeasured ones."""
+        if self.problem.equilibria.m == larger.problem.equilibria.m:
+            return {j: j for j in range(self.problem.equilibria.m)}
+        return dict(zip(larger.problem.used, self.problem.used, strict=True))
 
     def _stiffness(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log stiffnesses (n b,) that scale the nodes' rows, and their derivatives by p.
@@ -197,13 +182,21 @@ class Relaxation:
         total = float(each.sum()) + prior
         return total if np.isfinite(total) else np.inf
 
-    def mixed(self, values: Values) -> LinearMixed:
-        """The fit to first order, with the poses' own unknowns eliminated: one group of rows."""
-        rows, none = self._reduced(self._linearized(values), 0.0).rows, np.zeros((1, 0))
+    def mixed(self, values: Values, further: Iterable[Further] = ()) -> LinearMixed:
+        """The fit to first order, with the poses' own unknowns eliminated: one group of rows.
+
+        `further`: unknowns of larger models at the same shapes, without priors; they come last.
+        """
+        linearized = self._linearized(values)
+        for other, there, kept in further:
+            among = other._rows_in(self), other._poses_in(self)
+            linearized = linearized.and_columns(other._linearized(there), kept, *among)
+        rows, none = self._reduced(linearized, 0.0).rows, np.zeros((1, 0))
         gap = values.theta - self.problem.mean
         own = [np.zeros((len(rows), 0))]
         given = none, none[0], gap, self.problem.precision
-        return LinearMixed([-rows[:, -1]], [rows[:, :-1]], own, *given)
+        n = len(gap)
+        return LinearMixed([-rows[:, -1]], [rows[:, :n]], own, *given).beside([rows[:, n:-1]])
 
     def _along(self, values: Values) -> Tangents:
         """Directions: each own unknown of a pose, then of its state, then of theta."""
@@ -251,7 +244,7 @@ class Relaxation:
         return float(log), np.array(by_p).ravel()
 
     def _states(self, here: Assembly, along: Tangents) -> list[FloatArray]:
-        """Change of each pose's state by the unknowns of the pose before, see `_Linearized`."""
+        """Change of each pose's state by the unknowns of the pose before, see `Linearized`."""
         problem = self.problem
         own, known, q = self._counts[2:]
         states = np.zeros((problem.equilibria.m, known - own, q + 1))
@@ -260,7 +253,7 @@ class Relaxation:
             states[1:, :, :-1] = here.state_along(here.state_after(), along)[:-1]
         return list(states)
 
-    def _linearized(self, values: Values) -> _Linearized:
+    def _linearized(self, values: Values) -> Linearized:
         """Derivatives and residuals of all terms of the objective."""
         problem = self.problem
         equilibria = problem.equilibria
@@ -292,19 +285,20 @@ class Relaxation:
             stacked.append(np.concatenate([np.column_stack([a, -e]) for a, e in parts]))
         root, gap = self._prior, values.theta - problem.mean
         states = self._states(here, along)
-        return _Linearized(stacked, states, np.column_stack([root, -root @ gap]))
+        return Linearized(stacked, states, np.column_stack([root, -root @ gap]))
 
     def _reduced(
         self,
-        linearized: _Linearized,
+        linearized: Linearized,
         damping: float,
         fixed: BoolArray | None = None,
-    ) -> _Reduced:
+    ) -> Reduced:
         """Orthogonal elimination of each pose's own unknowns and state, from the last pose on.
 
         The rest of a pose's rows depends on its state, hence on the unknowns of the pose before.
         """
-        nodes, border, own, known, q = self._counts
+        nodes, border, own, known, _ = self._counts
+        q = linearized.prior.shape[1] - 1 + known
         free = np.ones(q - known, dtype=bool) if fixed is None else ~fixed
         kept = np.concatenate([np.ones(known, dtype=bool), free, [True]])
         model = self.problem.unknowns.model
@@ -326,7 +320,7 @@ class Relaxation:
         more = OF_UNKNOWNS * damping * np.eye(int(free.sum()), int(free.sum()) + 1)
         shared = [later[:, known:], linearized.prior[:, np.append(free, True)], more]
         left_over: FloatArray = np.asarray(np.linalg.qr(np.concatenate(shared), mode="r"))
-        return _Reduced(triangles, [x[:, :-1] for x in states], left_over, later[:, known:])
+        return Reduced(triangles, [x[:, :-1] for x in states], left_over, later[:, known:])
 
     @cached_property
     def _prior(self) -> FloatArray:
@@ -367,7 +361,7 @@ class Relaxation:
                 break
         return values
 
-    def _scaled(self, linearized: _Linearized, values: Values) -> _Linearized:
+    def _scaled(self, linearized: Linearized, values: Values) -> Linearized:
         """Rows in scaled steps: loads grow with the bending stiffness, as all forces do."""
         unknowns = self.problem.unknowns
         if not unknowns.are_loads.any():
@@ -384,10 +378,10 @@ class Relaxation:
         poses, states = (
             [changed(rows) for rows in part] for part in (linearized.poses, linearized.states)
         )
-        return _Linearized(poses, states, changed(linearized.prior))
+        return Linearized(poses, states, changed(linearized.prior))
 
     def _stepped(
-        self, values: Values, linearized: _Linearized, damping: float, fixed: BoolArray | None
+        self, values: Values, linearized: Linearized, damping: float, fixed: BoolArray | None
     ) -> Values:
         """Values after a damped step within reach, with the projections before it."""
         problem, reduced = self.problem, self._reduced(linearized, damping, fixed)
@@ -399,7 +393,7 @@ class Relaxation:
         stiff = np.isin(unknowns.names, STIFFNESSES)
         lower[stiff], upper[stiff] = (-np.expm1(-end[stiff]) for end in (lower, upper))
         step = np.zeros(unknowns.size)
-        step[free] = _bounded(reduced.shared, lower[free], upper[free])
+        step[free] = bounded(reduced.shared, lower[free], upper[free])
         m = equilibria.m
         change = np.zeros((m, own))
         before = np.zeros(known)
@@ -425,13 +419,3 @@ class Relaxation:
         theta = values.theta + taken
         theta = np.clip(np.where(unknowns.are_loads, larger * theta, theta), *unknowns.bounds)
         return Values(theta, shapes, values.projections)
-
-
-def _bounded(rows: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Least squares within bounds, of stacked rows whose last column is the target."""
-    step = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-12)[0]
-    if np.all(step >= lower) and np.all(step <= upper):
-        return np.asarray(step)
-    low = np.minimum(lower, 0.0)
-    high = np.maximum(np.maximum(upper, 0.0), low + 1e-12)
-    return np.asarray(lsq_linear(rows[:, :-1], rows[:, -1], (low, high), method="bvls").x)

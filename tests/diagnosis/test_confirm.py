@@ -10,10 +10,11 @@ from scipy.linalg import block_diag
 from dlo_casadi.diagnosis import refits
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
+from dlo_casadi.diagnosis.gram import sidak
 from dlo_casadi.diagnosis.refits import refit_with, refit_without
-from dlo_casadi.diagnosis.screening import Screen, _Moving, sidak
+from dlo_casadi.diagnosis.screening import Screen, _Moving
 from dlo_casadi.diagnosis.selection import AddedEffect
-from dlo_casadi.diagnosis.trials import Trials, judged_again
+from dlo_casadi.diagnosis.trials import Trials, judged
 from dlo_casadi.diagnosis.unknown_force import _Search
 from dlo_casadi.effects import EFFECTS, CableData, ClipOffset, LengthError, LumpedMass, UnknownPull
 from dlo_casadi.equilibrium.pose import HeldPose
@@ -182,7 +183,7 @@ def test_a_refit_beside_another_effect_has_the_weights_of_its_base(base, monkeyp
     (screened,) = Screen(base, [taper_of(base.model)]).run(np.inf)
     larger = refit_with(base, screened)
     beside = larger.reweighed(replace(base.noise, std=3 * NOISE))
-    monkeypatch.setattr(refits, "refit_with", lambda *_: None)  # the base loses its poses
+    monkeypatch.setattr(refits, "refit_with", lambda *_, **__: None)  # the base loses its poses
     assert refits.confirm(base, screened) is None
     found = refits.confirm(base, screened, beside=beside)
     assert found.fit.problem.weights is base.problem.weights
@@ -209,8 +210,11 @@ def test_the_offset_of_another_clip_replaces_a_first_one():
     effect = AddedEffect(first, 1e-9, cross_validate(base), wrong.validation, ())
     among = [name for name in EFFECTS if name != "clip_offset"]
     trials = Trials(base, None, among, SIGNIFICANCE, InProcess())
-    better, judged = judged_again(trials, wrong.fit, base, effect)
-    assert judged.candidate.effect == ClipOffset(clip=1)
-    assert not judged.rivals
+    own, before = replace(wrong, settled=True), cross_validate(base)
+    better, (effect,) = judged(trials, own, base, before, effect)
+    assert effect.candidate.effect == ClipOffset(clip=1)
+    assert not effect.rivals
     assert better.value("clip_offset_2.dy") == pytest.approx(-6e-3, abs=3e-4)
-    assert judged_again(trials, better, base, judged) == (better, judged)
+    own = replace(own, fit=better, screened=replace(own.screened, candidate=effect.candidate))
+    own = replace(own, validation=cross_validate(better))
+    assert judged(trials, own, base, before, effect) == (better, [effect])

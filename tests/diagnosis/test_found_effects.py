@@ -14,8 +14,8 @@ from dlo_casadi.diagnosis import diagnose as module
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
 from dlo_casadi.diagnosis.diagnose import diagnose
+from dlo_casadi.diagnosis.gram import Screened
 from dlo_casadi.diagnosis.refits import confirm, loads_from_best
-from dlo_casadi.diagnosis.screening import Screened
 from dlo_casadi.diagnosis.unknown_force import UnknownForce, estimate_unknown_force, start_from
 from dlo_casadi.effects import EFFECTS, CableData
 from dlo_casadi.equilibrium.pose import HeldPose

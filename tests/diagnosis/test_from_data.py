@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.diagnosis.candidates import candidates, candidates_of, setup_of
 from dlo_casadi.diagnosis.from_data import (
     RelaxedStart,
+    expected_left,
     from_data,
-    nearest,
-    screened_from_data,
 )
+from dlo_casadi.diagnosis.gram import Screened
 from dlo_casadi.diagnosis.near_data import (
+    _near_least,
     confirm_contact,
     confirm_from_data,
 )
@@ -31,7 +32,6 @@ from dlo_casadi.estimation.start import begin
 from dlo_casadi.estimation.unknowns import Unknowns
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.tolerances import Tolerances
-from dlo_casadi.runtime.executors import InProcess
 from dlo_casadi.sensing.measured_pose import MeasuredPose
 from dlo_casadi.sensing.noise import NoiseModel
 
@@ -99,7 +99,7 @@ def near(relaxed_fit):
 def screened(relaxed_fit):
     near, softness = relaxed_fit
     listed = [x for x in candidates(near.model, setup_of(near.model, n_poses=6)) if x.name in TRIED]
-    return {item.candidate.name: item for item in screened_from_data(near, softness, listed)}
+    return {item.candidate.name: item for item in RelaxedScreen(near, listed, softness).run(np.inf)}
 
 
 def test_a_relaxed_model_has_the_measured_shapes(base, near):
@@ -133,7 +133,7 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
     assert first.p_value < 1e-9
     assert first.score > 1.2 * second.score
 
-    fit = confirm_from_data(base, RelaxedStart.of(near, first)).fit
+    fit = confirm_from_data(base, RelaxedStart.of(near, (first,))).fit
     assert fit.noise.std == NOISE
     assert fit.value("bending_anisotropy.ratio") == pytest.approx(RATIO, rel=0.03)
     assert fit.value("bending_anisotropy.angle") == pytest.approx(ANGLE, abs=0.03)
@@ -143,7 +143,7 @@ def test_the_effect_has_the_highest_score_and_is_fitted_to_the_noise(base, near,
 
 @pytest.mark.long
 def test_with_another_effect_the_misfit_stays(base, near, screened):
-    found = confirm_from_data(base, RelaxedStart.of(near, screened["stiffness_gradient"]))
+    found = confirm_from_data(base, RelaxedStart.of(near, (screened["stiffness_gradient"],)))
     assert found is None or found.fit.noise.source == "misfit"
 
 
@@ -181,14 +181,15 @@ def on_a_table():
 
 
 def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
-    near, softness = from_data(on_a_table)
+    near, _ = from_data(on_a_table)
     assert near.p[0] > 100 * 0.02
 
-    listed = [x for x in candidates_of(near, None, ()) if x.name in ("contact_plane", "tether")]
-    screened = screened_from_data(near, softness, listed)
-    contact, tether = sorted(screened, key=lambda x: x.candidate.name)
-    start = RelaxedStart.of(near, contact)
-    found = confirm_contact(on_a_table, start)
+    listed = {x.name: x for x in candidates_of(near, None, ())}
+    contact, tether = (
+        RelaxedStart.of(near, (Screened(x, 0.0, 1.0, dict(x.scans[0])),))
+        for x in (listed["contact_plane"], listed["tether"])
+    )
+    found = confirm_contact(on_a_table, contact)
     assert found.name == "contact_plane"
     assert explains(found.fit)
     assert found.screened.p_value < 1e-9
@@ -196,9 +197,9 @@ def test_a_table_is_found_where_without_it_the_stiffness_runs_away(on_a_table):
     assert found.fit.value("contact_plane.height") == pytest.approx(TABLE, abs=5e-4)
 
     # The tether leaves far more than the table, which explains the shapes: it is no rival.
-    among = (near, softness, [RelaxedStart.of(near, tether)], (), InProcess(), None)
-    assert next(nearest(*among, pairs=False))
-    assert not next(nearest(*among, pairs=False, least=start.left))
+    noise = expected_left(near)
+    assert _near_least([tether], noise)
+    assert not _near_least([tether], noise, contact.left)
 
     # Contacts change so much from 16 to 32 elements that Newton's method alone loses a pose.
     coarse = refit(found.fit, found.fit.model.with_mesh(16))

@@ -42,7 +42,7 @@ def fitted(std, points, mass, model=MODEL, **options):
 def hidden_in(fit):
     """What one effect could do to the stiffness of a fit."""
     listed = candidates(fit.model, setup_of(fit.model, n_poses=10))
-    return if_hidden(fit, Screen(fit, listed).run(np.inf))["bending_stiffness"]
+    return if_hidden(fit, Screen(fit, listed).gram(np.inf))["bending_stiffness"]
 
 
 def test_a_weight_that_fits_as_well_as_none_widens_the_interval_of_the_stiffness():
@@ -71,8 +71,7 @@ def test_the_stiffness_beside_an_unknown_force_is_known_as_well_as_scipy_finds_i
     """Least squares of EI, rest curvature and a force by SciPy, without errors of fixtures."""
     fit = fitted(2e-3, 4, 0.0)
     weight = next(c for c in candidates(fit.model, setup_of(fit.model)) if c.name == "point_force")
-    (item,) = Screen(fit, [weight]).run(np.inf)
-    row = item.widest["bending_stiffness"]
+    (row,) = Screen(fit, [weight]).gram(np.inf).widened("bending_stiffness")
     place, pulled = row.scan["point_force.position"], fit.model.with_effect(PointForce())
     measured, s = fit.problem.measured, np.linspace(0.65 / 4, 0.65, 4)
     poses = [one.pose for one in measured]

@@ -5,7 +5,7 @@ import pytest
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.crossval import cross_validate
-from dlo_casadi.diagnosis.screening import sidak, survival
+from dlo_casadi.diagnosis.gram import sidak, survival
 from dlo_casadi.diagnosis.selection import AddedEffect
 from dlo_casadi.diagnosis.trials import Trials, pruned
 from dlo_casadi.effects import CableData, ContactPlane
@@ -76,11 +76,11 @@ def test_an_effect_of_fewer_parameters_takes_the_place_of_one_that_is_not_signif
     ]
     declared = fit_model(PLAIN, measured, Tolerances(), NOISE)
     fit = fit_model(section.add_to(PLAIN), measured, Tolerances(), NOISE)
-    told = cross_validate(fit)
+    both = cross_validate(declared), cross_validate(fit)
     others = [name for name in listed if name not in {"stiffness_gradient", "stiff_section"}]
     trials = Trials(declared, None, others, 1e-5, InProcess(), from_shapes=True)
 
-    found, kept = pruned(trials, fit, [AddedEffect(section, 1e-9, told, told, ())])
+    found, kept = pruned(trials, fit, [AddedEffect(section, 1e-9, *both, ())])
 
     assert [item.name for item in kept] == left
     assert [effect.name for effect in found.model.effects] == left
@@ -135,8 +135,8 @@ def test_an_effect_that_stands_for_the_error_of_the_mesh_is_dropped_on_a_finer_o
     model = fine.with_mesh(20)
     section = next(c for c in candidates(model, setup_of(model)) if c.name == "stiff_section")
     fit = fit_model(section.add_to(model), measured, Tolerances(), NOISE)
-    told = cross_validate(fit)
-    added = [AddedEffect(section, 1e-3, told, told, ())]
+    before = cross_validate(fit_model(model, measured, Tolerances(), NOISE))
+    added = [AddedEffect(section, 1e-3, before, cross_validate(fit), ())]
     for finest, kept in ((None, True), (80, False)):
         trials = Trials(fit, None, (), SIGNIFICANCE, InProcess(), finest)
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from dlo_casadi.diagnosis.candidates import candidates, setup_of
 from dlo_casadi.diagnosis.from_data import RelaxedStart, from_data
-from dlo_casadi.diagnosis.screening import Screened
+from dlo_casadi.diagnosis.gram import Screened
 from dlo_casadi.effects import BendingSoftening, CableData
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.estimation.fit import FIRST_STD
@@ -54,7 +54,7 @@ def test_a_strong_softening_is_reached_from_the_shapes():
     listed = candidates(near.model, setup_of(near.model, n_poses=6))
     softening = next(x for x in listed if x.name == "bending_softening")
 
-    start = RelaxedStart.of(near, Screened(softening, 0.0, 1.0, dict(softening.scans[0])))
+    start = RelaxedStart.of(near, (Screened(softening, 0.0, 1.0, dict(softening.scans[0])),))
     found = start.problem.unknowns.p(start.values.theta)
     names = start.problem.unknowns.model.names
     # The mesh of a search leaves a part of it.

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2, t
 from test_problem import CABLE, STD, measured_from
 
-from dlo_casadi.diagnosis.selection import p_with_new_noise, with_new_noise
+from dlo_casadi.diagnosis.selection import p_under_new_noise, with_new_noise
 from dlo_casadi.diagnosis.structure import noise_degrees, structure_of
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import EstimationError
@@ -163,8 +163,9 @@ def test_an_effect_that_leaves_no_point_over_is_not_significant():
     fit = fitted(1, poses=4, std=STD)
     noise = replace(fit.noise, source="estimated")
     fit = replace(fit, problem=replace(fit.problem, noise=noise))
-    assert p_with_new_noise(fit, fit, winner=None, tried=1) == 1.0
-    winner = SimpleNamespace(fit=fit, each=[SimpleNamespace(candidate=SimpleNamespace(name="x"))])
+    assert p_under_new_noise(None, fit, fit, tried=1) == 1.0
+    each = [SimpleNamespace(candidate=SimpleNamespace(name="x"))]
+    winner = SimpleNamespace(fit=fit, each=each, settled=False)
     current = replace(fit, converged=not fit.converged)
     closed, p_value = with_new_noise(winner, current, {"x": 0.001}, from_shapes=False)
     assert closed is current
