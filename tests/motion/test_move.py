@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import dlo_casadi as dlo
 from dlo_casadi.cable.move import Move
 from dlo_casadi.cable.moving_table import read_fixtures
 from dlo_casadi.cable.planner import Planner
+from dlo_casadi.codegen import generate
 from dlo_casadi.planning.course import Course
 from dlo_casadi.planning.predicted import predicted
 from dlo_casadi.rod.obstacles import Capsule
@@ -160,3 +164,20 @@ def test_tables_are_read_back(tmp_path: Path) -> None:
     assert move.plot().axes
     with pytest.raises(dlo.DloError, match=r"\.csv"):
         move.save(tmp_path / "way.txt")
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler (cc)")
+def test_a_gripper_of_c_tracks_the_table(tmp_path: Path) -> None:
+    cable, move = rope(), carried()
+    generate(cable.model, cable.p, cable.rest, motion=True).write(tmp_path)
+    program = Path(__file__).parents[2] / "scripts/planner/track.c"
+    command = ["cc", "-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror", f"-I{tmp_path}"]
+    command += [str(program), str(tmp_path / "dlo_solver.c"), "-lm", "-o", str(tmp_path / "track")]
+    subprocess.run(command, check=True, capture_output=True)
+    tips = []
+    for theta in (move.theta, move.course.least_jerk):
+        table = replace(move, theta=theta).save(tmp_path / "way.csv")
+        run = [str(tmp_path / "track"), str(table)]
+        said = subprocess.run(run, check=True, capture_output=True, text=True).stdout
+        tips.append(float(said.split()[1]))
+    assert tips[0] < 1.0 < 50.0 < tips[1]  # mm
