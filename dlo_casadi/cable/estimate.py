@@ -272,6 +272,30 @@ class EstimatedCable(CasadiCable):
         model = self.model.with_mesh(self.model.n if n is None else int(n), element)
         return replace(self, model=model, rest=model.rest_basis @ self.metadata.coefficients)
 
+    def fed_by(self, what: str) -> Self:
+        """The same cable whose poses tell tensions beyond ends that slide, or the length between.
+
+        It matters to `compile` and to functions for CasADi, which take one of both as a number of
+        the pose; `solve` takes either. A cable that was fitted to poses without tensions is fed by
+        its free length, any other by tensions.
+
+        Parameters
+        ----------
+        what : "tension" or "free_length"
+
+        Raises
+        ------
+        DloError
+            If no end slides, if both do and the length is asked for, or if `what` is neither.
+        """
+        model, name = self.model, self.model.cable.name
+        if what not in ("tension", "free_length"):
+            raise DloError(f"fed_by: 'tension' or 'free_length', found {what!r}")
+        if not model.slides:
+            held = f"its ends are {model.start} and {model.end}"
+            raise DloError(f"{name!r} is not fed: {held}\n  Try: boundary=('clamped', 'slide')")
+        return replace(self, model=replace(model, fed_by_length=what == "free_length"))
+
     def save(self, path: str | PathLike[str]) -> Path:
         """Write parameters.yaml, which `load` and the commands read; return its path.
 

@@ -370,7 +370,8 @@ def _row(model: CableModel, pose: object) -> FloatArray:
         mine, others = (", ".join(x) or "none" for x in (kinds, model.clips))
         raise DloError(f"{said}the pose has the clips {mine}, the solver {others}")
     if fed := pose.wrongly_fed((model.start, model.end), by_length=model.fed_by_length):
-        raise DloError(f"{said}{fed}")
+        other = "tension" if model.fed_by_length else "free_length"
+        raise DloError(f"{said}{fed}\n  Try: cable.fed_by({other!r}), if the pose tells that.")
     return pose.numbers
 
 

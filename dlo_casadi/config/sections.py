@@ -290,9 +290,10 @@ class Experiment(ConfigSection):
 
     @property
     def fed_by_length(self) -> bool:
-        """Whether ends slide and no pose tells the tension beyond them."""
+        """Whether ends slide and there are poses, of which none tells the tension beyond them."""
         slides = self.boundary.start.slides or self.boundary.end.slides
-        return slides and all(pose.held.tensions == (None, None) for pose in self.poses)
+        none = all(pose.held.tensions == (None, None) for pose in self.poses)
+        return slides and bool(self.poses) and none
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:

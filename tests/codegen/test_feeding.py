@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from solvers import QUICK, STRICT
 
+import dlo_casadi as dlo
 from dlo_casadi.codegen import generate
 from dlo_casadi.codegen.compiled import CompiledSolver
 from dlo_casadi.codegen.compiler import compile_library
@@ -187,6 +188,26 @@ def test_the_compiler_does_not_warn_and_the_example_runs(space, tmp_path):
     assert run.returncode == 0, run.stderr
     shown = subprocess.run(["./example"], cwd=tmp_path, capture_output=True, text=True)
     assert "bend radius" in shown.stdout, shown.stderr
+
+
+def test_a_known_cable_is_fed_by_its_tension_or_by_its_length():
+    sizes = {"length": 0.6, "mass": 0.06, "diameter": 0.008, "bending_stiffness": 0.009}
+    ends = {"gravity": (0, -9.81), "boundary": ("clamped", "slide"), "model": {"n": N}}
+    rope = dlo.known_cable(dlo.Cable(**sizes), **ends)
+    held = {"start": (0, 0), "start_heading": 0.0, "end": (0.5, 0.0), "end_heading": 0.0}
+    for what, told in (("tension", {"end_tension": 2.0}), ("free_length", {"free_length": 0.55})):
+        shape, own = rope.solve(**held, **told), rope.fed_by(what)
+        pose = dlo.Pose(**held, **told)
+        assert own.compile(flags=QUICK).solve(pose).fed == pytest.approx(shape.free_length - 0.6)
+        force = np.array(own.function()(pose.held.numbers)[1]).ravel()
+        np.testing.assert_allclose(force, shape.end_force, atol=1e-8)
+    assert not rope.model.fed_by_length
+    with pytest.raises(DloError, match="fed_by: 'tension' or"):
+        rope.fed_by("length")
+    with pytest.raises(DloError, match="is not fed: its ends are clamped and pinned"):
+        dlo.known_cable(dlo.Cable(**sizes), **ends | {"boundary": ("clamped", "pinned")}).fed_by(
+            "tension"
+        )
 
 
 def test_what_cannot_be_has_a_message():
