@@ -57,12 +57,22 @@ class MeasuredMotion:
     def noise(self) -> float:
         """Noise [m] of a coordinate from frame to frame; 0 if the frames are too few to tell.
 
-        The median absolute sixth difference, which a motion of nine or more frames a period hardly
-        touches; that of white noise is 0.6745 sqrt(924) times its std.
+        The median absolute divided difference of seven neighbours, over the root of the sum of its
+        squared weights: a motion of nine or more frames a period hardly touches it, at uneven times
+        either; that of white noise is 0.6745 times its std.
         """
-        sizes = np.abs(np.diff(self.points, n=6, axis=0))
+        count = len(self.t) - 6
+        if count < 1:
+            return 0.0
+        t = np.stack([self.t[k : k + count] for k in range(7)], axis=1)
+        apart = t[:, :, None] - t[:, None, :]
+        apart[:, range(7), range(7)] = 1.0
+        weights = 1 / (apart / np.abs(apart).max(axis=(1, 2), keepdims=True)).prod(axis=2)
+        weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+        windows = np.stack([self.points[k : k + count] for k in range(7)], axis=1)
+        sizes = np.abs(np.einsum("tk,tk...->t...", weights, windows))
         known = sizes[np.isfinite(sizes)]
-        return float(np.median(known)) / (0.6745 * 924**0.5) if len(known) else 0.0
+        return float(np.median(known)) / 0.6745 if len(known) else 0.0
 
     def deviations(self, predicted: FloatArray) -> FloatArray:
         """Predicted minus measured points (T', K, compared) [m] of the first T' instants.

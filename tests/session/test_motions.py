@@ -9,6 +9,7 @@ import pytest
 import dlo_casadi as dlo
 from dlo_casadi.config import Config, load_config
 from dlo_casadi.io.motions import read_motion
+from dlo_casadi.sensing.measured_motion import MeasuredMotion
 from dlo_casadi.session.motions import read_motions
 from dlo_casadi.session.still_in_motion import with_still_poses
 
@@ -237,3 +238,15 @@ def test_without_rest_it_is_said_what_to_add(tmp_path: Path) -> None:
     (tmp_path / "session.yaml").write_text(NO_POSES.split("  motions")[0])
     with pytest.raises(dlo.ConfigError, match="poses"):
         load_config(tmp_path / "session.yaml")
+
+
+def test_noise_from_frame_to_frame_at_even_and_uneven_times() -> None:
+    random = np.random.default_rng(0)
+    for t in (np.arange(300) / 60, np.unique(np.round(np.arange(0, 1200, 2.4))) / 240):
+        swing = 0.3 * np.sin(2 * np.pi * 3 * t)[:, None, None] + np.zeros((1, 6, 2))
+        points = swing + 5e-4 * random.normal(size=swing.shape)
+        points[5, 1] = np.nan
+        motion = MeasuredMotion(
+            "x", t, points, np.arange(6.0), np.zeros(0), {}, {}, at_rest=False, held_out=False
+        )
+        assert motion.noise == pytest.approx(5e-4, rel=0.06)
