@@ -56,7 +56,7 @@ def test_the_covariance_is_that_of_refits_at_many_roughnesses(fit):
     for std in likeliest * np.exp(np.linspace(-2.0, 3.0, 11)):
         near = descend(fit.reweighed(priors=replace(fit.problem.priors, roughness_std=std)))
         moved = near.point.theta - fit.point.theta
-        logs.append(near.log_evidence + np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2)))
+        logs.append(near.log_evidence + 2 * np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2)))
         covariances.append(near.covariance + np.outer(moved, moved))
     weights = np.exp(np.array(logs) - max(logs))
     refitted = np.average(covariances, axis=0, weights=weights)
@@ -86,7 +86,7 @@ def test_a_misfit_widens_the_errors_and_not_how_far_the_estimate_moves(fit):
         fixed = (1 / std**2 - 1 / known**2) * theta @ rough @ theta / excess
         prior = np.linalg.slogdet(rough[n:, n:] / std**2 + plain)[1]
         log = (prior - np.linalg.slogdet(precision)[1] - fixed + left) / 2
-        logs.append(log + np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2)))
+        logs.append(log + 2 * np.log(std / (1 + (std / FIRST_ROUGHNESS) ** 2)))
         means.append(np.linalg.inv(precision) + np.outer(moved, moved))
     weights = np.exp(np.array(logs) - max(logs))
     assert max(weights[0], weights[-1]) < 0.02 * weights.sum()
