@@ -136,10 +136,10 @@ class Fit(Brief):
         normal equations. c: the residual's excess over the noise, which also divides the log
         evidence; bounds do not have it. Where shapes hardly tell the rest curvature, its likeliest
         roughness is small, and `covariance` is that of a rest curvature known to be smooth. In the
-        prior the shrinkage 1 / (1 + roughness^2 / FIRST_ROUGHNESS^2) is uniform: small variances are
-        as likely as one another, for which intervals hold the truth as often as they say. One that
-        is flat in the roughness itself favours smooth ones: intervals of EI held it in 91 of 100
-        simulated lines between pins, with this one in 96.
+        prior the shrinkage 1 / (1 + roughness^2 / FIRST_ROUGHNESS^2) is uniform: small variances
+        are as likely as one another, for which intervals hold the truth as often as they say. One
+        that is flat in the roughness itself favours smooth ones: intervals of EI held it in 91 of
+        100 simulated lines between pins, with this one in 96.
 
         References
         ----------
