@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.estimate import Covariance
-from dlo_casadi.cable.seen import moved, with_unknowns
+from dlo_casadi.cable.inquiry import with_unknowns
+from dlo_casadi.cable.seen import moved
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.linear_mixed import LinearMixed
 

@@ -11,8 +11,7 @@ from scipy.optimize import least_squares
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.estimate import Covariance
-from dlo_casadi.cable.inquiry import Change
-from dlo_casadi.cable.seen import with_unknowns
+from dlo_casadi.cable.inquiry import Change, with_unknowns
 from dlo_casadi.cable.tracker import IN_A_ROW, WINDOW, Tracker
 
 STD, S = 4e-4, np.linspace(0.1, 0.6, 8)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,9 @@ from dlo_casadi.cable.seen import (
     Shaper,
     learned,
     with_covariance,
-    with_unknowns,
 )
 from dlo_casadi.errors import EquilibriumError
+from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.thresholds import EVIDENCE_APART, NEAR_END
 
 # Poses after an alarm at which its cause is judged again while others explain it as well.
@@ -306,3 +306,37 @@ def _value(cable: Any, start: Any, name: str) -> float:
     k = int(name.removeprefix("rest_curvature[").removesuffix("]"))
     basis = cable.model.rest_basis
     return float(np.linalg.lstsq(basis, cable.rest - start.rest, rcond=None)[0][k])
+
+
+def with_unknowns(
+    cable: Any, model: CableModel, values: Mapping[str, float], std: Mapping[str, float]
+) -> Any:
+    """The cable with more unknowns, or less known ones.
+
+    Parameters
+    ----------
+    model : CableModel
+        With all effects that have these unknowns.
+    values : mapping
+        Their first values, rest coefficients among them.
+    std : mapping
+        Their standard deviations, in addition to what the cable's covariance has of them.
+    """
+    old = cable.metadata.uncertainty
+    names = (*old.names, *(name for name in std if name not in old.names))
+    grown = len(names) - len(old.names)
+    covariance = np.pad(old.covariance, [(0, grown)] * 2)
+    covariance += np.diag([std.get(name, 0.0) ** 2 for name in names])
+    known = dict(zip(cable.model.names, cable.p, strict=True)) | dict(values)
+    p = np.array([known.get(q.name, q.nominal) for q in model.parameters])
+    rest = cable.rest.copy()
+    for name, value in values.items():
+        if name not in model.names:
+            k = int(name.removeprefix("rest_curvature[").removesuffix("]"))
+            rest += model.rest_basis[:, k] * value
+    bounds = np.array([q.bounds(estimated=True) for q in model.parameters])
+    free = np.array([name in std for name in model.names])
+    p = np.where(free, np.clip(p, bounds[:, 0], bounds[:, 1]), p)
+    uncertainty = replace(old, names=names, covariance=covariance)
+    metadata = replace(cable.metadata, uncertainty=uncertainty)
+    return replace(cable, model=model, p=p, rest=rest, metadata=metadata)

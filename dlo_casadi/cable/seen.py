@@ -6,7 +6,8 @@ pose to pose (fixtures, scatter, see `Repeats`). With H = dc/dtheta A and the in
 
     S = H H^T + B B^T + I,   K = H^T S^-1,   z = K (r + H z),   P = A (I - K H) A^T
 
-linearised anew at each z until it stays: the iterated Kalman filter, for poses that change nothing
+linearised anew at each z until it stays, with steps halved that lead uphill: the iterated Kalman
+filter, for poses that change nothing
 equal to the batch fit to first order.
 
 References
@@ -16,7 +17,6 @@ Bell and Cathey, IEEE Trans. Autom. Control 38 (1993).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -43,7 +43,7 @@ from dlo_casadi.sensing.noise import correlation
 
 # Relinearisations of an update, and the step at which they end, in standard deviations after it: a
 # smaller one is as good as linear.
-_ITERATIONS, _SMALL = 8, 0.1
+_ITERATIONS, _SMALL = 15, 0.1
 # Share of the noise of a line that is correlated, if any is; the rest keeps close points apart.
 _SHARE = 0.99
 # Largest change of a logarithm in an update.
@@ -343,7 +343,7 @@ def _learned(
     by_p, by_rest, by_deviation = uncertainty.ways_in(own.model)
     count = len(uncertainty.names)
     z, seen = np.zeros(count), None
-    shapes = shaper.found(batch, own, held, anew=anew)
+    shapes, least, best = shaper.found(batch, own, held, anew=anew), np.inf, z
     for iterations in range(1, _ITERATIONS + 1):
         now = moved(own, by_p[:, :count] @ z, by_rest[:, :count] @ z)
         if iterations > 1:
@@ -358,7 +358,12 @@ def _learned(
         residual, columns = measured.off(told), measured.along(told, change)
         by_z = columns[:, :count]
         by_own = np.hstack([columns[:, count:], measured.alike(told, uncertainty.repeat_std)])
-        spread = by_z @ by_z.T + by_own @ by_own.T + np.eye(len(residual))
+        noise = by_own @ by_own.T + np.eye(len(residual))
+        cost = float(z @ z + residual @ np.linalg.solve(noise, residual))
+        if cost > least:  # the step was too long
+            z = (z + best) / 2
+            continue
+        least, best, spread = cost, z, noise + by_z @ by_z.T
         factor = cho_factor(spread, lower=True)
         if seen is None:
             whole = np.tril(factor[0])
@@ -375,6 +380,8 @@ def _learned(
             break
         ahead = along.x[..., :count] @ step, along.lam[..., :count] @ step
         shapes = batch.moved(shapes, Vector(ahead[0][..., None], ahead[1][..., None]))
+    else:
+        z = best
     assert seen is not None
     seen = replace(seen, iterations=iterations)
     if seen.refused:
@@ -412,37 +419,3 @@ def with_covariance(cable: Any, covariance: FloatArray) -> Any:
     known = cable.metadata
     uncertainty = replace(known.uncertainty, covariance=covariance)
     return replace(cable, metadata=replace(known, uncertainty=uncertainty))
-
-
-def with_unknowns(
-    cable: Any, model: CableModel, values: Mapping[str, float], std: Mapping[str, float]
-) -> Any:
-    """The cable with more unknowns, or less known ones.
-
-    Parameters
-    ----------
-    model : CableModel
-        With all effects that have these unknowns.
-    values : mapping
-        Their first values, rest coefficients among them.
-    std : mapping
-        Their standard deviations, in addition to what the cable's covariance has of them.
-    """
-    old = cable.metadata.uncertainty
-    names = (*old.names, *(name for name in std if name not in old.names))
-    grown = len(names) - len(old.names)
-    covariance = np.pad(old.covariance, [(0, grown)] * 2)
-    covariance += np.diag([std.get(name, 0.0) ** 2 for name in names])
-    known = dict(zip(cable.model.names, cable.p, strict=True)) | dict(values)
-    p = np.array([known.get(q.name, q.nominal) for q in model.parameters])
-    rest = cable.rest.copy()
-    for name, value in values.items():
-        if name not in model.names:
-            k = int(name.removeprefix("rest_curvature[").removesuffix("]"))
-            rest += model.rest_basis[:, k] * value
-    bounds = np.array([q.bounds(estimated=True) for q in model.parameters])
-    free = np.array([name in std for name in model.names])
-    p = np.where(free, np.clip(p, bounds[:, 0], bounds[:, 1]), p)
-    uncertainty = replace(old, names=names, covariance=covariance)
-    metadata = replace(cable.metadata, uncertainty=uncertainty)
-    return replace(cable, model=model, p=p, rest=rest, metadata=metadata)
