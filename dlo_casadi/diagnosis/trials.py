@@ -110,13 +110,17 @@ class Trials:
         return found
 
     def gram_beside(self, fit: Fit) -> Gram | None:
-        """The last Gram matrix of all candidates beside the effects of a fit; made now if none."""
+        """The last Gram matrix of all candidates beside the effects of a fit; made now if none.
+
+        None if there is no candidate that has a derivative where its effect vanishes.
+        """
         labels = {effect.label for effect in fit.model.effects}
         for other, gram in reversed(self.known_grams):
             if {effect.label for effect in other.model.effects} == labels:
                 return gram
+        before = len(self.known_grams)
         self.screened(fit)
-        return self.known_grams[-1][1] if self.known_grams else None
+        return self.known_grams[-1][1] if len(self.known_grams) > before else None
 
     @accounted_as("candidates")
     def tried(self, current: Fit, *, largest: int) -> Tried:
