@@ -20,6 +20,8 @@ from dlo_casadi.planning.course import Course
 
 # Rate [1/s] of tables for robots, unless asked otherwise.
 RATE = 250.0
+# Swing [lengths] from which it is told that limits cause it.
+_STILL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,8 @@ class Move:
         low, high = (1e3 * x for x in self.band)
         rows.append(f"{'90 % band':16}{low:10.3f} to {high:.3f} mm")
         rows += [f"{name:16}{100 * x:10.1f} % of its limit" for name, x in self.used.items()]
+        if self.active and self.swing > _STILL * self.motion.cable.length:
+            rows.append(f"the limit of {' and '.join(self.active)} leaves a swing: take longer")
         return "\n".join([f"{self.duration:.4g} s; swing after arrival:", *rows])
 
 
