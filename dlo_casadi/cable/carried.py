@@ -48,12 +48,13 @@ class CarriedCable(CableInMotion):
             Shapes of this cable, or keywords of `solve`: {"start": (0, 0), "start_heading": -1.2}.
         duration : float [s], optional
             By default the shortest one that keeps the limits and leaves a swing of a thousandth
-            of the length at most.
+            of the length at most, unless `swing` is among the limits.
         limits : mapping, optional
             Largest `speed` [m/s], `acceleration` [m/s^2] and `jerk` [m/s^3] of fixtures' places,
             `turn_speed` [rad/s] and `turn_acceleration` [rad/s^2] of its direction; `force` [N] and
             `moment` [N m] of the cable on each fixture; smallest `bend_radius` [m] and `clearance`
             [m] of the cable's surface from obstacles; along the whole way and a period beyond.
+            `swing` [m]: what 95 % of the cables under the covariance shall stay below on arrival.
         obstacles : sequence of Obstacle or dict
             What the cable must not touch, as in `solve`.
         robust : bool

@@ -15,7 +15,7 @@ from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.planning.problem import FIXTURES
 
-LIMITS = (*FIXTURES, "force", "moment", "bend_radius", "clearance")
+LIMITS = (*FIXTURES, "force", "moment", "bend_radius", "clearance", "swing")
 
 
 def number(name: str, value: Any) -> float:

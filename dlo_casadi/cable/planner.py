@@ -138,7 +138,7 @@ class Planner:
     def task(self, course: Course, cases: Sequence[Case], limits: dict[str, float]) -> Task:
         """What is asked of a course: the swing is looked at for half a period."""
         dt = min(self.period / _A_PERIOD, course.duration / _A_MOTION)
-        own = {name: x for name, x in limits.items() if name != "bend_radius"}
+        own = {name: x for name, x in limits.items() if name not in ("bend_radius", "swing")}
         if "bend_radius" in limits:
             own["curvature"] = 1 / limits["bend_radius"]
         return Task(cases, dt, self.period / 2, own, self.obstacles)
@@ -247,6 +247,7 @@ class Planner:
             over = {name: x for name, x in used.items() if x > 1 + _OVER}
             if not over:
                 self.step(f"a motion of {duration:.4g} s", _ROUNDS, _ROUNDS)
+                used |= self._used_swing(course, found.theta, motion)
                 return Verified(course, found, motion, used)
             for name, share in over.items():
                 limits[name] = self._stricter(name, limits[name], share)
@@ -256,6 +257,23 @@ class Planner:
             f"move: in {duration:.4g} s {worst} needs {over[worst]:.3f} times its limit of "
             f"{self.limits[worst]:g} in a fine simulation"
         )
+
+    def _used_swing(self, course: Course, theta: FloatArray, motion: Motion) -> dict[str, float]:
+        """Used share of the limit of the swing, which 95 % of the cables shall keep.
+
+        Raises _LimitError if they do not.
+        """
+        if "swing" not in self.limits:
+            return {}
+        left, limit = self.swing(motion, course.duration), self.limits["swing"]
+        if self.directions:
+            left = max(left, self.band(course, theta)[1])
+        if left > limit:
+            raise _LimitError(
+                f"move: after {course.duration:.4g} s the swing may be {1e3 * left:.3g} mm, more "
+                f"than its limit of {1e3 * limit:.3g} mm"
+            )
+        return {"swing": left / limit}
 
     def _require_time(self, duration: float) -> None:
         """Raise an error if not even a cable without mass could be moved so fast."""
@@ -343,7 +361,7 @@ class Planner:
         except DloError as error:
             return None, str(error)
         left, allowed = self.swing(found.motion, duration), _STILL * self.cable.length
-        if left <= allowed:
+        if "swing" in self.limits or left <= allowed:
             return found, ""
         return None, (
             f"{1e3 * left:.3g} mm of swing are left, {1e3 * allowed:.2g} mm allowed.\n"

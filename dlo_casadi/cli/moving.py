@@ -158,7 +158,8 @@ def simulate(chosen: argparse.Namespace) -> None:
         nargs="+",
         metavar="NAME=VALUE",
         help="speed [m/s], acceleration [m/s^2], jerk [m/s^3], turn_speed [rad/s], "
-        "turn_acceleration [rad/s^2], force [N], moment [N m], bend_radius [m], clearance [m]",
+        "turn_acceleration [rad/s^2], force [N], moment [N m], bend_radius [m], clearance [m], "
+        "swing [m]",
     ),
     OBSTACLES,
     option("--robust", action="store_true", help="least swing under the fit's covariance"),

@@ -378,8 +378,9 @@ def test_round_trip_with_noise_within_three_sigma(element, markers):
     # 480 normal distances less about a dozen unknowns: chi2 per degree is 1 +- 0.065; of 48
     # coordinates of markers 1 +- 0.23.
     assert fit.chi2_per_dof == pytest.approx(1.0, abs=0.7 if markers else 0.2)
-    # A stiffness that is known to two percent, from a tenth of the numbers to a sixth.
-    assert fit.std("bending_stiffness") < (0.17 if markers else 0.05) * p[0]
+    # A stiffness that is known to two percent, from a tenth of the numbers to a fifth: few markers
+    # tell little of the rest curvature, whose roughness is integrated out.
+    assert fit.std("bending_stiffness") < (0.2 if markers else 0.05) * p[0]
 
 
 def test_what_residuals_determine_is_that_of_all_unknowns_at_once():

@@ -115,6 +115,18 @@ def test_advice_that_is_followed_helps() -> None:
     rope().move(held(0.0), held(0.3), duration=longer, limits={"speed": 0.2})
 
 
+def test_a_limit_of_the_swing_counts_what_is_unsure() -> None:
+    given = {"names": ("bending_stiffness",), "covariance": np.array([[9e-8]])}
+    known = rope()
+    uncertainty = replace(known.metadata.uncertainty, **given)
+    unsure = replace(known, metadata=replace(known.metadata, uncertainty=uncertainty))
+    way = (held(0.0), held(0.3))
+    found = unsure.move(*way, duration=1.3, limits={"swing": 0.01})
+    assert found.used["swing"] == pytest.approx(found.band[1] / 0.01)
+    with pytest.raises(dlo.DloError, match=r"swing may be .* limit of 0\.\d+ mm.*\n  Try: dur"):
+        unsure.move(*way, duration=1.3, limits={"swing": found.band[1] / 2})
+
+
 def test_what_swings_nothing_is_planned() -> None:
     lift = {"start": (0.0, 0.1), "start_heading": -np.pi / 2}
     move = rope().move({**lift, "start": (0.0, 0.0)}, lift, duration=0.3)

@@ -134,8 +134,8 @@ def test_held_out_poses_on_either_side_are_told_with_both_errors():
     assert (other.predicted.branch, other.other.branch) == ("cw", "ccw")
     assert other.other.rmse < 2 * STD < 0.1 < other.predicted.rmse
     assert other.told
-    # The clamp is known to a hundredth of a radian, and so is the cable at rest.
-    assert usual.tipping.std < 0.03
+    # The clamp is known to a hundredth of a radian, the cable at rest to a few.
+    assert usual.tipping.std < 0.04
     assert not usual.told
 
 

@@ -104,8 +104,8 @@ def test_a_clean_pose_is_complete_and_predicted_as_it_was_measured(case, tmp_pat
     found, stiffness = stage.parameters["bending_stiffness"], CASES[case][1][2]
     low, high = found.interval_95
     assert not found.identifiable
-    # With both ends held the shape alone tells no upper bound.
-    assert (high is None) == (case != "from a clamp to a free tip")
+    # With both ends held the shape alone tells no upper bound; with a free tip hardly.
+    assert high is None or (case == "from a clamp to a free tip" and high > 3 * stiffness)
     assert low < stiffness < (high or np.inf)
 
 
