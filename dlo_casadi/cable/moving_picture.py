@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from PIL import Image
 
 from dlo_casadi.arrays import FloatArray
@@ -16,6 +17,8 @@ from dlo_casadi.show import style
 _INSTANTS, _FRAMES, _DPI = 9, 25, 80
 # Displacement of a drawn mode as a share of the shape's extent.
 _SHOWN = 0.12
+# Swing [mm] at which bars begin to show.
+_LEAST_MM = 1e-3
 
 
 def draw_motion(points: FloatArray, t: FloatArray, title: str, *, tip: bool) -> Figure:
@@ -48,11 +51,13 @@ def draw_move(
             axes.plot(*points[k].T, color=1 - share * (1 - np.array(to_rgb(style.BLUE))), lw=2.0)
         axes.set_title(f"{len(picked)} instants, light to dark, in {duration:.3g} s")
         bars = drawing.add_subplot(1, 2, 2)
-        bars.barh(list(swings), list(swings.values()), color=style.BLUE)
+        bars.barh(list(swings), np.maximum(list(swings.values()), _LEAST_MM), color=style.BLUE)
         bars.set(xscale="log", xlabel="swing after arrival [mm]")
+        bars.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        bars.xaxis.set_minor_formatter(NullFormatter())
         bars.invert_yaxis()
         for k, value in enumerate(swings.values()):
-            bars.annotate(f" {value:.3g}", (value, k), va="center")
+            bars.annotate(f" {value:.3g}", (max(value, _LEAST_MM), k), va="center")
         bars.margins(x=0.15)
     return drawing
 
