@@ -30,7 +30,10 @@ def missing():
             *(("--space",), "100", ("bend_radius", "force", "twist", "clearance")),
             marks=pytest.mark.long,
         ),
-        (("--clips",), "100", ("bend_radius", "force", "moment", "twist", "clearance")),
+        pytest.param(
+            *(("--clips",), "100", ("bend_radius", "force", "moment", "twist", "clearance")),
+            marks=pytest.mark.long,
+        ),
     ],
     ids=["plane", "space", "clips"],
 )

@@ -58,7 +58,7 @@ def test_a_motion_without_a_swing_is_planned(folder, capsys):
     swings = json.loads(capsys.readouterr().out)["swings"]
     assert swings["planned"] < 0.01 * swings["minimum jerk"]
     assert way.read_text().startswith("t_s,start_x_m,start_y_m,start_heading_rad\n0,0,0,-1.2\n")
-    assert main([*words, "--duration", "1.1", "--limits", "speed=0.1"]) == 2
-    assert "too short for speed" in capsys.readouterr().err
+    assert main([*words, "--duration", "1.1", "--limits", "force=0.1"]) == 2
+    assert "no motion keeps it" in capsys.readouterr().err
     assert main([*words[:3], "begin=0,0", *words[4:]]) == 2
     assert "nothing is held by 'begin'" in capsys.readouterr().err

@@ -106,6 +106,14 @@ def test_limits_are_kept_along_the_way() -> None:
 
 
 @pytest.mark.long
+def test_a_bound_of_the_swing_takes_a_longer_motion() -> None:
+    cable, way = unsure(), (held(0.0), held(0.3))
+    found = cable.move(*way, duration=1.3)
+    with pytest.raises(dlo.DloError, match=r"swing may be .* limit of 0\.\d+ mm.*\n  Try: dur"):
+        cable.move(*way, duration=1.3, limits={"swing": found.band[1] / 2})
+
+
+@pytest.mark.long
 def test_advice_that_is_followed_helps() -> None:
     with pytest.raises(
         dlo.DloError, match=r"1\.08 s is too short for speed = 0\.2: .* 1\.5 s"
@@ -115,16 +123,17 @@ def test_advice_that_is_followed_helps() -> None:
     rope().move(held(0.0), held(0.3), duration=longer, limits={"speed": 0.2})
 
 
-def test_a_limit_of_the_swing_counts_what_is_unsure() -> None:
+def unsure() -> dlo.FittedCable:
+    """The rope, whose stiffness is known to 3 %."""
     given = {"names": ("bending_stiffness",), "covariance": np.array([[9e-8]])}
     known = rope()
     uncertainty = replace(known.metadata.uncertainty, **given)
-    unsure = replace(known, metadata=replace(known.metadata, uncertainty=uncertainty))
-    way = (held(0.0), held(0.3))
-    found = unsure.move(*way, duration=1.3, limits={"swing": 0.01})
+    return replace(known, metadata=replace(known.metadata, uncertainty=uncertainty))
+
+
+def test_a_limit_of_the_swing_counts_what_is_unsure() -> None:
+    found = unsure().move(held(0.0), held(0.3), duration=1.3, limits={"swing": 0.01})
     assert found.used["swing"] == pytest.approx(found.band[1] / 0.01)
-    with pytest.raises(dlo.DloError, match=r"swing may be .* limit of 0\.\d+ mm.*\n  Try: dur"):
-        unsure.move(*way, duration=1.3, limits={"swing": found.band[1] / 2})
 
 
 def test_what_swings_nothing_is_planned() -> None:
