@@ -40,6 +40,10 @@ _OVER, _ROUNDS = 1e-3, 3
 _STILL, _ACCURATE = 1e-3, 0.01
 # Longest duration that is tried, in periods of the slowest mode.
 _LONGEST = 16.0
+# Longest duration that is planned, in periods.
+_SLOWEST = 40.0
+# Shortest one that is sought, in periods: the cable does not move within it.
+_BRIEFEST = 0.05
 # Ratio of durations that are tried one after the other.
 _LONGER = 1.4
 # Directions of the parameters' covariance in which a robust motion is planned, draws of the band.
@@ -276,7 +280,12 @@ class Planner:
         return {"swing": left / limit}
 
     def _require_time(self, duration: float) -> None:
-        """Raise an error if not even a cable without mass could be moved so fast."""
+        """Raise an error if no cable could be moved so fast, or if nothing swings so slowly."""
+        if duration > (longest := max(_SLOWEST * self.period, 4 * self.shortest[0])):
+            raise DloError(
+                f"move: {duration:g} s is {duration / self.period:.3g} periods of the slowest "
+                f"mode: nothing swings.\n  Try: at most {longest:.3g} s, or points along a line"
+            )
         shortest = self.shortest
         if duration < shortest[0]:
             least, name = shortest
@@ -333,6 +342,7 @@ class Planner:
     def fastest(self) -> Move:
         """The motion of shortest duration that keeps the limits and leaves little swing."""
         low, best = self._first(max(0.5 * self.period, 1.2 * self.shortest[0]))
+        low = max(low, _BRIEFEST * self.period)
         while (high := best.course.duration) - low > _ACCURATE * high:
             middle = (low + high) / 2
             found, _ = self._possible(middle, best.planned.theta)

@@ -173,8 +173,9 @@ def simulate(chosen: argparse.Namespace) -> None:
 def move(chosen: argparse.Namespace) -> None:
     """Plan a motion of the fixtures after which a fitted cable is at rest.
 
-    dlo move results/rope --from start=0,0 --to start=0.3,0 --duration 1.2 --output way.csv
-    dlo move results/rope --from start=0,0 --to start=0.3,0 --limits speed=0.5 force=2
+    dlo move results/rope --from start=0,0 start_heading=-1 --to start=0.3,0 start_heading=-1
+    dlo move results/rope --from end=0.3,0 --to end=0.4,0.1 --duration 1.2 --output way.csv
+    dlo move results/rope --from end=0.3,0 --to end=0.4,0.1 --limits speed=0.5 force=2
     """
     from dlo_casadi.cable.move_checks import table_file
     from dlo_casadi.errors import DloError

@@ -1,6 +1,7 @@
 /* A gripper of 2 kg tracks the path of `dlo move` at 1 kHz, and the simulated cable pulls at it.
  *
- *   dlo move results/rope --from start=0,0 --to start=0.3,0 --duration 1.1 --output way.csv
+ *   dlo move results/rope --from start=0,0 start_heading=-1.2 \
+ *            --to start=0.3,0 start_heading=-1.2 --duration 1.1 --output way.csv
  *   dlo generate-solver results/rope --output solver --motion
  *   cc -O2 -Isolver scripts/planner/track.c solver/dlo_solver.c -lm -o track && ./track way.csv
  *
