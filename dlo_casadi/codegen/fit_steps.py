@@ -22,7 +22,7 @@ from dlo_casadi.codegen.stepper import CompiledStepper
 from dlo_casadi.effects import EFFECTS, IN_MOTION, Effect, Load, Setup
 from dlo_casadi.errors import DloError
 from dlo_casadi.model.cable_model import CableModel
-from dlo_casadi.motion.sensitivities import Columns, Numbers, Steps
+from dlo_casadi.motion.sensitivities import Columns, Numbers, Stepping, Steps
 from dlo_casadi.motion.state import Fixtures
 from dlo_casadi.motion.steps import Moving
 from dlo_casadi.motion.system import MovingCable
@@ -139,7 +139,7 @@ def _columns(out: NDArray[Any]) -> Columns:
     )
 
 
-def fastest_steps(cable: MovingCable) -> Steps | CompiledSteps:
+def fastest_steps(cable: MovingCable) -> Stepping:
     """Compiled steps where there is a C compiler; else those of Python."""
     try:
         return compiled_steps(cable)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray, IntArray
-from dlo_casadi.codegen.fit_steps import CompiledSteps, fastest_steps
+from dlo_casadi.codegen.fit_steps import fastest_steps
 from dlo_casadi.effects import SectionLaw
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.solve import solve_equilibrium
@@ -24,7 +24,7 @@ from dlo_casadi.motion import sensitivities
 from dlo_casadi.motion.beginning import Basis, begun, columns_of
 from dlo_casadi.motion.handles import between
 from dlo_casadi.motion.path import FixturePath
-from dlo_casadi.motion.sensitivities import Columns, Steps, Tangent
+from dlo_casadi.motion.sensitivities import Columns, Stepping, Tangent
 from dlo_casadi.motion.state import Fixtures, State
 from dlo_casadi.motion.steps import Moving, begun_by, first_step
 from dlo_casadi.motion.system import MovingCable
@@ -212,7 +212,7 @@ class Recording:
 
     def _states(
         self,
-        steps: Steps | CompiledSteps,
+        steps: Stepping,
         held: HeldFixtures,
         first: State,
         numbers: GivenNumbers | None,
@@ -265,7 +265,7 @@ class Recording:
 
     def _stepped(
         self,
-        steps: Steps | CompiledSteps,
+        steps: Stepping,
         held: HeldFixtures,
         now: Moving,
         columns: Columns | None,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import casadi as ca
 import numpy as np
@@ -178,6 +179,24 @@ def stepped(
         rates_1[node, b:] = numbers.velocities[k]
         changed_1[node, b:] = own[node, b:] = numbers.accelerations[k]
     return Columns(turn, place, rates_1, changed_1, own, force, moment)
+
+
+class Stepping(Protocol):
+    """Steps in time and derivatives through them: those of Python, or compiled ones."""
+
+    def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
+        """The state dt later; None if there is no step."""
+
+    def derived(
+        self,
+        before: Moving,
+        after: Moving,
+        columns: Columns,
+        fixtures: Fixtures,
+        numbers: Numbers,
+        dt: float,
+    ) -> Columns:
+        """Derivatives after a step."""
 
 
 class Steps:

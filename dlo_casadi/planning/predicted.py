@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,29 +17,11 @@ from scipy.spatial.transform import Rotation
 from dlo_casadi.arrays import FloatArray
 from dlo_casadi.errors import MotionError
 from dlo_casadi.model.functions import functions_of
-from dlo_casadi.motion.sensitivities import Columns, Numbers, both_nodes
-from dlo_casadi.motion.state import Fixtures, State
-from dlo_casadi.motion.steps import Moving, still
+from dlo_casadi.motion.sensitivities import Columns, Stepping, both_nodes
+from dlo_casadi.motion.state import State
+from dlo_casadi.motion.steps import still
 from dlo_casadi.motion.system import MovingCable
 from dlo_casadi.planning.course import Course
-
-
-class Stepping(Protocol):
-    """Steps in time and derivatives through them: those of Python, or compiled ones."""
-
-    def step(self, before: Moving, fixtures: Fixtures, dt: float) -> Moving | None:
-        """The state dt later; None if there is no step."""
-
-    def derived(
-        self,
-        before: Moving,
-        after: Moving,
-        columns: Columns,
-        fixtures: Fixtures,
-        numbers: Numbers,
-        dt: float,
-    ) -> Columns:
-        """Derivatives after a step."""
 
 
 @dataclass(frozen=True, eq=False)
