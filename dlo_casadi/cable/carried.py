@@ -12,7 +12,7 @@ from dlo_casadi.cable.move_checks import checked_limits, checked_pose, number
 from dlo_casadi.cable.move_limits import require_rest
 from dlo_casadi.cable.planner import Planner, Shape
 from dlo_casadi.config import Obstacle
-from dlo_casadi.errors import DloError
+from dlo_casadi.errors import DloError, EquilibriumError
 from dlo_casadi.planning.course import Course
 from dlo_casadi.runtime.progress import Progress, nobody
 
@@ -77,11 +77,18 @@ class CarriedCable(CableInMotion):
         time = None if duration is None else number("duration", duration)
         for name, given in (("before", before), ("after", after)):
             pose = checked_pose(self, name, given)
-            shapes.append(given if pose is None else self.solve(**pose))
+            try:
+                shapes.append(given if pose is None else self.solve(**pose))
+            except EquilibriumError:
+                raise
+            except DloError as error:
+                raise DloError(f"{name}: {error.message}") from None
         first, last = shapes
         if not Course.between(first.pose, last.pose, 1.0).parts:
             raise DloError("move: both poses are the same, nothing moves")
         surfaces = among(self.model, self.p, obstacles)["model"].obstacles if obstacles else ()
+        if robust and not self.metadata.uncertainty.names:
+            raise DloError("robust: this cable is known exactly, nothing of it is unsure")
         step = nobody if progress is None else progress.step
         planner = Planner(self, first, last, asked, tuple(surfaces), robust, step)
         for name, shape in (("before", first), ("after", last)):

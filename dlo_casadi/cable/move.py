@@ -17,6 +17,7 @@ from dlo_casadi.cable.move_checks import held_by, number, table_file
 from dlo_casadi.cable.moving_picture import draw_move
 from dlo_casadi.io.files import write_file
 from dlo_casadi.planning.course import Course
+from dlo_casadi.planning.problem import CLEAR
 
 # Rate [1/s] of tables for robots, unless asked otherwise.
 RATE = 250.0
@@ -44,7 +45,8 @@ class Move:
         5 % and 95 % quantiles of the swing under the parameters' covariance; of a cable without
         one both are the swing.
     limits, used : dict
-        What was asked, and the largest used share of each along the way, 1 at the limit.
+        What was asked, and the largest used share of each along the way, 1 at the limit; of a
+        clearance one less for each twentieth of the length beyond it.
     steps : int
         Of IPOPT.
     """
@@ -124,7 +126,12 @@ class Move:
         rows = [f"{name:16}{1e3 * x:10.3f} mm" for name, x in self.swings.items()]
         low, high = (1e3 * x for x in self.band)
         rows.append(f"{'90 % band':16}{low:10.3f} to {high:.3f} mm")
-        rows += [f"{name:16}{100 * x:10.1f} % of its limit" for name, x in self.used.items()]
+        for name, x in self.used.items():
+            if name == "clearance":
+                gap = self.limits[name] + (1 - x) * CLEAR * self.motion.cable.length
+                rows.append(f"{name:16}{1e3 * gap:10.3g} mm, {1e3 * self.limits[name]:g} asked")
+            else:
+                rows.append(f"{name:16}{100 * x:10.1f} % of its limit")
         if self.active and self.swing > _STILL * self.motion.cable.length:
             rows.append(f"the limit of {' and '.join(self.active)} leaves a swing: take longer")
         return "\n".join([f"{self.duration:.4g} s; swing after arrival:", *rows])

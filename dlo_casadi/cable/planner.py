@@ -239,7 +239,7 @@ class Planner:
             course, found = self.plan(duration, limits, start)
             self._require(found, duration)
             try:
-                motion = self.simulated(course, course.values(found.theta, self._times(course)))
+                motion = self.simulated(course, course.values(found.theta, self.times(course)))
             except MotionError as error:
                 raise MotionError(
                     f"move: the motion that was planned for {duration:.4g} s has no solution on "
@@ -248,7 +248,7 @@ class Planner:
                     t=error.t,
                 ) from error
             used = used_along(course, found.theta, motion, self.limits, self.obstacles)
-            over = {name: x for name, x in used.items() if x > 1 + _OVER}
+            over = {name: x for name, x in used.items() if not x <= 1 + _OVER}
             if not over:
                 self.step(f"a motion of {duration:.4g} s", _ROUNDS, _ROUNDS)
                 used |= self._used_swing(course, found.theta, motion)
@@ -318,7 +318,7 @@ class Planner:
     def _require(self, found: Planned, duration: float) -> None:
         """Raise an error if limits cannot be kept."""
         names = {"curvature": "bend_radius"}
-        over = {names.get(k, k): x for k, x in found.used.items() if x > 1 + _OVER}
+        over = {names.get(k, k): x for k, x in found.used.items() if not x <= 1 + _OVER}
         if found.converged and not over:
             return
         if not over:
@@ -380,7 +380,7 @@ class Planner:
 
     # ---- fine simulation -------------------------------------------------------------------------
 
-    def _times(self, course: Course) -> FloatArray:
+    def times(self, course: Course) -> FloatArray:
         """Times [s] of the fixtures' table: at a robot's rate, and a period beyond arrival."""
         rate = max(RATE, RATE / course.duration)  # 250 rows of a short motion
         count = int(np.ceil((course.duration + self.period) * rate))
@@ -391,7 +391,7 @@ class Planner:
         held = held_by(self.before.pose)
         held |= rows_of(course, values)
         told: dict[str, Any] = {"begins": self.before, "tolerance": _FINE}
-        return self.cable.simulate(self._times(course), **held, **told)
+        return self.cable.simulate(self.times(course), **held, **told)
 
     def swing(self, motion: Motion, duration: float) -> float:
         """Of a motion after arrival [m]."""
@@ -401,7 +401,7 @@ class Planner:
     def _result(self, found: Verified) -> Move:
         """The motion beside those of least jerk and of zero vibration."""
         course, theta = found.course, found.planned.theta
-        t, duration = self._times(course), course.duration
+        t, duration = self.times(course), course.duration
         swings = {"planned": self.swing(found.motion, duration)}
         others = {
             "minimum jerk": least_jerk(course, t),

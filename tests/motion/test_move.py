@@ -149,6 +149,12 @@ def test_what_cannot_be_kept_is_told_with_numbers() -> None:
         rope().move(held(0.0), held(0.3), duration=1.0, limits={"sped": 1.0})
     with pytest.raises(dlo.DloError, match="no obstacles"):
         rope().move(held(0.0), held(0.3), duration=1.0, limits={"clearance": 0.01})
+    with pytest.raises(dlo.DloError, match="known exactly"):
+        rope().move(held(0.0), held(0.3), duration=1.0, robust=True)
+    with pytest.raises(dlo.DloError, match=r"after: the start .* no heading"):
+        rope().move(held(0.0), {"start": (0.3, 0.0)}, duration=1.0)
+    with pytest.raises(dlo.DloError, match="928 periods"):
+        rope().move(held(0.0), held(0.3), duration=1000.0)
     with pytest.raises(dlo.DloError, match="duration: a number above zero"):
         rope().move(held(0.0), held(0.3), duration=-1.0)
 
