@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from dlo_casadi.cable.fitted_cable import Shape as Shape
     from dlo_casadi.cable.move import Move as Move
     from dlo_casadi.cable.placing import Placing as Placing
-    from dlo_casadi.cable.tracker import Tracker as Tracker
-    from dlo_casadi.cable.tracker import Update as Update
     from dlo_casadi.codegen import CompiledSolver as CompiledSolver
     from dlo_casadi.config import Cable as Cable
     from dlo_casadi.config import Clip as Clip
@@ -34,6 +32,8 @@ if TYPE_CHECKING:
     from dlo_casadi.errors import EstimationError as EstimationError
     from dlo_casadi.errors import MeasurementError as MeasurementError
     from dlo_casadi.errors import VisionError as VisionError
+    from dlo_casadi.tracking.tracker import Tracker as Tracker
+    from dlo_casadi.tracking.tracker import Update as Update
 
 # Module -> its public names. They are imported on first use, so that the command responds at once
 # and handles an interrupt.
@@ -44,7 +44,7 @@ _PUBLIC = {
     "cable.fitted_cable": "FittedCable Shape",
     "cable.move": "Move",
     "cable.placing": "Placing",
-    "cable.tracker": "Tracker Update",
+    "tracking.tracker": "Tracker Update",
     "codegen": "CompiledSolver",
     "config": "Cable Clip FixturePath Motion Obstacle Pose",
     "effects": "EFFECTS",

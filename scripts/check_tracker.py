@@ -20,9 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import dlo_casadi as dlo
-from dlo_casadi.cable.estimate import Covariance
-from dlo_casadi.cable.inquiry import with_unknowns
-from dlo_casadi.cable.seen import moved
+from dlo_casadi.cable.tracked import known_of, with_known
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
 from dlo_casadi.linear_mixed import LinearMixed
 
@@ -46,10 +44,7 @@ def rope(d: int, effects: str = "weight", n: int = 20) -> dlo.FittedCable:
 
 def uncertain(cable: dlo.FittedCable, std: dict[str, float]) -> dlo.FittedCable:
     """The cable with some of its parameters known to a standard deviation."""
-    known = with_unknowns(cable, cable.model, {}, std)
-    found = known.metadata.uncertainty
-    covariance = Covariance(found.names, found.covariance)
-    return replace(known, metadata=replace(known.metadata, covariance=covariance))
+    return with_known(cable, known_of(cable).with_unknowns(cable.model, {}, std))
 
 
 def with_values(cable: dlo.FittedCable, values: dict[str, float]) -> dlo.FittedCable:
@@ -63,7 +58,7 @@ def with_values(cable: dlo.FittedCable, values: dict[str, float]) -> dlo.FittedC
 def with_effect(cable: dlo.FittedCable, name: str, values: dict[str, float]) -> dlo.FittedCable:
     """The cable with one more effect."""
     model = cable.model.with_effect(dlo.EFFECTS[name]())
-    return with_values(with_unknowns(cable, model, {}, {}), values)
+    return with_known(cable, known_of(cable).with_unknowns(model, values, {}))
 
 
 def wandering(d: int, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
@@ -214,14 +209,14 @@ def changes(d: int, runs: int, first: int) -> None:
 
 def at_once(cable: dlo.FittedCable, poses: list[dlo.Pose]) -> tuple[Any, np.ndarray]:
     """The cable after all poses, by Gauss and Newton's method for all at once, and its std."""
-    known, model = cable.metadata.uncertainty, cable.model
+    before, known, model = known_of(cable), cable.metadata.uncertainty, cable.model
     held = [cable.solve(pose.changed(points=None, at=None)) for pose in poses]
     batch = BatchEquilibrium(known.pose_scatter.within(model), [one.pose for one in held])
     by_p, by_rest, by_deviation = known.ways_in(model)
     count, z = len(known.names), np.zeros(len(known.names))
     shapes = batch.start_shapes(np.array([one.equilibrium.x for one in held]))
     for _ in range(8):
-        now = moved(cable, by_p[:, :count] @ z, by_rest[:, :count] @ z)
+        now = before.moved(by_p[:, :count] @ z, by_rest[:, :count] @ z)
         rise = np.where([q.log for q in model.parameters], now.p / np.where(cable.p, cable.p, 1), 1)
         shapes, _ = batch.solve(shapes, now.p, now.rest)
         ways = by_rest, rise[:, None] * by_p, by_deviation

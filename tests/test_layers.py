@@ -38,8 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "config",
         "io",
         "codegen",
-        "diagnosis",
-        "sensing",
+        "tracking",
         "show",
         "export",
         "runtime",
@@ -49,6 +48,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "estimation": {*MECHANICS, "motion", "codegen", "sensing", "runtime"},
     "paper": {*MECHANICS, "sensing"},
     "diagnosis": {*MECHANICS, "sensing", "estimation", "runtime"},
+    "tracking": {*MECHANICS, "config", "io", "codegen", "sensing", "diagnosis"},
 }
 FITTING = {*MECHANICS, "sensing", "estimation", "diagnosis"}
 MAY_IMPORT["recordings"] = {"config", "vision", "io"}

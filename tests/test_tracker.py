@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 
 import dlo_casadi as dlo
 from dlo_casadi.cable.estimate import Covariance
-from dlo_casadi.cable.inquiry import Change, with_unknowns
-from dlo_casadi.cable.tracker import IN_A_ROW, WINDOW, Tracker
+from dlo_casadi.cable.tracked import known_of, with_known
+from dlo_casadi.tracking.inquiry import Change
+from dlo_casadi.tracking.tracker import IN_A_ROW, WINDOW, Tracker
 
 STD, S = 4e-4, np.linspace(0.1, 0.6, 8)
 NAMES = ("bending_stiffness", "lumped_mass.mass")
@@ -209,10 +210,8 @@ def test_a_curved_cable_is_saved_as_it_is(tmp_path) -> None:
     held = {"gravity": (0, -9.81), "boundary": ("clamped", "free")}
     cable = dlo.known_cable(data, **held, rest_curvature=[0.5, 1.0, 0.2, 0.0], model={"n": 8})
     names = ("bending_stiffness", "rest_curvature[1]")
-    cable = with_unknowns(cable, cable.model, {}, dict(zip(names, (0.002, 0.3), strict=True)))
-    cable = replace(
-        cable, metadata=replace(cable.metadata, covariance=Covariance(names, np.eye(2)))
-    )
+    sizes = dict(zip(names, (0.002, 0.3), strict=True))
+    cable = with_known(cable, known_of(cable).with_unknowns(cable.model, {}, sizes))
     tracker = cable.tracker(STD)
     true = replace(cable, rest=cable.rest * 1.2)
     followed(tracker, true, HEADINGS[:3])

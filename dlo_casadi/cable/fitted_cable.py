@@ -18,7 +18,7 @@ from dlo_casadi.cable.limits import Asked, LimitCheck, check_limits
 from dlo_casadi.cable.picture import draw_shape, outlines, touching
 from dlo_casadi.cable.placing import Aim, Placing, placed
 from dlo_casadi.cable.shape_in_motion import POINTS, ShapeInMotion
-from dlo_casadi.cable.tracker import TrackedCable
+from dlo_casadi.cable.tracked import TrackedCable
 from dlo_casadi.config import Clip, Obstacle, Pose
 from dlo_casadi.effects import MeasurementEffect
 from dlo_casadi.equilibrium.equilibrium import Equilibrium

@@ -14,13 +14,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from dlo_casadi.cable.arrivals import Arrival, Arrivals, FolderArrivals, TableArrivals
 from dlo_casadi.cable.file import cable_of
 from dlo_casadi.cable.fitted_cable import FittedCable
 from dlo_casadi.cable.saved import FILE
-from dlo_casadi.cable.tracker import Tracker, Update
+from dlo_casadi.cable.tracked import known_of
 from dlo_casadi.errors import DloError, OutputError
 from dlo_casadi.io.files import finite, make_folder, write_file
+from dlo_casadi.tracking.arrivals import Arrival, Arrivals, FolderArrivals, TableArrivals
+from dlo_casadi.tracking.tracker import Tracker, Update
 
 SCHEMA = "dlo-watch/1"
 STATE, LINES = "state.json", "poses.jsonl"
@@ -70,7 +71,8 @@ class Watched:
         make_folder(into)
         if known is not None:
             self._length = known["lines"]
-            self.tracker.resume(known["tracker"], cable_of(known["tracker"]["parameters"]))
+            then = cable_of(known["tracker"]["parameters"])
+            self.tracker.resume(known["tracker"], known_of(then))
         self._lines = _opened(into / LINES, self._length)
 
     def _known(self) -> dict[str, Any] | None:

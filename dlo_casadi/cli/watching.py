@@ -9,13 +9,13 @@ from typing import Any
 
 from dlo_casadi.cable.file import load
 from dlo_casadi.cable.fitted_cable import FittedCable
-from dlo_casadi.cable.inquiry import Change
 from dlo_casadi.cable.watch import Watched
 from dlo_casadi.cli import signals
 from dlo_casadi.cli.common import PARAMETERS, Page, command, option
 from dlo_casadi.cli.fitted import named
 from dlo_casadi.errors import DloError, counted
 from dlo_casadi.io.files import only_run, write_file
+from dlo_casadi.tracking.inquiry import Change
 
 # Poses on the page, and the shortest time [s] between two of its versions.
 _SHOWN, _REFRESHED = 100, 1.0

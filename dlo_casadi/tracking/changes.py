@@ -29,7 +29,6 @@ from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from dlo_casadi.arrays import BoolArray, FloatArray
-from dlo_casadi.cable.seen import Seen, declared
 from dlo_casadi.diagnosis.candidates import Candidate, candidates, setup_of
 from dlo_casadi.effects import EFFECTS, Effect, Load, PointLoad
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
@@ -37,6 +36,8 @@ from dlo_casadi.linear_mixed import Score
 from dlo_casadi.model.assembly import Shapes
 from dlo_casadi.model.cable_model import STIFFNESSES, CableModel
 from dlo_casadi.thresholds import COLLINEAR, SCANS_APART
+from dlo_casadi.tracking.known import coefficient
+from dlo_casadi.tracking.seen import Seen, declared
 
 # Places of a new weight, of those that the diagnosis tries, that are looked at every few poses.
 _WEIGHTS = (2, 8, 14, 20)
@@ -259,8 +260,7 @@ def _directions(model: CableModel, names: Sequence[str]) -> tuple[FloatArray, Fl
         if name in model.names:
             by_p[model.names.index(name), k] = 1.0
         else:
-            coefficient = int(name.removeprefix("rest_curvature[").removesuffix("]"))
-            by_rest[:, k] = model.rest_basis[:, coefficient]
+            by_rest[:, k] = model.rest_basis[:, coefficient(name)]
     return by_p, by_rest
 
 
@@ -302,7 +302,7 @@ class Jumps:
         new["square"] += (d**2).sum(axis=0)
         new["poses"] += 1
         if not seen.refused:
-            gain = seen.prior.metadata.uncertainty.covariance @ h.T
+            gain = seen.prior.uncertainty.covariance @ h.T
             new["taken"] += gain @ g
         self._sums = new
 

@@ -25,8 +25,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import chdtrc
 
-from dlo_casadi.arrays import BoolArray, FloatArray
-from dlo_casadi.cable.held import HELD, posed
+from dlo_casadi.arrays import FloatArray
 from dlo_casadi.codegen import CompiledShape, CompiledSolver
 from dlo_casadi.config import Pose
 from dlo_casadi.equilibrium.batch import BatchEquilibrium
@@ -40,14 +39,13 @@ from dlo_casadi.rod.band import Vector
 from dlo_casadi.rod.ends import reaction_rows
 from dlo_casadi.rod.quantities import quantity_of
 from dlo_casadi.sensing.noise import correlation
+from dlo_casadi.tracking.known import Known
 
 # Relinearisations of an update, and the step at which they end, in standard deviations after it: a
 # smaller one is as good as linear.
 _ITERATIONS, _SMALL = 15, 0.1
 # Share of the noise of a line that is correlated, if any is; the rest keeps close points apart.
 _SHARE = 0.99
-# Largest change of a logarithm in an update.
-_LOGS = 3.0
 # Largest last step [rad] of Newton's method: a thousandth of what any camera sees.
 _EXACT = 1e-7
 # Probability of a pose by chance below which it is refused.
@@ -191,7 +189,7 @@ class Seen:
     number : int
         Of the pose, the first is 1.
     pose : Pose
-    prior : EstimatedCable
+    prior : Known
         What was known of the cable.
     model, held : CableModel, HeldPose
         With the clips of the pose.
@@ -209,7 +207,7 @@ class Seen:
 
     number: int
     pose: Pose
-    prior: Any
+    prior: Known
     model: CableModel
     held: HeldPose
     shapes: Shapes
@@ -250,7 +248,7 @@ class Shaper:
     last: tuple[CableModel, HeldPose, Shapes] | None = None
     _solvers: dict[Any, tuple[CompiledSolver, CompiledShape | None]] = field(default_factory=dict)
 
-    def found(self, batch: BatchEquilibrium, cable: Any, held: HeldPose, *, anew: bool) -> Shapes:
+    def found(self, batch: BatchEquilibrium, cable: Known, held: HeldPose, *, anew: bool) -> Shapes:
         """The equilibrium of a pose; not the one near the last if `anew`."""
         p, rest, model = cable.p, cable.rest, cable.model
         near = None if anew else self._near(model, held)
@@ -277,7 +275,7 @@ class Shaper:
         return shapes if near else None
 
     def _by_c(
-        self, batch: BatchEquilibrium, cable: Any, held: HeldPose, near: Shapes | None
+        self, batch: BatchEquilibrium, cable: Known, held: HeldPose, near: Shapes | None
     ) -> Shapes | None:
         """A shape by C, of the cable as it was when it was compiled."""
         key = cable.model.clips
@@ -305,13 +303,13 @@ def declared(batch: BatchEquilibrium, shapes: Shapes) -> Shapes:
 
 
 def learned(
-    prior: Any, pose: Pose, noise: Noise, number: int, shaper: Shaper
-) -> tuple[Any, Seen | None]:
+    prior: Known, pose: Pose, held: HeldPose, noise: Noise, number: int, shaper: Shaper
+) -> tuple[Known, Seen | None]:
     """The cable after a pose, and how the pose was seen; None if nothing was measured.
 
     A pose that a shape near the last one does not explain is solved anew: cables snap.
     """
-    own, held = posed(prior, {name: getattr(pose, name) for name in (*HELD, "clips")})
+    own = prior.between(held)
     measured = Measured.of(pose, own.model, noise)
     if not measured.size:
         return prior, None
@@ -326,8 +324,8 @@ def learned(
 
 
 def _learned(
-    prior: Any,
-    own: Any,
+    prior: Known,
+    own: Known,
     held: HeldPose,
     pose: Pose,
     measured: Measured,
@@ -335,8 +333,8 @@ def _learned(
     shaper: Shaper,
     *,
     anew: bool,
-) -> tuple[Any, Seen]:
-    uncertainty = prior.metadata.uncertainty
+) -> tuple[Known, Seen]:
+    uncertainty = prior.uncertainty
     batch = BatchEquilibrium(
         uncertainty.pose_scatter.within(own.model), [held], wrenches=bool(measured.rows)
     )
@@ -345,13 +343,13 @@ def _learned(
     z, seen = np.zeros(count), None
     shapes, least, best = shaper.found(batch, own, held, anew=anew), np.inf, z
     for iterations in range(1, _ITERATIONS + 1):
-        now = moved(own, by_p[:, :count] @ z, by_rest[:, :count] @ z)
+        now = own.moved(by_p[:, :count] @ z, by_rest[:, :count] @ z)
         if iterations > 1:
             shapes, converged = batch.solve(shapes, now.p, now.rest, tolerance=_EXACT)
             if not converged.all():
                 found = solve_equilibrium(own.model, now.p, now.rest, held)
                 shapes = declared(batch, found.shapes)
-        rate = _rises(own.model, now.p, own.p)
+        rate = own.rises(now.p, own.p)
         along = batch.by_rest(shapes, now.p, now.rest, by_rest, rate[:, None] * by_p, by_deviation)
         ((told, change),) = batch.observe(shapes, now.p, now.rest, along)
         measured = measured.on(told)
@@ -391,31 +389,5 @@ def _learned(
         np.array([rates.get(name, 1.0) for name in uncertainty.names])[:, None] * uncertainty.root
     )
     covariance = root @ ((left + left.T) / 2) @ root.T
-    after = moved(prior, by_p[:, :count] @ z, by_rest[:, :count] @ z)
-    return with_covariance(after, covariance), seen
-
-
-def moved(cable: Any, by_p: FloatArray, by_rest: FloatArray) -> Any:
-    """The cable with other values, within their bounds; logarithms change by as much as a share."""
-    bounds = np.array([q.bounds(estimated=True) for q in cable.model.parameters])
-    rise = np.exp(np.clip(_rises(cable.model, by_p, cable.p), -_LOGS, _LOGS))
-    new = np.where(_logs(cable.model), cable.p * rise, cable.p + by_p)
-    p = np.where(by_p == 0, cable.p, np.clip(new, bounds[:, 0], bounds[:, 1]))
-    return replace(cable, p=p, rest=cable.rest + by_rest)
-
-
-def _logs(model: CableModel) -> BoolArray:
-    """Whether each parameter is Gaussian in its logarithm, as in the fit."""
-    return np.array([q.log for q in model.parameters], dtype=bool)
-
-
-def _rises(model: CableModel, new: FloatArray, old: FloatArray) -> FloatArray:
-    """Ratios of values that are logarithms, 1 for others."""
-    return np.divide(new, old, out=np.ones(len(old)), where=_logs(model))
-
-
-def with_covariance(cable: Any, covariance: FloatArray) -> Any:
-    """The cable with another covariance of its unknowns."""
-    known = cable.metadata
-    uncertainty = replace(known.uncertainty, covariance=covariance)
-    return replace(cable, metadata=replace(known, uncertainty=uncertainty))
+    after = prior.moved(by_p[:, :count] @ z, by_rest[:, :count] @ z)
+    return after.with_covariance(covariance), seen

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
-from dlo_casadi.cable.changes import Jump, Jumps, Probe
-from dlo_casadi.cable.seen import (
-    OUTLIER,
-    Noise,
-    Seen,
-    Shaper,
-    learned,
-    with_covariance,
-)
 from dlo_casadi.errors import EquilibriumError
-from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.thresholds import EVIDENCE_APART, NEAR_END
+from dlo_casadi.tracking.changes import Jump, Jumps, Probe
+from dlo_casadi.tracking.known import Known
+from dlo_casadi.tracking.seen import OUTLIER, Noise, Seen, Shaper, learned
 
 # Poses after an alarm at which its cause is judged again while others explain it as well.
 JUDGED = (1, 2, 4, 8, 16, 32)
@@ -80,7 +73,7 @@ class Replayed:
 
     Parameters
     ----------
-    cable : EstimatedCable
+    cable : Known
         After the last pose.
     seen : list of Seen
     before : float
@@ -88,7 +81,7 @@ class Replayed:
     """
 
     jump: Jump
-    cable: Any
+    cable: Known
     seen: list[Seen]
     before: float
 
@@ -120,16 +113,16 @@ class Inquiry:
     Parameters
     ----------
     poses : list of Seen
-    cable : EstimatedCable
+    cable : Known
         That filter's, after the last pose.
     faded : callable
         The cable before the next pose: what is known has faded, and has walked.
     """
 
     poses: list[Seen]
-    cable: Any
+    cable: Known
     noise: Noise
-    faded: Callable[[Any], Any]
+    faded: Callable[[Known], Known]
     shaper: Shaper
     since: int
     opened: int
@@ -138,7 +131,7 @@ class Inquiry:
 
     def __post_init__(self) -> None:
         last = self.poses[-1]
-        unknown = last.prior.metadata.uncertainty.names
+        unknown = last.prior.uncertainty.names
         for probe in Probe.every(last.model, unknown):
             jumps = Jumps(probe, len(self.poses) + JUDGED[-1])
             for seen, columns in zip(self.poses, probe.columns(self.poses), strict=True):
@@ -147,8 +140,9 @@ class Inquiry:
 
     def add(self, seen: Seen) -> None:
         """One more pose, as the tracker has seen it."""
+        shaper = Shaper(False, self._last)
         after, own = learned(
-            self.faded(self.cable), seen.pose, self.noise, seen.number, Shaper(False, self._last)
+            self.faded(self.cable), seen.pose, seen.held, self.noise, seen.number, shaper
         )
         assert own is not None
         self.cable = after
@@ -161,7 +155,7 @@ class Inquiry:
         last = self.poses[-1]
         return last.model, last.held, last.shapes
 
-    def verdict(self, *, final: bool) -> tuple[Change, Any]:
+    def verdict(self, *, final: bool) -> tuple[Change, Known]:
         """What changed, and the cable after it."""
         ranked = self._ranked()
         top = ranked[0]
@@ -216,29 +210,24 @@ class Inquiry:
             self._lines[key] = line
         return line
 
-    def _unknown(self, final: bool) -> tuple[Change, Any]:
+    def _unknown(self, final: bool) -> tuple[Change, Known]:
         """Nothing explains it: the cable with much of what was known forgotten."""
-        covariance = self.cable.metadata.uncertainty.covariance
-        wide = with_covariance(self.cable, _FORGOTTEN * covariance)
+        covariance = self.cable.uncertainty.covariance
+        wide = self.cable.with_covariance(_FORGOTTEN * covariance)
         return Change(self.since, None, {}, {}, (), final), wide
 
     def _sizes(self, found: Replayed) -> tuple[dict[str, float], dict[str, float]]:
         """Size of the change and its standard deviation."""
         after, start = found.cable, self._before(found.jump)
-        model, stds, olds = after.model, _stds(after), _stds(start)
+        stds, olds = after.stds, start.stds
         values, std = {}, {}
-        names = _names(found.jump)
-        for name in names:
-            if name in model.names:
-                now = float(after.p[model.names.index(name)])
-                first = start.model.names
-                values[name] = now - (float(start.p[first.index(name)]) if name in first else 0.0)
-            else:
-                values[name] = _value(after, start, name)
+        for name in _names(found.jump):
+            old = start.value(name, start) if name in start.model.names else 0.0
+            values[name] = after.value(name, start) - old
             std[name] = float(np.hypot(stds[name], olds.get(name, 0.0)))
         return values, std
 
-    def _before(self, jump: Jump) -> Any:
+    def _before(self, jump: Jump) -> Known:
         """What was known before the change."""
         return next(seen for seen in self.poses if seen.number == jump.since).prior
 
@@ -256,13 +245,13 @@ class Inquiry:
             width = {name: max(width.get(name, 0.0), sizes[name]) for name in candidate.frees}
         found: Replayed | None = None
         for _ in range(2):
-            cable = with_unknowns(start, model, first, width)
+            cable = start.with_unknowns(model, first, width)
             now = self._going_on(Replayed(jump, cable, [], before), poses)
             if now is None:
                 break
             found = now
-            first = {name: _value(found.cable, start, name) for name in width}
-            stds = _stds(found.cable)
+            first = {name: found.cable.value(name, start) for name in width}
+            stds = found.cable.stds
             width = {name: _WIDE * stds[name] for name in width}
         return found
 
@@ -273,7 +262,8 @@ class Inquiry:
             for one in poses:
                 prior = self.faded(cable) if seen else cable
                 last = (seen[-1].model, seen[-1].held, seen[-1].shapes) if seen else None
-                cable, told = learned(prior, one.pose, self.noise, one.number, Shaper(False, last))
+                shaper = Shaper(False, last)
+                cable, told = learned(prior, one.pose, one.held, self.noise, one.number, shaper)
                 assert told is not None
                 seen.append(told)
         except EquilibriumError:
@@ -281,62 +271,12 @@ class Inquiry:
         return Replayed(line.jump, cable, seen, line.before)
 
 
-def _stds(cable: Any) -> dict[str, float]:
-    """Standard deviations of a cable's unknowns."""
-    known = cable.metadata.uncertainty
-    roots = np.sqrt(np.maximum(np.diag(known.covariance), 0.0))
-    return dict(zip(known.names, roots.tolist(), strict=True))
-
-
 def _names(jump: Jump) -> tuple[str, ...]:
     candidate = jump.suspect.candidate
     return jump.suspect.names if candidate is None else candidate.frees
 
 
-def _jumped(cable: Any, step: Mapping[str, float]) -> dict[str, float]:
+def _jumped(cable: Known, step: Mapping[str, float]) -> dict[str, float]:
     """Values after a jump; of rest coefficients the jump itself."""
     known = dict(zip(cable.model.names, cable.p, strict=True))
     return {name: known.get(name, 0.0) + x for name, x in step.items()}
-
-
-def _value(cable: Any, start: Any, name: str) -> float:
-    """A parameter, or the change of a rest coefficient from the start."""
-    if name in cable.model.names:
-        return float(cable.p[cable.model.names.index(name)])
-    k = int(name.removeprefix("rest_curvature[").removesuffix("]"))
-    basis = cable.model.rest_basis
-    return float(np.linalg.lstsq(basis, cable.rest - start.rest, rcond=None)[0][k])
-
-
-def with_unknowns(
-    cable: Any, model: CableModel, values: Mapping[str, float], std: Mapping[str, float]
-) -> Any:
-    """The cable with more unknowns, or less known ones.
-
-    Parameters
-    ----------
-    model : CableModel
-        With all effects that have these unknowns.
-    values : mapping
-        Their first values, rest coefficients among them.
-    std : mapping
-        Their standard deviations, in addition to what the cable's covariance has of them.
-    """
-    old = cable.metadata.uncertainty
-    names = (*old.names, *(name for name in std if name not in old.names))
-    grown = len(names) - len(old.names)
-    covariance = np.pad(old.covariance, [(0, grown)] * 2)
-    covariance += np.diag([std.get(name, 0.0) ** 2 for name in names])
-    known = dict(zip(cable.model.names, cable.p, strict=True)) | dict(values)
-    p = np.array([known.get(q.name, q.nominal) for q in model.parameters])
-    rest = cable.rest.copy()
-    for name, value in values.items():
-        if name not in model.names:
-            k = int(name.removeprefix("rest_curvature[").removesuffix("]"))
-            rest += model.rest_basis[:, k] * value
-    bounds = np.array([q.bounds(estimated=True) for q in model.parameters])
-    free = np.array([name in std for name in model.names])
-    p = np.where(free, np.clip(p, bounds[:, 0], bounds[:, 1]), p)
-    uncertainty = replace(old, names=names, covariance=covariance)
-    metadata = replace(cable.metadata, uncertainty=uncertainty)
-    return replace(cable, model=model, p=p, rest=rest, metadata=metadata)

@@ -11,21 +11,22 @@ Page, Biometrika 41 (1954); Lorden, Ann. Math. Statist. 42 (1971).
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
 from dlo_casadi.arrays import FloatArray
-from dlo_casadi.cable.changes import Jumps, Probe
-from dlo_casadi.cable.estimate import Covariance, Estimate, EstimatedCable, Estimates
-from dlo_casadi.cable.inquiry import JUDGED, Change, Inquiry
-from dlo_casadi.cable.saved import cable_document, parameters_hash
-from dlo_casadi.cable.seen import Noise, Seen, Shaper, learned, with_covariance
 from dlo_casadi.config import Pose
+from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.errors import DloError
 from dlo_casadi.io.files import finite
+from dlo_casadi.model.cable_model import CableModel
+from dlo_casadi.tracking.changes import Jumps, Probe
+from dlo_casadi.tracking.inquiry import JUDGED, Change, Inquiry
+from dlo_casadi.tracking.known import Known
+from dlo_casadi.tracking.seen import Noise, Seen, Shaper, learned
 
 # So many poses in a row that are refused are a change.
 IN_A_ROW = 3
@@ -95,7 +96,9 @@ class Tracker:
         The last change.
     """
 
-    _cable: Any
+    _known: Known
+    _held: Callable[[CableModel, Pose], HeldPose]  # how a pose holds a cable of this model
+    _as_cable: Callable[[Known], Any]  # with its parameters and its document
     noise: Noise
     forget: float = 1.0
     drift: Mapping[str, float] = field(default_factory=dict)
@@ -120,12 +123,12 @@ class Tracker:
     @property
     def cable(self) -> Any:
         """The cable after the last pose: its parameters and their covariance; `save` keeps it."""
-        return _documented(self._cable)
+        return self._as_cable(self._known)
 
     @property
-    def params(self) -> Estimates:
+    def params(self) -> Any:
         """Parameters after the last pose."""
-        return Estimates(self.cable.metadata.params)
+        return self.cable.params
 
     def update(self, pose: Pose) -> Update:
         """Learn from a pose: its fixtures, and what was measured of the cable.
@@ -152,9 +155,10 @@ class Tracker:
             raise
 
     def _updated(self, pose: Pose) -> Update:
-        prior = self._faded(self._cable)
-        after, seen = learned(prior, pose, self.noise, self.count + 1, self._shaper)
-        self.count, self._cable = self.count + 1, after
+        prior = self._faded(self._known)
+        held, number = self._held(prior.model, pose), self.count + 1
+        after, seen = learned(prior, pose, held, self.noise, number, self._shaper)
+        self.count, self._known = number, after
         change = None if seen is None else self._judged(seen)
         most = WINDOW + (0 if self._inquiry is None else JUDGED[-1])
         while len(self._kept) > most:
@@ -166,19 +170,19 @@ class Tracker:
             seen.iterations,
         )
 
-    def _faded(self, cable: Any) -> Any:
+    def _faded(self, cable: Known) -> Known:
         """The cable before a pose: what is known has faded, and has walked."""
         if self.forget == 1 and not self.drift:
             return cable
-        known = cable.metadata.uncertainty
+        known = cable.uncertainty
         walked = np.array([self.drift.get(name, 0.0) for name in known.names])
-        return with_covariance(cable, known.covariance / self.forget + np.diag(walked**2))
+        return cable.with_covariance(known.covariance / self.forget + np.diag(walked**2))
 
     # ---- kept and resumed ------------------------------------------------------------------------
 
     def _now(self) -> dict[str, Any]:
         """What a pose changes."""
-        names = ("_cable", "count", "change", "_suspicion", "_since", "_refused")
+        names = ("_known", "count", "change", "_suspicion", "_since", "_refused")
         return {name: getattr(self, name) for name in names}
 
     def state(self) -> dict[str, Any]:
@@ -187,16 +191,16 @@ class Tracker:
         change = first["change"]
         return finite(
             {
-                "parameters": _documented(first["_cable"]).metadata.document,
+                "parameters": self._as_cable(first["_known"]).metadata.document,
                 "tests": {name: first[name] for name in ("count", *_TESTS)},
                 "change": None if change is None else asdict(change),
                 "poses": [_plain(pose) for _, pose in self._kept],
             }
         )
 
-    def resume(self, state: Mapping[str, Any], cable: Any) -> None:
-        """Go on from a `state` of such a tracker; `cable`: that of its parameters."""
-        self._cable, self.count = cable, state["tests"]["count"]
+    def resume(self, state: Mapping[str, Any], known: Known) -> None:
+        """Go on from a `state` of such a tracker; `known`: the cable of its parameters."""
+        self._known, self.count = known, state["tests"]["count"]
         self.change = None if state["change"] is None else Change(**state["change"])
         self._kept.clear()
         self._begin()
@@ -244,7 +248,7 @@ class Tracker:
     def _looked(self) -> int | None:
         """Likelihood ratios of what may have changed, since each of the last poses."""
         if self._jumps is None:
-            names = self._cable.metadata.uncertainty.names
+            names = self._known.uncertainty.names
             self._jumps = Jumps(Probe.quick(self._unseen[-1].model, names), WINDOW)
         jumps = self._jumps
         for one, columns in zip(self._unseen, jumps.probe.columns(self._unseen), strict=True):
@@ -259,9 +263,8 @@ class Tracker:
         """An alarm: what changed is asked of the poses that are kept."""
         run = self.count - self._refused if self._refused >= IN_A_ROW else self.count
         poses = [one for one in self._window if not one.refused or one.number > run]
-        cable = self._cable
         self._inquiry = Inquiry(
-            poses, cable, self.noise, self._faded, self._shaper, since, self.count
+            poses, self._known, self.noise, self._faded, self._shaper, since, self.count
         )
         return self._concluded(final=False)
 
@@ -278,7 +281,7 @@ class Tracker:
     def _concluded(self, *, final: bool) -> Change:
         inquiry = self._inquiry
         assert inquiry is not None
-        change, self._cable = inquiry.verdict(final=final)
+        change, self._known = inquiry.verdict(final=final)
         self.change = change
         self._begin()
         if change.decided:
@@ -288,105 +291,6 @@ class Tracker:
         return change
 
 
-class TrackedCable(EstimatedCable):
-    """A fitted cable that is tracked."""
-
-    if TYPE_CHECKING:
-
-        def solve(self, *pose: Any, **held: Any) -> Any:
-            """See `FittedCable.solve`."""
-
-    def tracker(
-        self,
-        std: float,
-        *,
-        force_std: float | None = None,
-        moment_std: float | None = None,
-        correlated: float = 0.0,
-        forget: float = 1.0,
-        drift: Mapping[str, float] | None = None,
-        compiled: bool = False,
-    ) -> Tracker:
-        """Estimate the cable further, one pose after the other.
-
-        Parameters
-        ----------
-        std : float [m]
-            Standard deviation of one coordinate of a measured point.
-        force_std, moment_std : float [N, N m], optional
-            Of one component of a reading; without them readings are not used.
-        correlated : float [m]
-            Distance along a line at which errors of its points are correlated by 1/e: the report's
-            `correlation_length_m`. Points with arc lengths have independent errors.
-        forget : float
-            Share of what is known that is kept from pose to pose, at most 1.
-        drift : mapping of str to float, optional
-            Standard deviation per pose of parameters that change slowly: {"bending_stiffness":
-            1e-4}.
-        compiled : bool
-            Whether equilibria are first found by compiled C; it takes some seconds to compile.
-
-        Raises
-        ------
-        DloError
-            If a value is impossible, if there is no such parameter, if nothing is uncertain, or if
-            there is no C compiler.
-        """
-        _checked("std", std, "the noise of a coordinate [m]")
-        for name, size in (("force_std", force_std), ("moment_std", moment_std)):
-            if size is not None:
-                _checked(name, size, "the noise of a component [N, N m]")
-        if correlated:
-            _checked("correlated", correlated, "a distance along the cable [m]")
-        if not isinstance(forget, int | float) or not 0.5 <= forget <= 1:
-            raise DloError(f"forget: 0.5 to 1 belongs here, found {forget!r}")
-        names = self.covariance.names
-        if self.model.has_state:
-            raise DloError("tracker: a rest shape that changes from pose to pose is not tracked")
-        if not names:
-            raise DloError(
-                "tracker: all parameters of this cable are exact.\n  Try: a fitted cable"
-            )
-        for name, value in (drift or {}).items():
-            if name not in names:
-                raise DloError(f"drift: {name!r} is not estimated.\n  Try: {', '.join(names)}")
-            if not 0 <= float(value) < np.inf:
-                raise DloError(f"drift: {name}: a standard deviation, found {value!r}")
-        noise = Noise(float(std), force_std, moment_std, float(correlated))
-        return Tracker(self, noise, float(forget), dict(drift or {}), compiled)
-
-
-def _checked(name: str, value: object, meant: str) -> None:
-    """Raise a DloError if a value is no positive number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
-        raise DloError(f"{name}: {meant} belongs here, found {value!r}")
-
-
 def _plain(pose: Pose) -> dict[str, Any]:
     """Arguments of a pose."""
     return {key: x for key, x in asdict(pose).items() if x not in (None, (), "")}
-
-
-def _documented(cable: Any) -> Any:
-    """The cable with its values in its parameters and its document."""
-    old, model, known = cable.metadata, cable.model, cable.metadata.uncertainty
-    found = Covariance(known.names, known.covariance)
-    params = {
-        q.name: Estimate(
-            float(value), found.std.get(q.name, 0.0), q.unit, fixed=q.name not in known.names
-        )
-        for q, value in zip(model.parameters, cable.p, strict=True)
-    }
-    coefficients = np.linalg.lstsq(model.rest_basis, cable.rest, rcond=None)[0]
-    document = {**old.document, **cable_document(model, cable.p, coefficients, cable.rest, known)}
-    document["cable"] = {**old.document["cable"], **document["cable"]}
-    document["model_hash"] = parameters_hash(document)
-    metadata = replace(
-        old,
-        params=params,
-        covariance=found,
-        coefficients=coefficients,
-        document=document,
-        model_hash=document["model_hash"],
-    )
-    return replace(cable, metadata=metadata)
