@@ -13,6 +13,9 @@ from filelock import FileLock
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+# Tests start many processes, each of which would compile the whole package again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # Solvers are compiled without optimisation, which takes clang a fifth of GCC's time. Tests that
 # name a compiler keep theirs.
 if shutil.which("clang"):

@@ -23,11 +23,13 @@ SPACE = CableData(0.6, 0.03, 0.004, 0.015, "loom <&>", torsional_stiffness=0.011
 PLANE = CableData(0.8, 0.2, 0.012, 0.3, "rope")
 MASS, PLACE, RATIO = 0.02, 0.25, 3.0
 ON_TABLE = HeldPose((0.0, 0.0), (0.5, 0.1))
+GUIDED = {"start_heading": -1.0, "end_heading": 1.1, "end_tension": 1.0}
 
 
-def in_space(*effects, start="clamped", end="clamped", **values):
+def in_space(*effects, start="clamped", end="clamped", free_length=None, **values):
     """A curved cable between two clamps, far from straight."""
     model = CableModel(SPACE, 20, "quadratic", start, end, (0, 0, -9.81), n_rest=4)
+    model = replace(model, fed_by_length=free_length is not None)
     for effect in effects:
         model = model.with_effect(EFFECTS[effect]())
     p = model.nominal.copy()
@@ -38,22 +40,25 @@ def in_space(*effects, start="clamped", end="clamped", **values):
     pose = HeldPose(
         (0.1, 0.2, 0.3), (0.45, 0.3, 0.35), start_orientation=(0, 0, 0, 1), end_orientation=turned
     )
-    return SolvedCable.of(model, p, rest, pose)
+    return SolvedCable.of(model, p, rest, replace(pose, free_length=free_length))
 
 
-def in_plane(start="pinned", end="pinned"):
+def in_plane(start="pinned", end="pinned", **more):
     model = CableModel(PLANE, 20, "quadratic", start, end, n_rest=4)
     rest = model.rest_basis @ np.array([0.5, 2.0, 1.0, 0.2])
     pose = HeldPose((0.1, 0.2), (0.6, 0.1) if end != "free" else None, start_heading=0.3)
+    pose = replace(pose, **more)
     return SolvedCable.of(model, model.nominal, rest, pose)
 
 
 def off(held, rod, nodes):
     """Largest distance of nodes from our curve at the same arc length, over the length."""
-    inside = (rod.s >= 0) & (rod.s <= held.model.cable.length * (1 + 1e-12))
+    low, high = held.places[[0, -1]]
+    length = high - low
+    inside = (rod.s >= low) & (rod.s <= high + 1e-12 * length)
     ours = np.zeros((inside.sum(), 3))
-    ours[:, : held.curve.d] = held.curve.at(rod.s[inside])
-    return np.linalg.norm(nodes[inside] - ours, axis=1).max() / held.model.cable.length
+    ours[:, : held.curve.d] = held.curve.along(length).at(rod.s[inside] - low)
+    return np.linalg.norm(nodes[inside] - ours, axis=1).max() / length
 
 
 CASES = {
@@ -66,6 +71,8 @@ CASES = {
     "swivels": lambda: in_space(start="swivel", end="swivel"),
     "plane": in_plane,
     "overhang": lambda: in_plane("clamped", "free"),
+    "fed": lambda: in_plane("clamped", "slide", **GUIDED),
+    "fed at the start": lambda: in_space(start="slide", free_length=0.7),
 }
 
 
@@ -78,7 +85,9 @@ def test_the_rod_lies_on_the_curve(case):
     assert off(held, rod, rod.nodes) < 1e-3
     assert np.linalg.norm(np.diff(rod.nodes, axis=0), axis=1) == pytest.approx(rod.h, rel=1e-6)
     assert rod.frames.apply([1.0, 0.0, 0.0]) == pytest.approx(np.diff(rod.nodes, axis=0) / rod.h)
-    assert rod.masses.sum() == pytest.approx(held.model.cable.mass)
+    share = np.ptp(held.places) / held.model.cable.length
+    assert (share != 1) == ("fed" in case)
+    assert rod.masses.sum() == pytest.approx(share * held.model.cable.mass)
 
 
 def test_what_effects_are_to_a_rod():
@@ -271,6 +280,18 @@ def test_a_table_that_a_fit_has_found_is_not_carried_either():
     told, moved = told_and_moved(held, free, "obstacles")
     assert told == pytest.approx(moved, rel=0.05)  # two digits
     assert moved > 2
+
+
+def test_what_is_fed_stays_as_in_the_pose():
+    """The rest curvature beyond the declared length stays as at its ends, and a file says so."""
+    held = CASES["fed at the start"]()
+    rod, target = Rod.of(held, 40), TARGETS["mujoco"]
+    beyond = rod.s[1:-1] < 0.0
+    assert 2 < beyond.sum() < 20
+    ends = np.tile([0.0, 0.5, 0.3], (beyond.sum() - 1, 1))
+    assert rod.rest[beyond][:-1] == pytest.approx(ends, rel=1e-3)
+    between = f"the {1e3 * np.ptp(held.places):.1f} mm between the ends of this shape stay"
+    assert between in losses(held, target, rod)["feeding through an end"]
 
 
 def test_clips_are_not_carried_either():

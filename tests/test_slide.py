@@ -18,7 +18,6 @@ from dlo_casadi.equilibrium.solve import solve_equilibrium
 from dlo_casadi.equilibrium.spread import SolvedCable
 from dlo_casadi.equilibrium.symbolic import CasadiCable
 from dlo_casadi.errors import ConfigError, DloError, EquilibriumError
-from dlo_casadi.export.rod import Rod
 from dlo_casadi.model.cable_model import CableModel
 from dlo_casadi.model.clips import HeldClip
 from dlo_casadi.rod.obstacles import Plane
@@ -434,9 +433,6 @@ def test_what_a_sliding_end_has_not():
         replace(model, start="slide", end="free")
     with pytest.raises(DloError, match="smooth element"):
         replace(model, element="link")
-    rest = np.zeros(model.chain.n_rests)
-    with pytest.raises(DloError, match="cannot be exported"):
-        Rod.of(SolvedCable.of(model, model.nominal, rest, pose))
 
 
 SESSION = """

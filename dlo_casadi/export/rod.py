@@ -27,7 +27,6 @@ from dlo_casadi.effects import (
 from dlo_casadi.equilibrium.curve import NodeCurve
 from dlo_casadi.equilibrium.pose import HeldPose
 from dlo_casadi.equilibrium.spread import SolvedCable
-from dlo_casadi.errors import DloError
 from dlo_casadi.export.common import printable
 from dlo_casadi.export.driven import Driven
 from dlo_casadi.model.cable_model import DAMPING_TIME, CableModel
@@ -54,6 +53,7 @@ Feature = Literal[
     "clips",
     "obstacles",
     "free roll of an end",
+    "feeding through an end",
     "damping beside the cable's own",
 ]
 # GJ / EI of a cable that was measured in a plane: that of a solid round rod.
@@ -96,7 +96,7 @@ class Rod:
         Kind of the model's nodes. With headings the cable stayed in the plane z = 0, and nothing is
         known out of the plane.
     s : (n + 1,) [m]
-        Arc lengths of the nodes; nodes inside clamps lie outside [0, L].
+        Arc lengths of the nodes from the declared start; nodes inside clamps lie beyond the ends.
     nodes : (n + 1, 3) [m]
     frames : (n,) rotations
         Material frames of the segments: x along the cable, y and z the section's axes.
@@ -144,27 +144,23 @@ class Rod:
     @classmethod
     def of(cls, held: SolvedCable, segments: int | None = None) -> Self:
         """Cut a cable into segments, by default as many as keep each joint's turn below `TURN`."""
-        model, p, pose, curve = held.model, held.p, held.pose, held.curve
-        if model.slides:
-            side = "start" if model.start.slides else "end"
-            raise DloError(
-                f"a cable that slides through its {side} cannot be exported.\n"
-                f"  Try: {side}: swivel, with the free length as cable.length"
-            )
-        terms, length = lagrangian_of(model), model.cable.length
+        model, p, pose = held.model, held.p, held.pose
+        low, high = held.places[[0, -1]].tolist()
+        terms, length = lagrangian_of(model), high - low
+        curve = held.curve.along(length)
         true, true_length = _numbers(terms, p, pose, terms.true_ends.vector, length * terms.stretch)
         if segments is None:
             sharpest = np.linalg.norm(curve.at(np.linspace(0, length, 400), 2), axis=1).max()
             segments = int(np.clip(np.ceil(sharpest * length / TURN), *SEGMENTS))
         clamped = [kind.direction for kind in (model.start, model.end)]
         h = length / (segments - sum(clamped) / 2)
-        s = h * (np.arange(segments + 1) - clamped[0] / 2)
+        s = low + h * (np.arange(segments + 1) - clamped[0] / 2)
         fixtures = _fixtures(model, pose, true, curve, held.equilibrium.x)
         stretch = float(true_length) / length
         nodes, frames = _segments(held, fixtures, s, h * stretch)
         mass, gravity = _weights(terms, p, pose)
         bending, torsion = _stiffness(terms, p, pose, s, h)
-        cover = np.clip(s, 0.0, length)
+        cover = np.clip(s, low, high)
         compliance = float(_numbers(terms, p, pose, terms.axial_compliance)[0])
         features = features_of(model, p, pose)
         if np.abs(held.rest).max(initial=0.0) > 0:
@@ -172,6 +168,7 @@ class Rod:
         features |= {"clips": ()} if pose.clips else {}
         features |= {"obstacles": ()} if model.surfaces else {}
         features |= {"free roll of an end": ()} if any(x.rolls for x in fixtures) else {}
+        features |= {"feeding through an end": ()} if model.slides else {}
         return cls(
             name=printable(model.cable.name),
             node=model.node,
@@ -361,12 +358,13 @@ def _segments(
 ) -> tuple[FloatArray, Rotation]:
     """Nodes and frames of equal segments along the curve, closed between the fixtures."""
     start, end = fixtures
-    model, length = cable.model, cable.model.cable.length
-    middles = np.clip((s[:-1] + s[1:]) / 2, 0.0, length)
+    model, (low, high) = cable.model, cable.places[[0, -1]]
+    middles = np.clip((s[:-1] + s[1:]) / 2, low, high)
     frames = model.node.rotations(
         model.node.interpolated(middles, cable.places, cable.equilibrium.x)
     )
-    ways = np.diff(_spatial(cable.curve.at(np.clip(s, 0.0, length))), axis=0)
+    curve = cable.curve.along(high - low)
+    ways = np.diff(_spatial(curve.at(np.clip(s, low, high) - low)), axis=0)
     first, last = start.cable_place, end.cable_place
     held = [k for k, side in ((0, start), (-1, end)) if side.kind.direction]
     for k in held:
@@ -417,7 +415,7 @@ def _stiffness(
 ) -> tuple[FloatArray, FloatArray]:
     """Bending (n - 1, 2, 2) and torsional (n - 1,) stiffness [N m^2] of the joints."""
     section, model = terms.section, terms.model
-    cells = np.clip(np.stack([s[1:-1] - h / 2, s[1:-1] + h / 2]), 0.0, model.cable.length)
+    cells = np.stack([s[1:-1] - h / 2, s[1:-1] + h / 2])
     along = [section.along(Cell(ca.SX(a), ca.SX(b - a), h)) for a, b in cells.T]
     factor, bending, torsion = _numbers(
         terms, p, pose, ca.vertcat(*along), section.bending, section.torsion
@@ -428,13 +426,22 @@ def _stiffness(
 
 
 def _rest(model: CableModel, rest: FloatArray, s: FloatArray, h: float) -> FloatArray:
-    """Rest strains (n - 1, 3) [1/m] of joints at s: means over the cable within h / 2 of each."""
+    """Rest strains (n - 1, 3) [1/m] of joints at s: means over the cable within h / 2 of each.
+
+    Beyond the declared length, of a cable that is fed, they stay as at its ends.
+    """
     chain, out = model.chain, np.zeros((len(s), 3))
     edges = np.append(chain.cells[:, 0], chain.cells[-1, 1])
-    low, high = (np.clip(s + side * h / 2, *edges[[0, -1]]) for side in (-1, 1))
     about = model.node.about
     for axis, means in zip(about, np.split(rest, len(about)), strict=True):
         turned = np.append(0.0, np.cumsum(means * np.diff(edges)))
         angle = CubicSpline(edges, turned)
-        out[:, "xyz".index(axis)] = (angle(high) - angle(low)) / (high - low)
+        low, high = (_beyond(angle, s + side * h / 2) for side in (-1, 1))
+        out[:, "xyz".index(axis)] = (high - low) / h
     return out
+
+
+def _beyond(spline: CubicSpline, s: FloatArray) -> FloatArray:
+    """Values of a spline, continued as a straight line beyond its ends."""
+    inside = np.clip(s, *spline.x[[0, -1]])
+    return np.asarray(spline(inside) + (s - inside) * spline(inside, 1))

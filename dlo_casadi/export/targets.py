@@ -324,6 +324,9 @@ def _cost(cable: SolvedCable, rod: Rod, feature: Feature) -> str:
     named = f"{', '.join(labels)} left out; " if labels else ""
     if feature == "damping beside the cable's own":
         return f"{named}it changes motions, not shapes at rest"
+    if feature == "feeding through an end":
+        between = float(np.ptp(cable.places))
+        return f"the {1e3 * between:.1f} mm between the ends of this shape stay between them"
     try:
         plain = SolvedCable.of(model, p, rest, pose)
     except EquilibriumError:

@@ -179,9 +179,9 @@ def round_trip(
 def _relaxed(
     pose: Pose, case: str, shape: Shape, rod: Rod, measured: MeasuredPose, target: Target
 ) -> Relaxation:
-    length, d = shape.cable.length, shape.curve.d
-    s = np.linspace(0.0, length, _CHORDS + 1)
-    ours, seen = shape.curve.at(s), shape.seen.at(s)
+    (low, high), d = shape.held.places[[0, -1]], shape.curve.d
+    s, length = np.linspace(low, high, _CHORDS + 1), high - low
+    ours, seen = (curve.at(np.minimum(s - low, length)) for curve in (shape.curve, shape.seen))
     reading = pose.readings.get("end_force")
     nothing = Relaxation(
         pose.name,
@@ -203,7 +203,7 @@ def _relaxed(
         return replace(nothing, problem=error.message.partition("\n")[0])
     points = CubicSpline(rod.s, at_rest.nodes)(s)[:, :d]
     curve = NodeCurve(length, points + seen - ours, None)
-    inside = (rod.s >= 0) & (rod.s <= length)
+    inside = (rod.s >= low) & (rod.s <= high)
     gap = np.linalg.norm(points - ours, axis=1)
     out_of_plane = np.abs(at_rest.nodes[inside, d:]).max(initial=0.0)
     return replace(
